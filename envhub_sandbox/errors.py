@@ -1,0 +1,210 @@
+"""Every error that a caller can meet.
+
+::
+
+    EnvHubError
+      HubReferenceError (ValueError)
+      SnapshotError
+        SnapshotTooLargeError
+        SnapshotIntegrityError
+        RepositoryUnavailableError
+      PolicyError (ValueError)
+      SandboxUnavailableError
+      DependencyError
+      LoadError
+      WorkerError
+        WorkerStartupError
+        WorkerDiedError
+        WorkerTimeoutError (TimeoutError)
+      ProtocolError
+        LocalProtocolError
+        RemoteProtocolError
+          MessageTooLargeError
+          VersionMismatchError
+      RemoteEnvError
+        RemoteAttributeError (AttributeError), RemoteValueError (ValueError), ...
+
+A remote exception arrives as text. ``remote_error`` maps its builtin ancestor through a fixed
+table, so ``except AttributeError`` keeps working although nothing of the worker is imported.
+"""
+
+from __future__ import annotations
+
+from envhub_worker.protocol.errors import (
+    EnvHubError,
+    LocalProtocolError,
+    MessageTooLargeError,
+    ProtocolError,
+    RemoteProtocolError,
+    VersionMismatchError,
+)
+
+__all__ = [
+    "DependencyError",
+    "EnvHubError",
+    "HubReferenceError",
+    "LoadError",
+    "LocalProtocolError",
+    "MessageTooLargeError",
+    "PolicyError",
+    "ProtocolError",
+    "RemoteEnvError",
+    "RemoteProtocolError",
+    "RepositoryUnavailableError",
+    "SandboxUnavailableError",
+    "SnapshotError",
+    "SnapshotIntegrityError",
+    "SnapshotTooLargeError",
+    "VersionMismatchError",
+    "WorkerDiedError",
+    "WorkerError",
+    "WorkerStartupError",
+    "WorkerTimeoutError",
+    "remote_error",
+]
+
+
+class HubReferenceError(EnvHubError, ValueError):
+    """A hub reference cannot be read; the text says what to write instead."""
+
+
+class SnapshotError(EnvHubError):
+    """A repository's files could not be brought here."""
+
+
+class SnapshotTooLargeError(SnapshotError):
+    """The repository is over the limit of bytes or files."""
+
+
+class SnapshotIntegrityError(SnapshotError):
+    """A file is not what the pinned commit says it is."""
+
+
+class RepositoryUnavailableError(SnapshotError):
+    """The Hub did not give the repository, revision or file; ``__cause__`` says why."""
+
+
+class PolicyError(EnvHubError, ValueError):
+    """A policy, limit or timeout has an unknown name or an impossible value."""
+
+
+class SandboxUnavailableError(EnvHubError):
+    """This host cannot enforce the policy; the text names the layer, the reason and the fix."""
+
+
+class DependencyError(EnvHubError):
+    """The repository needs a package that the worker's interpreter does not have."""
+
+
+class LoadError(EnvHubError):
+    """The repository's entry point cannot be imported, or returned something unusable."""
+
+
+class WorkerError(EnvHubError):
+    """The worker process failed."""
+
+
+class WorkerStartupError(WorkerError):
+    """The worker did not come up."""
+
+
+class WorkerDiedError(WorkerError):
+    """The process that ran the environment ended.
+
+    Attributes:
+        exit_code: The exit code, or None when a signal ended it.
+        signal: The name of the signal (``"SIGKILL"``), or None.
+        reason: ``"exit"``, ``"signal"``, ``"out-of-memory"``, ``"cpu-limit"`` or ``"killed"``.
+        log_tail: The last lines of its output, control characters escaped.
+        request: The operation that it was serving (``"step"``), or None.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        exit_code: int | None = None,
+        signal: str | None = None,
+        reason: str = "exit",
+        log_tail: str = "",
+        request: str | None = None,
+    ) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code
+        self.signal = signal
+        self.reason = reason
+        self.log_tail = log_tail
+        self.request = request
+
+
+class WorkerTimeoutError(WorkerError, TimeoutError):
+    """The worker did not answer in time. ``reset()`` brings the environment back."""
+
+
+class RemoteEnvError(EnvHubError):
+    """The repository's code raised. Trust: every attribute is text from the worker.
+
+    Attributes:
+        type_name: The class, as the worker named it (``"mypkg.Oops"``).
+        message: ``str()`` of the exception.
+        traceback: The formatted traceback.
+    """
+
+    def __init__(self, type_name: str, message: str, traceback: str = "") -> None:
+        super().__init__(f"{type_name}: {message}" if message else type_name)
+        self.type_name = type_name
+        self.message = message
+        self.traceback = traceback
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return (remote_error, (_builtin_of(type(self)), self.type_name, self.message, self.traceback))
+
+
+_BUILTINS: tuple[type[Exception], ...] = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    EOFError,
+    FileNotFoundError,
+    ImportError,
+    IndexError,
+    KeyError,
+    LookupError,
+    MemoryError,
+    ModuleNotFoundError,
+    NotImplementedError,
+    OSError,
+    OverflowError,
+    PermissionError,
+    RecursionError,
+    RuntimeError,
+    TimeoutError,
+    TypeError,
+    ValueError,
+    ZeroDivisionError,
+)
+
+
+def _twin(builtin: type[Exception]) -> type[RemoteEnvError]:
+    # str() must stay ours: KeyError would print a repr, OSError its errno pair.
+    body = {
+        "__doc__": f"The repository's code raised a {builtin.__name__}.",
+        "__module__": __name__,
+        "__str__": Exception.__str__,
+    }
+    return type(f"Remote{builtin.__name__}", (RemoteEnvError, builtin), body)
+
+
+_TWINS = {builtin.__name__: _twin(builtin) for builtin in _BUILTINS}
+globals().update({twin.__name__: twin for twin in _TWINS.values()})
+
+
+def _builtin_of(cls: type[RemoteEnvError]) -> str:
+    return cls.__name__.removeprefix("Remote")
+
+
+def remote_error(
+    builtin: str, type_name: str, message: str, traceback: str = ""
+) -> RemoteEnvError:
+    """The exception for a remote failure: the builtin's twin, or plain ``RemoteEnvError``."""
+    return _TWINS.get(builtin, RemoteEnvError)(type_name, message, traceback)

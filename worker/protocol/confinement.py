@@ -1,0 +1,58 @@
+"""What a jail is permitted, as it travels from the client's ``Policy`` to the lockdown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+MIB = 1024 * 1024
+GIB = 1024 * MIB
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """Hard caps of one jail. ``None`` where a cap may be lifted means no cap of ours.
+
+    Attributes:
+        memory_bytes: All memory of all processes of the jail, shared memory included.
+        processes: Processes and threads alive at once.
+        cpu_s: CPU seconds that one process of the jail may burn, or None.
+        open_files: File descriptors of one process.
+        disk_bytes: Bytes in the jail's scratch (home, temporary files, working directory).
+        disk_files: Files and folders in that scratch.
+        file_bytes: Size of one file, or None for ``disk_bytes``.
+        output_bytes: Bytes of stdout and stderr that are kept (the last ones).
+        message_bytes: Size of one message from the jail.
+        elements: Elements of all spaces of one vector environment together.
+    """
+
+    memory_bytes: int = 8 * GIB
+    processes: int = 512
+    cpu_s: int | None = None
+    open_files: int = 1024
+    disk_bytes: int = 2 * GIB
+    disk_files: int = 100_000
+    file_bytes: int | None = None
+    output_bytes: int = 64 * 1024
+    message_bytes: int = 256 * MIB
+    elements: int = 200_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Confinement:
+    """One jail's permissions, in the field's words; each mechanism reads its part.
+
+    Attributes:
+        profile: Which layers must hold: ``"strict"`` (all), ``"no-userns"``, ``"container"``.
+        network: ``"none"``, ``"loopback"`` (its own, empty one) or ``"host"``.
+        readable: Further absolute paths that the jail may read.
+        gpu: Grants the render and NVIDIA device nodes and the driver libraries.
+        environment: Environment variables that the caller grants by name, with their values.
+        limits: Hard caps.
+    """
+
+    profile: str = "strict"
+    network: str = "none"
+    readable: tuple[str, ...] = ()
+    gpu: bool = False
+    environment: dict[str, str] = field(default_factory=dict)
+    limits: Limits = field(default_factory=Limits)
