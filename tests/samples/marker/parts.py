@@ -1,0 +1,10 @@
+"""Reached by a relative import."""
+
+from dataclasses import dataclass
+
+
+@dataclass
+class Bolt:
+    """A bolt."""
+
+    diameter: int

@@ -1,0 +1,51 @@
+"""Where the sample repositories are, and how to run one in this process as the reference.
+
+Importing them here is allowed: they are ours. The environments that come out are what an
+in-process user of Gymnasium would have, and so the oracle for the sandbox.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+SAMPLES = Path(__file__).resolve().parent.parent / "samples"
+EXAMPLES = SAMPLES.parent.parent / "examples"
+
+
+def sample(name: str) -> Path:
+    """The folder of a sample repository.
+
+    Raises:
+        FileNotFoundError: There is none of that name.
+    """
+    folder = SAMPLES / name
+    if not folder.is_dir():
+        raise FileNotFoundError(f"no sample repository named {name!r}")
+    return folder
+
+
+def make_env_of(folder: Path) -> Callable[..., Any]:
+    """``make_env`` of a repository's ``env.py``, imported into this process."""
+    package = f"reference_{folder.name}"
+    if package not in sys.modules:
+        module = types.ModuleType(package)
+        module.__path__ = [str(folder)]
+        sys.modules[package] = module
+    entry = importlib.import_module(f"{package}.env")
+    make_env: Callable[..., Any] = entry.make_env
+    return make_env
+
+
+def reference(name: str, n_envs: int = 1, **env_kwargs: Any) -> gym.vector.VectorEnv[Any, Any, Any]:
+    """The vector environment that a sample builds in this process, with ``SyncVectorEnv``."""
+    made = make_env_of(sample(name))(n_envs=n_envs, use_async_envs=False, **env_kwargs)
+    if not isinstance(made, gym.vector.VectorEnv):
+        raise TypeError(f"{name} gives a {type(made).__name__}, which is no single reference")
+    return made
