@@ -4,7 +4,7 @@ import os
 
 os.environ.setdefault("MUJOCO_GL", "egl")  # a screen is not needed
 
-import gymnasium as gym  # noqa: E402
+import gymnasium as gym
 
 
 def make_env(
