@@ -1,0 +1,65 @@
+"""Stand-ins for values that cannot cross, and text that is safe to print."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+from envhub_worker.protocol.text import printable
+
+MAX_NAME_CHARS = 256
+MAX_REPR_CHARS = 1024
+
+
+@dataclass(frozen=True)
+class RemoteObject:
+    """A value of the peer that has no form on the wire: its type and its ``repr``, as text.
+
+    Attributes:
+        type_name: Qualified class name, at most 256 characters.
+        text: Bounded ``repr``; printable, on one line.
+    """
+
+    type_name: str
+    text: str
+
+    def __repr__(self) -> str:
+        return f"<remote {self.type_name}: {self.text}>"
+
+
+@dataclass(frozen=True, repr=False)
+class RemoteEnum(RemoteObject):
+    """A member of an enumeration that lives in the peer; ``text`` is the member's name.
+
+    Attributes:
+        value: The member's value, decoded. Takes no part in comparison or hashing.
+    """
+
+    value: object = field(default=None, compare=False)
+
+
+def one_line(text: str, max_chars: int = MAX_REPR_CHARS) -> str:
+    """Returns text that a terminal or a log prints on one line and never obeys, bounded."""
+    kept = printable(text[:max_chars], max_chars).replace("\n", "\\n").replace("\t", "\\t")
+    return kept if len(text) <= max_chars else kept + "..."
+
+
+def describe(value: object) -> RemoteObject:
+    """Turns any object into its inert description. A ``__repr__`` that raises is reported."""
+    try:
+        text = repr(value)
+    except Exception as error:
+        text = f"<repr failed with {type(error).__name__}>"
+    return RemoteObject(type_name(type(value)), one_line(text))
+
+
+def describe_enum(member: Enum) -> tuple[str, str]:
+    """Returns the qualified class name and the name of a member, both printable."""
+    name = member.name if isinstance(member.name, str) else str(member)
+    return type_name(type(member)), one_line(name, MAX_NAME_CHARS)
+
+
+def type_name(cls: type) -> str:
+    """Returns ``module.QualName`` of a class, without the module for builtins."""
+    module, name = str(cls.__module__), str(cls.__qualname__)
+    return one_line(name if module == "builtins" else f"{module}.{name}", MAX_NAME_CHARS)

@@ -1,0 +1,42 @@
+"""Hard caps on what one message may hold. They are security limits, not tuning knobs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+KIB = 1024
+MIB = 1024 * KIB
+
+
+@dataclass(frozen=True, kw_only=True)
+class WireLimits:
+    """What a receiver accepts, checked before anything of that size is allocated.
+
+    Attributes:
+        header_bytes: The header frame: structure, text, scalars, small arrays. Decoded Python
+            objects take some ten times as much memory as their bytes on the wire.
+        frame_bytes: One raw buffer, that is one large array (eight 4K RGB images are 199 MB).
+        message_bytes: All frames of one message together, as held in memory at once.
+        frames: Number of frames; each costs a socket part and a Python object.
+        depth: Nesting of containers. Code that walks a decoded value recurses; Python's own
+            limit is 1000 frames.
+        items: Elements of all containers together, a map's key and value counting as two.
+            An empty map takes one byte on the wire and about 70 in memory.
+        text_bytes: One string in UTF-8. One wide character makes Python store four bytes each.
+        int_bytes: One integer beyond 64 bit. Printing one takes quadratic time.
+        hashed_keys: Keys of large maps, and elements of large sets, that are not text. Python
+            randomises the hash of text only: other keys can be made to collide.
+    """
+
+    header_bytes: int = 8 * MIB
+    frame_bytes: int = 256 * MIB
+    message_bytes: int = 256 * MIB
+    frames: int = 4096
+    depth: int = 32
+    items: int = 200_000
+    text_bytes: int = 4 * MIB
+    int_bytes: int = 1 * KIB
+    hashed_keys: int = 10_000
+
+
+DEFAULT_LIMITS = WireLimits()
