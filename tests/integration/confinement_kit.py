@@ -1,0 +1,191 @@
+"""Runs Python source in a host of a real jail, and the same source without one as the control."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from envhub_worker.jailspec import JailSpec
+from envhub_worker.protocol.confinement import Confinement
+from envhub_worker.spawner import (
+    HostExited,
+    HostStarted,
+    Jail,
+    JailExited,
+    Ready,
+    Spawner,
+    ZygoteDied,
+)
+
+DEADLINE_S = 60.0
+TARGET = f"{os.path.abspath(__file__)}:serve_source"
+
+
+def execute(source: str) -> dict[str, Any]:
+    """Run ``source``; its ``result``, or the error's class, errno and text."""
+    names: dict[str, Any] = {"__name__": "probe"}
+    try:
+        exec(source, names)
+    except BaseException as error:
+        number = getattr(error, "errno", None)
+        return {"error": type(error).__name__, "errno": number, "text": str(error)}
+    return {"result": names.get("result")}
+
+
+def serve_source(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
+    """In the host: answer one line of JSON (source) with one line of JSON, until the end."""
+    global STREAM, FDS
+    STREAM, FDS = stream, fds
+    with stream.makefile("rw") as lines:
+        for line in lines:
+            lines.write(json.dumps(execute(json.loads(line))) + "\n")
+            lines.flush()
+    return 0
+
+
+def unconfined(source: str) -> dict[str, Any]:
+    """The control: ``source`` in a plain interpreter as the current user."""
+    code = "import sys, confinement_kit as k, json; print(json.dumps(k.execute(sys.stdin.read())))"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        input=source,
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=os.path.dirname(os.path.abspath(__file__)),
+        timeout=DEADLINE_S,
+    )
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+class Cell:
+    """A jail and what is known of it. Not an API: a test's convenience."""
+
+    def __init__(self, spawner: Spawner, jail: Jail) -> None:
+        self.spawner = spawner
+        self.jail = jail
+        self.events: list[Any] = []
+        self.output = b""
+        self._streams: dict[int, Any] = {}
+
+    def start(self, fds: tuple[int, ...] = ()) -> int:
+        """Start a host; its id."""
+        host, stream = self.jail.start_host(fds)
+        stream.settimeout(DEADLINE_S)
+        self._streams[host] = stream.makefile("rw")
+        stream.close()
+        return host
+
+    def run(self, source: str, host: int = 1) -> dict[str, Any]:
+        """Run ``source`` in ``host``; see ``execute``."""
+        lines = self._streams[host]
+        lines.write(json.dumps(source) + "\n")
+        lines.flush()
+        return json.loads(lines.readline() or '{"error": "the host has gone"}')
+
+    def hang_up(self, host: int = 1) -> None:
+        """Close the host's stream, so that it ends."""
+        self._streams.pop(host).close()
+
+    def pump(self, timeout_s: float = 0.05) -> None:
+        """Collect events and output."""
+        poller = select.poll()
+        for fd in (self.spawner.fileno(), self.jail.fileno(), self.jail.output):
+            if fd >= 0:
+                poller.register(fd, select.POLLIN)
+        poller.poll(timeout_s * 1000)
+        self.events += self.spawner.poll() + self.jail.poll()
+        try:
+            while data := os.read(self.jail.output, 65536):
+                self.output += data
+        except BlockingIOError:
+            pass
+
+    def wait_for(self, kind: type) -> Any:
+        """The first event of ``kind``, waiting for it."""
+        deadline = time.monotonic() + DEADLINE_S
+        while time.monotonic() < deadline:
+            for event in self.events:
+                if isinstance(event, kind):
+                    return event
+            died = [event for event in self.events if isinstance(event, ZygoteDied)]
+            assert not died, died
+            self.pump()
+        raise AssertionError(f"no {kind.__name__} in {self.events}, output {self.output!r}")
+
+    def wait_for_output(self, text: bytes) -> None:
+        """Wait until the jail has printed ``text``."""
+        deadline = time.monotonic() + DEADLINE_S
+        while text not in self.output:
+            assert time.monotonic() < deadline, self.output
+            self.pump()
+
+
+@contextmanager
+def spawner_in(folder: Path, confinement: Confinement, **options: Any) -> Iterator[Spawner]:
+    """A spawner whose hosts run ``serve_source``."""
+    options.setdefault("target", TARGET)
+    spawner = Spawner(confinement, runtime_dir=folder, readable_roots=[str(folder)], **options)
+    try:
+        yield spawner
+    finally:
+        spawner.close()
+
+
+def make_snapshot(folder: Path) -> str:
+    """A tiny snapshot below ``folder``."""
+    snapshot = folder / "snapshot"
+    (snapshot / "assets").mkdir(parents=True)
+    (snapshot / "env.py").write_text("VALUE = 7\n")
+    (snapshot / "assets" / "a.txt").write_text("asset")
+    return str(snapshot)
+
+
+@contextmanager
+def cell_in(folder: Path, confinement: Confinement, **options: Any) -> Iterator[Cell]:
+    """A cell with one host that runs what it is told."""
+    with spawner_in(folder, confinement, **options) as spawner:
+        cell = new_cell(spawner, make_snapshot(folder), confinement)
+        cell.start()
+        yield cell
+        cell.jail.kill()
+
+
+def new_cell(spawner: Spawner, snapshot: str, confinement: Confinement) -> Cell:
+    """A further jail of ``spawner``, without hosts."""
+    spec = JailSpec(snapshot=snapshot, entry="env.py", confinement=confinement, name="test")
+    return Cell(spawner, spawner.spawn(spec))
+
+
+def wait_until(condition: Any, what: str) -> None:
+    """Poll ``condition`` with a generous deadline."""
+    deadline = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.01)
+
+
+__all__ = [
+    "Cell",
+    "HostExited",
+    "HostStarted",
+    "JailExited",
+    "Ready",
+    "cell_in",
+    "execute",
+    "make_snapshot",
+    "new_cell",
+    "serve_source",
+    "spawner_in",
+    "unconfined",
+    "wait_until",
+]

@@ -1,0 +1,290 @@
+"""The server's side of zygote, inits and hosts, against real processes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "integration"))
+from confinement_kit import (
+    Cell,
+    HostExited,
+    HostStarted,
+    JailExited,
+    Ready,
+    cell_in,
+    make_snapshot,
+    new_cell,
+    spawner_in,
+    wait_until,
+)
+from envhub_worker.protocol.confinement import Confinement, Limits
+from envhub_worker.spawner import Spawner, ZygoteDied
+
+CONFINEMENT = Confinement(profile="no-userns", environment={"GRANTED": "yes"})
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> Iterator[Cell]:
+    """A jail with one host."""
+    with cell_in(tmp_path, CONFINEMENT) as cell:
+        yield cell
+
+
+def processes_that_mention(text: str) -> list[int]:
+    """Pids of other processes with ``text`` in their command line."""
+    found = []
+    for name in os.listdir("/proc"):
+        if name.isdigit() and int(name) != os.getpid():
+            try:
+                command = Path(f"/proc/{name}/cmdline").read_bytes()
+            except OSError:
+                continue
+            if text.encode() in command:
+                found.append(int(name))
+    return found
+
+
+def test_host_runs_code_and_is_announced_with_its_layers(cell: Cell) -> None:
+    """Ready, then HostStarted with a report, and the stream reaches the host."""
+    assert cell.run("result = 6 * 7") == {"result": 42}
+    cell.wait_for(Ready)
+    started = cell.wait_for(HostStarted)
+    assert started.host_id == 1
+    assert {"no-new-privileges", "rlimits"} <= {layer["layer"] for layer in started.report}
+    assert all(layer["enforced"] in (True, False) for layer in started.report)
+
+
+def test_host_sees_only_the_built_environment(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing of the server's environment arrives; what is granted does."""
+    names = cell.run("import os; result = sorted(os.environ)")["result"]
+    assert "GRANTED" in names
+    assert "PYTEST_CURRENT_TEST" not in names
+    raw = cell.run("result = open('/proc/self/environ').read()")["result"]
+    assert "PYTEST_CURRENT_TEST" not in raw
+
+
+def test_host_holds_only_the_named_descriptors(tmp_path: Path) -> None:
+    """Standard streams, its stream and what was passed through; stdin is empty."""
+    source = "import os, sys; result = [len(os.listdir('/proc/self/fd')), sys.stdin.read()]"
+    read, write = os.pipe()
+    with spawner_in(tmp_path, CONFINEMENT) as spawner:
+        cell = new_cell(spawner, make_snapshot(tmp_path), CONFINEMENT)
+        cell.start((write,))
+        # 0, 1, 2, the stream, the passed pipe, and the listing's own descriptor.
+        assert cell.run(source) == {"result": [6, ""]}
+        assert cell.run(
+            "import os, sys; k = sys._getframe(1).f_globals; result = os.write(k['FDS'][0], b'x')"
+        ) == {"result": 1}
+        assert os.read(read, 10) == b"x"
+    os.close(read)
+    os.close(write)
+
+
+def test_host_has_private_home_and_shows_the_snapshot(cell: Cell) -> None:
+    """HOME, TMPDIR and the working directory are the jail's own; the snapshot shows through."""
+    source = """
+import os, tempfile
+open('new.txt', 'w').write('x')
+home = os.path.expanduser('~')
+open(home + '/.config-file', 'w').write('x')
+result = [os.listdir(home), tempfile.gettempdir() == os.environ['TMPDIR'],
+          open('assets/a.txt').read(), open('env.py').read()]
+"""
+    result = cell.run(source)["result"]
+    assert result == [[".config-file"], True, "asset", "VALUE = 7\n"]
+    assert not (Path(cell.jail.spec.snapshot) / "new.txt").exists()
+
+
+def test_hosts_draw_different_random_numbers(cell: Cell) -> None:
+    """A fork copies the generators' state: each host is reseeded."""
+    second = cell.start()
+    source = "import random, numpy; result = [random.random(), float(numpy.random.rand())]"
+    first_draw, second_draw = cell.run(source), cell.run(source, second)
+    assert first_draw["result"][0] != second_draw["result"][0]
+    assert first_draw["result"][1] != second_draw["result"][1]
+
+
+def test_output_of_all_hosts_arrives(cell: Cell) -> None:
+    """Python's and C's output, stdout and stderr, of children too."""
+    cell.run("import os, sys; os.write(1, b'one\\n'); os.write(2, b'two\\n'); print('three')")
+    cell.run("import subprocess; subprocess.run(['/bin/echo', 'four'])")
+    cell.hang_up()  # flushes what Python still buffers
+    for text in (b"one", b"two", b"three", b"four"):
+        cell.wait_for_output(text)
+
+
+def test_exit_code_of_a_host_is_told(cell: Cell) -> None:
+    """SystemExit inside the target ends the host with its code."""
+    cell.run("import os; os._exit(7)")
+    exited = cell.wait_for(HostExited)
+    assert (exited.code, exited.signal, exited.reason) == (7, None, "exit")
+
+
+def test_signal_that_ends_a_host_is_told(cell: Cell) -> None:
+    """A crash is a signal, not a code."""
+    cell.run("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    exited = cell.wait_for(HostExited)
+    assert (exited.code, exited.signal) == (None, signal.SIGSEGV)
+    assert exited.reason == "signal"
+
+
+def test_killed_host_takes_its_children_along(cell: Cell, tmp_path: Path) -> None:
+    """kill_host ends the host and a child in a session of its own; others go on."""
+    second = cell.start()
+    mark = str(tmp_path / "mark")
+    child = f"['/bin/sh', '-c', 'sleep 1000; : {mark}']"
+    cell.run(f"import subprocess; subprocess.Popen({child}, start_new_session=True)")
+    wait_until(lambda: processes_that_mention(mark), "the child never came")
+    cell.jail.kill_host(1)
+    exited = cell.wait_for(HostExited)
+    assert (exited.host_id, exited.reason) == (1, "killed")
+    wait_until(lambda: not processes_that_mention(mark), "the child lived on")
+    assert cell.run("result = 1", second) == {"result": 1}
+
+
+DAEMON = """
+import os, time
+if os.fork() == 0:
+    os.setsid()
+    if os.fork() == 0:
+        os.execv('/bin/sh', ['/bin/sh', '-c', 'sleep 1000; : {mark}'])
+    os._exit(0)
+"""
+
+
+def test_killed_jail_leaves_no_daemon(cell: Cell, tmp_path: Path) -> None:
+    """A double-forked daemon in its own session dies with its jail, and its files go."""
+    mark = str(tmp_path / "mark")
+    cell.run(DAEMON.format(mark=mark))
+    wait_until(lambda: processes_that_mention(mark), "the daemon never came")
+    cell.jail.kill()
+    cell.jail.kill()
+    cell.wait_for(JailExited)
+    wait_until(lambda: not processes_that_mention(mark), "the daemon lived on")
+
+
+def test_last_host_takes_daemons_along(cell: Cell, tmp_path: Path) -> None:
+    """When no host is left, nothing else of the jail runs on."""
+    mark = str(tmp_path / "mark")
+    cell.run(DAEMON.format(mark=mark))
+    wait_until(lambda: processes_that_mention(mark), "the daemon never came")
+    cell.hang_up()
+    cell.wait_for(HostExited)
+    wait_until(lambda: not processes_that_mention(mark), "the daemon lived on")
+
+
+def test_jail_can_start_hosts_after_its_last_one_ended(cell: Cell) -> None:
+    """A new host in the same jail replaces one that died."""
+    cell.run("import os; os._exit(1)")
+    cell.wait_for(HostExited)
+    second = cell.start()
+    assert cell.run("result = 'again'", second) == {"result": "again"}
+
+
+def test_close_leaves_no_process_and_no_file(tmp_path: Path) -> None:
+    """After close, no process mentions the runtime folder and nothing is left in it."""
+    runtime = tmp_path / "runtime"
+    runtime.mkdir()
+    with spawner_in(runtime, CONFINEMENT) as spawner:
+        cell = new_cell(spawner, make_snapshot(tmp_path), CONFINEMENT)
+        cell.start()
+        assert cell.run("result = 1") == {"result": 1}
+        zygote = spawner._process.pid
+    assert not os.path.exists(f"/proc/{zygote}")
+    assert list(runtime.iterdir()) == []
+
+
+def test_dead_zygote_is_told_with_its_log(tmp_path: Path) -> None:
+    """An interpreter without numpy ends the zygote; the log says why."""
+    bare = tmp_path / "bare"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(bare)], check=True)
+    spawner = Spawner(
+        CONFINEMENT, runtime_dir=tmp_path, readable_roots=[], python=str(bare / "bin/python")
+    )
+    wait_until(lambda: any(isinstance(e, ZygoteDied) for e in _keep(spawner)), "it lives")
+    died = next(event for event in _SEEN if isinstance(event, ZygoteDied))
+    assert "ModuleNotFoundError" in died.log
+    assert died.code == 1
+    spawner.close()
+
+
+_SEEN: list[object] = []
+
+
+def _keep(spawner: Spawner) -> list[object]:
+    _SEEN.extend(spawner.poll())
+    return _SEEN
+
+
+SERVER = """
+import sys, time
+sys.path.insert(0, {kit!r})
+from pathlib import Path
+from confinement_kit import *
+from envhub_worker.protocol.confinement import Confinement
+confinement = Confinement(profile="no-userns")
+with spawner_in(Path({folder!r}), confinement) as spawner:
+    cell = new_cell(spawner, make_snapshot(Path({folder!r})), confinement)
+    cell.start()
+    cell.run({daemon!r})
+    print("up", flush=True)
+    time.sleep(1000)
+"""
+
+
+def test_killed_server_leaves_no_process(tmp_path: Path) -> None:
+    """SIGKILL of the server ends zygote, init, host and a daemon of the jail."""
+    mark = str(tmp_path / "mark")
+    kit = str(Path(__file__).parents[1] / "integration")
+    source = SERVER.format(kit=kit, folder=str(tmp_path), daemon=DAEMON.format(mark=mark))
+    server = subprocess.Popen([sys.executable, "-c", source], stdout=subprocess.PIPE)
+    assert server.stdout is not None
+    assert server.stdout.readline() == b"up\n"
+    below = processes_below(server.pid)
+    assert len(below) >= 3
+    wait_until(lambda: processes_that_mention(mark), "the daemon never came")
+    server.kill()
+    server.wait()
+    server.stdout.close()
+    wait_until(lambda: not any(map(alive, below)), "a process lived on")
+    wait_until(lambda: not processes_that_mention(mark), "the daemon lived on")
+
+
+def processes_below(root: int) -> list[int]:
+    """Every descendant of ``root``."""
+    from envhub_worker.lockdown.sweep import descendants
+
+    return descendants(root)
+
+
+def alive(pid: int) -> bool:
+    """Whether the process exists and is no zombie."""
+    try:
+        return ") Z " not in Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return False
+
+
+def test_cpu_limit_is_told(tmp_path: Path) -> None:
+    """A host that burns its CPU seconds ends with the reason cpu-limit."""
+    confinement = Confinement(profile="no-userns", limits=Limits(cpu_s=1))
+    with cell_in(tmp_path, confinement) as cell:
+        cell.run("while True: pass")
+        assert cell.wait_for(HostExited).reason == "cpu-limit"
+
+
+def test_requests_wait_for_the_zygote(tmp_path: Path) -> None:
+    """Many jails asked for before the zygote is up all come."""
+    with spawner_in(tmp_path, CONFINEMENT) as spawner:
+        snapshot = make_snapshot(tmp_path)
+        cells = [new_cell(spawner, snapshot, CONFINEMENT) for _ in range(5)]
+        for cell in cells:
+            cell.start()
+        assert [cell.run("result = 1") for cell in cells] == [{"result": 1}] * 5

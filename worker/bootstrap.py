@@ -1,0 +1,53 @@
+"""Runs this package in any interpreter, by path: nothing of it stands on ``sys.path``.
+
+The interpreter may be one that has never heard of ``envhub_worker`` (a repository's own
+environment), and a repository may bring a ``worker.py`` of its own. So the package is loaded
+from the folder of this very file::
+
+    python -I .../bootstrap.py serve ARGS...     envhub_worker.__main__.main(ARGS)
+    python -I .../bootstrap.py zygote ARGS...    envhub_worker.zygote.main(ARGS)
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import sys
+from collections.abc import Sequence
+
+_PROGRAMS = {"serve": "envhub_worker.__main__", "zygote": "envhub_worker.zygote"}
+
+
+def command(python: str, program: str, *args: str) -> list[str]:
+    """The argv that runs ``program`` (``"serve"`` or ``"zygote"``) with ``args`` in ``python``."""
+    return [python, "-I", os.path.abspath(__file__), program, *args]
+
+
+def load_package() -> None:
+    """Make ``import envhub_worker`` mean the folder of this file."""
+    folder = os.path.dirname(os.path.abspath(__file__))
+    spec = importlib.util.spec_from_file_location(
+        "envhub_worker",
+        os.path.join(folder, "__init__.py"),
+        submodule_search_locations=[folder],
+    )
+    assert spec is not None
+    assert spec.loader is not None
+    package = importlib.util.module_from_spec(spec)
+    sys.modules["envhub_worker"] = package
+    spec.loader.exec_module(package)
+
+
+def main(argv: Sequence[str]) -> int:
+    """Load the package and run the program that ``argv`` names; return its exit code."""
+    if not argv or argv[0] not in _PROGRAMS:
+        sys.stderr.write(f"usage: bootstrap.py {{{','.join(_PROGRAMS)}}} ARGS...\n")
+        return 2
+    load_package()
+    program = importlib.import_module(_PROGRAMS[argv[0]])
+    return int(program.main(list(argv[1:])) or 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,104 @@
+"""Small JSON messages with file descriptors between the server, its zygote and its inits.
+
+Only our own code holds an end of such a channel: it is closed before a stranger's code runs.
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import json
+import os
+import socket
+from collections.abc import Sequence
+from typing import Any
+
+# SEQPACKET refuses a message above the socket buffer (212992 by default); say so early.
+MAX_MESSAGE_BYTES = 128 * 1024
+MAX_FDS = 64
+
+Message = dict[str, Any]
+
+
+class Channel:
+    """One end of a ``SOCK_SEQPACKET`` pair. Owns the socket."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        self._socket = sock
+        self._unsent: collections.deque[tuple[bytes, tuple[int, ...]]] = collections.deque()
+
+    @classmethod
+    def pair(cls) -> tuple[Channel, socket.socket]:
+        """A non-blocking channel, and the blocking socket for the other side."""
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        ours.setblocking(False)
+        return cls(ours), theirs
+
+    def fileno(self) -> int:
+        """The socket's descriptor, or -1 when closed."""
+        return self._socket.fileno()
+
+    def send(self, message: Message, fds: Sequence[int] = ()) -> None:
+        """Send, or keep for ``flush`` when the socket is full. ``fds`` stay the caller's.
+
+        Raises:
+            ValueError: The message is larger than ``MAX_MESSAGE_BYTES``.
+        """
+        data = json.dumps(message).encode()
+        if len(data) > MAX_MESSAGE_BYTES:
+            raise ValueError(f"message of {len(data)} bytes is over {MAX_MESSAGE_BYTES}")
+        self._unsent.append((data, tuple(os.dup(fd) for fd in fds)))
+        self.flush()
+
+    def flush(self) -> None:
+        """Send what is waiting, as far as the socket takes it. A peer that is gone is no error."""
+        while self._unsent:
+            data, fds = self._unsent[0]
+            try:
+                socket.send_fds(self._socket, [data], fds, socket.MSG_NOSIGNAL)
+            except BlockingIOError:
+                return
+            except OSError:
+                pass  # the reader sees the end of the stream and says what died
+            self._unsent.popleft()
+            close_fds(fds)
+
+    def receive(self) -> tuple[Message, list[int]] | None:
+        """The next message and its descriptors, or None at the end of the stream.
+
+        Raises:
+            BlockingIOError: Nothing is there (non-blocking sockets).
+        """
+        try:
+            data, fds, flags, _ = socket.recv_fds(
+                self._socket, MAX_MESSAGE_BYTES, MAX_FDS, socket.MSG_CMSG_CLOEXEC
+            )
+        except ConnectionError:
+            return None
+        if not data:
+            return None
+        assert not flags & (socket.MSG_TRUNC | socket.MSG_CTRUNC)
+        return json.loads(data), fds
+
+    def drain(self) -> tuple[list[tuple[Message, list[int]]], bool]:
+        """Everything that is there now, and whether the stream has ended."""
+        messages = []
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                received = self.receive()
+                if received is None:
+                    return messages, True
+                messages.append(received)
+        return messages, False
+
+    def close(self) -> None:
+        """Close the socket and whatever was not sent. Idempotent."""
+        while self._unsent:
+            close_fds(self._unsent.popleft()[1])
+        self._socket.close()
+
+
+def close_fds(fds: Sequence[int]) -> None:
+    """Close each descriptor."""
+    for fd in fds:
+        os.close(fd)

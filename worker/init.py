@@ -1,0 +1,202 @@
+"""The first process of a jail: it sets the jail up, starts hosts in it, and ends them all.
+
+Trusted code. It reads its jail's specification from its control channel, which is the first
+message; then requests::
+
+    {"op": "start", "host": N} + [the host's stream, further descriptors...]
+    {"op": "kill", "host": N}
+
+Events::
+
+    {"event": "ready", "report": [layer...]}
+    {"event": "failed", "layer": L, "reason": R, "fix": F}                  and it exits
+    {"event": "host_started", "host": N, "pid": P, "report": [layer...]}
+    {"event": "host_exited", "host": N, "code": C | null, "signal": S | null, "reason": R}
+
+``pid`` is the one inside the jail. The end of the channel ends the jail.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import socket
+import sys
+import traceback
+from dataclasses import dataclass, field
+from typing import Any, NoReturn
+
+from envhub_worker import launch
+from envhub_worker.channel import Channel, close_fds
+from envhub_worker.jailspec import JailSpec
+from envhub_worker.lockdown import process, sweep
+from envhub_worker.lockdown.report import LayerUnavailableError
+from envhub_worker.lockdown.scratch import Scratch
+
+
+def run(parent: int, control: int, output: int, target: str) -> NoReturn:
+    """Be the init of a jail in this freshly forked child of ``parent``. Never returns."""
+    code = 1
+    try:
+        process.reset_signals()
+        process.die_with_parent(parent, signal.SIGTERM)
+        os.dup2(output, 1)
+        os.dup2(output, 2)
+        process.close_all_but({0, 1, 2, control})
+        process.become_subreaper()
+        Init(Channel(socket.socket(fileno=control)), target).run()
+        code = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stderr.flush()
+        os._exit(code)
+
+
+@dataclass
+class _Host:
+    """A host as its init knows it."""
+
+    number: int
+    status: int
+    report: bytes = b""
+    killed: bool = field(default=False)
+
+
+class Init:
+    """The loop: requests from the server, reports of hosts, and their deaths."""
+
+    def __init__(self, channel: Channel, target: str) -> None:
+        self._channel = channel
+        self._target = target
+        self._hosts: dict[int, _Host] = {}
+        self._running = True
+        self._poller = select.poll()
+
+    def run(self) -> None:
+        """Set the jail up and serve until the channel ends."""
+        received = self._channel.receive()
+        if received is None:
+            return
+        wakeup = sweep.child_signals()
+        signal.signal(signal.SIGTERM, self._stop)
+        try:
+            self._set_up(received[0])
+            self._loop(wakeup)
+        except LayerUnavailableError as error:
+            self._fail(error)
+        finally:
+            sweep.kill_descendants(keep=())
+
+    def _set_up(self, message: dict[str, Any]) -> None:
+        self._spec = JailSpec.from_wire(message["spec"])
+        self._scratch = Scratch(message["scratch"])
+        self._channel.send({"event": "ready", "report": []})
+
+    def _fail(self, error: LayerUnavailableError) -> None:
+        event = {"event": "failed", "layer": error.layer, "reason": error.reason}
+        self._channel.send({**event, "fix": error.fix})
+
+    def _stop(self, *_: object) -> None:
+        self._running = False
+
+    def _loop(self, wakeup: int) -> None:
+        self._poller.register(self._channel, select.POLLIN)
+        self._poller.register(wakeup, select.POLLIN)
+        while self._running:
+            ready = [fd for fd, _ in self._poller.poll()]
+            for fd in ready:
+                if fd == wakeup:
+                    sweep.drain(wakeup)
+                elif fd == self._channel.fileno():
+                    self._serve()
+                else:
+                    self._read_report(fd)
+            if wakeup in ready:
+                self._reap()
+
+    def _serve(self) -> None:
+        received = self._channel.receive()
+        if received is None:
+            self._running = False
+            return
+        message, fds = received
+        if message["op"] == "start":
+            self._start(message["host"], fds)
+        else:
+            self._kill(message["host"])
+
+    def _start(self, number: int, fds: list[int]) -> None:
+        read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        order = launch.Order(
+            parent=os.getpid(),
+            spec=self._spec,
+            scratch=self._scratch,
+            target=self._target,
+            fds=fds,
+            status=write,
+        )
+        pid = os.fork()
+        if pid == 0:
+            launch.run(order)
+        close_fds([*fds, write])
+        self._hosts[pid] = _Host(number, read)
+        self._poller.register(read, select.POLLIN)
+
+    def _kill(self, number: int) -> None:
+        for pid, host in self._hosts.items():
+            if host.number == number:
+                host.killed = True
+                # Not reaped yet, so the pid is still its own. Stopped, it cannot fork away.
+                os.kill(pid, signal.SIGSTOP)
+                sweep.kill_below(pid)
+                os.kill(pid, signal.SIGKILL)
+
+    def _read_report(self, fd: int) -> None:
+        pid, host = next((pid, host) for pid, host in self._hosts.items() if host.status == fd)
+        with contextlib.suppress(BlockingIOError):
+            while data := os.read(fd, 65536):
+                host.report += data
+            self._close_report(host)
+            self._tell_report(pid, host)
+
+    def _close_report(self, host: _Host) -> None:
+        if host.status >= 0:
+            self._poller.unregister(host.status)
+            os.close(host.status)
+            host.status = -1
+
+    def _tell_report(self, pid: int, host: _Host) -> None:
+        if not host.report:
+            return  # it died before it was confined: its exit says so
+        report = json.loads(host.report)
+        if "layer" in report:
+            raise LayerUnavailableError(**report)
+        fields = {"host": host.number, "pid": pid, "report": report["report"]}
+        self._channel.send({"event": "host_started", **fields})
+
+    def _reap(self) -> None:
+        for pid, status in sweep.reap():
+            host = self._hosts.get(pid)
+            if host is None:
+                continue
+            if host.status >= 0:
+                self._read_report(host.status)
+                self._close_report(host)
+            del self._hosts[pid]
+            if not self._hosts:
+                sweep.kill_descendants(keep=())  # daemons do not outlive the last host
+            self._tell_exit(host, status)
+
+    def _tell_exit(self, host: _Host, status: int) -> None:
+        fields = process.exit_fields(status)
+        reason = "exit" if fields["signal"] is None else "signal"
+        if fields["signal"] == signal.SIGXCPU:
+            reason = "cpu-limit"
+        elif host.killed:
+            reason = "killed"
+        event = {"event": "host_exited", "host": host.number, "reason": reason}
+        self._channel.send({**event, **fields})

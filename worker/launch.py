@@ -1,0 +1,130 @@
+"""A host, from its fork to the first line of the code that serves it.
+
+Everything here runs before anything of the repository does. The order is the point: what needs
+a privilege comes before its drop, and the syscall filter comes last.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import random
+import runpy
+import socket
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NoReturn
+
+import numpy as np
+from envhub_worker.jailspec import JailSpec
+from envhub_worker.lockdown import process, rlimits
+from envhub_worker.lockdown.environment import jail_environment
+from envhub_worker.lockdown.report import Layer, LayerUnavailableError
+from envhub_worker.lockdown.scratch import Scratch
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """What init asks a new host to be.
+
+    Attributes:
+        parent: Init's pid.
+        spec: The jail.
+        scratch: Its writable folders.
+        target: What to run once confined, as ``"module:function"`` or ``"file.py:function"``.
+        fds: The stream to the server, then whatever the server passes through.
+        status: Write end of the pipe for the report; closed before the target runs.
+    """
+
+    parent: int
+    spec: JailSpec
+    scratch: Scratch
+    target: str
+    fds: list[int]
+    status: int
+
+
+def run(order: Order) -> NoReturn:
+    """Confine this freshly forked process, report, and run the target. Never returns."""
+    code = 1
+    try:
+        code = _run(order)
+    except SystemExit as error:
+        code = _exit_code(error)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        # Not sys.exit: the zygote's atexit handlers and init's frames are not ours to run.
+        _flush()
+        os._exit(code & 0xFF)
+
+
+def _run(order: Order) -> int:
+    try:
+        layers = confine(order)
+    except LayerUnavailableError as error:
+        _report(order.status, {"layer": error.layer, "reason": error.reason, "fix": error.fix})
+        return 1
+    _report(order.status, {"report": [layer.to_wire() for layer in layers]})
+    stream = socket.socket(fileno=order.fds[0])
+    return int(_resolve(order.target)(stream, order.spec, order.fds[1:]) or 0)
+
+
+def _resolve(target: str) -> Callable[[socket.socket, JailSpec, list[int]], int | None]:
+    place, _, function = target.partition(":")
+    if place.endswith(".py"):
+        return runpy.run_path(place)[function]  # type: ignore[no-any-return]
+    return getattr(importlib.import_module(place), function)  # type: ignore[no-any-return]
+
+
+def confine(order: Order) -> list[Layer]:
+    """Give up everything that the jail does not need; return what holds."""
+    process.die_with_parent(order.parent)
+    os.setsid()
+    process.reset_signals()
+    process.close_all_but({0, 1, 2, order.status, *order.fds})
+    _forget_the_zygote(order)
+    rlimits.apply(rlimits.wanted(order.spec.confinement.limits, None))
+    process.set_no_new_privileges()
+    return [
+        Layer("rlimits", True, "core, file size, open files, locked memory, priorities"),
+        Layer("no-new-privileges", True, "set-user-id programs gain nothing"),
+    ]
+
+
+def _forget_the_zygote(order: Order) -> None:
+    """Own environment, folders and random numbers; a fork shares them all with its siblings."""
+    scratch, granted = order.scratch, order.spec.confinement.environment
+    built = jail_environment(os.environ, granted, scratch.home, scratch.temporary)
+    os.environ.clear()
+    os.environ.update(built)
+    os.chdir(scratch.work)
+    os.umask(0o022)
+    tempfile.tempdir = None
+    random.seed()
+    np.random.seed()
+
+
+def _report(status: int, message: dict[str, object]) -> None:
+    data = json.dumps(message).encode()
+    os.write(status, data)  # far below the pipe's capacity: never partial
+    os.close(status)
+
+
+def _exit_code(error: SystemExit) -> int:
+    if error.code is None or isinstance(error.code, int):
+        return error.code or 0
+    sys.stderr.write(f"{error.code}\n")
+    return 1
+
+
+def _flush() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except BaseException:
+            continue  # the stranger may have replaced or closed it

@@ -1,0 +1,56 @@
+"""The environment variables of the zygote and of a jail: built, never inherited."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+
+_PATH = "/usr/local/bin:/usr/bin:/bin:/usr/local/sbin:/usr/sbin:/sbin"
+_INHERITED = ("LANG", "LC_ALL", "LC_CTYPE", "TZ")
+
+# A jail has no display, sound card or terminal; without these, libraries look for them.
+_HEADLESS = {
+    "MPLBACKEND": "Agg",
+    "PYGAME_HIDE_SUPPORT_PROMPT": "1",
+    "SDL_AUDIODRIVER": "dummy",
+    "SDL_VIDEODRIVER": "dummy",
+}
+
+
+def zygote_environment(host: Mapping[str, str], python: str) -> dict[str, str]:
+    """What the zygote is executed with. ``host`` gives language and time zone, nothing else."""
+    return {
+        **{name: host[name] for name in _INHERITED if name in host},
+        "PATH": f"{os.path.dirname(python)}:{_PATH}",
+        "HOME": "/nonexistent",
+        # A thread in the zygote would make unshare(CLONE_NEWUSER) fail, and die in the fork.
+        "OPENBLAS_NUM_THREADS": "1",
+    }
+
+
+def jail_environment(
+    base: Mapping[str, str], granted: Mapping[str, str], home: str, temporary: str
+) -> dict[str, str]:
+    """What a host of a jail sees.
+
+    Args:
+        base: The zygote's own environment.
+        granted: Variables that the caller grants by name; they win.
+        home: The jail's private home.
+        temporary: The jail's private folder for temporary files.
+    """
+    kept = {name: value for name, value in base.items() if name in ("PATH", *_INHERITED)}
+    return {
+        **kept,
+        **_HEADLESS,
+        "HOME": home,
+        "LOGNAME": "sandbox",
+        "TMPDIR": temporary,
+        "USER": "sandbox",
+        "XDG_CACHE_HOME": f"{home}/.cache",
+        "XDG_CONFIG_HOME": f"{home}/.config",
+        "XDG_DATA_HOME": f"{home}/.local/share",
+        "XDG_RUNTIME_DIR": f"{temporary}/runtime",
+        "XDG_STATE_HOME": f"{home}/.local/state",
+        **granted,
+    }

@@ -1,0 +1,41 @@
+"""How lockdown speaks of its layers: what holds, and what this host cannot give."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One layer that was enforced or deliberately was not.
+
+    Attributes:
+        layer: Its name (``"landlock"``).
+        enforced: Whether it holds for this jail.
+        detail: What exactly, or why not.
+    """
+
+    layer: str
+    enforced: bool
+    detail: str
+
+    def to_wire(self) -> dict[str, Any]:
+        """Plain data: ``{"layer", "enforced", "detail"}``."""
+        return asdict(self)
+
+
+class LayerUnavailableError(Exception):
+    """A layer that the profile names cannot be had on this host. Nothing may run.
+
+    Attributes:
+        layer: Its name.
+        reason: What the host answered.
+        fix: What the user can do, by exact command where there is one.
+    """
+
+    def __init__(self, layer: str, reason: str, fix: str) -> None:
+        super().__init__(f"{layer}: {reason}. {fix}")
+        self.layer = layer
+        self.reason = reason
+        self.fix = fix

@@ -1,0 +1,94 @@
+"""A jail's writable folders: home, temporary files, and a working view of its snapshot."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import stat
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Scratch:
+    """Absolute paths of one jail's writable folders, all below ``root``."""
+
+    root: str
+
+    @property
+    def home(self) -> str:
+        """The private home."""
+        return f"{self.root}/home"
+
+    @property
+    def temporary(self) -> str:
+        """The folder for temporary files."""
+        return f"{self.root}/tmp"
+
+    @property
+    def work(self) -> str:
+        """The working directory: shows the snapshot's files, takes new ones."""
+        return f"{self.root}/work"
+
+    def create(self) -> None:
+        """Make the folders, readable by nobody else; ``root`` must exist."""
+        for folder in (self.home, self.temporary, f"{self.temporary}/runtime", self.work):
+            os.mkdir(folder, 0o700)
+
+
+def link_snapshot(snapshot: str, work: str) -> None:
+    """Show the snapshot's top-level entries in ``work`` as symbolic links."""
+    for name in os.listdir(snapshot):
+        os.symlink(f"{snapshot}/{name}", f"{work}/{name}")
+
+
+def remove_tree(path: str) -> None:
+    """Remove a folder that a stranger filled; nothing may be running in it any more.
+
+    Deep trees cost neither stack nor descriptors: a folder's sub-folders are moved up to the
+    root before they are looked into. Symbolic links are removed, never followed.
+    """
+    try:
+        root = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    except FileNotFoundError:
+        return
+    try:
+        _empty(root)
+    finally:
+        os.close(root)
+    os.rmdir(path)
+
+
+def _empty(root: int) -> None:
+    # A name that the stranger could not foresee and put in the way.
+    prefix, moved = f".{secrets.token_hex(8)}", 0
+    os.fchmod(root, 0o700)
+    pending = _unlink_files(root)
+    while pending:
+        name = pending.pop()
+        folder = _open_folder(name, root)
+        for child in _unlink_files(folder):
+            # Renaming a folder into another one rewrites its "..", so it must be writable.
+            os.chmod(child, 0o700, dir_fd=folder)
+            moved += 1
+            os.rename(child, f"{prefix}-{moved}", src_dir_fd=folder, dst_dir_fd=root)
+            pending.append(f"{prefix}-{moved}")
+        os.close(folder)
+        os.rmdir(name, dir_fd=root)
+
+
+def _open_folder(name: str, root: int) -> int:
+    os.chmod(name, 0o700, dir_fd=root)
+    return os.open(name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=root)
+
+
+def _unlink_files(folder: int) -> list[str]:
+    """Remove all but the folders in ``folder`` and return those."""
+    folders = []
+    for name in os.listdir(folder):
+        if stat.S_ISDIR(os.lstat(name, dir_fd=folder).st_mode):
+            folders.append(name)
+        else:
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(name, dir_fd=folder)
+    return folders

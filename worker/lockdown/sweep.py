@@ -1,0 +1,86 @@
+"""Ending every process below this one where no pid namespace does it for us."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+from collections.abc import Collection, Iterator
+
+_ROUNDS_S = 5.0
+
+
+def child_signals() -> int:
+    """A descriptor that becomes readable when a child changes state, or a handled signal comes."""
+    read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+    signal.signal(signal.SIGCHLD, lambda *_: None)
+    signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+    return read
+
+
+def drain(fd: int) -> None:
+    """Read whatever is in the non-blocking ``fd`` and drop it."""
+    with contextlib.suppress(BlockingIOError):
+        while os.read(fd, 4096):
+            pass
+
+
+def reap() -> Iterator[tuple[int, int]]:
+    """The pid and wait status of every child that has ended; orphans we adopted included."""
+    with contextlib.suppress(ChildProcessError):
+        while True:
+            pid, status = os.waitpid(-1, os.WNOHANG)
+            if pid == 0:
+                return
+            yield pid, status
+
+
+def descendants(root: int, keep: Collection[int] = ()) -> list[int]:
+    """Pids below ``root``, without those in ``keep`` and what is below them."""
+    children: dict[int, list[int]] = {}
+    for name in os.listdir("/proc"):
+        if name.isdigit():
+            with contextlib.suppress(OSError):
+                children.setdefault(_parent(int(name)), []).append(int(name))
+    found: list[int] = []
+    pending = [root]
+    while pending:
+        below = [pid for pid in children.get(pending.pop(), ()) if pid not in keep]
+        found += below
+        pending += below
+    return found
+
+
+def _parent(pid: int) -> int:
+    with open(f"/proc/{pid}/stat", "rb") as stat:
+        # The command may hold anything, parentheses and blanks included.
+        return int(stat.read().rpartition(b")")[2].split()[1])
+
+
+def kill_descendants(keep: Collection[int]) -> None:
+    """SIGKILL everything below this process but ``keep``, daemons and fork bombs included."""
+    kill_below(os.getpid(), keep)
+
+
+def kill_below(root: int, keep: Collection[int] = ()) -> None:
+    """SIGKILL everything below ``root``.
+
+    All are stopped first, until none is new: a stopped process cannot fork away. ``root`` must
+    adopt the orphans of its descendants.
+    """
+    deadline = time.monotonic() + _ROUNDS_S
+    stopped: set[int] = set()
+    while time.monotonic() < deadline:
+        new = [pid for pid in descendants(root, keep) if pid not in stopped]
+        if not new:
+            break
+        _signal(new, signal.SIGSTOP)
+        stopped.update(new)
+    _signal(stopped, signal.SIGKILL)
+
+
+def _signal(pids: Collection[int], signum: int) -> None:
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signum)
