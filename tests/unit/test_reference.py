@@ -1,0 +1,257 @@
+"""Hub references: every form works or says what to write instead."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from envhub_sandbox.errors import HubReferenceError
+from envhub_sandbox.reference import HubRef, is_local
+
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+SITE = "https://huggingface.co"
+
+WORKING = {
+    # LeRobot's four forms.
+    "org/repo": HubRef("org/repo"),
+    "org/repo@main": HubRef("org/repo", "main"),
+    "org/repo:envs/a.py": HubRef("org/repo", None, "envs/a.py"),
+    "org/repo@v1.0:envs/a.py": HubRef("org/repo", "v1.0", "envs/a.py"),
+    # Corners of the grammar.
+    "org/repo@refs/pr/3": HubRef("org/repo", "refs/pr/3"),
+    "org/repo@feature/x:a.py": HubRef("org/repo", "feature/x", "a.py"),
+    "org/repo@v1@2": HubRef("org/repo", "v1@2"),
+    "org/repo:envs/a@b.py": HubRef("org/repo", None, "envs/a@b.py"),
+    "org/repo@v1:envs/a@b.py": HubRef("org/repo", "v1", "envs/a@b.py"),
+    "org/repo:a:b.py": HubRef("org/repo", None, "a:b.py"),
+    "org/repo:my env.py": HubRef("org/repo", None, "my env.py"),
+    "org/repo:./a//b.py": HubRef("org/repo", None, "a/b.py"),
+    "  org/repo \n": HubRef("org/repo"),
+    f"org/repo@{COMMIT.upper()}": HubRef("org/repo", COMMIT),
+    # Types.
+    "models/org/repo": HubRef("org/repo", repo_type="model"),
+    "spaces/org/repo@dev": HubRef("org/repo", "dev", repo_type="space"),
+    "datasets/org/repo:a.py": HubRef("org/repo", None, "a.py", "dataset"),
+    "space/org/repo": HubRef("org/repo", repo_type="space"),
+    # Pages of the site.
+    f"{SITE}/org/repo": HubRef("org/repo"),
+    f"{SITE}/org/repo.git": HubRef("org/repo"),
+    "huggingface.co/org/repo/": HubRef("org/repo"),
+    "https://hf.co/spaces/org/repo": HubRef("org/repo", repo_type="space"),
+    f"{SITE}/spaces/org/repo/tree/main": HubRef("org/repo", "main", repo_type="space"),
+    f"{SITE}/org/repo/blob/v1/envs/a.py#L3": HubRef("org/repo", "v1", "envs/a.py"),
+    f"{SITE}/org/repo/resolve/v1/a.py?download=true": HubRef("org/repo", "v1", "a.py"),
+    f"{SITE}/org/repo/blob/feature%2Fx/my%20env.py": HubRef("org/repo", "feature/x", "my env.py"),
+    f"{SITE}/org/repo/tree/refs/pr/3": HubRef("org/repo", "refs/pr/3"),
+    f"{SITE}/datasets/org/repo/blob/refs%2Fpr%2F3/a.py": HubRef(
+        "org/repo", "refs/pr/3", "a.py", "dataset"
+    ),
+    f"{SITE}/org/repo/commit/{COMMIT}": HubRef("org/repo", COMMIT),
+    # hf:// as in huggingface_hub's file system, and with a colon.
+    "hf://org/repo": HubRef("org/repo"),
+    "hf://org/repo/envs/a.py": HubRef("org/repo", None, "envs/a.py"),
+    "hf://spaces/org/repo@dev/a.py": HubRef("org/repo", "dev", "a.py", "space"),
+    "hf://org/repo@refs/pr/1/a.py": HubRef("org/repo", "refs/pr/1", "a.py"),
+    "hf://org/repo@v1:a.py": HubRef("org/repo", "v1", "a.py"),
+}
+
+# The text, what the error says is wrong, and what it says to write.
+REFUSED = [
+    ("", "empty", "owner/name"),
+    ("org/repo@", "revision after '@' is empty", "'org/repo'"),
+    ("org/repo@:a.py", "revision after '@' is empty", "'org/repo:a.py'"),
+    ("hf://org/repo@/a.py", "revision after '@' is empty", "'org/repo:a.py'"),
+    ("org/repo:", "path after ':' is empty", "'org/repo'"),
+    ("org/repo@main:", "path after ':' is empty", "'org/repo@main'"),
+    ("org/", "name is missing", "owner/name"),
+    ("@org/repo", "owner is missing", "owner/name"),
+    ("cartpole-env", "owner is missing", "'./cartpole-env' for a local folder"),
+    ("cartpole-env@main", "owner is missing", "'OWNER/cartpole-env@main'"),
+    ("spaces/repo", "owner is missing", "'spaces/OWNER/repo'"),
+    ("org/repo/envs/a.py", "behind a colon", "'org/repo:envs/a.py'"),
+    ("spaces/org/repo/envs", "behind a colon", "'spaces/org/repo:envs/env.py'"),
+    ("org//repo", "one slash", "owner/name"),
+    ("org/repo:../a.py", "'..'", "inside the repository"),
+    ("org/repo@v1:a/../b.py", "'..'", "'org/repo@v1:b.py'"),
+    ("org/repo:/a.py", "absolute", "'org/repo:a.py'"),
+    ("org/repo:envs\\a.py", "backslashes", "'org/repo:envs/a.py'"),
+    ("org/repo:C:/a.py", "drive letter", "inside the repository"),
+    ("C:\\envs\\a.py", "drive letter", "owner/name"),
+    ("C:/envs", "drive letter", "owner/name"),
+    ("org/re po", "'re po' cannot be a name", "owner/name"),
+    ("org/repo@ma in", "'ma in' cannot be a revision", "'org/repo@main'"),
+    ("org/repo: a.py", "spaces around", "'org/repo:a.py'"),
+    ("org/re\npo", "control characters", "owner/name"),
+    ("org/repo:a\x00.py", "control characters", "owner/name"),
+    ("org/repo:a\u2028.py", "control characters", "owner/name"),
+    ("org/repo@a..b", "cannot be a revision", "'org/repo@main'"),
+    ("org/repo@main~1", "cannot be a revision", "'org/repo@main'"),
+    ("org/repo@/main", "cannot be a revision", "'org/repo@main'"),
+    ("org/repo:envs", "is a folder", "'org/repo:envs/env.py'"),
+    ("org/repo:envs/", "is a folder", "'org/repo:envs/env.py'"),
+    ("org/repo:README.md", "not a .py file", "inside the repository"),
+    ("org/repo:.py", "not a .py file", "inside the repository"),
+    ("org/repo:a.py@v1", "behind the path", "'org/repo@v1:a.py'"),
+    ("org/repo.git", ".git", "'org/repo'"),
+    ("o--x/repo", "'o--x' cannot be a name", "owner/name"),
+    ("org/-repo", "'-repo' cannot be a name", "owner/name"),
+    ("org/" + "x" * 97, "cannot be a name", "owner/name"),
+    ("é/repo", "cannot be a name", "owner/name"),
+    ("git@hf.co:org/repo.git", "git remote", "'org/repo'"),
+    ("ssh://git@hf.co/org/repo", "git remote", "'org/repo'"),
+    ("s3://bucket/env", "'s3://'", "owner/name"),
+    ("./my-env", "folder of this machine", "make_env"),
+    ("~/my-env", "folder of this machine", "make_env"),
+    ("/srv/my-env", "folder of this machine", "make_env"),
+    ("https://hf-mirror.com/org/repo", "not the Hugging Face Hub", "'https://hf-mirror.com'"),
+    ("https://[bad", "cannot be read", "owner/name"),
+    (f"{SITE}/", "names no repository", "owner/name"),
+    (f"{SITE}/spaces/org", "names no repository", "owner/name"),
+    (f"{SITE}/org/repo/tree/main/envs", "is a folder", "'org/repo@main:envs/env.py'"),
+    (f"{SITE}/org/repo/blob/main/README.md", "not a .py file", "inside the repository"),
+    (f"{SITE}/spaces/org/repo/discussions/4", "'discussions'", "'spaces/org/repo@refs/pr/4'"),
+    (f"{SITE}/org/repo/settings", "'settings'", "'org/repo'"),
+]
+
+
+@pytest.mark.parametrize("text", WORKING)
+def test_form_is_read(text: str) -> None:
+    """Each form is read into the reference that it can only mean."""
+    assert HubRef.parse(text) == WORKING[text]
+
+
+@pytest.mark.parametrize("text", WORKING)
+def test_canonical_text_reads_back(text: str) -> None:
+    """The printed form of a reference means the same reference."""
+    ref = HubRef.parse(text)
+    assert HubRef.parse(str(ref)) == ref
+
+
+@pytest.mark.parametrize(("text", "what", "write"), REFUSED)
+def test_refusal_names_the_reference_and_a_fix(text: str, what: str, write: str) -> None:
+    """A refused text comes back in the error, with what is wrong and what to write."""
+    with pytest.raises(HubReferenceError) as caught:
+        HubRef.parse(text)
+    message = str(caught.value)
+    assert repr(text) in message
+    said, _, advice = message.rpartition("; write ")
+    assert what in said
+    assert write in advice
+
+
+@pytest.mark.parametrize("text", [text for text, _, write in REFUSED if write[0] == "'"])
+def test_suggestion_between_quotes_is_itself_readable(text: str) -> None:
+    """What an error tells the user to write works when it is written (owners filled in)."""
+    with pytest.raises(HubReferenceError) as caught:
+        HubRef.parse(text)
+    advice = str(caught.value).rpartition("; write ")[2]
+    HubRef.parse(advice.split("'")[1])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"https://user:hf_secret@{SITE.removeprefix('https://')}/org/repo",
+        "https://hf_secret@hf-mirror.com/org/repo",
+        "git+https://user:hf_secret@hf.co/org/repo",
+        "https://user:hf_secret@[bad",
+    ],
+)
+def test_token_in_a_url_is_not_repeated(text: str) -> None:
+    """A URL that carries a token is refused, and the error does not show the token."""
+    with pytest.raises(HubReferenceError) as caught:
+        HubRef.parse(text)
+    assert "hf_secret" not in str(caught.value)
+
+
+def test_something_else_than_text_is_refused() -> None:
+    """A path object or None gets the grammar, not an AttributeError."""
+    with pytest.raises(HubReferenceError, match="owner/name@revision"):
+        HubRef.parse(None)  # type: ignore[arg-type]
+
+
+def test_refusal_is_a_value_error() -> None:
+    """Callers who catch ValueError, as they do for LeRobot's parser, catch this."""
+    with pytest.raises(ValueError, match="owner is missing"):
+        HubRef.parse("nope")
+
+
+@pytest.mark.parametrize(
+    ("revision", "pinned"),
+    [(None, False), ("main", False), (COMMIT[:12], False), (COMMIT, True), (COMMIT + "0", False)],
+)
+def test_only_a_full_commit_is_pinned(revision: str | None, pinned: bool) -> None:
+    """Branches, tags and short hashes can move or clash; 40 hexadecimal digits cannot."""
+    assert HubRef("org/repo", revision).is_pinned is pinned
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"repo_id": "repo"},
+        {"repo_id": "a/b/c"},
+        {"repo_id": "org/repo", "revision": ""},
+        {"repo_id": "org/repo", "path": "../env.py"},
+        {"repo_id": "org/repo", "path": "a/./env.py"},
+        {"repo_id": "org/repo", "repo_type": "kernel"},
+    ],
+)
+def test_reference_that_no_hub_has_cannot_be_built(fields: dict[str, str]) -> None:
+    """The fields are checked however a reference is made, so later code can rely on them."""
+    with pytest.raises(HubReferenceError):
+        HubRef(**fields)
+
+
+@pytest.mark.parametrize("text", [".", "..", "~", "./env", "../env", "/env", "~/env"])
+def test_local_folder_is_recognised(text: str) -> None:
+    """Paths that start like paths are local; everything else is the Hub's."""
+    assert is_local(text)
+    assert not is_local("org/repo")
+
+
+_names = st.from_regex(r"[a-zA-Z0-9](?:[a-zA-Z0-9_]|[-.](?=[a-zA-Z0-9])){0,20}", fullmatch=True)
+_steps = st.from_regex(r"[a-zA-Z0-9@_:+-]{1,12}", fullmatch=True)
+_revisions = st.none() | st.lists(
+    st.from_regex(r"[a-zA-Z0-9][a-zA-Z0-9_@-]{0,12}", fullmatch=True), min_size=1, max_size=3
+).map("/".join)
+_paths = st.lists(_steps, min_size=1, max_size=4).map(lambda steps: "/".join(steps) + ".py")
+_types = st.sampled_from([None, "model", "space", "dataset"])
+
+
+@given(owner=_names, name=_names, revision=_revisions, path=_paths, repo_type=_types)
+def test_printing_and_parsing_are_inverse(
+    owner: str, name: str, revision: str | None, path: str, repo_type: str | None
+) -> None:
+    """Every reference that can be built is read back from its own text."""
+    try:
+        ref = HubRef(f"{owner}/{name}", revision, path, repo_type)
+    except HubReferenceError:
+        return
+    assert HubRef.parse(str(ref)) == ref
+
+
+@given(st.text(max_size=40) | st.text(alphabet="ab/@:.\\ ~-spaceshf://\n", max_size=40))
+def test_any_text_is_read_or_refused_with_our_error(text: str) -> None:
+    """No text makes the parser fail in another way, and what it reads reads back."""
+    try:
+        ref = HubRef.parse(text)
+    except HubReferenceError:
+        return
+    assert HubRef.parse(str(ref)) == ref
+    assert ".." not in ref.path.split("/")
+    assert not ref.path.startswith("/")
+
+
+def test_reading_a_reference_imports_nothing_heavy() -> None:
+    """A command line can refuse a typo before huggingface_hub, numpy or gymnasium are loaded."""
+    code = (
+        "import sys; from envhub_sandbox.reference import HubRef; HubRef.parse('org/repo');"
+        "print([m for m in ('huggingface_hub', 'numpy', 'gymnasium', 'requests', 'httpx')"
+        " if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
