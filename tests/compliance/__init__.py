@@ -1,0 +1,1 @@
+"""One suite that every way of running an environment has to pass."""

@@ -1,0 +1,82 @@
+"""An environment and its reference, driven by the same seeds and actions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from tests.support.compare import assert_same
+
+VectorEnv = Any
+
+
+@dataclass
+class Pair:
+    """A reference in this process and the sandboxed environment that must do the same.
+
+    Attributes:
+        reference: What the repository's ``make_env`` builds with ``SyncVectorEnv``.
+        sandboxed: The proxy of the same repository with the same arguments.
+    """
+
+    reference: VectorEnv
+    sandboxed: VectorEnv
+
+    @property
+    def num_envs(self) -> int:
+        """The number of sub-environments."""
+        return int(self.reference.num_envs)
+
+    def sample_actions(self, seed: int, steps: int) -> list[Any]:
+        """Batches of actions, the same for the same seed."""
+        space = self.reference.action_space
+        space.seed(seed)
+        return [space.sample() for _ in range(steps)]
+
+    def reset(self, **kwargs: Any) -> Any:
+        """Reset both and compare. Each gets ``options`` of its own: Gymnasium pops from it."""
+        expected = self.reference.reset(**_copied(kwargs))
+        actual = self.sandboxed.reset(**_copied(kwargs))
+        assert_same(expected, actual, f"reset({kwargs})")
+        return actual
+
+    def step(self, actions: Any, what: str = "step") -> Any:
+        """Step both and compare the five results."""
+        expected = self.reference.step(actions)
+        actual = self.sandboxed.step(actions)
+        names = ("observations", "rewards", "terminations", "truncations", "infos")
+        for name, one, other in zip(names, expected, actual, strict=True):
+            assert_same(one, other, f"{what}: {name}")
+        return actual
+
+    def drive(self, seed: int, steps: int) -> int:
+        """Reset and step both; with autoreset disabled, reset what has ended by mask.
+
+        Returns:
+            How many episodes ended.
+        """
+        self.reset(seed=seed)
+        ended = 0
+        for number, actions in enumerate(self.sample_actions(seed, steps)):
+            _, _, terminations, truncations, _ = self.step(actions, f"step {number}")
+            done = np.logical_or(terminations, truncations)
+            ended += int(done.sum())
+            if done.any() and self.autoreset_mode is AutoresetMode.DISABLED:
+                self.reset(options={"reset_mask": done})
+        return ended
+
+    @property
+    def autoreset_mode(self) -> AutoresetMode:
+        """The reference's autoreset mode."""
+        mode = self.reference.metadata["autoreset_mode"]
+        assert isinstance(mode, AutoresetMode)
+        return mode
+
+
+def _copied(kwargs: dict[str, Any]) -> dict[str, Any]:
+    if isinstance(kwargs.get("options"), dict):
+        return kwargs | {"options": dict(kwargs["options"])}
+    return kwargs

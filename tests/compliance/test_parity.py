@@ -1,0 +1,169 @@
+"""The samples that have a ``SyncVectorEnv`` to be compared with, against the suite."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+from tests.compliance.pair import Pair
+from tests.compliance.vector_env import Case, VectorEnvCompliance, cases
+from tests.support.compare import assert_same
+
+
+class TestCounter(VectorEnvCompliance):
+    """Every kind of value in the infos, episodes of two to six steps."""
+
+    sample = "counter"
+    cases = cases(n_envs=(1, 3, 4))
+    steps = 150
+
+    def test_options_reach_the_sub_environments(self, pair: Pair) -> None:
+        """Options arrive as they were given; this sample repeats them in its info."""
+        for options in (None, {}, {"level": 3, "names": ["a", "b"], "deep": {"x": (1, 2.5)}}):
+            pair.reset(seed=1, options=options)
+
+    def test_methods_take_arguments(self, pair: Pair) -> None:
+        """``call`` hands over positional and keyword arguments and gives a tuple of results."""
+        for args, kwargs in (((1,), {}), ((1, 2), {}), ((1,), {"b": 5})):
+            expected = pair.reference.call("add", *args, **kwargs)
+            assert_same(expected, pair.sandboxed.call("add", *args, **kwargs), "call")
+        pair.sandboxed.call_async("add", 4)
+        assert_same(pair.reference.call("add", 4), pair.sandboxed.call_wait(), "call_wait")
+
+    def test_get_attr_calls_what_can_be_called(self, pair: Pair) -> None:
+        """``get_attr`` is ``call`` without arguments, as in Gymnasium."""
+        pair.reset(seed=2)
+        assert_same(pair.reference.get_attr("render"), pair.sandboxed.get_attr("render"))
+
+    def test_exceptions_keep_their_builtin_class(self, pair: Pair) -> None:
+        """What a method raises can be caught as the builtin that it is; the env goes on."""
+        pair.reset(seed=3)
+        with pytest.raises(ValueError, match="counter 0 failed"):
+            pair.sandboxed.call("fail")
+        with pytest.raises(NotImplementedError):
+            pair.sandboxed.call("not_here")
+        with pytest.raises(TypeError):
+            pair.sandboxed.call("add")
+        pair.step(pair.sample_actions(3, 1)[0])
+
+    def test_frames(self, pair: Pair) -> None:
+        """``render`` and ``call("render")`` give the reference's frames."""
+        pair.reset(seed=4)
+        pair.step(pair.sample_actions(4, 1)[0])
+        assert_same(pair.reference.render(), pair.sandboxed.render(), "render")
+        assert_same(pair.reference.call("render"), pair.sandboxed.call("render"), "call")
+
+    def test_attribute_changes_the_environment(self, pair: Pair) -> None:
+        """An attribute that was set is used by the environment's own code."""
+        for env in (pair.reference, pair.sandboxed):
+            env.set_attr("gain", [0.5 + i for i in range(pair.num_envs)])
+        pair.drive(seed=5, steps=10)
+        for env in (pair.reference, pair.sandboxed):
+            env.set_attr("gain", 1.0)
+
+    def test_stepping_what_has_ended(self, pair: Pair) -> None:
+        """With autoreset disabled a step after the end is an AssertionError, until a reset."""
+        if pair.autoreset_mode is not AutoresetMode.DISABLED:
+            return
+        pair.reset(seed=6)
+        for actions in pair.sample_actions(6, 7):
+            *_, terminations, truncations, _ = pair.step(actions)
+            if np.logical_or(terminations, truncations).any():
+                break
+        for env in (pair.reference, pair.sandboxed):
+            with pytest.raises(AssertionError):
+                env.step(pair.sample_actions(6, 1)[0])
+        pair.drive(seed=6, steps=5)
+
+    def test_actions_of_every_kind(self, pair: Pair) -> None:
+        """Lists, tuples and other integer arrays are actions too."""
+        pair.reset(seed=7)
+        numbers = [i % 3 for i in range(pair.num_envs)]
+        kinds = [numbers, tuple(numbers), np.array(numbers), np.array(numbers, np.int32)]
+        for actions in kinds:
+            if pair.autoreset_mode is AutoresetMode.DISABLED:
+                pair.reset(seed=7)
+            pair.step(actions)
+
+
+class TestCartPole(VectorEnvCompliance):
+    """Discrete actions, float32 observations, thousands of steps."""
+
+    sample = "cartpole"
+    cases = cases(n_envs=(4,))
+    steps = 3000
+
+
+class TestPendulum(VectorEnvCompliance):
+    """Continuous actions, truncation."""
+
+    sample = "pendulum"
+    cases = cases(n_envs=(1, 3))
+    steps = 200
+
+
+class TestLeRobotPendulum(VectorEnvCompliance):
+    """Dict observations and ``is_success`` in every info."""
+
+    sample = "lerobot_pendulum"
+    cases = cases(n_envs=(2,))
+
+
+class TestExoticSpaces(VectorEnvCompliance):
+    """Spaces that have no fixed layout, for observations and actions."""
+
+    sample = "exotic_spaces"
+    cases = cases(n_envs=(1, 3))
+    steps = 60
+
+
+class TestMiniGrid(VectorEnvCompliance):
+    """A custom space in the observation."""
+
+    sample = "minigrid"
+    cases = cases(n_envs=(2,), modes=("NextStep", "SameStep"))
+    steps = 60
+
+    def test_spaces_are_equal(self, pair: Pair) -> None:
+        """The custom space describes itself and refuses to sample; the others are equal."""
+        expected = pair.reference.single_observation_space
+        actual = pair.sandboxed.single_observation_space
+        assert list(actual) == list(expected)
+        assert {key: actual[key] for key in ("direction", "image")} == {
+            key: expected[key] for key in ("direction", "image")
+        }
+        assert "MissionSpace" in repr(actual["mission"])
+        with pytest.raises(NotImplementedError, match="MissionSpace"):
+            actual["mission"].sample()
+
+
+class TestLunarLander(VectorEnvCompliance):
+    """A native physics engine."""
+
+    sample = "lunar_lander"
+    cases = cases(n_envs=(2,), modes=("NextStep",))
+
+
+class TestHalfCheetah(VectorEnvCompliance):
+    """MuJoCo, float64 observations, flat infos in every step."""
+
+    sample = "half_cheetah"
+    cases = cases(n_envs=(2,), modes=("NextStep", "SameStep"))
+    steps = 100
+
+
+class TestPushT(VectorEnvCompliance):
+    """Pixels and a state in a dict."""
+
+    sample = "pusht"
+    cases = cases(n_envs=(2,), modes=("NextStep", "SameStep"))
+    steps = 45
+
+
+class TestMultiObjective(VectorEnvCompliance):
+    """Vector rewards, from a subclass of ``SyncVectorEnv`` with a ``step`` of its own."""
+
+    sample = "mo_gymnasium"
+    cases = [Case(3)]  # noqa: RUF012
+    steps = 60

@@ -1,0 +1,114 @@
+"""Bit-for-bit comparison of what two environments returned."""
+
+from __future__ import annotations
+
+import enum
+import math
+import struct
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+
+def assert_same(expected: object, actual: object, what: str = "value") -> None:
+    """Assert that two values are the same: types, dtypes, shapes, bits, order of keys.
+
+    A value that cannot cross as itself (an enum member, an object of the repository) is the same
+    when its inert stand-in says so.
+    """
+    found = next(differences(expected, actual, what), None)
+    assert found is None, found
+
+
+def differences(expected: Any, actual: Any, path: str = "value") -> Iterator[str]:
+    """Where two values differ, in words; nothing if they are the same."""
+    if type(actual).__name__ in ("RemoteEnum", "RemoteObject"):
+        yield from _stand_in(expected, actual, path)
+    elif type(expected) is not type(actual):
+        yield f"{path}: expected {_brief(expected)}, got {_brief(actual)}"
+    elif isinstance(expected, dict):
+        yield from _mappings(expected, actual, path)
+    elif isinstance(expected, (list, tuple)):
+        yield from _sequences(expected, actual, path)
+    elif isinstance(expected, np.ndarray):
+        yield from _arrays(expected, actual, path)
+    elif isinstance(expected, np.random.Generator):
+        yield from differences(_state(expected), _state(actual), f"{path}.state")
+    elif not _equal(expected, actual):
+        yield f"{path}: expected {_brief(expected)}, got {_brief(actual)}"
+
+
+def assert_same_space(expected: gym.Space[Any], actual: gym.Space[Any], what: str) -> None:
+    """Assert that two spaces are equal, down to dtypes, order of keys and what they sample."""
+    assert type(actual) is type(expected), f"{what}: {actual} is no {type(expected).__name__}"
+    assert actual == expected, f"{what}: expected {expected}, got {actual}"
+    assert repr(actual) == repr(expected), what
+    assert actual.shape == expected.shape, what
+    assert actual.dtype == expected.dtype, what
+    expected.seed(123)
+    wanted = expected.sample()
+    actual.seed(123)
+    assert_same(wanted, actual.sample(), f"sample of {what}")
+
+
+def _mappings(expected: dict[Any, Any], actual: dict[Any, Any], path: str) -> Iterator[str]:
+    if list(expected) != list(actual):
+        yield f"{path}: expected keys {list(expected)}, got {list(actual)}"
+        return
+    for key, value in expected.items():
+        yield from differences(value, actual[key], f"{path}[{key!r}]")
+
+
+def _sequences(expected: Any, actual: Any, path: str) -> Iterator[str]:
+    if len(expected) != len(actual):
+        yield f"{path}: expected {len(expected)} items, got {len(actual)}"
+        return
+    for index, pair in enumerate(zip(expected, actual, strict=True)):
+        yield from differences(*pair, f"{path}[{index}]")
+
+
+def _arrays(expected: Any, actual: Any, path: str) -> Iterator[str]:
+    if (expected.dtype, expected.shape) != (actual.dtype, actual.shape):
+        yield f"{path}: expected {_brief(expected)}, got {_brief(actual)}"
+    elif expected.dtype.hasobject:
+        for index in np.ndindex(expected.shape):
+            yield from differences(expected[index], actual[index], f"{path}{list(index)}")
+    elif expected.tobytes() != actual.tobytes():
+        yield f"{path}: expected {expected!r}, got {actual!r}"
+
+
+def _stand_in(expected: Any, actual: Any, path: str) -> Iterator[str]:
+    # The module's name depends on who imported it, the class's does not.
+    if not actual.type_name.endswith(type(expected).__qualname__):
+        yield f"{path}: expected a {type(expected).__qualname__}, got {actual!r}"
+    text = expected.name if isinstance(expected, enum.Enum) else repr(expected)
+    if actual.text != text:
+        yield f"{path}: expected {text!r}, got {actual!r}"
+
+
+def _equal(expected: Any, actual: Any) -> bool:
+    if isinstance(expected, float) and not isinstance(expected, np.generic):
+        return struct.pack("d", expected) == struct.pack("d", actual) or (
+            math.isnan(expected) and math.isnan(actual)
+        )
+    if isinstance(expected, np.generic):
+        return bool(expected.dtype == actual.dtype and expected.tobytes() == actual.tobytes())
+    if hasattr(expected, "numpy"):  # a torch tensor
+        return expected.dtype == actual.dtype and _equal_arrays(expected.numpy(), actual.numpy())
+    return bool(expected == actual)
+
+
+def _equal_arrays(expected: Any, actual: Any) -> bool:
+    return next(_arrays(expected, actual, ""), None) is None
+
+
+def _state(generator: np.random.Generator) -> dict[str, Any]:
+    return dict(generator.bit_generator.state)
+
+
+def _brief(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype}{value.shape}"
+    return f"{type(value).__name__} {value!r:.120}"
