@@ -169,8 +169,9 @@ class ArrayReader:
             )
         flat: Array = np.frombuffer(frame, dtype)
         if self._copy:
-            return flat.copy()
-        flat.flags.writeable = False
+            flat = flat.copy()
+        else:
+            flat.flags.writeable = False
         return flat
 
 

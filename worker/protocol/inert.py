@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from enum import Enum
 
 from envhub_worker.protocol.text import printable
 
+_ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")
 MAX_NAME_CHARS = 256
 MAX_REPR_CHARS = 1024
 
@@ -47,7 +49,8 @@ def one_line(text: str, max_chars: int = MAX_REPR_CHARS) -> str:
 def describe(value: object) -> RemoteObject:
     """Turns any object into its inert description. A ``__repr__`` that raises is reported."""
     try:
-        text = repr(value)
+        # Addresses tell nobody anything, and make equal things look different.
+        text = _ADDRESS.sub("", repr(value))
     except Exception as error:
         text = f"<repr failed with {type(error).__name__}>"
     return RemoteObject(type_name(type(value)), one_line(text))
