@@ -4,7 +4,7 @@ The interpreter may be one that has never heard of ``envhub_worker`` (a reposito
 environment), and a repository may bring a ``worker.py`` of its own. So the package is loaded
 from the folder of this very file::
 
-    python -I .../bootstrap.py serve ARGS...     envhub_worker.__main__.main(ARGS)
+    python -I .../bootstrap.py worker ARGS...    envhub_worker.__main__.main(ARGS)
     python -I .../bootstrap.py zygote ARGS...    envhub_worker.zygote.main(ARGS)
 """
 
@@ -16,11 +16,11 @@ import os
 import sys
 from collections.abc import Sequence
 
-_PROGRAMS = {"serve": "envhub_worker.__main__", "zygote": "envhub_worker.zygote"}
+_PROGRAMS = {"worker": "envhub_worker.__main__", "zygote": "envhub_worker.zygote"}
 
 
 def command(python: str, program: str, *args: str) -> list[str]:
-    """The argv that runs ``program`` (``"serve"`` or ``"zygote"``) with ``args`` in ``python``."""
+    """The argv that runs ``program`` (``"worker"`` or ``"zygote"``) with ``args`` in ``python``."""
     return [python, "-I", os.path.abspath(__file__), program, *args]
 
 

@@ -1,0 +1,1 @@
+"""The places that a worker can run in: one file each, one protocol in ``base``."""

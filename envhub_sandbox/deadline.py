@@ -1,0 +1,28 @@
+"""One deadline per operation, asked for what is left at each wait."""
+
+from __future__ import annotations
+
+from time import monotonic
+
+
+class Deadline:
+    """A point in time. ``Deadline(None)`` never comes."""
+
+    __slots__ = ("_at",)
+
+    def __init__(self, timeout_s: float | None) -> None:
+        self._at = None if timeout_s is None else monotonic() + timeout_s
+
+    def left_s(self) -> float | None:
+        """Seconds until it comes, at least 0; None for never."""
+        return None if self._at is None else max(0.0, self._at - monotonic())
+
+    def left_ms(self) -> int | None:
+        """Milliseconds until it comes, rounded up; None for never."""
+        left = self.left_s()
+        return None if left is None else int(left * 1000) + 1
+
+    @property
+    def passed(self) -> bool:
+        """Whether it has come."""
+        return self._at is not None and monotonic() >= self._at

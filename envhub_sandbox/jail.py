@@ -1,0 +1,166 @@
+"""The client's end of one open jail: messages to its hosts, and the jail's end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import cloudpickle
+
+from envhub_sandbox.client import WorkerClient, death, expect, refusal
+from envhub_sandbox.deadline import Deadline
+from envhub_sandbox.errors import (
+    DependencyError,
+    EnvHubError,
+    LoadError,
+    RemoteProtocolError,
+    WorkerError,
+    remote_error,
+)
+from envhub_sandbox.tensors import to_tensor
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.limits import WireLimits
+
+
+class RemoteJail:
+    """An open jail. Not thread-safe: its owner holds a lock.
+
+    Attributes:
+        number: The server's number for it.
+        hosts: Its hosts' numbers; sub-environments are spread over them in this order.
+        report: One mapping per layer of the confinement: ``layer``, ``enforced``, ``detail``.
+    """
+
+    def __init__(
+        self,
+        client: WorkerClient,
+        number: int,
+        hosts: Sequence[int],
+        report: list[dict[str, Any]],
+        limits: WireLimits,
+    ) -> None:
+        self.client = client
+        self.number = number
+        self.hosts = list(hosts)
+        self.report = report
+        self._limits = limits
+
+    def through(self, client: WorkerClient) -> RemoteJail:
+        """The same jail over another connection of ours."""
+        return RemoteJail(client, self.number, self.hosts, self.report, self._limits)
+
+    def start_hosts(self, count: int, deadline: Deadline) -> None:
+        """Fork further hosts."""
+        reply, _ = self.client.request(m.StartHosts(self.number, count), deadline=deadline)
+        self.hosts += expect(reply, m.JailOpened).hosts
+
+    def send(self, operation: str, requests: Sequence[tuple[int, m.Message]]) -> int:
+        """Send one message to each of some hosts, in one request; returns its id."""
+        payload: list[Buffer] = []
+        parts = []
+        for host, message in requests:
+            # the only way in for the caller's own objects; nothing is ever unpickled here
+            frames = m.pack(message, 0, pickler=cloudpickle.dumps, limits=self._limits)
+            parts.append((host, len(frames)))
+            payload += frames
+        return self.client.send(m.Relay(self.number, operation, tuple(parts)), payload)
+
+    def receive(self, request_id: int, deadline: Deadline) -> list[m.Message]:
+        """The hosts' replies, in the order of the request.
+
+        Raises:
+            WorkerTimeoutError: The deadline came first.
+            WorkerDiedError: The jail ended.
+            RemoteProtocolError: A host broke the rules.
+        """
+        reply, payload = self.client.receive(request_id, deadline)
+        relayed = expect(reply, m.Relayed)
+        if sum(relayed.parts) != len(payload) or any(count < 1 for count in relayed.parts):
+            raise RemoteProtocolError("the worker's frames do not add up")
+        replies = []
+        start = 0
+        for count in relayed.parts:
+            replies.append(self._unpack(payload[start : start + count]))
+            start += count
+        return replies
+
+    def _unpack(self, frames: Sequence[Buffer]) -> m.Message:
+        return m.unpack(frames, limits=self._limits, tensors=to_tensor)[1]
+
+    def exchange(
+        self, operation: str, requests: Sequence[tuple[int, m.Message]], deadline: Deadline
+    ) -> list[m.Message]:
+        """``send`` and ``receive``; a host's exception is raised."""
+        replies = self.receive(self.send(operation, requests), deadline)
+        for reply in replies:
+            check(reply)
+        return replies
+
+    def output(self, deadline: Deadline) -> str:
+        """The last lines that the jail printed."""
+        reply, _ = self.client.request(m.ReadOutput(self.number), deadline=deadline)
+        return expect(reply, m.Output).text
+
+    def close(self, deadline: Deadline) -> None:
+        """End the jail and everything in it. A server that has gone has ended it already."""
+        try:
+            self.client.request(m.CloseJail(self.number), deadline=deadline)
+        except WorkerError:
+            pass
+        finally:
+            self.client.close()
+
+
+def open_jail(
+    client: WorkerClient, request: m.OpenJail, limits: WireLimits, deadline: Deadline
+) -> RemoteJail:
+    """Open a jail.
+
+    Raises:
+        SandboxUnavailableError: A layer of the confinement is missing.
+        WorkerDiedError: It did not come up.
+    """
+    reply, _ = client.request(request, deadline=deadline)
+    opened = expect(reply, m.JailOpened)
+    report = [dict(layer) for layer in opened.report if isinstance(layer, dict)]
+    return RemoteJail(client, opened.jail, opened.hosts, report, limits)
+
+
+def check(reply: m.Message) -> None:
+    """Raise what a reply says went wrong."""
+    if isinstance(reply, m.Raised):
+        raise raised(reply)
+    if isinstance(reply, m.Died):
+        raise death(reply)
+    if isinstance(reply, m.Refused):
+        raise refusal(reply)
+
+
+_LOADING = {
+    "import": "the entry file could not be imported",
+    "make_env": "its make_env failed",
+    "return": "its make_env returned something unusable",
+}
+
+
+def raised(reply: m.Raised) -> EnvHubError:
+    """The error for an exception of the repository. Trust: text from the worker."""
+    if reply.stage not in _LOADING:
+        return remote_error(reply.builtin, reply.type_name, reply.message, reply.traceback)
+    what = _LOADING[reply.stage]
+    if reply.stage == "return":
+        return LoadError(reply.message)
+    cause: Any = remote_error(reply.builtin, reply.type_name, reply.message, reply.traceback)
+    if reply.builtin == "ModuleNotFoundError":
+        error: EnvHubError = DependencyError(
+            f"{what}: {reply.message}. The worker runs in this interpreter's environment: install "
+            "the package there, or choose another interpreter with make_env(..., python=...)"
+        )
+    elif reply.type_name.endswith(".EntryError"):
+        return LoadError(reply.message)
+    else:
+        trace = f"\nRemote traceback:\n{reply.traceback.rstrip()}" if reply.traceback else ""
+        error = LoadError(f"{what}: {reply.type_name}: {reply.message}{trace}")
+    error.__cause__ = cause
+    return error

@@ -1,0 +1,156 @@
+"""What a jail is permitted, how much, and how long one waits. Frozen, keyword-only values.
+
+Unknown names and impossible values are refused with ``PolicyError``: a misspelt limit that
+silently did nothing would be a hole.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, TypeVar
+
+from envhub_sandbox.errors import PolicyError
+from envhub_worker.protocol.confinement import Confinement, Limits
+
+__all__ = ["Limits", "Policy", "Timeouts", "limits_from", "policy_from", "timeouts_from"]
+
+PROFILES = ("strict", "no-userns", "container")
+NETWORKS = ("none", "loopback", "host")
+RESTARTS = ("never", "on_reset", "transparent")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timeouts:
+    """Seconds that one operation may take; None waits for ever.
+
+    Attributes:
+        startup_s: From forking a jail to the repository's ``make_env`` having returned.
+        reset_s: One ``reset``.
+        step_s: One ``step``.
+        call_s: One ``call``, ``get_attr``, ``set_attr`` or ``render``.
+        close_s: The environment's own ``close``; afterwards its processes are killed.
+    """
+
+    startup_s: float | None = 300.0
+    reset_s: float | None = 300.0
+    step_s: float | None = 300.0
+    call_s: float | None = 300.0
+    close_s: float | None = 5.0
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if value is not None and not (_is_number(value) and value > 0):
+                raise PolicyError(
+                    f"timeouts: {item.name} is {value!r}; it takes seconds above 0, or None"
+                )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Policy:
+    """What a repository's code may reach.
+
+    Attributes:
+        profile: Which layers must hold. ``"strict"`` needs all of them; ``"no-userns"`` and
+            ``"container"`` are weaker and must be asked for by name (``docs/threat-model.md``).
+        network: ``"none"``, ``"loopback"`` (its own, empty one) or ``"host"``.
+        readable: Further absolute paths that the jail may read.
+        gpu: Grant the render and NVIDIA device nodes and the driver's libraries.
+        environment: Names of environment variables whose values the jail may see.
+        limits: Hard caps.
+        restart: What happens after the worker has died: ``"never"``, or a fresh one at the next
+            ``reset()`` with ``"on_reset"``.
+    """
+
+    profile: str = "strict"
+    network: str = "none"
+    readable: tuple[str, ...] = ()
+    gpu: bool = False
+    environment: tuple[str, ...] = ()
+    limits: Limits = field(default_factory=Limits)
+    restart: str = "never"
+
+    def __post_init__(self) -> None:
+        _one_of("profile", self.profile, PROFILES)
+        _one_of("network", self.network, NETWORKS)
+        _one_of("restart", self.restart, RESTARTS)
+        _check_limits(self.limits)
+        for path in self.readable:
+            if not os.path.isabs(path):
+                raise PolicyError(f"policy: readable holds {path!r}; it takes absolute paths")
+
+    def confinement(self) -> Confinement:
+        """What travels to the worker; the named environment variables get their values here."""
+        granted = {name: os.environ[name] for name in self.environment if name in os.environ}
+        return Confinement(
+            profile=self.profile,
+            network=self.network,
+            readable=tuple(self.readable),
+            gpu=self.gpu,
+            environment=granted,
+            limits=self.limits,
+        )
+
+
+T = TypeVar("T", Policy, Limits, Timeouts)
+
+
+def policy_from(value: Policy | Mapping[str, Any] | None, limits: Limits | None) -> Policy:
+    """A policy from what ``make_env`` was given; ``limits`` replaces the policy's own."""
+    policy = _from(Policy, value, "policy")
+    if limits is None:
+        return policy
+    values = {item.name: getattr(policy, item.name) for item in fields(policy)}
+    return Policy(**(values | {"limits": limits}))
+
+
+def limits_from(value: Limits | Mapping[str, Any] | None) -> Limits | None:
+    """Limits from what ``make_env`` was given."""
+    return None if value is None else _from(Limits, value, "limits")
+
+
+def timeouts_from(value: Timeouts | Mapping[str, Any] | None) -> Timeouts:
+    """Timeouts from what ``make_env`` was given."""
+    return _from(Timeouts, value, "timeouts")
+
+
+def _from(cls: type[T], value: T | Mapping[str, Any] | None, what: str) -> T:
+    if value is None:
+        return cls()
+    if isinstance(value, cls):
+        return value
+    if not isinstance(value, Mapping):
+        raise PolicyError(f"{what} takes a {cls.__name__} or a mapping, not {type(value).__name__}")
+    known = [item.name for item in fields(cls)]
+    unknown = [name for name in value if name not in known]
+    if unknown:
+        raise PolicyError(
+            f"{what} knows no {', '.join(map(str, unknown))}; it knows {', '.join(known)}"
+        )
+    made = dict(value)
+    if cls is Policy and isinstance(made.get("limits"), Mapping):
+        made["limits"] = _from(Limits, made["limits"], "limits")
+    return cls(**made)
+
+
+def _one_of(name: str, value: str, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise PolicyError(f"policy: {name} is {value!r}; it is one of {', '.join(known)}")
+
+
+_OPTIONAL_LIMITS = frozenset({"cpu_s", "file_bytes"})
+
+
+def _check_limits(limits: Limits) -> None:
+    for item in fields(limits):
+        value = getattr(limits, item.name)
+        if value is None and item.name in _OPTIONAL_LIMITS:
+            continue
+        if not (_is_number(value) and value == int(value) and value > 0):
+            raise PolicyError(f"limits: {item.name} is {value!r}; it takes a whole number above 0")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)

@@ -1,0 +1,273 @@
+"""One task's environment: its jail, opened when it is first needed, and its life.
+
+``vector_env`` asks it for replies and knows nothing of jails; ``Lifecycle`` says what is legal.
+Sub-environments are spread over shards; every request goes to all of them in one message.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from envhub_sandbox.deadline import Deadline
+from envhub_sandbox.errors import (
+    EnvHubError,
+    LoadError,
+    WorkerDiedError,
+    WorkerError,
+    WorkerTimeoutError,
+)
+from envhub_sandbox.jail import check
+from envhub_sandbox.jail_sources import JailSource
+from envhub_sandbox.repository import LoadedJail, Repository
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.batches import even_bounds
+from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
+from envhub_worker.protocol.manifest import EnvManifest
+
+_GRACE_S = 2.0
+"""How long ``reset`` waits for a late reply before it gives the jail up and starts another."""
+_INTERRUPT_S = 10.0
+"""How long ``close`` waits for another thread to notice that the jail has gone."""
+
+MessageFor = Callable[[int, tuple[int, int]], m.Message]
+"""Makes the message for a shard out of the environment's number and the shard's bounds."""
+
+_numbers = itertools.count(1)
+
+
+class RemoteEnv:
+    """One vector environment in a jail.
+
+    Safe to use from one thread at a time; ``close`` may come from any thread at any time.
+
+    Args:
+        jails: Gives and takes back the jail.
+        manifest: What the environment is expected to be.
+        shards: Over how many processes its sub-environments are spread.
+    """
+
+    def __init__(self, jails: JailSource, manifest: EnvManifest, shards: int) -> None:
+        self.manifest = manifest
+        self.bounds = even_bounds(manifest.num_envs, shards)
+        self.lifecycle = Lifecycle()
+        self._jails = jails
+        self._lock = threading.Lock()
+        self._loaded: LoadedJail | None = None
+        self._hosts: list[int] = []
+        self._number = 0
+        self._pending: tuple[int, str] | None = None
+
+    @property
+    def repository(self) -> Repository:
+        """The repository that it comes from."""
+        return self._jails.repository
+
+    # --- requests ------------------------------------------------------------------------------
+
+    def submit(self, operation: str, message_for: MessageFor) -> None:
+        """Send a request to every shard, opening the jail if there is none.
+
+        Raises:
+            LocalProtocolError: It cannot be sent; nothing was.
+            WorkerError: The environment is not in a state to take it.
+        """
+        with self._lock, self.repository.named():
+            self._refuse_unless_usable(operation)
+            if self.lifecycle.state is State.IDLE:
+                self._start()
+            requests = [
+                (host, message_for(self._number, bounds))
+                for host, bounds in zip(self._hosts, self.bounds, strict=True)
+            ]
+            self._send(operation, requests)
+
+    def collect(self, timeout_s: float | None) -> list[m.Message]:
+        """The shards' replies to the last ``submit``; the environment is usable afterwards.
+
+        Raises:
+            WorkerTimeoutError: The environment is then LATE: ``reset`` brings it back.
+            WorkerDiedError: The environment is then DEAD.
+            RemoteEnvError: The repository's code raised; the environment is still usable.
+        """
+        with self._lock, self.repository.named():
+            replies = self._collect(Deadline(timeout_s), timeout_s)
+            for reply in replies:
+                check(reply)
+            return replies
+
+    def request(
+        self, operation: str, message_for: MessageFor, timeout_s: float | None
+    ) -> list[m.Message]:
+        """``submit`` and ``collect``."""
+        self.submit(operation, message_for)
+        return self.collect(timeout_s)
+
+    def recover(self) -> None:
+        """Before a reset: catch up with a late reply, or give up the jail that owes it.
+
+        After a death a fresh jail is started only if the policy says ``restart="on_reset"``.
+        """
+        with self._lock, self.repository.named():
+            if self.lifecycle.state is State.LATE:
+                self._catch_up()
+            may_restart = self.repository.policy.restart != "never"
+            if self.lifecycle.state is State.DEAD and may_restart:
+                self._forget()
+
+    def _catch_up(self) -> None:
+        loaded, pending = self._loaded, self._pending
+        assert loaded is not None
+        assert pending is not None
+        try:
+            loaded.jail.receive(pending[0], Deadline(_GRACE_S))
+        except EnvHubError:
+            self._forget()
+            return
+        self._pending = None
+        self.lifecycle.on(Event.REPLY)
+
+    def _refuse_unless_usable(self, operation: str) -> None:
+        state = self.lifecycle.state
+        if state is State.LATE:
+            raise WorkerTimeoutError(
+                f"cannot {operation}: the reply to the last request is late; call reset() first"
+            )
+        if state is State.DEAD:
+            raise WorkerDiedError(
+                f"cannot {operation}: the worker process has died; make the environment again, or "
+                "use policy={'restart': 'on_reset'} and call reset()"
+            )
+        if state not in (State.IDLE, State.READY):
+            raise WorkerError(f"cannot {operation}: the environment is {state.value}")
+
+    def _send(self, operation: str, requests: Sequence[tuple[int, m.Message]]) -> None:
+        assert self._loaded is not None
+        request_id = self._loaded.jail.send(operation, requests)
+        self._pending = (request_id, operation)
+        self.lifecycle.on(Event.SUBMIT)
+
+    def _collect(self, deadline: Deadline, timeout_s: float | None) -> list[m.Message]:
+        loaded, pending = self._loaded, self._pending
+        if loaded is None or pending is None:
+            state = self.lifecycle.state.value
+            raise WorkerError(f"there is no request to wait for: the environment is {state}")
+        try:
+            replies = loaded.jail.receive(pending[0], deadline)
+        except WorkerTimeoutError as error:
+            self._moved(Event.TIMEOUT)
+            raise WorkerTimeoutError(
+                f"{pending[1]} has not finished after {timeout_s} s; reset() brings the "
+                "environment back, in a fresh process if it still does not answer"
+            ) from error
+        except EnvHubError:
+            self._moved(Event.DEATH)
+            raise
+        self._pending = None
+        self._moved(Event.REPLY)
+        return replies
+
+    def _moved(self, event: Event) -> None:
+        # close() may have come meanwhile, from another thread
+        if self.lifecycle.state is not State.CLOSED:
+            self.lifecycle.on(event)
+
+    # --- the jail ------------------------------------------------------------------------------
+
+    def adopt(self, loaded: LoadedJail) -> None:
+        """Use a jail that is already loaded, instead of opening one later."""
+        with self._lock:
+            self._build(loaded, Deadline(self.repository.timeouts.startup_s))
+
+    def _start(self) -> None:
+        deadline = Deadline(self.repository.timeouts.startup_s)
+        self._build(self._jails.take(deadline), deadline)
+
+    def _build(self, loaded: LoadedJail, deadline: Deadline) -> None:
+        try:
+            self._check_manifest(loaded)
+            hosts = self.repository.spread(loaded, len(self.bounds), deadline)
+            number = next(_numbers)
+            wanted = self.manifest
+            builds = [
+                (host, m.Build(number, wanted.suite, wanted.task, start, stop))
+                for host, (start, stop) in zip(hosts, self.bounds, strict=True)
+            ]
+            loaded.jail.exchange("make_env", builds, deadline)
+        except BaseException:
+            self._jails.give_back(loaded)
+            raise
+        self._loaded, self._hosts, self._number = loaded, hosts, number
+        self.lifecycle.on(Event.START)
+
+    def _check_manifest(self, loaded: LoadedJail) -> None:
+        key = (self.manifest.suite, self.manifest.task)
+        found = next((e for e in loaded.manifest.envs if (e.suite, e.task) == key), None)
+        if found is None or _shape(found) != _shape(self.manifest):
+            self._jails.forget_manifest()
+            raise LoadError(
+                f"make_env returned another environment for {key} than before: its result must "
+                "not change between calls. The remembered description has been dropped; call "
+                "make_env again"
+            )
+
+    def _forget(self) -> None:
+        """Give up the jail; the next request opens another."""
+        if self._loaded is not None:
+            self._jails.end(self._loaded)
+            self._jails.give_back(self._loaded)
+        self._loaded, self._pending = None, None
+        self.lifecycle.on(Event.FORGET)
+
+    def close(self) -> None:
+        """Close the environment and end its processes, in bounded time, from any thread."""
+        if self.lifecycle.state is State.CLOSED:
+            return
+        if not self._lock.acquire(blocking=False):
+            self._interrupt()
+            return
+        try:
+            state, loaded = self.lifecycle.state, self._loaded
+            if state is State.CLOSED:
+                return
+            self.lifecycle.on(Event.CLOSE)
+            if loaded is not None:
+                if state is State.READY:
+                    self._close_politely(loaded)
+                self._jails.give_back(loaded)
+        finally:
+            self._lock.release()
+
+    def _interrupt(self) -> None:
+        """Another thread waits for a reply: end the jail under it, then clean up after it."""
+        loaded = self._loaded
+        self.lifecycle.on(Event.CLOSE)
+        if loaded is None:
+            return
+        self._jails.end(loaded)
+        if self._lock.acquire(timeout=_INTERRUPT_S):
+            try:
+                self._jails.give_back(loaded)
+            finally:
+                self._lock.release()
+
+    def _close_politely(self, loaded: LoadedJail) -> None:
+        """Let the repository's ``close`` run; whatever it does, the processes end after it."""
+        deadline = Deadline(self.repository.timeouts.close_s)
+        requests = [(host, m.Close(self._number)) for host in self._hosts]
+        try:
+            loaded.jail.receive(loaded.jail.send("close", requests), deadline)
+        except EnvHubError:
+            pass
+
+
+def _shape(manifest: EnvManifest) -> tuple[Any, ...]:
+    return (
+        manifest.num_envs,
+        manifest.shardable,
+        manifest.autoreset_mode,
+        manifest.single_observation_space,
+        manifest.single_action_space,
+    )

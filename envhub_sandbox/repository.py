@@ -1,0 +1,213 @@
+"""One repository under one policy: opens jails for it, and keeps what they said about it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from envhub_sandbox.client import WorkerClient
+from envhub_sandbox.deadline import Deadline
+from envhub_sandbox.errors import EnvHubError, LoadError
+from envhub_sandbox.jail import RemoteJail, check, open_jail
+from envhub_sandbox.policy import Policy, Timeouts
+from envhub_sandbox.sandboxes.base import Sandbox, WorkerServer
+from envhub_sandbox.snapshot import Snapshot
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.manifest import Manifest, decode_manifest
+
+_CLOSE_S = 5.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadArguments:
+    """What the repository's ``make_env`` is called with."""
+
+    n_envs: int = 1
+    use_async_envs: bool = False
+    cfg: dict[str, object] | None = None
+    env_kwargs: dict[str, object] = field(default_factory=dict)
+
+    def message(self) -> m.Load:
+        """As it travels."""
+        return m.Load(self.n_envs, self.use_async_envs, self.cfg, self.env_kwargs)
+
+
+@dataclass
+class LoadedJail:
+    """An open jail whose first host has called ``make_env``.
+
+    Attributes:
+        jail: The jail.
+        manifest: What ``make_env`` returned, checked.
+        loaded: Hosts that have called it.
+    """
+
+    jail: RemoteJail
+    manifest: Manifest
+    value: dict[str, object]
+    loaded: set[int]
+    server: WorkerServer
+
+
+class Repository:
+    """Opens jails for one snapshot. Thread-safe.
+
+    Args:
+        snapshot: The verified files.
+        arguments: For the repository's ``make_env``.
+        policy: What a jail may do.
+        timeouts: How long operations may take.
+        sandbox: Where workers run.
+        python: The interpreter of the jails; empty for ours.
+    """
+
+    def __init__(
+        self,
+        snapshot: Snapshot,
+        arguments: LoadArguments,
+        policy: Policy,
+        timeouts: Timeouts,
+        sandbox: Sandbox,
+        python: str,
+    ) -> None:
+        self.snapshot = snapshot
+        self.arguments = arguments
+        self.policy = policy
+        self.timeouts = timeouts
+        self.python = python
+        self.report: list[dict[str, Any]] = []
+        self._sandbox = sandbox
+        self._lock = threading.Lock()
+
+    @property
+    def label(self) -> str:
+        """Repository, commit and entry file, for errors."""
+        snapshot = self.snapshot
+        if snapshot.repo_type == "local":
+            return f"{snapshot.repo_id}:{snapshot.path}"
+        prefix = "" if snapshot.repo_type == "model" else f"{snapshot.repo_type}s/"
+        return f"{prefix}{snapshot.repo_id}@{snapshot.commit[:12]}:{snapshot.path}"
+
+    @property
+    def wire_limits(self) -> WireLimits:
+        """Bounds on what a jail may send."""
+        size = self.policy.limits.message_bytes
+        return WireLimits(frame_bytes=size, message_bytes=size)
+
+    @contextmanager
+    def named(self) -> Iterator[None]:
+        """Put the repository's name in front of the errors of this project."""
+        try:
+            yield
+        except EnvHubError as error:
+            name_source(error, self.label)
+            raise
+
+    def open(self, deadline: Deadline) -> LoadedJail:
+        """Fork a jail and have its first host call ``make_env``.
+
+        Raises:
+            LoadError: The repository failed to load, or returned something unusable.
+            WorkerError: The jail did not come up, died, or took too long.
+        """
+        server = self._sandbox.acquire(self.snapshot.store)
+        try:
+            return self._open(server, deadline)
+        except BaseException:
+            self._sandbox.release(server)
+            raise
+
+    def _open(self, server: WorkerServer, deadline: Deadline) -> LoadedJail:
+        client = WorkerClient(server.endpoint, server.process_fd, self.wire_limits)
+        try:
+            client.hello(deadline)
+            jail = open_jail(client, self._order(), self.wire_limits, deadline)
+        except BaseException:
+            client.close()
+            raise
+        try:
+            self.report = jail.report
+            return self._load(jail, server, deadline)
+        except BaseException:
+            jail.close(Deadline(_CLOSE_S))
+            raise
+
+    def _order(self) -> m.OpenJail:
+        return m.OpenJail(
+            name=self.label,
+            python=self.python,
+            snapshot=str(self.snapshot.root),
+            entry=self.snapshot.path,
+            confinement=asdict(self.policy.confinement()),
+            hosts=1,
+        )
+
+    def _load(self, jail: RemoteJail, server: WorkerServer, deadline: Deadline) -> LoadedJail:
+        host = jail.hosts[0]
+        [reply] = jail.exchange("make_env", [(host, self.arguments.message())], deadline)
+        if not isinstance(reply, m.Loaded):
+            raise LoadError(f"the worker answered Load with {type(reply).__name__}")
+        manifest = decode_manifest(reply.manifest, max_elements=self.policy.limits.elements)
+        return LoadedJail(jail, manifest, reply.manifest, {host}, server)
+
+    def spread(self, loaded: LoadedJail, shards: int, deadline: Deadline) -> list[int]:
+        """The first ``shards`` hosts of a jail, forked and loaded if they are not yet."""
+        jail = loaded.jail
+        if len(jail.hosts) < shards:
+            jail.start_hosts(shards - len(jail.hosts), deadline)
+        hosts = jail.hosts[:shards]
+        fresh = [host for host in hosts if host not in loaded.loaded]
+        if fresh:
+            load = self.arguments.message()
+            for reply in jail.exchange("make_env", [(host, load) for host in fresh], deadline):
+                check(reply)
+            loaded.loaded.update(fresh)
+        return hosts
+
+    def connect(self, loaded: LoadedJail, deadline: Deadline) -> LoadedJail:
+        """A further connection to an open jail; environments that share one wait apart."""
+        server = self._sandbox.acquire(self.snapshot.store)
+        client = WorkerClient(server.endpoint, server.process_fd, self.wire_limits)
+        try:
+            client.hello(deadline)
+        except BaseException:
+            client.close()
+            self._sandbox.release(server)
+            raise
+        jail = loaded.jail.through(client)
+        return LoadedJail(jail, loaded.manifest, loaded.value, loaded.loaded, server)
+
+    def disconnect(self, loaded: LoadedJail) -> None:
+        """Drop a further connection."""
+        loaded.jail.client.close()
+        self._sandbox.release(loaded.server)
+
+    def close(self, loaded: LoadedJail) -> None:
+        """End a jail and give its server back."""
+        try:
+            loaded.jail.close(Deadline(_CLOSE_S))
+        finally:
+            self._sandbox.release(loaded.server)
+
+    def interrupt(self, loaded: LoadedJail) -> None:
+        """End a jail over a connection of its own, while another thread waits on the first."""
+        client = WorkerClient(loaded.server.endpoint, loaded.server.process_fd, self.wire_limits)
+        deadline = Deadline(_CLOSE_S)
+        try:
+            client.hello(deadline)
+            client.request(m.CloseJail(loaded.jail.number), deadline=deadline)
+        except EnvHubError:
+            pass  # the server has gone, and the jail with it
+        finally:
+            client.close()
+
+
+def name_source(error: EnvHubError, label: str) -> None:
+    """Prefix an error's text with where it came from, once."""
+    text = str(error.args[0]) if error.args else ""
+    if not text.startswith(label):
+        error.args = (f"{label}: {text}", *error.args[1:])

@@ -1,0 +1,158 @@
+"""``sandbox="process"``: the worker server as a child process on this machine.
+
+One server serves all environments of this process: it keeps a warm zygote. It is a fresh
+interpreter with a built environment and named descriptors, and it ends when this process does,
+whatever ended it: it holds a pidfd of us.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import os
+import select
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import envhub_worker.protocol
+from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
+
+_BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
+_STARTUP_S = 60.0
+_STOP_S = 5.0
+_KEPT_VARIABLES = ("PATH", "LANG", "LC_ALL", "LC_CTYPE", "TZ", "TMPDIR")
+
+
+@dataclass
+class ProcessServer:
+    """A worker server that we started."""
+
+    endpoint: str
+    process_fd: int
+    process: subprocess.Popen[bytes]
+    folder: Path
+    owner: int = field(default_factory=os.getpid)
+    users: int = 0
+
+    def stop(self) -> None:
+        """End it and everything below it, in bounded time. A fork of its owner does nothing."""
+        if os.getpid() != self.owner:
+            return
+        self.process.terminate()
+        try:
+            self.process.wait(_STOP_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        with contextlib.suppress(OSError):
+            os.close(self.process_fd)
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+class ProcessSandbox:
+    """Workers on this machine, confined by the kernel."""
+
+    name = "process"
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._servers: dict[tuple[int, Path], ProcessServer] = {}
+
+    def acquire(self, store: Path) -> ProcessServer:
+        """The server for this process, started if there is none."""
+        if not sys.platform.startswith("linux"):
+            raise SandboxUnavailableError(
+                f"sandbox='process' needs Linux, and this is {sys.platform}: nothing here can "
+                "confine a process. Run the worker in a container or on a Linux host."
+            )
+        with self._lock:
+            server = self._servers.get((os.getpid(), store))
+            if server is None or server.process.poll() is not None:
+                server = self._servers[os.getpid(), store] = _start(store)
+            server.users += 1
+            return server
+
+    def release(self, server: ProcessServer) -> None:  # type: ignore[override]
+        """Give a server back; the last one who does ends it."""
+        with self._lock:
+            server.users -= 1
+            if server.users > 0:
+                return
+            for key, known in list(self._servers.items()):
+                if known is server:
+                    del self._servers[key]
+        server.stop()
+
+    def stop_all(self) -> None:
+        """End all servers of this process, as at its exit."""
+        with self._lock:
+            mine = [key for key in self._servers if key[0] == os.getpid()]
+            servers = [self._servers.pop(key) for key in mine]
+        for server in servers:
+            server.stop()
+
+
+def _start(store: Path) -> ProcessServer:
+    # mkdtemp gives mode 0700: the endpoint is ours alone
+    folder = Path(tempfile.mkdtemp(prefix="envhub-"))
+    endpoint = f"ipc://{folder}/server"
+    ready, ready_end = os.pipe()
+    try:
+        process = _execute(folder, store, endpoint, ready_end)
+    except BaseException:
+        os.close(ready)
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    finally:
+        os.close(ready_end)
+    server = ProcessServer(endpoint, os.pidfd_open(process.pid), process, folder)
+    try:
+        _wait_until_ready(ready, server)
+    except BaseException:
+        server.stop()
+        raise
+    finally:
+        os.close(ready)
+    return server
+
+
+def _execute(folder: Path, store: Path, endpoint: str, ready: int) -> subprocess.Popen[bytes]:
+    ourselves = os.pidfd_open(os.getpid())
+    arguments = [
+        *(sys.executable, "-I", str(_BOOTSTRAP), "worker", "serve"),
+        *("--endpoint", endpoint, "--runtime-dir", str(folder)),
+        *("--readable-root", str(store)),
+        *("--ready-fd", str(ready), "--client-pidfd", str(ourselves)),
+    ]
+    try:
+        with (folder / "server.log").open("wb") as log:
+            return subprocess.Popen(
+                arguments,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                cwd="/",
+                env={name: os.environ[name] for name in _KEPT_VARIABLES if name in os.environ},
+                pass_fds=(ready, ourselves),
+                start_new_session=True,  # Ctrl-C is for the client, which then closes us
+            )
+    finally:
+        os.close(ourselves)
+
+
+def _wait_until_ready(ready: int, server: ProcessServer) -> None:
+    readable, _, _ = select.select([ready], [], [], _STARTUP_S)
+    if readable and os.read(ready, 16):
+        return
+    log = (server.folder / "server.log").read_text("utf-8", "replace")[-4000:]
+    what = "ended" if readable else f"was not ready after {_STARTUP_S:.0f} s"
+    raise WorkerStartupError(f"the worker server {what} ({sys.executable}):\n{log}")
+
+
+PROCESS = ProcessSandbox()
+atexit.register(PROCESS.stop_all)

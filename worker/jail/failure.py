@@ -1,0 +1,55 @@
+"""Turns an exception of the repository into text."""
+
+from __future__ import annotations
+
+import builtins
+import traceback
+
+from envhub_worker.protocol.messages import Raised
+from envhub_worker.protocol.text import printable
+
+_MAX_MESSAGE = 8_192
+_MAX_TRACEBACK = 32_768
+_OURS = f"{__name__.rpartition('.')[0]}."
+
+
+def raised(error: BaseException, stage: str) -> Raised:
+    """The message for an exception: its nearest builtin ancestor, its text, its traceback."""
+    kind = type(error)
+    name = kind.__qualname__
+    if kind.__module__ not in ("builtins", "__main__"):
+        name = f"{kind.__module__}.{name}"
+    return Raised(
+        builtin=_builtin(kind),
+        type_name=printable(name, 512),
+        message=printable(_text(error), _MAX_MESSAGE),
+        traceback=printable(_traceback(error), _MAX_TRACEBACK),
+        stage=stage,
+    )
+
+
+def _builtin(kind: type[BaseException]) -> str:
+    for base in kind.__mro__:
+        if getattr(builtins, base.__name__, None) is base:
+            return base.__name__
+    return "Exception"
+
+
+def _text(error: BaseException) -> str:
+    try:
+        return str(error)
+    except Exception:
+        return "(its text could not be read)"
+
+
+def _traceback(error: BaseException) -> str:
+    """The traceback, without the frames of this package that called into the repository."""
+    frames = error.__traceback__
+    while frames and frames.tb_frame.f_globals.get("__name__", "").startswith(_OURS):
+        frames = frames.tb_next
+    try:
+        return "".join(
+            traceback.format_exception(type(error), error, frames or error.__traceback__)
+        )
+    except Exception:
+        return ""

@@ -1,0 +1,177 @@
+"""The env host: holds the live vector environments of one jail and answers for them.
+
+One small function per message, found in a table. It speaks length-prefixed packets over one
+inherited stream, on the main thread (a repository may set signal handlers), and dies with it.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable
+from typing import Any
+
+import cloudpickle
+
+from envhub_worker.jail import describe, loader
+from envhub_worker.jail.failure import raised
+from envhub_worker.jail.standins import standing_in
+from envhub_worker.jail.tasks import ResultError, Task, tasks_of
+from envhub_worker.jailspec import JailSpec
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.manifest import encode_env, encode_manifest
+from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
+
+_CHUNK = 1 << 20
+
+
+def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
+    """Serve until the other side closes the stream. Runs confined, as the jail's main program."""
+    host = Host(spec.snapshot, spec.entry)
+    reader = PacketReader()
+    while data := stream.recv(_CHUNK):
+        for packet in reader.feed(data):
+            _send(stream, packet.request_id, host.answer(packet))
+    return 0
+
+
+def _send(stream: socket.socket, request_id: int, frames: list[Any]) -> None:
+    buffers = [memoryview(buffer).cast("B") for buffer in pack_packet(request_id, frames)]
+    while buffers:
+        sent = stream.sendmsg(buffers[:512])
+        while buffers and sent >= buffers[0].nbytes:
+            sent -= buffers.pop(0).nbytes
+        if sent:
+            buffers[0] = buffers[0][sent:]
+
+
+class Host:
+    """The state of one host: the repository's tasks and the environments built of them."""
+
+    def __init__(self, snapshot: str, entry: str) -> None:
+        self._snapshot = snapshot
+        self._entry = entry
+        self._tasks: dict[tuple[str, Any], Task] = {}
+        self._envs: dict[int, Any] = {}
+        self._stage = ""
+
+    def answer(self, packet: Packet) -> list[Any]:
+        """The reply's frames; whatever the repository raises becomes ``Raised``."""
+        # the caller's own arguments may be pickled: this is the only place that unpickles
+        request_id, request = m.unpack(packet.frames, unpickler=cloudpickle.loads)
+        self._stage = type(request).__name__.lower()
+        try:
+            return m.pack(_HANDLERS[type(request)](self, request), request_id)
+        except ResultError as error:
+            return m.pack(raised(error, "return"), request_id)
+        except BaseException as error:
+            return m.pack(raised(error, self._stage), request_id)
+
+    def load(self, request: m.Load) -> m.Message:
+        """Import the repository, call ``make_env``, describe what came back."""
+        self._stage = "import"
+        make_env = loader.import_entry(self._snapshot, self._entry, os.environ["HOME"])
+        self._stage = "make_env"
+        with standing_in():
+            result = loader.call_make_env(make_env, request)
+
+        def again() -> Any:
+            one = m.Load(1, request.use_async_envs, request.cfg, request.env_kwargs)
+            return loader.call_make_env(make_env, one)
+
+        tasks = tasks_of(result, request.n_envs, request.use_async_envs, again)
+        self._tasks = {(task.suite, task.task): task for task in tasks}
+        return m.Loaded(encode_manifest(describe.describe(tasks)))
+
+    def build(self, request: m.Build) -> m.Message:
+        """Build a slice of a task."""
+        task = self._tasks[request.suite, request.task]
+        env = self._envs[request.env] = task.build(request.start, request.stop)
+        live = Task(task.suite, task.task, vector=env)
+        return m.Built(encode_env(describe.describe_vector(live, env)))
+
+    def reset(self, request: m.Reset) -> m.Message:
+        """``VectorEnv.reset``."""
+        options = request.options
+        if request.mask is not None:
+            options = {**(options or {}), "reset_mask": request.mask}
+        observation, info = self._envs[request.env].reset(seed=request.seeds, options=options)
+        return m.ResetDone(observation, info)
+
+    def step(self, request: m.Step) -> m.Message:
+        """``VectorEnv.step``."""
+        return m.StepDone(*self._envs[request.env].step(request.actions))
+
+    def call(self, request: m.Call) -> m.Message:
+        """``VectorEnv.call``."""
+        results = _caller(self._envs[request.env])(request.name, *request.args, **request.kwargs)
+        return m.Value(tuple(results) if isinstance(results, list) else results)
+
+    def set_attr(self, request: m.SetAttr) -> m.Message:
+        """``VectorEnv.set_attr``."""
+        env = self._envs[request.env]
+        if hasattr(env, "set_attr"):
+            env.set_attr(request.name, list(request.values))
+        else:
+            setattr(env, request.name, request.values[0])
+        return m.Value(None)
+
+    def render(self, request: m.Render) -> m.Message:
+        """``VectorEnv.render``."""
+        return m.Value(self._envs[request.env].render())
+
+    def get_own(self, request: m.GetOwn) -> m.Message:
+        """An attribute of the vector environment, or of what it wraps."""
+        value = _own(self._envs[request.env], request.name)
+        return m.Method() if callable(value) else m.Value(value)
+
+    def call_own(self, request: m.CallOwn) -> m.Message:
+        """A method of the vector environment, or of what it wraps."""
+        method = _own(self._envs[request.env], request.name)
+        return m.Value(method(*request.args, **request.kwargs))
+
+    def get_random(self, request: m.GetRandom) -> m.Message:
+        """The state of each sub-environment's random number generator."""
+        generators = _caller(self._envs[request.env])("np_random")
+        return m.Value(tuple(generator.bit_generator.state for generator in generators))
+
+    def close(self, request: m.Close) -> m.Message:
+        """``VectorEnv.close``."""
+        env = self._envs.pop(request.env, None)
+        if env is not None:
+            env.close()
+        return m.Value(None)
+
+
+def _caller(env: Any) -> Callable[..., Any]:
+    """``env.call``, or for a vector environment without one, its own attribute."""
+    if hasattr(env, "call"):
+        return env.call  # type: ignore[no-any-return]
+
+    def call(name: str, *args: Any, **kwargs: Any) -> Any:
+        value = _own(env, name)
+        return value(*args, **kwargs) if callable(value) else value
+
+    return call
+
+
+def _own(env: Any, name: str) -> Any:
+    try:
+        return getattr(env, name)
+    except AttributeError:
+        return getattr(getattr(env, "unwrapped", env), name)
+
+
+_HANDLERS: dict[type[m.Message], Callable[[Host, Any], m.Message]] = {
+    m.Load: Host.load,
+    m.Build: Host.build,
+    m.Reset: Host.reset,
+    m.Step: Host.step,
+    m.Call: Host.call,
+    m.SetAttr: Host.set_attr,
+    m.Render: Host.render,
+    m.GetOwn: Host.get_own,
+    m.CallOwn: Host.call_own,
+    m.GetRandom: Host.get_random,
+    m.Close: Host.close,
+}

@@ -1,0 +1,133 @@
+"""Stand-ins for Gymnasium's vector classes while a repository's ``make_env`` runs.
+
+``SyncVectorEnv(...)`` and ``AsyncVectorEnv(...)`` then only write down their arguments. The host
+builds the sub-environments that it needs and drives them itself, so a suite of many tasks costs
+nothing before it is used. The object is a real instance of its class: whoever looks into it (a
+wrapper, the repository itself) makes it build itself after all, and it is driven as it is.
+
+Followed: ``gymnasium.vector.SyncVectorEnv.__init__`` and ``AsyncVectorEnv.__init__`` (1.1 to 1.4).
+Older releases have other autoreset semantics; there the classes are left alone.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
+
+_KEY = "_envhub_recording"
+_ANSWERED = frozenset({"__class__", "__dict__", "unwrapped", "spec", "closed", "num_envs"})
+# arguments that change what the class does in ways the worker's own loop does not follow
+_FOREIGN_ARGUMENTS = frozenset({"worker", "observation_space", "action_space"})
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The arguments of a vector environment that has not been built.
+
+    Attributes:
+        env_fns: One function per sub-environment.
+        sync: Whether it is a ``SyncVectorEnv``.
+        observation_mode: As in Gymnasium.
+        autoreset_mode: ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``.
+        arguments: All arguments, for building it after all.
+    """
+
+    env_fns: list[Callable[[], gym.Env[Any, Any]]]
+    sync: bool
+    observation_mode: Any
+    autoreset_mode: str
+    arguments: dict[str, Any]
+
+
+def recording(env: object) -> Recording | None:
+    """The recording of a vector environment that nobody has looked into, else None."""
+    found = object.__getattribute__(env, "__dict__").get(_KEY) if _is_lazy(env) else None
+    return found if isinstance(found, Recording) else None
+
+
+@contextmanager
+def standing_in() -> Iterator[None]:
+    """While it lasts, the two classes record instead of building."""
+    if not hasattr(gym.vector, "AutoresetMode"):
+        yield
+        return
+    for cls, lazy in _LAZY.items():
+        cls.__init__ = _recorder(cls, lazy)  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        for cls, real in _REAL_INIT.items():
+            cls.__init__ = real  # type: ignore[method-assign]
+
+
+def _is_lazy(env: object) -> bool:
+    return type(env) in _LAZY.values()
+
+
+def _recorder(cls: type[VectorEnv[Any, Any, Any]], lazy: type) -> Callable[..., None]:
+    real = _REAL_INIT[cls]
+    signature = inspect.signature(real)
+
+    def __init__(self: Any, *args: Any, **kwargs: Any) -> None:
+        made = _record(cls, signature, self, args, kwargs) if type(self) is cls else None
+        if made is None:
+            real(self, *args, **kwargs)
+            return
+        self.__dict__[_KEY] = made
+        self.__dict__["num_envs"] = len(made.env_fns)
+        self.__class__ = lazy
+
+    return __init__
+
+
+def _record(
+    cls: type, signature: inspect.Signature, self: Any, args: Any, kwargs: Any
+) -> Recording | None:
+    try:
+        bound = signature.bind(self, *args, **kwargs)
+    except TypeError:
+        return None  # the real __init__ says it better
+    arguments = dict(bound.arguments)
+    arguments.pop("self", None)
+    if any(arguments.get(name) is not None for name in _FOREIGN_ARGUMENTS):
+        return None
+    env_fns = arguments["env_fns"] = list(arguments["env_fns"])
+    mode = arguments.get("autoreset_mode", "NextStep")
+    return Recording(
+        env_fns=env_fns,
+        sync=cls is SyncVectorEnv,
+        observation_mode=arguments.get("observation_mode", "same"),
+        autoreset_mode=gym.vector.AutoresetMode(mode).value,
+        arguments=arguments,
+    )
+
+
+def _build_after_all(env: Any, cls: type) -> None:
+    kept = dict(object.__getattribute__(env, "__dict__"))
+    made = kept.pop(_KEY)
+    env.__class__ = cls
+    env.__dict__.pop(_KEY)
+    _REAL_INIT[cls](env, **made.arguments)
+    env.__dict__.update(kept)
+
+
+def _lazy_class(cls: type[VectorEnv[Any, Any, Any]]) -> type:
+    def __getattribute__(self: Any, name: str) -> Any:
+        own = object.__getattribute__(self, "__dict__")
+        if name not in _ANSWERED and name not in own:
+            _build_after_all(self, cls)
+            return getattr(self, name)
+        return object.__getattribute__(self, name)
+
+    body = {"__getattribute__": __getattribute__, "__doc__": cls.__doc__, "__module__": __name__}
+    return type(cls.__name__, (cls,), body)
+
+
+_LAZY = {cls: _lazy_class(cls) for cls in (SyncVectorEnv, AsyncVectorEnv)}
+_REAL_INIT: dict[type, Callable[..., None]] = {cls: cls.__init__ for cls in _LAZY}

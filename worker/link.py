@@ -1,0 +1,98 @@
+"""The server's end of the stream to one host: bounded both ways, never blocking."""
+
+from __future__ import annotations
+
+import collections
+import socket
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
+
+MAX_PENDING = 16
+"""Requests that one host may owe: a client waits for its answer before it asks again, but a
+late one after a timeout may still be under way."""
+_CHUNK = 1 << 20
+_MAX_IOVECS = 512
+
+
+@dataclass
+class HostLink:
+    """One host's stream. ``pending`` maps the request ids that it owes, oldest first."""
+
+    sock: socket.socket
+    limits: WireLimits
+    pending: collections.OrderedDict[int, Any] = field(default_factory=collections.OrderedDict)
+    _unsent: collections.deque[memoryview] = field(default_factory=collections.deque)
+
+    def __post_init__(self) -> None:
+        self.sock.setblocking(False)
+        self._reader = PacketReader(self.limits)
+
+    def fileno(self) -> int:
+        """The stream's descriptor."""
+        return self.sock.fileno()
+
+    @property
+    def wants_write(self) -> bool:
+        """Whether something waits to be sent."""
+        return bool(self._unsent)
+
+    def send(self, request_id: int, frames: Sequence[Buffer], owner: Any) -> None:
+        """Queue a request and send what the socket takes."""
+        self.pending[request_id] = owner
+        for buffer in pack_packet(request_id, frames):
+            view = memoryview(buffer).cast("B")
+            if view.nbytes:
+                self._unsent.append(view)
+        self.flush()
+
+    def flush(self) -> None:
+        """Send what the socket takes. A host that is gone is noticed by its exit."""
+        while self._unsent:
+            batch = [self._unsent[i] for i in range(min(len(self._unsent), _MAX_IOVECS))]
+            try:
+                self._drop(self.sock.sendmsg(batch, (), socket.MSG_NOSIGNAL))
+            except BlockingIOError:
+                return
+            except OSError:
+                self._unsent.clear()
+
+    def _drop(self, sent: int) -> None:
+        while self._unsent and sent >= self._unsent[0].nbytes:
+            sent -= self._unsent.popleft().nbytes
+        if sent:
+            self._unsent[0] = self._unsent[0][sent:]
+
+    def receive(self) -> list[tuple[Packet, Any]] | None:
+        """The replies that have arrived with their owners, or None at the end of the stream.
+
+        Raises:
+            RemoteProtocolError: The host sent what nobody asked for. Trust: it is hostile.
+        """
+        try:
+            data = self.sock.recv(_CHUNK)
+        except BlockingIOError:
+            return []
+        except OSError:
+            return None
+        if not data:
+            return None
+        return [(packet, self._owner(packet)) for packet in self._reader.feed(data)]
+
+    def _owner(self, packet: Packet) -> Any:
+        expected = next(iter(self.pending), None)
+        if packet.request_id != expected:
+            raise RemoteProtocolError(
+                f"the host answered request {packet.request_id}, it owes {expected}"
+            )
+        return self.pending.pop(packet.request_id)
+
+    def close(self) -> None:
+        """Close the stream. Idempotent."""
+        self._unsent.clear()
+        self.sock.close()

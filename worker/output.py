@@ -1,0 +1,45 @@
+"""What a jail prints: read as it comes, the last bytes kept, shown with controls escaped."""
+
+from __future__ import annotations
+
+import os
+
+from envhub_worker.protocol.text import printable
+
+_CHUNK = 1 << 16
+
+
+class OutputTail:
+    """The last ``limit`` bytes of a pipe that a jail writes to. Owns the descriptor."""
+
+    def __init__(self, fd: int, limit: int) -> None:
+        self._fd = fd
+        self._limit = limit
+        self._kept = bytearray()
+
+    def fileno(self) -> int:
+        """The descriptor, or -1 when the pipe has ended."""
+        return self._fd
+
+    def read(self) -> None:
+        """Take what is there. One read a call, so that a flood cannot hold up the server."""
+        try:
+            data = os.read(self._fd, _CHUNK)
+        except BlockingIOError:
+            return
+        if not data:
+            self.close()
+        self._kept += data
+        if len(self._kept) > 2 * self._limit:
+            del self._kept[: -self._limit]
+
+    def text(self, lines: int = 40) -> str:
+        """The last lines, fit for a terminal."""
+        kept = bytes(self._kept[-self._limit :]).decode("utf-8", "backslashreplace")
+        return printable("\n".join(kept.splitlines()[-lines:]))
+
+    def close(self) -> None:
+        """Close the pipe. Idempotent."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1

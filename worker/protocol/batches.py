@@ -1,0 +1,157 @@
+"""Cutting batches of actions into slices for shards, and joining the slices of their results.
+
+The dispatch is on the *single* space: a batched ``Tuple`` may be a batch of tuples or, for a
+custom space, a tuple of members. Followed: ``gymnasium.vector.utils.iterate`` and ``concatenate``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import singledispatch
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.spaces.graph import GraphInstance
+
+Bounds = Sequence[tuple[int, int]]
+_ARRAYS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+
+
+def even_bounds(count: int, parts: int) -> list[tuple[int, int]]:
+    """``count`` members over ``parts`` shards, as evenly as it goes: ``[(start, stop), ...]``."""
+    size, larger = divmod(count, parts)
+    starts = [index * size + min(index, larger) for index in range(parts + 1)]
+    return list(zip(starts, starts[1:], strict=False))
+
+
+@singledispatch
+def split(space: gym.Space[Any], batch: Any, bounds: Bounds) -> list[Any]:
+    """The slices of a batch. Arrays are views."""
+    return [batch[start:stop] for start, stop in bounds]
+
+
+@split.register
+def _split_dict(space: spaces.Dict, batch: Any, bounds: Bounds) -> list[Any]:
+    parts = {key: split(sub, batch[key], bounds) for key, sub in space.spaces.items()}
+    return [{key: part[index] for key, part in parts.items()} for index in range(len(bounds))]
+
+
+@split.register
+def _split_tuple(space: spaces.Tuple, batch: Any, bounds: Bounds) -> list[Any]:
+    parts = [split(sub, item, bounds) for sub, item in zip(space.spaces, batch, strict=True)]
+    return [tuple(part[index] for part in parts) for index in range(len(bounds))]
+
+
+@singledispatch
+def join(space: gym.Space[Any], parts: Sequence[Any]) -> Any:
+    """One batch out of the shards' slices, in order."""
+    if isinstance(space, _ARRAYS):
+        return np.concatenate(parts)
+    return tuple(member for part in parts for member in part)
+
+
+@join.register
+def _join_dict(space: spaces.Dict, parts: Sequence[Any]) -> Any:
+    return {key: join(sub, [part[key] for part in parts]) for key, sub in space.spaces.items()}
+
+
+@join.register
+def _join_tuple(space: spaces.Tuple, parts: Sequence[Any]) -> Any:
+    return tuple(
+        join(sub, [part[index] for part in parts]) for index, sub in enumerate(space.spaces)
+    )
+
+
+def join_infos(parts: Sequence[dict[Any, Any]], sizes: Sequence[int]) -> dict[Any, Any]:
+    """The infos of all shards as ``VectorEnv._add_info`` would have built them in one go."""
+    present = [index for index, part in enumerate(parts) if part]
+    if not present:
+        return {}
+    joined: dict[Any, Any] = {}
+    starts = np.cumsum([0, *sizes]).tolist()
+    for index in present:
+        window = slice(starts[index], starts[index] + sizes[index])
+        for key, value in parts[index].items():
+            _join_value(joined, key, value, window, starts[-1])
+    return joined
+
+
+def _join_value(joined: dict[Any, Any], key: Any, value: Any, window: slice, count: int) -> None:
+    if isinstance(value, dict):
+        nested = joined.setdefault(key, {})
+        for inner, item in value.items():
+            _join_value(nested, inner, item, window, count)
+        return
+    if key not in joined:
+        fill = None if value.dtype == object else 0
+        joined[key] = np.full((count, *value.shape[1:]), fill, dtype=value.dtype)
+    joined[key][window] = value
+
+
+def restores(space: gym.Space[Any]) -> bool:
+    """Whether members of the space lose their class on the wire (``GraphInstance``)."""
+    if isinstance(space, spaces.Graph):
+        return True
+    if isinstance(space, spaces.Dict):
+        return any(map(restores, space.spaces.values()))
+    inner = getattr(space, "spaces", None) or getattr(space, "feature_space", None)
+    if isinstance(inner, tuple):
+        return any(map(restores, inner))
+    return isinstance(inner, gym.Space) and restores(inner)
+
+
+@singledispatch
+def restore_batch(space: gym.Space[Any], batch: Any) -> Any:
+    """A batch with the classes that Gymnasium gives its members."""
+    if isinstance(batch, tuple):
+        return tuple(restore(space, member) for member in batch)
+    return batch
+
+
+@restore_batch.register
+def _restore_batch_dict(space: spaces.Dict, batch: Any) -> Any:
+    return {key: restore_batch(sub, batch[key]) for key, sub in space.spaces.items()}
+
+
+@restore_batch.register
+def _restore_batch_tuple(space: spaces.Tuple, batch: Any) -> Any:
+    pairs = zip(space.spaces, batch, strict=True)
+    return tuple(restore_batch(sub, item) for sub, item in pairs)
+
+
+@singledispatch
+def restore(space: gym.Space[Any], member: Any) -> Any:
+    """One member with the class that Gymnasium gives it."""
+    return member
+
+
+@restore.register
+def _restore_graph(space: spaces.Graph, member: Any) -> Any:
+    is_graph = isinstance(member, tuple) and len(member) == len(GraphInstance._fields)
+    return GraphInstance(*member) if is_graph else member
+
+
+@restore.register
+def _restore_dict(space: spaces.Dict, member: Any) -> Any:
+    if not isinstance(member, dict):
+        return member
+    return {
+        key: restore(space[key], item) if key in space.spaces else item
+        for key, item in member.items()
+    }
+
+
+@restore.register
+def _restore_tuple(space: spaces.Tuple, member: Any) -> Any:
+    if not isinstance(member, tuple) or len(member) != len(space.spaces):
+        return member
+    return tuple(restore(sub, item) for sub, item in zip(space.spaces, member, strict=True))
+
+
+@restore.register
+def _restore_sequence(space: spaces.Sequence, member: Any) -> Any:
+    if not isinstance(member, tuple) or space.stack:
+        return member
+    return tuple(restore(space.feature_space, item) for item in member)

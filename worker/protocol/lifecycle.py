@@ -1,0 +1,67 @@
+"""The life of one environment as the client sees it: a table. A missing key is an illegal move."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+
+class State(Enum):
+    """Where an environment is; the value is what a user reads."""
+
+    IDLE = "not started"
+    READY = "ready"
+    PENDING = "waiting for a reply"
+    LATE = "waiting for a reply that is late"
+    DEAD = "dead"
+    CLOSED = "closed"
+
+
+class Event(Enum):
+    """What happens to an environment."""
+
+    START = "its jail is up"
+    SUBMIT = "a request was sent"
+    REPLY = "the reply came"
+    TIMEOUT = "the deadline came first"
+    DEATH = "its jail ended"
+    FORGET = "its jail was given up"
+    CLOSE = "it was closed"
+
+
+TABLE: dict[tuple[State, Event], State] = {
+    (State.IDLE, Event.START): State.READY,
+    (State.IDLE, Event.CLOSE): State.CLOSED,
+    (State.READY, Event.SUBMIT): State.PENDING,
+    (State.READY, Event.DEATH): State.DEAD,
+    (State.READY, Event.FORGET): State.IDLE,
+    (State.READY, Event.CLOSE): State.CLOSED,
+    (State.PENDING, Event.REPLY): State.READY,
+    (State.PENDING, Event.TIMEOUT): State.LATE,
+    (State.PENDING, Event.DEATH): State.DEAD,
+    (State.PENDING, Event.CLOSE): State.CLOSED,
+    (State.LATE, Event.REPLY): State.READY,
+    (State.LATE, Event.DEATH): State.DEAD,
+    (State.LATE, Event.FORGET): State.IDLE,
+    (State.LATE, Event.CLOSE): State.CLOSED,
+    (State.DEAD, Event.FORGET): State.IDLE,
+    (State.DEAD, Event.CLOSE): State.CLOSED,
+}
+
+
+class Lifecycle:
+    """A state and its legal moves."""
+
+    def __init__(self) -> None:
+        self.state = State.IDLE
+
+    def on(self, event: Event) -> State:
+        """Move.
+
+        Raises:
+            RuntimeError: The move is illegal; that is a defect of this package.
+        """
+        following = TABLE.get((self.state, event))
+        if following is None:
+            raise RuntimeError(f"no move from {self.state.name} on {event.name}")
+        self.state = following
+        return following

@@ -1,0 +1,200 @@
+"""The manifest: what a repository's ``make_env`` returned, described as data.
+
+It is made in the jail and read in the client, so every reader here treats it as hostile: counts
+are bounded, names are strings of bounded length, spaces are checked before they are built.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+
+from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.spaces import decode_space, encode_space
+
+MAX_ENVS = 4096
+"""Vector environments in one manifest: a benchmark suite has a few hundred tasks."""
+MAX_NUM_ENVS = 65_536
+"""Sub-environments of one vector environment."""
+MAX_NAME = 512
+"""Characters of a suite, task, attribute or package name."""
+MAX_NAMES = 1024
+"""Names in one list: attributes of an environment, packages of an interpreter."""
+
+AUTORESET_MODES = ("NextStep", "SameStep", "Disabled")
+
+TaskId = int | str
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvManifest:
+    """One vector environment.
+
+    Attributes:
+        suite: Key of the outer mapping.
+        task: Key of the inner mapping.
+        num_envs: Number of sub-environments.
+        shardable: The worker drives the sub-environments itself, so they can be spread over
+            several processes; otherwise the environment has a ``step`` of its own.
+        sync: The repository asked for ``SyncVectorEnv``: its sub-environments may share state.
+        single_observation_space, single_action_space: Spaces of one sub-environment.
+        observation_space, action_space: Batched spaces.
+        autoreset_mode: ``"NextStep"``, ``"SameStep"``, ``"Disabled"``, or None if not stated.
+        metadata: The environment's metadata, without the autoreset mode.
+        render_mode: As in Gymnasium.
+        spec: ``id`` and the plain fields of the environment's ``EnvSpec``, or None.
+        attributes: Names of attributes that the vector environment has beyond Gymnasium's.
+        type_name: The class that the repository returned.
+    """
+
+    suite: str
+    task: TaskId
+    num_envs: int
+    shardable: bool
+    sync: bool
+    single_observation_space: gym.Space[Any]
+    single_action_space: gym.Space[Any]
+    observation_space: gym.Space[Any]
+    action_space: gym.Space[Any]
+    autoreset_mode: str | None
+    metadata: dict[str, Any]
+    render_mode: str | None
+    spec: dict[str, Any] | None
+    attributes: tuple[str, ...]
+    type_name: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Manifest:
+    """All vector environments of a repository and what they run on.
+
+    Attributes:
+        envs: In the order of the repository's mapping.
+        lazy: No environment has been built yet; each task can live in a jail of its own.
+        interpreter: ``implementation version`` and path of the worker's Python.
+        packages: Versions of the distributions that the repository could import.
+    """
+
+    envs: tuple[EnvManifest, ...]
+    lazy: bool
+    interpreter: dict[str, str] = field(default_factory=dict)
+    packages: dict[str, str] = field(default_factory=dict)
+
+
+_SPACES = ("single_observation_space", "single_action_space", "observation_space", "action_space")
+_ENV_FIELDS = frozenset(EnvManifest.__dataclass_fields__)
+_FIELDS = frozenset(Manifest.__dataclass_fields__)
+
+
+def encode_env(manifest: EnvManifest) -> dict[str, object]:
+    """The plain value of one environment's manifest."""
+    value = {name: getattr(manifest, name) for name in _ENV_FIELDS}
+    return value | {name: encode_space(value[name]) for name in _SPACES}
+
+
+def encode_manifest(manifest: Manifest) -> dict[str, object]:
+    """The plain value of a manifest."""
+    return {
+        "envs": tuple(encode_env(env) for env in manifest.envs),
+        "lazy": manifest.lazy,
+        "interpreter": manifest.interpreter,
+        "packages": manifest.packages,
+    }
+
+
+def decode_manifest(value: object, *, max_elements: int) -> Manifest:
+    """Read a manifest. Trust: input from the worker.
+
+    Raises:
+        RemoteProtocolError: It is not a manifest, or over a limit.
+    """
+    fields = _mapping(value, _FIELDS, "a manifest")
+    envs = fields["envs"]
+    if type(envs) is not tuple or not 1 <= len(envs) <= MAX_ENVS:
+        raise RemoteProtocolError(f"a manifest holds 1 to {MAX_ENVS} environments")
+    decoded = tuple(decode_env(env, max_elements=max_elements) for env in envs)
+    if len({(env.suite, env.task) for env in decoded}) != len(decoded):
+        raise RemoteProtocolError("a manifest names the same task twice")
+    return Manifest(
+        envs=decoded,
+        lazy=_typed(fields, "lazy", bool),
+        interpreter=_texts(fields["interpreter"], "interpreter"),
+        packages=_texts(fields["packages"], "packages"),
+    )
+
+
+def decode_env(value: object, *, max_elements: int) -> EnvManifest:
+    """Read one environment's manifest. Trust: input from the worker.
+
+    Raises:
+        RemoteProtocolError: It is not one, or over a limit.
+    """
+    fields = _mapping(value, _ENV_FIELDS, "an environment's manifest")
+    num_envs = _typed(fields, "num_envs", int)
+    if not 1 <= num_envs <= MAX_NUM_ENVS:
+        raise RemoteProtocolError(f"num_envs is {num_envs}, outside 1..{MAX_NUM_ENVS}")
+    spaces = {name: decode_space(fields[name], max_elements=max_elements) for name in _SPACES}
+    mode = fields["autoreset_mode"]
+    if mode is not None and mode not in AUTORESET_MODES:
+        raise RemoteProtocolError(f"autoreset mode {str(mode)[:40]!r} is not one of Gymnasium's")
+    return EnvManifest(
+        suite=_name(fields["suite"], "suite"),
+        task=_task(fields["task"]),
+        num_envs=num_envs,
+        shardable=_typed(fields, "shardable", bool),
+        sync=_typed(fields, "sync", bool),
+        autoreset_mode=mode,
+        metadata=_string_keys(fields["metadata"], "metadata"),
+        render_mode=_optional_name(fields["render_mode"], "render_mode"),
+        spec=None if fields["spec"] is None else _string_keys(fields["spec"], "spec"),
+        attributes=_names(fields["attributes"], "attributes"),
+        type_name=_name(fields["type_name"], "type_name"),
+        **spaces,
+    )
+
+
+def _mapping(value: object, names: frozenset[str], what: str) -> Mapping[str, Any]:
+    if type(value) is not dict or value.keys() != names:
+        raise RemoteProtocolError(f"{what} has the fields {', '.join(sorted(names))}")
+    return value
+
+
+def _typed(fields: Mapping[str, Any], name: str, kind: type) -> Any:
+    if type(fields[name]) is not kind:
+        raise RemoteProtocolError(f"{name} is not of type {kind.__name__}")
+    return fields[name]
+
+
+def _name(value: object, what: str) -> str:
+    if type(value) is not str or len(value) > MAX_NAME:
+        raise RemoteProtocolError(f"{what} is not a string of at most {MAX_NAME} characters")
+    return value
+
+
+def _optional_name(value: object, what: str) -> str | None:
+    return None if value is None else _name(value, what)
+
+
+def _task(value: object) -> TaskId:
+    return value if type(value) is int else _name(value, "task")
+
+
+def _names(value: object, what: str) -> tuple[str, ...]:
+    if type(value) is not tuple or len(value) > MAX_NAMES:
+        raise RemoteProtocolError(f"{what} is not a tuple of at most {MAX_NAMES} names")
+    return tuple(_name(item, what) for item in value)
+
+
+def _texts(value: object, what: str) -> dict[str, str]:
+    return {key: _name(text, what) for key, text in _string_keys(value, what).items()}
+
+
+def _string_keys(value: object, what: str) -> dict[str, Any]:
+    if type(value) is not dict or len(value) > MAX_NAMES:
+        raise RemoteProtocolError(f"{what} is not a mapping of at most {MAX_NAMES} entries")
+    for key in value:
+        _name(key, what)
+    return value

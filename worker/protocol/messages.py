@@ -1,0 +1,433 @@
+"""Every message, one frozen dataclass each; ``docs/protocol.md`` is its document.
+
+A message is the value ``[kind, id, field, ...]`` in the codec's encoding: one msgpack header and
+raw buffers. ``id`` ties a reply to its request. Two conversations share this file:
+
+- client and worker server (over ZeroMQ), to open and close jails and to relay;
+- client and jail host (inside ``Relay``), about environments. The server never decodes these.
+
+``unpack`` checks the kind, the number of fields and each field's type, so that a decoded message
+is what its class says. Trust: what comes from a jail is hostile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from functools import cache
+from typing import Any, ClassVar, TypeVar
+
+from envhub_worker.protocol.codec import Buffer, decode, encode
+from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+
+VERSION = 1
+"""The protocol's version: what ``Hello`` offers and ``Welcome`` agrees to."""
+
+
+class Message:
+    """Base of all messages; ``kind`` is its number on the wire and never changes."""
+
+    __slots__ = ()
+    kind: ClassVar[int]
+
+
+M = TypeVar("M", bound=Message)
+KINDS: dict[int, type[Message]] = {}
+
+
+def _message(kind: int) -> Callable[[type[M]], type[M]]:
+    def register(cls: type[M]) -> type[M]:
+        made = dataclass(frozen=True, slots=True)(cls)
+        made.kind = kind
+        KINDS[kind] = made
+        return made
+
+    return register
+
+
+# --- client and server -------------------------------------------------------------------------
+
+
+@_message(1)
+class Hello(Message):
+    """The first request on every connection. Reply: ``Welcome`` or ``Refused``."""
+
+    oldest: int
+    newest: int
+    session: bytes
+    """Random bytes that join the connections of one client; jails belong to a session."""
+
+
+@_message(2)
+class Welcome(Message):
+    """The agreed version, and what the worker server runs on."""
+
+    version: int
+    worker: str
+    pid: int
+
+
+@_message(3)
+class Refused(Message):
+    """The server did not do it. ``error`` is a name out of a table in the client.
+
+    ``layer`` and ``fix`` are filled where a layer of the confinement is missing.
+    """
+
+    error: str
+    message: str
+    layer: str
+    fix: str
+
+
+@_message(4)
+class OpenJail(Message):
+    """Fork a jail with ``hosts`` hosts for a snapshot. Reply: ``JailOpened``, ``Refused``, ``Died``.
+
+    ``confinement`` holds the fields of ``Confinement``, with ``limits`` as a nested mapping.
+    ``python`` is the interpreter that runs the repository; empty for the server's own.
+    """
+
+    name: str
+    python: str
+    snapshot: str
+    entry: str
+    confinement: dict[str, object]
+    hosts: int
+
+
+@_message(5)
+class JailOpened(Message):
+    """The jail's number and its hosts' numbers."""
+
+    jail: int
+    hosts: tuple[int, ...]
+    report: tuple[object, ...]
+    """One mapping per layer: ``layer``, ``enforced``, ``detail``."""
+
+
+@_message(6)
+class StartHosts(Message):
+    """Fork further hosts in an open jail. Reply: ``JailOpened`` with just the new ones."""
+
+    jail: int
+    hosts: int
+
+
+@_message(7)
+class Relay(Message):
+    """Hand the frames that follow to hosts: ``parts`` is ``((host, frames), ...)``.
+
+    Reply: ``Relayed`` once every host has answered, or ``Died``.
+    """
+
+    jail: int
+    operation: str
+    parts: tuple[object, ...]
+
+
+@_message(8)
+class Relayed(Message):
+    """The hosts' replies: ``parts`` is the number of frames of each, in the request's order."""
+
+    parts: tuple[int, ...]
+
+
+@_message(9)
+class Died(Message):
+    """A process of the jail ended. Trust: ``tail`` is the jail's own output, escaped."""
+
+    host: int
+    reason: str
+    exit_code: int | None
+    signal: str | None
+    detail: str
+    tail: str
+    operation: str
+
+
+@_message(10)
+class CloseJail(Message):
+    """End a jail and everything in it. Reply: ``Done``, once it is gone."""
+
+    jail: int
+
+
+@_message(11)
+class Done(Message):
+    """It is done, and there is nothing to say about it."""
+
+
+@_message(12)
+class ReadOutput(Message):
+    """Ask for the last lines that a jail printed. Reply: ``Output``."""
+
+    jail: int
+
+
+@_message(13)
+class Output(Message):
+    """The last lines of a jail's output, control characters escaped."""
+
+    text: str
+
+
+@_message(14)
+class GetStatus(Message):
+    """Ask for the server's jails. Reply: ``Status``."""
+
+
+@_message(15)
+class Status(Message):
+    """One mapping per jail: ``jail``, ``name``, ``pids``, ``busy_s``, ``operation``."""
+
+    jails: tuple[object, ...]
+
+
+# --- client and jail host ----------------------------------------------------------------------
+
+
+@_message(32)
+class Load(Message):
+    """Import the entry file and call its ``make_env``. Reply: ``Loaded`` or ``Raised``.
+
+    ``cfg`` holds the ``vars()`` of the caller's config object, or None.
+    """
+
+    n_envs: int
+    use_async_envs: bool
+    cfg: dict[str, object] | None
+    env_kwargs: dict[str, object]
+
+
+@_message(33)
+class Loaded(Message):
+    """What the repository's ``make_env`` returned: see ``manifest.decode_manifest``."""
+
+    manifest: dict[str, object]
+
+
+@_message(34)
+class Build(Message):
+    """Build sub-environments ``start`` to ``stop`` of a task as ``env``. Reply: ``Built``.
+
+    The reply's manifest is that of the built slice.
+    """
+
+    env: int
+    suite: str
+    task: object
+    start: int
+    stop: int
+
+
+@_message(35)
+class Built(Message):
+    """The slice is ready: see ``manifest.decode_env``."""
+
+    manifest: dict[str, object]
+
+
+@_message(36)
+class Reset(Message):
+    """``seeds`` is None or one seed or None per sub-environment of the slice; so is ``mask``."""
+
+    env: int
+    seeds: object
+    options: dict[str, object] | None
+    mask: object
+
+
+@_message(37)
+class ResetDone(Message):
+    """Batched observation and infos of the slice."""
+
+    observation: object
+    info: dict[object, object]
+
+
+@_message(38)
+class Step(Message):
+    """The slice's batch of actions."""
+
+    env: int
+    actions: object
+
+
+@_message(39)
+class StepDone(Message):
+    """Batched results of the slice."""
+
+    observation: object
+    rewards: object
+    terminations: object
+    truncations: object
+    info: dict[object, object]
+
+
+@_message(40)
+class Call(Message):
+    """``VectorEnv.call``: a method or attribute of every sub-environment. Reply: ``Value``."""
+
+    env: int
+    name: str
+    args: tuple[object, ...]
+    kwargs: dict[str, object]
+
+
+@_message(41)
+class SetAttr(Message):
+    """One value per sub-environment of the slice. Reply: ``Value``."""
+
+    env: int
+    name: str
+    values: tuple[object, ...]
+
+
+@_message(42)
+class Render(Message):
+    """``VectorEnv.render``. Reply: ``Value`` with a tuple of frames or None."""
+
+    env: int
+
+
+@_message(43)
+class GetOwn(Message):
+    """An attribute of the vector environment itself. Reply: ``Value``, or ``Method``."""
+
+    env: int
+    name: str
+
+
+@_message(44)
+class Method(Message):
+    """The attribute is callable; ``CallOwn`` calls it."""
+
+
+@_message(45)
+class CallOwn(Message):
+    """Call a method of the vector environment itself. Reply: ``Value``."""
+
+    env: int
+    name: str
+    args: tuple[object, ...]
+    kwargs: dict[str, object]
+
+
+@_message(46)
+class GetRandom(Message):
+    """Ask for each sub-environment's generator. Reply: ``Value``, a tuple of state mappings."""
+
+    env: int
+
+
+@_message(47)
+class Close(Message):
+    """Close an environment. Reply: ``Value`` with None."""
+
+    env: int
+
+
+@_message(48)
+class Value(Message):
+    """A result."""
+
+    value: object
+
+
+@_message(49)
+class Raised(Message):
+    """The repository's code raised. ``builtin`` is its nearest builtin ancestor."""
+
+    builtin: str
+    type_name: str
+    message: str
+    traceback: str
+    stage: str
+    """``"import"``, ``"make_env"``, ``"return"`` or the operation."""
+
+
+# --- packing -----------------------------------------------------------------------------------
+
+
+def pack(
+    message: Message,
+    request_id: int,
+    *,
+    pickler: Callable[[object], bytes] | None = None,
+    limits: WireLimits = DEFAULT_LIMITS,
+) -> list[Buffer]:
+    """The frames of a message.
+
+    Raises:
+        LocalProtocolError: A field holds what the wire cannot carry; nothing was sent.
+    """
+    names = _names(type(message))
+    value = [message.kind, request_id, *[getattr(message, name) for name in names]]
+    return encode(value, pickler=pickler, limits=limits)
+
+
+def unpack(
+    frames: Sequence[Buffer],
+    *,
+    limits: WireLimits = DEFAULT_LIMITS,
+    unpickler: Callable[[bytes], object] | None = None,
+    tensors: Callable[[Any, str], object] | None = None,
+) -> tuple[int, Message]:
+    """The request id and the message of some frames.
+
+    Raises:
+        RemoteProtocolError: The peer broke the rules.
+    """
+    value = decode(frames, limits=limits, unpickler=unpickler, tensors=tensors)
+    if type(value) is not list or len(value) < 2:
+        raise RemoteProtocolError("a message is a list that starts with its kind and its id")
+    kind, request_id, *rest = value
+    cls = KINDS.get(kind) if type(kind) is int else None
+    if cls is None or type(request_id) is not int:
+        raise RemoteProtocolError(f"unknown message kind {str(kind)[:40]}")
+    _check_fields(cls, rest)
+    return request_id, cls(*rest)
+
+
+def _check_fields(cls: type[Message], values: list[object]) -> None:
+    checks = _checks(cls)
+    if len(values) != len(checks):
+        raise RemoteProtocolError(
+            f"{cls.__name__} has {len(checks)} fields, the peer sent {len(values)}"
+        )
+    for (name, accepted), value in zip(checks, values, strict=True):
+        if accepted is not None and type(value) not in accepted:
+            raise RemoteProtocolError(
+                f"{cls.__name__}.{name} cannot be of type {type(value).__name__}"
+            )
+
+
+@cache
+def _names(cls: type[Message]) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(cls))  # type: ignore[arg-type]
+
+
+_ACCEPTED: dict[str, frozenset[type] | None] = {
+    "int": frozenset({int}),
+    "bool": frozenset({bool}),
+    "str": frozenset({str}),
+    "bytes": frozenset({bytes}),
+    "int | None": frozenset({int, type(None)}),
+    "str | None": frozenset({str, type(None)}),
+    "tuple[int, ...]": frozenset({tuple}),
+    "tuple[object, ...]": frozenset({tuple}),
+    "dict[str, object]": frozenset({dict}),
+    "dict[object, object]": frozenset({dict}),
+    "dict[str, object] | None": frozenset({dict, type(None)}),
+    "object": None,
+}
+
+
+@cache
+def _checks(cls: type[Message]) -> tuple[tuple[str, frozenset[type] | None], ...]:
+    return tuple(
+        (field.name, _ACCEPTED[str(field.type)])
+        for field in fields(cls)  # type: ignore[arg-type]
+    )

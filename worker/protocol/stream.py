@@ -1,0 +1,118 @@
+"""Length-prefixed frames on the stream between the server and a jail's host. No I/O here.
+
+A packet is ``count: u32, reserved: u32, request id: u64``, then ``count`` lengths as ``u64``,
+then the frames. The reader checks every number before it allocates: the peer is hostile.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+
+_PREFIX = struct.Struct("<IIQ")
+_MAX_ID = 2**63
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """The frames of one message, and the id of the request that they belong to."""
+
+    request_id: int
+    frames: list[Buffer]
+
+
+def pack_packet(request_id: int, frames: Sequence[Buffer]) -> list[Buffer]:
+    """The buffers to write, in order; large frames are not copied."""
+    lengths = [memoryview(frame).nbytes for frame in frames]
+    head = _PREFIX.pack(len(frames), 0, request_id)
+    return [head + struct.pack(f"<{len(lengths)}Q", *lengths), *frames]
+
+
+class PacketReader:
+    """Cuts a byte stream into packets."""
+
+    def __init__(self, limits: WireLimits = DEFAULT_LIMITS) -> None:
+        self._limits = limits
+        self._pending = bytearray()
+        self._head: tuple[int, tuple[int, ...]] | None = None
+        self._body: memoryview | None = None
+        self._filled = 0
+
+    def feed(self, data: Buffer) -> Iterator[Packet]:
+        """Take the next bytes; yields the packets that they complete.
+
+        Raises:
+            RemoteProtocolError: The stream breaks the rules; it cannot be read any further.
+        """
+        rest = memoryview(data)
+        while rest.nbytes or self._body_is_complete():
+            rest = self._fill_body(rest) if self._body is not None else self._fill_head(rest)
+            if self._body_is_complete():
+                yield self._take()
+
+    def _body_is_complete(self) -> bool:
+        return self._body is not None and self._filled == self._body.nbytes
+
+    def _fill_head(self, data: memoryview) -> memoryview:
+        self._pending += data
+        head = self._parse_head()
+        if head is None:
+            return data[data.nbytes :]
+        size, self._head = head
+        rest = bytes(self._pending[size:])
+        self._pending.clear()
+        # numpy maps large blocks lazily: a length that is declared and never sent costs no memory
+        self._body = memoryview(np.empty(sum(self._head[1]), np.uint8))
+        self._filled = 0
+        return memoryview(rest)
+
+    def _parse_head(self) -> tuple[int, tuple[int, tuple[int, ...]]] | None:
+        if len(self._pending) < _PREFIX.size:
+            return None
+        count, reserved, request_id = _PREFIX.unpack_from(self._pending)
+        if count == 0 or count > self._limits.frames or reserved or request_id >= _MAX_ID:
+            raise RemoteProtocolError(f"a packet of {count} frames is outside 1..the limit")
+        size = _PREFIX.size + 8 * count
+        if len(self._pending) < size:
+            return None
+        lengths = struct.unpack_from(f"<{count}Q", self._pending, _PREFIX.size)
+        self._check_lengths(lengths)
+        return size, (request_id, lengths)
+
+    def _check_lengths(self, lengths: tuple[int, ...]) -> None:
+        limits = self._limits
+        if lengths[0] > limits.header_bytes:
+            raise MessageTooLargeError(
+                f"a header of {lengths[0]} bytes is over the limit of {limits.header_bytes}"
+            )
+        largest = max(lengths)
+        if largest > limits.frame_bytes or sum(lengths) > limits.message_bytes:
+            raise MessageTooLargeError(
+                f"a message of {sum(lengths)} bytes (largest frame {largest}) is over the limit of "
+                f"{limits.message_bytes} (a frame: {limits.frame_bytes})"
+            )
+
+    def _fill_body(self, data: memoryview) -> memoryview:
+        assert self._body is not None
+        take = min(data.nbytes, self._body.nbytes - self._filled)
+        self._body[self._filled : self._filled + take] = data[:take]
+        self._filled += take
+        return data[take:]
+
+    def _take(self) -> Packet:
+        assert self._head is not None and self._body is not None
+        request_id, lengths = self._head
+        frames: list[Buffer] = []
+        start = 0
+        for length in lengths:
+            frames.append(self._body[start : start + length])
+            start += length
+        self._head = self._body = None
+        return Packet(request_id, frames)
