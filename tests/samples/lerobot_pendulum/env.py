@@ -12,7 +12,7 @@ class SwingUp(gym.Wrapper):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
 
     def __init__(self, task: str) -> None:
-        super().__init__(gym.make("Pendulum-v1", disable_env_checker=True).unwrapped)
+        super().__init__(gym.make("Pendulum-v1", render_mode="rgb_array").unwrapped)
         self.observation_space = gym.spaces.Dict({"agent_pos": self.env.observation_space})
         self.task = task
         self.task_description = f"{task.replace('_', ' ')} the pendulum"

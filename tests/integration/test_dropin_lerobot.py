@@ -1,0 +1,110 @@
+"""``lerobot-eval`` gets the same numbers from the proxy as from an in-process environment."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox import make_env
+from tests.support.compare import assert_same
+from tests.support.repositories import write_repository
+from tests.support.samples import make_env_of, reference, sample
+
+torch = pytest.importorskip("torch")
+lerobot = pytest.importorskip("tests.support.lerobot")
+
+SUITE = """
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+from swing_up import SwingUp
+
+def make_env(n_envs=1, use_async_envs=False):
+    vector = AsyncVectorEnv if use_async_envs else SyncVectorEnv
+    return {
+        "pendulum": {
+            task: vector([lambda task=task: SwingUp(f"swing_up_{task}")] * n_envs)
+            for task in range(3)
+        }
+    }
+"""
+
+
+def policy(batch: dict[str, Any]) -> Any:
+    """Pushes against the velocity; the longer the task's name, the harder."""
+    assert all(task.endswith("the pendulum") for task in batch["task"])
+    velocity = batch["observation.state"][:, 2:3]
+    return torch.clamp(-velocity, -2, 2)
+
+
+@pytest.fixture
+def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A suite of three tasks, whose environment class is a sibling file."""
+    swing_up = (sample("lerobot_pendulum") / "env.py").read_text()
+    folder = write_repository(tmp_path / "pendulum_suite", SUITE, swing_up__py=swing_up)
+    monkeypatch.syspath_prepend(str(folder))
+    return folder
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+@pytest.mark.parametrize("use_async_envs", [False, True])
+def test_rollout_is_the_same(mode: str, use_async_envs: bool) -> None:
+    """Every tensor that a rollout stacks is equal, tasks and frames included."""
+    kwargs = {"autoreset_mode": mode}
+    frames: tuple[list[Any], list[Any]] = ([], [])
+    expected = lerobot.rollout(
+        reference("lerobot_pendulum", 3, **kwargs), policy, [4, 5, 6], frames[0]
+    )
+    made = make_env(
+        sample("lerobot_pendulum"), n_envs=3, use_async_envs=use_async_envs, env_kwargs=kwargs
+    )
+    with made as suites:
+        actual = lerobot.rollout(suites.env, policy, [4, 5, 6], frames[1])
+    assert_same(expected, actual)
+    assert_same(*frames)
+
+
+@pytest.mark.parametrize("max_parallel_tasks", [1, 3])
+@pytest.mark.parametrize("use_async_envs", [False, True])
+def test_evaluation_of_a_suite_is_the_same(
+    repository: Path, use_async_envs: bool, max_parallel_tasks: int
+) -> None:
+    """Metrics of every task agree, one by one and from a pool of threads."""
+    expected = lerobot.evaluate_all(make_env_of(repository)(n_envs=2), policy, 3, 1)
+    envs = make_env(repository, n_envs=2, use_async_envs=use_async_envs)
+    actual = lerobot.evaluate_all(envs, policy, 3, max_parallel_tasks)
+    assert_same(expected, dict(sorted(actual.items())))
+    lerobot.close_envs(envs)
+    envs.close()
+
+
+def test_missing_task_falls_back_as_in_lerobot() -> None:
+    """An environment without a task gives empty ones: the error is an AttributeError."""
+    with make_env(sample("pendulum"), n_envs=2) as suites:
+        suites.env.reset(seed=0)
+        assert lerobot._tasks(suites.env) == ["", ""]
+        assert not lerobot._has_attribute(suites.env, "task")
+        assert suites.env.call("_max_episode_steps") == (25, 25)
+
+
+class TestWithoutSandbox:
+    """``sandbox=None`` is LeRobot's own way: in this process, after explicit consent."""
+
+    def test_refusal_without_consent(self) -> None:
+        """The message is LeRobot's, and nothing is asked of the network before it."""
+        with pytest.raises(RuntimeError, match="Refusing to execute remote code from the Hub") as e:
+            make_env("nobody/nothing", sandbox=None, endpoint="http://127.0.0.1:9")
+        for part in (
+            "'nobody/nothing'",
+            "trust_remote_code=True",
+            "user/repo@<commit-hash>:env.py",
+        ):
+            assert part in str(e.value)
+
+    def test_with_consent_it_runs_here(self) -> None:
+        """With consent the result is a plain vector environment with the same results."""
+        expected = reference("cartpole", 2)
+        with make_env(sample("cartpole"), n_envs=2, sandbox=None, trust_remote_code=True) as suites:
+            assert suites.env.unwrapped.envs[0].unwrapped.__class__.__name__ == "CartPoleEnv"
+            assert_same(expected.reset(seed=1), suites.env.reset(seed=1))
+            assert_same(expected.step([0, 1]), suites.env.step([0, 1]))

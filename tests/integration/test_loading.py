@@ -1,0 +1,390 @@
+"""How repositories are laid out, what their ``make_env`` may look like, and what goes wrong."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.vector import VectorEnv
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import DependencyError, EnvHubError, LoadError, WorkerDiedError
+from tests.support.compare import assert_same
+from tests.support.repositories import CARTPOLES, write_repository
+from tests.support.samples import make_env_of, reference, sample
+
+
+def roll(env: VectorEnv[Any, Any, Any], steps: int = 5) -> Any:
+    """Reset with a seed, step with seeded actions, return the last result."""
+    env.reset(seed=1)
+    env.action_space.seed(1)
+    return [env.step(env.action_space.sample()) for _ in range(steps)][-1]
+
+
+class TestWhereTheCodeRuns:
+    """The sample ``marker`` leaves traces of where it was imported."""
+
+    def test_only_the_worker_imports_the_repository(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The marker appears from another pid, and no module of the repository appears here."""
+        marker = tmp_path / "marker.txt"
+        monkeypatch.setenv("ENVHUB_MARKER", str(marker))
+        before = set(sys.modules)
+        with make_env(sample("marker")) as suites:
+            suites.env.reset(seed=0)
+            [pids] = suites.env.get_attr("import_pids")
+            [pid] = suites.env.get_attr("pid")
+        assert pids == [pid]
+        assert not marker.exists(), "the worker saw a variable of the caller's environment"
+        fresh = set(sys.modules) - before
+        folder = str(sample("marker"))
+        files = {str(getattr(sys.modules[name], "__file__", "")) for name in fresh}
+        assert not [file for file in files if file.startswith(folder)]
+        assert not {name for name in fresh if name.split(".")[0] in ("worker", "parts", "hub_env")}
+
+    def test_without_a_sandbox_the_same_marker_names_this_process(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The control: imported in process, the marker is written, by this pid."""
+        marker = tmp_path / "marker.txt"
+        monkeypatch.setenv("ENVHUB_MARKER", str(marker))
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.syspath_prepend(str(sample("marker")))
+        try:
+            make_env_of(sample("marker"))
+        finally:
+            for name in [n for n in sys.modules if n.startswith("reference_marker")] + ["worker"]:
+                sys.modules.pop(name, None)
+        assert marker.read_text().split() == [str(os.getpid())]
+
+    def test_siblings_assets_and_dataclasses_work(self) -> None:
+        """Siblings, relative imports, assets by both kinds of path, postponed annotations."""
+        with make_env(sample("marker")) as suites:
+            env = suites.env
+            assert env.get_attr("own_worker") == ("the repository's own worker.py",)
+            assert env.get_attr("asset_by_file") == ("hello from an asset",)
+            assert env.get_attr("asset_by_cwd") == ("hello from an asset",)
+            [text] = env.get_attr("settings_repr")
+            assert text == "Settings(size=3, bolts=[Bolt(diameter=4)])"
+
+    @pytest.mark.parametrize("method", ["fork", "spawn", "forkserver"])
+    def test_classes_of_the_repository_can_be_pickled_to_its_children(self, method: str) -> None:
+        """The repository's own multiprocessing gets its classes through pickle and back."""
+        with make_env(sample("marker")) as suites:
+            assert suites.env.call("child_says", method) == ((9, "Settings"),)
+
+    def test_no_secret_variable_is_visible(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """The worker's environment holds nothing that the caller put into its own."""
+        monkeypatch.setenv("HF_TOKEN", "hf_secret")
+        monkeypatch.setenv("SOMETHING_ELSE", "1")
+        with make_env(sample("marker")) as suites:
+            [names] = suites.env.get_attr("visible_variables")
+        assert not {"HF_TOKEN", "SOMETHING_ELSE"} & set(names)
+
+    def test_writes_stay_in_the_scratch(self, tmp_path: Path) -> None:
+        """Home, working and temporary directory can be written to, and are not the caller's."""
+        with make_env(sample("scribbler")) as suites:
+            [written] = suites.env.get_attr("written")
+            roll(suites.env)
+        assert len(set(written)) == 3
+        assert not (Path.home() / "scribbled.txt").exists()
+        assert not (Path.cwd() / "scribbled.txt").exists()
+        assert not (sample("scribbler") / "scribbled.txt").exists()
+        assert not [path for path in written if Path(path).exists()]
+
+    def test_make_env_runs_on_the_main_thread(self) -> None:
+        """Signal handlers can be set at import, which only the main thread may."""
+        with make_env(sample("signal_handlers"), n_envs=2) as suites:
+            assert suites.env.get_attr("imported_on_main_thread") == (True, True)
+            assert suites.env.get_attr("built_on_main_thread") == (True, True)
+
+
+class TestLayouts:
+    """Where the entry point is, and what it is."""
+
+    def test_src_layout(self) -> None:
+        """A package under ``src/`` is importable from ``env.py``."""
+        with make_env(sample("src_layout"), n_envs=2) as suites:
+            assert roll(suites.env)[0].shape == (2, 1)
+
+    def test_file_in_a_sub_folder_with_impossible_names(self) -> None:
+        """``:path`` names any file; its siblings and its assets are found."""
+        folder = f"{sample('sub_folder')}:envs-v1/pick-cube.py"
+        with make_env(folder, n_envs=2) as suites:
+            assert suites.env.get_attr("colour") == ("red", "red")
+            observations, *_ = roll(suites.env)
+            assert observations.shape == (2,)
+
+    def test_relative_folder(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """``./name`` is a folder, not a hub reference."""
+        monkeypatch.chdir(sample("cartpole").parent)
+        with make_env("./cartpole", n_envs=2) as suites:
+            assert roll(suites.env)[0].shape == (2, 4)
+
+    @pytest.mark.parametrize("use_async_envs", [False, True])
+    def test_partial_as_entry_point(self, use_async_envs: bool) -> None:
+        """``make_env`` may be a ``functools.partial``."""
+        made = make_env(sample("partial_entry"), n_envs=2, use_async_envs=use_async_envs)
+        with made as suites:
+            assert roll(suites.env)[0].shape == (2, 4)
+
+    @pytest.mark.parametrize("use_async_envs", [False, True])
+    def test_vector_classes_imported_by_name(self, use_async_envs: bool) -> None:
+        """``from gymnasium.vector import AsyncVectorEnv`` at the top works as well."""
+        made = make_env(sample("async_import"), n_envs=2, use_async_envs=use_async_envs)
+        with made as suites:
+            assert_same(roll(reference("async_import", 2)), roll(suites.env))
+
+    @pytest.mark.parametrize(
+        ("signature", "kwargs"),
+        [
+            ("make_env()", {}),
+            ("make_env(n_envs)", {}),
+            ("make_env(n_envs, use_async_envs)", {}),
+            ("make_env(**kwargs)", {}),
+            ("make_env(n_envs=1, use_async_envs=False, difficulty='easy', *, seed=None)", {}),
+            ("make_env(n_envs=1, *, difficulty)", {"difficulty": "hard"}),
+            ("make_env(n_envs=1, cfg=None)", {}),
+        ],
+    )
+    def test_signatures(self, tmp_path: Path, signature: str, kwargs: dict[str, Any]) -> None:
+        """``make_env`` gets those of our arguments that it takes, and ``env_kwargs``."""
+        body = f"{CARTPOLES}\ndef {signature}:\n    return cartpoles(2)\n"
+        folder = write_repository(tmp_path / "repo", body)
+        with make_env(folder, n_envs=2, env_kwargs=kwargs) as suites:
+            assert roll(suites.env)[0].shape == (2, 4)
+
+    def test_env_kwargs_reach_make_env(self) -> None:
+        """``env_kwargs`` are ``make_env``'s own arguments, plain values and nested."""
+        with make_env(sample("lerobot_pendulum"), env_kwargs={"task": "stay_up"}) as suites:
+            assert suites.env.get_attr("task") == ("stay_up",)
+
+    def test_config_object(self) -> None:
+        """A config's attributes cross as plain attributes, also those that are no fields."""
+        cfg = SimpleNamespace(
+            hub_path=str(sample("cfg_reader")), task="CartPole-v1", episode_length=3
+        )
+        cfg.camera = {"width": 64}
+        with make_env(cfg, n_envs=2) as suites:
+            env = suites.env
+            assert env.get_attr("told")[0] == ["camera", "episode_length", "hub_path", "task"]
+            *_, truncations, _ = roll(env, steps=3)
+            assert truncations.all()
+
+    def test_cfg_is_not_passed_for_a_plain_reference(self) -> None:
+        """Without a config object ``make_env`` keeps its own default for ``cfg``."""
+        with pytest.raises(LoadError, match="wants a config"):
+            make_env(sample("cfg_reader"))
+
+
+class TestWhatMakeEnvReturns:
+    """Everything becomes ``{suite: {task_id: VectorEnv}}``."""
+
+    def test_vector_env_without_spec(self) -> None:
+        """A VectorEnv without a spec is task 0 of the suite ``hub_env``, as in LeRobot."""
+        with make_env(sample("cartpole"), n_envs=2) as suites:
+            assert {suite: list(tasks) for suite, tasks in suites.items()} == {"hub_env": [0]}
+            assert isinstance(suites, dict)
+            assert suites.env is suites["hub_env"][0]
+
+    @pytest.mark.parametrize("use_async_envs", [False, True])
+    def test_single_env(self, use_async_envs: bool) -> None:
+        """A single Env is wrapped; its spec names the suite."""
+        with make_env(sample("single_env"), use_async_envs=use_async_envs) as suites:
+            assert list(suites) == ["CartPole-v1"]
+            assert_same(roll(reference("cartpole", 1)), roll(suites.env))
+
+    @pytest.mark.parametrize("use_async_envs", [False, True])
+    def test_single_env_times_n(self, use_async_envs: bool) -> None:
+        """``n_envs`` is honoured although the repository ignores it."""
+        made = make_env(sample("single_env"), n_envs=3, use_async_envs=use_async_envs)
+        with made as suites:
+            assert suites.env.num_envs == 3
+            assert_same(roll(reference("cartpole", 3)), roll(suites.env))
+
+    def test_loose_suites(self) -> None:
+        """A bare VectorEnv is task 0, a list counts from 0, single environments are wrapped."""
+        with make_env(sample("loose_suites"), n_envs=2) as suites:
+            tasks = {suite: list(group) for suite, group in suites.items()}
+            assert tasks == {"bare": [0], "list": [0, 1], "singles": [3]}
+            sizes = {env.num_envs for group in suites.values() for env in group.values()}
+            assert sizes == {2}
+            assert roll(suites["bare"][0])[0].shape == (2, 4)
+            assert roll(suites["list"][1])[0].shape == (2, 2)
+            assert roll(suites["singles"][3])[0].shape == (2, 3)
+
+    def test_string_tasks(self) -> None:
+        """Task ids may be text, with any characters."""
+        with make_env(sample("string_tasks"), n_envs=2) as suites:
+            assert list(suites["classics"]) == ["balance the pole", "climb/the-hill"]
+            assert roll(suites["classics"]["climb/the-hill"])[0].shape == (2, 2)
+
+    def test_duck_typed_vector_env(self) -> None:
+        """An object with the methods of a VectorEnv is one, and keeps its attributes."""
+        with make_env(sample("duck_typed"), n_envs=2) as suites:
+            env = suites.env
+            assert env.nickname == "duck"
+            assert_same(roll(reference("cartpole", 2)), roll(env))
+
+    @pytest.mark.parametrize("use_async_envs", [False, True])
+    def test_vector_wrapper(self, use_async_envs: bool) -> None:
+        """A VectorWrapper is called, not looked through."""
+        made = make_env(sample("vector_wrapper"), n_envs=2, use_async_envs=use_async_envs)
+        with made as suites:
+            assert suites.env.factor == 0.5
+            assert_same(roll(reference("vector_wrapper", 2)), roll(suites.env))
+
+    def test_custom_vector_env(self) -> None:
+        """A VectorEnv with its own step is compared bit for bit, infos included."""
+        expected = reference("custom_vector", 3)
+        with make_env(sample("custom_vector"), n_envs=3) as suites:
+            env = suites.env
+            assert_same(expected.reset(seed=4), env.reset(seed=4))
+            for scale in (0.1, -0.3, 1.0):
+                actions = np.full((3, 1), scale, np.float32)
+                assert_same(expected.step(actions), env.step(actions))
+            assert_same(expected.render(), env.render())
+            assert_same(dict(expected.metadata), dict(env.metadata))
+
+    def test_own_attributes_of_the_vector_env(self) -> None:
+        """``env.hub_config`` is a value, ``env.initialize()`` a method of the remote env."""
+        with make_env(sample("custom_vector"), n_envs=2) as suites:
+            env = suites.env
+            expected = {"name": "swarm", "gains": [0.5, 2.0], "limits": {"speed": 1}}
+            assert_same(expected, env.hub_config)
+            assert env.initialized is False
+            assert env.initialize(friction=0.25) == 0.25
+            assert (env.initialized, env.friction) == (True, 0.25)
+            assert not hasattr(env, "no_such_thing")
+
+    @pytest.mark.parametrize(
+        ("mistake", "named"),
+        [
+            ("none", "None"),
+            ("int", "42"),
+            ("text", "CartPole-v1"),
+            ("module", "module"),
+            ("class", "type"),
+            ("list of ints", "list"),
+            ("empty", "empty"),
+            ("suite of None", "None"),
+            ("task of int", "42"),
+            ("empty suite", "no environment"),
+            ("tuple key", "tuple"),
+        ],
+    )
+    def test_wrong_types_are_named(self, mistake: str, named: str) -> None:
+        """The error says what ``make_env`` returned instead of an environment."""
+        with pytest.raises(LoadError, match=named):
+            make_env(sample("wrong_types"), env_kwargs={"mistake": mistake})
+
+
+class TestWhatGoesWrong:
+    """Each failure to load has an error of its own that says where it came from."""
+
+    @pytest.mark.parametrize(
+        ("env_py", "error", "text"),
+        [
+            ("import gymnasium\n", LoadError, "make_env"),
+            ("make_env = 3\n", LoadError, "make_env is a"),
+            ("def make_env(:\n", LoadError, "SyntaxError"),
+            ("import no_such_package_x\n", DependencyError, "no_such_package_x"),
+            ("from gymnasium import no_such_name\n", LoadError, "no_such_name"),
+            ("1 / 0\n", LoadError, "ZeroDivisionError"),
+            ("def make_env(**k):\n    raise OSError('broken')\n", LoadError, "broken"),
+            ("def make_env(n_envs, colour):\n    pass\n", LoadError, "colour"),
+            ("def make_env(**k):\n    import no_such_package_y\n", DependencyError, "package_y"),
+            ("raise SystemExit('go away')\n", EnvHubError, "go away"),
+        ],
+    )
+    def test_failure_is_named(
+        self, tmp_path: Path, env_py: str, error: type[Exception], text: str
+    ) -> None:
+        """The error's class says what kind of failure, its text what failed and where."""
+        folder = write_repository(tmp_path / "broken", env_py)
+        with pytest.raises(error, match=text) as caught:
+            make_env(folder)
+        assert "broken" in str(caught.value)
+
+    def test_remote_traceback_is_text(self, tmp_path: Path) -> None:
+        """What the repository raised comes with its traceback, as text."""
+        body = "def make_env(**k):\n    return deep()\ndef deep():\n    raise KeyError('oh')\n"
+        with pytest.raises(LoadError, match=r"(?s)Remote traceback.*in deep.*KeyError") as caught:
+            make_env(write_repository(tmp_path / "repo", body))
+        assert isinstance(caught.value.__cause__, KeyError)
+
+    def test_unknown_env_kwargs_are_refused(self) -> None:
+        """Arguments that ``make_env`` does not take are an error, not dropped."""
+        with pytest.raises(LoadError, match="colour"):
+            make_env(sample("cartpole"), env_kwargs={"colour": "red"})
+
+    def test_missing_entry_file(self, tmp_path: Path) -> None:
+        """A folder without ``env.py`` is refused before any process starts."""
+        (tmp_path / "README.md").write_text("nothing here")
+        with pytest.raises(EnvHubError, match=r"env\.py"):
+            make_env(tmp_path)
+
+    def test_input_gets_end_of_file(self) -> None:
+        """A repository that asks a question does not hang."""
+        with pytest.raises(LoadError, match="EOFError"):
+            make_env(sample("prompts"))
+
+    def test_escape_sequences_do_not_reach_errors(self) -> None:
+        """What a repository prints and raises is shown without control characters."""
+        with pytest.raises(LoadError, match="gave up") as caught:
+            make_env(sample("noisy"))
+        text = str(caught.value)
+        unsafe = [char for char in text if not char.isprintable() and char not in "\n\t"]
+        assert not unsafe
+
+    def test_printing_repository_works(self) -> None:
+        """Output on both streams disturbs nothing."""
+        with make_env(sample("noisy"), env_kwargs={"fail": False, "lines": 5000}) as suites:
+            assert roll(suites.env)[0].shape == (1, 4)
+
+    @pytest.mark.parametrize(("ending", "code"), [("exit", 7), ("sys.exit", None)])
+    def test_exit_while_loading(self, ending: str, code: int | None) -> None:
+        """A repository that exits in ``make_env`` gives an error, not a hang."""
+        with pytest.raises(EnvHubError) as caught:
+            make_env(sample("exits"), env_kwargs={"when": "make", "ending": ending})
+        if code is not None:
+            assert isinstance(caught.value, WorkerDiedError)
+            assert caught.value.exit_code == code
+
+    @pytest.mark.parametrize("use_async_envs", [False, True])
+    @pytest.mark.parametrize(
+        ("ending", "code", "signal"), [("exit", 7, None), ("kill", None, "SIGKILL")]
+    )
+    def test_death_in_a_step_is_told_and_reset_brings_the_env_back(
+        self, ending: str, code: int | None, signal: str | None, use_async_envs: bool
+    ) -> None:
+        """The step raises how the process ended; ``reset`` starts a new one."""
+        made = make_env(
+            sample("exits"),
+            n_envs=2,
+            use_async_envs=use_async_envs,
+            env_kwargs={"ending": ending},
+        )
+        with made as suites:
+            env = suites.env
+            env.reset(seed=0)
+            env.step([0, 0])
+            with pytest.raises(WorkerDiedError) as caught:
+                env.step([0, 1])
+            assert (caught.value.exit_code, caught.value.signal) == (code, signal)
+            observations, _ = env.reset(seed=0)
+            assert observations.tolist() == [[0.0], [0.0]]
+            assert env.step([0, 0])[0].tolist() == [[1.0], [1.0]]
+
+    def test_death_while_closing_is_no_error(self) -> None:
+        """A repository that exits when it is closed is closed."""
+        suites = make_env(sample("exits"), env_kwargs={"when": "close"})
+        suites.env.reset(seed=0)
+        suites.close()
+        assert suites.env.closed
