@@ -26,12 +26,12 @@ from envhub_worker.protocol.limits import WireLimits
 Buffer = bytes | memoryview
 Array = NDArray[Any]
 
-# Below this an own frame costs more than two copies (measured with ZeroMQ over ipc).
-INLINE_BYTES = 1024
+# Up to this a frame of its own costs more than the copies (measured with ZeroMQ over ipc).
+INLINE_BYTES = 16 * 1024
 # The tail is copied a few times; beyond this, arrays become frames however small they are.
-MAX_TAIL_BYTES = 1024 * 1024
+MAX_TAIL_BYTES = 128 * 1024
 MAX_DIMENSIONS = 32
-MAX_DIMENSION = 2**31 - 1
+MAX_ELEMENTS = 2**40
 MAX_STRING_ITEM_BYTES = 1024 * 1024
 
 _FIXED = ("?", "<i1", "<i2", "<i4", "<i8", "<u1", "<u2", "<u4", "<u8", "<f2", "<f4", "<f8")
@@ -82,19 +82,16 @@ class ArrayWriter:
         Raises:
             LocalProtocolError: A dtype that the wire does not know (object, void, long double).
         """
-        array = _native(array)
-        head = describe_dtype(array.dtype)
-        if array.ndim > MAX_DIMENSIONS:
-            raise LocalProtocolError(f"an array of {array.ndim} dimensions")
+        in_tail, in_frame, plain = _descriptors(array.dtype, array.shape)
+        if not plain:
+            array = _native(array)
         nbytes = array.nbytes
-        flags = array.ndim
         if nbytes <= INLINE_BYTES and self._tail_bytes + nbytes <= MAX_TAIL_BYTES:
             self.tail.append(array.tobytes())
             self._tail_bytes += nbytes
-        else:
-            flags |= _OWN_FRAME
-            self.frames.append(_raw(array))
-        return bytes((head[0], flags)) + head[1:] + _SHAPES[array.ndim].pack(*array.shape)
+            return in_tail
+        self.frames.append(_raw(array))
+        return in_frame
 
 
 class ArrayReader:
@@ -106,8 +103,8 @@ class ArrayReader:
         tail: Bytes of small arrays.
         frames: Bytes of large arrays, one each.
         limits: Cap on the bytes of one array.
-        copy: Whether arrays own their memory and can be written, or are read-only views of
-            ``frames``.
+        copy: Whether arrays have memory of their own and can be written. Otherwise they are
+            read-only, and the large ones are views of ``frames``.
     """
 
     __slots__ = ("_copy", "_frames", "_limits", "_next_byte", "_next_frame", "_tail")
@@ -123,42 +120,39 @@ class ArrayReader:
         """Returns the array of the next descriptor, native in byte order and C-contiguous.
 
         Raises:
-            RemoteProtocolError: The descriptor is malformed, or its bytes are missing or of
-                another length.
+            RemoteProtocolError: The descriptor is malformed, or its bytes are missing, of
+                another length, or no values of its dtype.
         """
-        dtype, own_frame, shape = parse_descriptor(descriptor)
-        if max(shape, default=0) > MAX_DIMENSION:
-            raise RemoteProtocolError("An array has an absurd dimension.")
-        nbytes = math.prod(shape) * dtype.itemsize
+        dtype, shape, nbytes, own_frame = parse_descriptor(descriptor)
         if not nbytes:
-            if own_frame:
-                raise RemoteProtocolError("An array without elements has a frame.")
-            return empty(dtype, shape)
-        if nbytes > self._limits.frame_bytes:
-            raise MessageTooLargeError(
-                f"An array of {nbytes} bytes is over the limit of {self._limits.frame_bytes} "
-                "(frame_bytes)."
-            )
-        flat = self._from_frame(dtype, nbytes) if own_frame else self._from_tail(dtype, nbytes)
-        _check_content(flat)
-        return flat.reshape(shape)
+            return np.empty(shape, dtype)
+        raw = self._frame(nbytes) if own_frame else self._slice(nbytes)
+        if dtype.kind in "bU":
+            _check_content(raw, dtype.kind)
+        array: Array = np.ndarray(shape, dtype, raw)
+        if own_frame:
+            return array.copy() if self._copy else _read_only(array)
+        return array
 
     def finish(self) -> None:
         """Raises ``RemoteProtocolError`` if any bytes were left over."""
         if self._next_byte != len(self._tail) or self._next_frame != len(self._frames):
             raise RemoteProtocolError("The message has array bytes that nothing describes.")
 
-    def _from_tail(self, dtype: np.dtype[Any], nbytes: int) -> Array:
-        start = self._next_byte
-        if start + nbytes > len(self._tail):
+    def _slice(self, nbytes: int) -> bytes | bytearray:
+        """Returns the next bytes of the tail; always a copy, for they are not aligned there."""
+        end = self._next_byte + nbytes
+        if end > len(self._tail):
             raise RemoteProtocolError("An array's bytes are missing in the header's tail.")
-        self._next_byte = start + nbytes
-        # Always a copy: the tail does not align its arrays.
-        flat: Array = np.frombuffer(self._tail, dtype, nbytes // dtype.itemsize, start).copy()
-        flat.flags.writeable = self._copy
-        return flat
+        raw = self._tail[self._next_byte : end]
+        self._next_byte = end
+        return bytearray(raw) if self._copy else bytes(raw)
 
-    def _from_frame(self, dtype: np.dtype[Any], nbytes: int) -> Array:
+    def _frame(self, nbytes: int) -> Buffer:
+        if nbytes > self._limits.frame_bytes:
+            raise MessageTooLargeError(
+                f"An array of {nbytes} bytes is over {self._limits.frame_bytes} (frame_bytes)."
+            )
         if self._next_frame == len(self._frames):
             raise RemoteProtocolError("An array's frame is missing.")
         frame = self._frames[self._next_frame]
@@ -167,12 +161,7 @@ class ArrayReader:
             raise RemoteProtocolError(
                 f"An array of {nbytes} bytes came with a frame of {len(frame)}."
             )
-        flat: Array = np.frombuffer(frame, dtype)
-        if self._copy:
-            flat = flat.copy()
-        else:
-            flat.flags.writeable = False
-        return flat
+        return frame
 
 
 def describe_dtype(dtype: np.dtype[Any]) -> bytes:
@@ -204,19 +193,37 @@ def read_dtype(code: int, descriptor: bytes, offset: int) -> tuple[np.dtype[Any]
     return _sized_dtype(code, parameter), offset + _PARAMETER.size
 
 
-def parse_descriptor(descriptor: bytes) -> tuple[np.dtype[Any], bool, tuple[int, ...]]:
-    """Splits a descriptor into dtype, whether it has its own frame, and shape.
+# Messages repeat: the same few descriptors come with every step.
+@lru_cache(maxsize=1024)
+def parse_descriptor(descriptor: bytes) -> tuple[np.dtype[Any], tuple[int, ...], int, bool]:
+    """Splits a descriptor into dtype, shape, bytes of the array, and whether it has a frame.
 
     Raises:
-        RemoteProtocolError: The descriptor is malformed.
+        RemoteProtocolError: The descriptor is malformed or describes an absurd array.
     """
     if len(descriptor) < 2:
         raise RemoteProtocolError("An array descriptor is too short.")
-    ndim = descriptor[1] & ~_OWN_FRAME
     dtype, offset = read_dtype(descriptor[0], descriptor, 2)
-    if ndim > MAX_DIMENSIONS or len(descriptor) != offset + 8 * ndim:
+    shape = unpack_shape(descriptor[offset:])
+    if len(shape) != descriptor[1] & ~_OWN_FRAME:
         raise RemoteProtocolError("An array descriptor has a wrong number of dimensions.")
-    return dtype, bool(descriptor[1] & _OWN_FRAME), _SHAPES[ndim].unpack_from(descriptor, offset)
+    nbytes = math.prod(shape) * dtype.itemsize
+    own_frame = bool(descriptor[1] & _OWN_FRAME)
+    if own_frame and not nbytes:
+        raise RemoteProtocolError("An array without elements has a frame.")
+    return dtype, shape, nbytes, own_frame
+
+
+@lru_cache(maxsize=1024)
+def _descriptors(dtype: np.dtype[Any], shape: tuple[int, ...]) -> tuple[bytes, bytes, bool]:
+    """Returns the descriptors for tail and frame, and whether the bytes travel as they are."""
+    plain = dtype.isnative and dtype.kind not in "US"
+    # numpy's empty strings have no width; they travel as one character.
+    head = describe_dtype(dtype if dtype.itemsize else np.dtype((dtype.kind, 1)))
+    sizes = pack_shape(shape)
+    in_tail = head[:1] + bytes((len(shape),)) + head[1:] + sizes
+    in_frame = head[:1] + bytes((len(shape) | _OWN_FRAME,)) + head[1:] + sizes
+    return in_tail, in_frame, plain
 
 
 def write_scalar(scalar: np.generic) -> bytes:
@@ -236,9 +243,9 @@ def read_scalar(data: bytes) -> np.generic:
     dtype, offset = read_dtype(data[0], data, 1)
     if len(data) != offset + dtype.itemsize:
         raise RemoteProtocolError("A numpy scalar has a wrong number of bytes.")
-    flat = np.frombuffer(data, dtype, 1, offset)
-    _check_content(flat)
-    scalar: np.generic = flat[0]
+    if dtype.kind in "bU":
+        _check_content(data[offset:], dtype.kind)
+    scalar: np.generic = np.frombuffer(data, dtype, 1, offset)[0]
     return scalar
 
 
@@ -255,16 +262,10 @@ def unpack_shape(data: bytes) -> tuple[int, ...]:
     if rest or ndim > MAX_DIMENSIONS:
         raise RemoteProtocolError("A shape is malformed.")
     shape = _SHAPES[ndim].unpack(data)
-    if max(shape, default=0) > MAX_DIMENSION:
-        raise RemoteProtocolError("An array has an absurd dimension.")
+    # numpy multiplies the sizes that are not 0, also of arrays without elements.
+    if math.prod(size for size in shape if size) > MAX_ELEMENTS:
+        raise RemoteProtocolError("An array has absurd dimensions.")
     return shape
-
-
-def empty(dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
-    """Returns an array without elements. Raises ``RemoteProtocolError`` for absurd shapes."""
-    if math.prod(size for size in shape if size) * dtype.itemsize > MAX_DIMENSION:
-        raise RemoteProtocolError("An array without elements has absurd dimensions.")
-    return np.empty(shape, dtype)
 
 
 def _native(array: Array) -> Array:
@@ -322,16 +323,23 @@ def _sized_dtype(code: int, parameter: int) -> np.dtype[Any]:
     return np.dtype(f"<{kind}[{count}{_UNITS[unit]}]" if unit else f"<{kind}")
 
 
-def _check_content(flat: Array) -> None:
+def _read_only(array: Array) -> Array:
+    array.flags.writeable = False
+    return array
+
+
+def _check_content(raw: Buffer | bytearray, kind: str) -> None:
     """Refuses bytes that are not values of their dtype.
 
     numpy counts a mask's True values by adding its bytes and writes that many elements, so
     that a boolean of 2 reaches outside of an array; a character beyond Unicode makes str fail.
     """
-    kind = flat.dtype.kind
-    if kind == "b" and flat.view(np.uint8).max() > 1:
-        raise RemoteProtocolError("A boolean is neither 0 nor 1.")
     if kind == "U":
-        points = flat.view(np.uint32)
+        points = np.frombuffer(raw, np.uint32)
         if points.max() > 0x10FFFF or ((points >= 0xD800) & (points <= 0xDFFF)).any():
             raise RemoteProtocolError("A string array holds something that is no character.")
+    elif len(raw) <= 1024:
+        if bytes(raw).strip(b"\0\1"):
+            raise RemoteProtocolError("A boolean is neither 0 nor 1.")
+    elif np.frombuffer(raw, np.uint8).max() > 1:
+        raise RemoteProtocolError("A boolean is neither 0 nor 1.")

@@ -7,6 +7,7 @@ allocate a thousand times as much. Nothing here builds a value.
 from __future__ import annotations
 
 import re
+from typing import NoReturn
 
 from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
 from envhub_worker.protocol.limits import WireLimits
@@ -18,6 +19,8 @@ _OPENERS = bytes([*range(0x80, 0xA0), *range(0xDC, 0xE0)])
 # msgpack's own ext code -1 becomes a Timestamp without asking us.
 _TIMESTAMP = re.compile(rb"[\xd4-\xd8]\xff|\xc7.\xff|\xc8..\xff|\xc9....\xff", re.DOTALL)
 
+# What an empty container has in the table of widths.
+_NO_ELEMENTS = -1
 _MAP, _ARRAY, _TEXT, _BINARY, _EXT = range(5)
 
 
@@ -54,24 +57,43 @@ def _walk(document: bytes, limits: WireLimits) -> None:
         if position >= end:
             raise RemoteProtocolError("The header ends in the middle of a value.")
         remaining -= 1
-        first = document[position]
-        if width := _WIDTHS[first]:
+        width = _WIDTHS[document[position]]
+        if width > 0:
             position += width
             continue
-        kind, length, position = _read_length(document, position, first)
-        if kind > _ARRAY:
-            _check_length(kind, length, limits)
-            position += length
-            continue
-        count = 2 * length if kind == _MAP else length
+        if width < 0:
+            count = _NO_ELEMENTS - width
+            position += 1
+        else:
+            count, position = _read_long(document, position, limits)
+            if count < 0:
+                continue
         items += count
-        _check_container(items, len(pending) + 1, count <= end - position, limits)
-        pending.append(remaining)
-        remaining = count
+        if count > end - position or items > limits.items or len(pending) >= limits.depth:
+            _refuse_container(items, len(pending), limits)
+        if count:
+            pending.append(remaining)
+            remaining = count
 
 
-def _read_length(document: bytes, position: int, first: int) -> tuple[int, int, int]:
+def _read_long(document: bytes, position: int, limits: WireLimits) -> tuple[int, int]:
+    """Returns the elements of a container and the position of the first.
+
+    For a text, binary or extension returns -1 and the position after its content.
+    """
+    kind, length, position = _read_length(document, position)
+    if kind <= _ARRAY:
+        return (2 * length if kind == _MAP else length), position
+    if kind == _TEXT and length > limits.text_bytes:
+        raise MessageTooLargeError(
+            f"A text of {length} bytes is over {limits.text_bytes} (text_bytes)."
+        )
+    return -1, position + length
+
+
+def _read_length(document: bytes, position: int) -> tuple[int, int, int]:
     """Returns kind, declared length, and the position of the content or first element."""
+    first = document[position]
     if first not in _LENGTHS:
         raise RemoteProtocolError("The header is not msgpack.")
     kind, length_bytes, length = _LENGTHS[first]
@@ -86,25 +108,23 @@ def _read_length(document: bytes, position: int, first: int) -> tuple[int, int, 
     return kind, length, position
 
 
-def _check_length(kind: int, length: int, limits: WireLimits) -> None:
-    if kind == _TEXT and length > limits.text_bytes:
-        raise MessageTooLargeError(
-            f"A text of {length} bytes is over the limit of {limits.text_bytes} (text_bytes)."
-        )
-
-
-def _check_container(items: int, depth: int, fits: bool, limits: WireLimits) -> None:
-    if not fits:
-        raise RemoteProtocolError("A container claims more elements than the header has bytes.")
+def _refuse_container(items: int, depth: int, limits: WireLimits) -> NoReturn:
     if items > limits.items:
         raise MessageTooLargeError(f"More than {limits.items} items (items) in one message.")
-    if depth > limits.depth:
+    if depth >= limits.depth:
         raise MessageTooLargeError(f"Containers are nested deeper than {limits.depth} (depth).")
+    raise RemoteProtocolError("A container claims more elements than the header has bytes.")
 
 
 def _widths() -> tuple[int, ...]:
-    """Bytes of the tokens whose size the first byte alone tells; 0 for all others."""
+    """By first byte: bytes of the whole token if positive, elements if negative, 0 for neither.
+
+    Elements are counted down from ``_NO_ELEMENTS``, so that an empty container is negative too.
+    """
     table = [0] * 256
+    for length in range(16):
+        table[0x80 + length] = _NO_ELEMENTS - 2 * length
+        table[0x90 + length] = _NO_ELEMENTS - length
     for first in (*range(0x80), 0xC0, 0xC2, 0xC3, *range(0xE0, 0x100)):
         table[first] = 1
     for first in range(0xA0, 0xC0):
@@ -117,8 +137,7 @@ def _widths() -> tuple[int, ...]:
 
 def _lengths() -> dict[int, tuple[int, int, int]]:
     """First byte to (kind, bytes of the length field, length where there is no field)."""
-    table = {0x80 + length: (_MAP, 0, length) for length in range(16)}
-    table |= {0x90 + length: (_ARRAY, 0, length) for length in range(16)}
+    table = {}
     for offset, size in enumerate((1, 2, 4)):
         table[0xC4 + offset] = (_BINARY, size, 0)
         table[0xC7 + offset] = (_EXT, size, 0)
