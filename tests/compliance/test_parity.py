@@ -102,6 +102,14 @@ class TestPendulum(VectorEnvCompliance):
     cases = cases(n_envs=(1, 3))
     steps = 200
 
+    def test_actions_keep_their_precision(self, pair: Pair) -> None:
+        """float64 and integer actions reach a float32 Box as they are, as in Gymnasium."""
+        pair.reset(seed=1)
+        shape = pair.reference.action_space.shape
+        pair.step(np.full(shape, 1 / 3))
+        pair.step(np.ones(shape, np.int64))
+        pair.step([[1 / 3]] * pair.num_envs)
+
 
 class TestLeRobotPendulum(VectorEnvCompliance):
     """Dict observations and ``is_success`` in every info."""

@@ -59,7 +59,7 @@ class TestWhereTheCodeRuns:
         try:
             make_env_of(sample("marker"))
         finally:
-            for name in [n for n in sys.modules if n.startswith("reference_marker")] + ["worker"]:
+            for name in [n for n in sys.modules if n.startswith("reference_samples_marker")] + ["worker"]:
                 sys.modules.pop(name, None)
         assert marker.read_text().split() == [str(os.getpid())]
 

@@ -33,7 +33,7 @@ def sample(name: str) -> Path:
 
 def make_env_of(folder: Path) -> Callable[..., Any]:
     """``make_env`` of a repository's ``env.py``, imported into this process."""
-    package = f"reference_{folder.name}"
+    package = f"reference_{folder.parent.name}_{folder.name}"
     if package not in sys.modules:
         module = types.ModuleType(package)
         module.__path__ = [str(folder)]
