@@ -11,7 +11,11 @@ import msgpack  # type: ignore[import-untyped]
 import numpy as np
 
 from envhub_worker.protocol.arrays import Array, ArrayReader, read_scalar, unpack_shape
-from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
+from envhub_worker.protocol.errors import (
+    MessageTooLargeError,
+    ProtocolError,
+    RemoteProtocolError,
+)
 from envhub_worker.protocol.inert import (
     MAX_NAME_CHARS,
     MAX_REPR_CHARS,
@@ -77,6 +81,7 @@ class Decoder:
         """Decodes a document that ``structure.check`` let through.
 
         Raises:
+            MessageTooLargeError: Over a limit that only decoding can tell.
             RemoteProtocolError: Malformed in any way.
         """
         try:
@@ -87,7 +92,12 @@ class Decoder:
                 object_pairs_hook=self._map,
                 strict_map_key=False,
             )
-        except (ValueError, TypeError, OverflowError, RecursionError) as error:
+        except ProtocolError:
+            raise
+        except MemoryError as error:
+            raise MessageTooLargeError("There is not enough memory to decode it.") from error
+        except Exception as error:
+            # msgpack and numpy refuse in many ways, and hostile keys compare in many more.
             raise RemoteProtocolError(f"The header cannot be decoded: {error}") from error
         if self._heads:
             raise RemoteProtocolError("An extension that heads an array stands elsewhere.")

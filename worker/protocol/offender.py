@@ -10,7 +10,6 @@ from envhub_worker.protocol.encoder import Encoder, Pickler
 from envhub_worker.protocol.inert import describe, one_line
 from envhub_worker.protocol.limits import WireLimits
 
-
 Path = tuple[object, ...]
 
 
