@@ -10,8 +10,8 @@ import numpy as np
 from gymnasium.envs.classic_control.cartpole import CartPoleEnv
 from gymnasium.wrappers import TimeLimit
 
-HEIGHT, WIDTH = 120, 240
-GROUND, POLE = 90, 60  # pixels from the top, pixels of length
+HEIGHT, WIDTH = 128, 240
+GROUND, POLE = 96, 60  # pixels from the top, pixels of length
 SKY, SOIL, CART, WOOD = (236, 240, 245), (170, 160, 140), (40, 60, 90), (200, 120, 50)
 
 
@@ -19,7 +19,7 @@ class DrawnCartPole(CartPoleEnv):
     """Keep the pole up by pushing the cart left (0) or right (1)."""
 
     def render(self):
-        """A uint8 frame of shape ``(120, 240, 3)``."""
+        """A uint8 frame of shape ``(128, 240, 3)``."""
         frame = np.full((HEIGHT, WIDTH, 3), SKY, np.uint8)
         frame[GROUND:] = SOIL
         position, _, angle, _ = (0, 0, 0, 0) if self.state is None else self.state

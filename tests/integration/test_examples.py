@@ -1,0 +1,51 @@
+"""The bundled examples run as their first lines say."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from envhub_sandbox import make_env
+from tests.support.samples import EXAMPLES
+
+
+@pytest.mark.parametrize(
+    ("name", "tasks", "frame"),
+    [
+        ("cartpole", {"hub_env": [0]}, (128, 240, 3)),
+        ("catch", {"hub_env": [0]}, (64, 64, 3)),
+        ("two_tasks", {"maze": [0, 1]}, (96, 96, 3)),
+    ],
+)
+def test_example_repository(name: str, tasks: dict[str, list[int]], frame: tuple[int, ...]) -> None:
+    """Each example steps and draws, with nothing but the core dependencies."""
+    with make_env(EXAMPLES / name, n_envs=2) as suites:
+        assert {suite: list(group) for suite, group in suites.items()} == tasks
+        for env in suites[next(iter(tasks))].values():
+            env.reset(seed=0)
+            env.step(env.action_space.sample())
+            for picture in env.render():
+                assert (picture.shape, picture.dtype) == (frame, np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("script", "printed"),
+    [
+        ("quickstart.py", "its code is still unknown here: True"),
+        ("train_random_search.py", "steps upright"),
+    ],
+)
+def test_example_script(script: str, printed: str) -> None:
+    """Each script ends well and prints what it promises."""
+    done = subprocess.run(
+        [sys.executable, str(EXAMPLES / script)],
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert printed in done.stdout
