@@ -1,0 +1,49 @@
+"""Environments from the Hugging Face Hub, in a process that holds nothing of yours.
+
+    >>> from envhub_sandbox import make_env
+    >>> envs = make_env("org/repo@<commit>", n_envs=4)
+    >>> obs, infos = envs.env.reset(seed=0)
+
+Importing this package imports nothing heavy: names are looked up when they are used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from envhub_sandbox import errors as errors
+    from envhub_sandbox.api import make_env as make_env
+    from envhub_sandbox.policy import Limits as Limits
+    from envhub_sandbox.policy import Policy as Policy
+    from envhub_sandbox.policy import Timeouts as Timeouts
+    from envhub_sandbox.reference import HubRef as HubRef
+    from envhub_sandbox.suites import EnvSuites as EnvSuites
+    from envhub_sandbox.vector_env import SandboxVectorEnv as SandboxVectorEnv
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "EnvSuites": "suites",
+    "HubRef": "reference",
+    "Limits": "policy",
+    "Policy": "policy",
+    "SandboxVectorEnv": "vector_env",
+    "Timeouts": "policy",
+    "errors": "errors",
+    "make_env": "api",
+}
+
+__all__ = [*_HOMES]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = importlib.import_module(f"{__name__}.{_HOMES[name]}")
+    return module if name == "errors" else getattr(module, name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOMES])

@@ -9,6 +9,7 @@
         SnapshotIntegrityError
         RepositoryUnavailableError
       PolicyError (ValueError)
+      ActionError (ValueError)
       SandboxUnavailableError
       DependencyError
       LoadError
@@ -40,6 +41,7 @@ from envhub_worker.protocol.errors import (
 )
 
 __all__ = [
+    "ActionError",
     "DependencyError",
     "EnvHubError",
     "HubReferenceError",
@@ -86,6 +88,10 @@ class RepositoryUnavailableError(SnapshotError):
 
 class PolicyError(EnvHubError, ValueError):
     """A policy, limit or timeout has an unknown name or an impossible value."""
+
+
+class ActionError(EnvHubError, ValueError):
+    """Actions of a wrong shape, dtype or structure. Nothing was sent; the env is still usable."""
 
 
 class SandboxUnavailableError(EnvHubError):
@@ -157,7 +163,10 @@ class RemoteEnvError(EnvHubError):
         self.traceback = traceback
 
     def __reduce__(self) -> tuple[object, ...]:
-        return (remote_error, (_builtin_of(type(self)), self.type_name, self.message, self.traceback))
+        return (
+            remote_error,
+            (_builtin_of(type(self)), self.type_name, self.message, self.traceback),
+        )
 
 
 _BUILTINS: tuple[type[Exception], ...] = (
@@ -203,8 +212,6 @@ def _builtin_of(cls: type[RemoteEnvError]) -> str:
     return cls.__name__.removeprefix("Remote")
 
 
-def remote_error(
-    builtin: str, type_name: str, message: str, traceback: str = ""
-) -> RemoteEnvError:
+def remote_error(builtin: str, type_name: str, message: str, traceback: str = "") -> RemoteEnvError:
     """The exception for a remote failure: the builtin's twin, or plain ``RemoteEnvError``."""
     return _TWINS.get(builtin, RemoteEnvError)(type_name, message, traceback)

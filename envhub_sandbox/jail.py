@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import cloudpickle
+import cloudpickle  # type: ignore[import-untyped]
 
 from envhub_sandbox.client import WorkerClient, death, expect, refusal
 from envhub_sandbox.deadline import Deadline

@@ -6,6 +6,7 @@ Sub-environments are spread over shards; every request goes to all of them in on
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import threading
 from collections.abc import Callable, Sequence
@@ -230,8 +231,6 @@ class RemoteEnv:
             return
         try:
             state, loaded = self.lifecycle.state, self._loaded
-            if state is State.CLOSED:
-                return
             self.lifecycle.on(Event.CLOSE)
             if loaded is not None:
                 if state is State.READY:
@@ -257,10 +256,8 @@ class RemoteEnv:
         """Let the repository's ``close`` run; whatever it does, the processes end after it."""
         deadline = Deadline(self.repository.timeouts.close_s)
         requests = [(host, m.Close(self._number)) for host in self._hosts]
-        try:
+        with contextlib.suppress(EnvHubError):
             loaded.jail.receive(loaded.jail.send("close", requests), deadline)
-        except EnvHubError:
-            pass
 
 
 def _shape(manifest: EnvManifest) -> tuple[Any, ...]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.client import WorkerClient
@@ -63,6 +63,7 @@ class Repository:
         timeouts: How long operations may take.
         sandbox: Where workers run.
         python: The interpreter of the jails; empty for ours.
+        store: The folder that snapshots lie in.
     """
 
     def __init__(
@@ -73,6 +74,7 @@ class Repository:
         timeouts: Timeouts,
         sandbox: Sandbox,
         python: str,
+        store: Path,
     ) -> None:
         self.snapshot = snapshot
         self.arguments = arguments
@@ -81,7 +83,7 @@ class Repository:
         self.python = python
         self.report: list[dict[str, Any]] = []
         self._sandbox = sandbox
-        self._lock = threading.Lock()
+        self._store = store
 
     @property
     def label(self) -> str:
@@ -114,7 +116,7 @@ class Repository:
             LoadError: The repository failed to load, or returned something unusable.
             WorkerError: The jail did not come up, died, or took too long.
         """
-        server = self._sandbox.acquire(self.snapshot.store)
+        server = self._sandbox.acquire(self._store)
         try:
             return self._open(server, deadline)
         except BaseException:
@@ -170,7 +172,7 @@ class Repository:
 
     def connect(self, loaded: LoadedJail, deadline: Deadline) -> LoadedJail:
         """A further connection to an open jail; environments that share one wait apart."""
-        server = self._sandbox.acquire(self.snapshot.store)
+        server = self._sandbox.acquire(self._store)
         client = WorkerClient(server.endpoint, server.process_fd, self.wire_limits)
         try:
             client.hello(deadline)

@@ -34,8 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments.readable_root,
         arguments.client_pidfd,
     )
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: server.stop())
+    server.stop_on(signal.SIGTERM, signal.SIGINT)
     if arguments.ready_fd is not None:
         os.write(arguments.ready_fd, b"ready\n")
         os.close(arguments.ready_fd)

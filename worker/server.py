@@ -17,6 +17,7 @@ from time import monotonic
 from typing import Any
 
 import zmq
+
 from envhub_worker import __version__
 from envhub_worker.jailspec import JailSpec, confinement_from_wire
 from envhub_worker.link import MAX_PENDING, HostLink
@@ -119,6 +120,14 @@ class Server:
         self._watch(self._router, self._serve_clients)
         if client_pidfd is not None:
             self._watch(client_pidfd, self.stop)
+
+    def stop_on(self, *signals: int) -> None:
+        """End the loop at these signals; to be called on the main thread."""
+        woken, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        signal.set_wakeup_fd(wakes)
+        for number in signals:
+            signal.signal(number, lambda *_: self.stop())
+        self._watch(woken, self.stop)
 
     def _listen(self, endpoint: str) -> zmq.Socket[bytes]:
         router = self._context.socket(zmq.ROUTER)

@@ -14,12 +14,14 @@ class WorkerServer(Protocol):
         process_fd: A descriptor that becomes readable when it ends.
     """
 
-    endpoint: str
-    process_fd: int
+    @property
+    def endpoint(self) -> str: ...  # noqa: D102
+    @property
+    def process_fd(self) -> int: ...  # noqa: D102
 
 
 class Sandbox(Protocol):
-    """A place for workers. Servers are shared and counted: every ``acquire`` has its ``release``."""
+    """A place for workers. Servers are shared: every ``acquire`` has its ``release``."""
 
     name: str
 

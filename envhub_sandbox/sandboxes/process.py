@@ -21,6 +21,7 @@ from pathlib import Path
 
 import envhub_worker.protocol
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
+from envhub_sandbox.sandboxes.base import WorkerServer
 
 _BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
 _STARTUP_S = 60.0
@@ -77,8 +78,9 @@ class ProcessSandbox:
             server.users += 1
             return server
 
-    def release(self, server: ProcessServer) -> None:  # type: ignore[override]
+    def release(self, server: WorkerServer) -> None:
         """Give a server back; the last one who does ends it."""
+        assert isinstance(server, ProcessServer)
         with self._lock:
             server.users -= 1
             if server.users > 0:

@@ -85,9 +85,10 @@ def _spaces(env: Any, name: str, num_envs: int) -> tuple[Any, Any]:
     batched = getattr(env, name, None)
     if single is None and batched is None:
         raise AttributeError(f"{type(env).__qualname__} has no single_{name}")
-    if single is None:
-        return batched, batch_space(batched, num_envs)
-    return single, batched if batched is not None else batch_space(single, num_envs)
+    known: Any = batched if single is None else single
+    if single is not None and batched is not None:
+        return single, batched
+    return known, batch_space(known, num_envs)
 
 
 def _spec(env: Any) -> dict[str, Any] | None:
@@ -113,7 +114,7 @@ def _interpreter() -> dict[str, str]:
 
 
 def _packages() -> dict[str, str]:
-    found = {}
+    found: dict[str, str] = {}
     for item in importlib.metadata.distributions():
         name = item.metadata["Name"] if item.metadata else None
         if name and len(found) < MAX_NAMES:

@@ -31,7 +31,7 @@ def raised(error: BaseException, stage: str) -> Raised:
 def _builtin(kind: type[BaseException]) -> str:
     for base in kind.__mro__:
         if getattr(builtins, base.__name__, None) is base:
-            return base.__name__
+            return str(base.__name__)
     return "Exception"
 
 

@@ -11,7 +11,7 @@ import socket
 from collections.abc import Callable
 from typing import Any
 
-import cloudpickle
+import cloudpickle  # type: ignore[import-untyped]
 
 from envhub_worker.jail import describe, loader
 from envhub_worker.jail.failure import raised

@@ -58,12 +58,12 @@ def standing_in() -> Iterator[None]:
         yield
         return
     for cls, lazy in _LAZY.items():
-        cls.__init__ = _recorder(cls, lazy)  # type: ignore[method-assign]
+        cls.__init__ = _recorder(cls, lazy)
     try:
         yield
     finally:
         for cls, real in _REAL_INIT.items():
-            cls.__init__ = real  # type: ignore[method-assign]
+            cls.__init__ = real
 
 
 def _is_lazy(env: object) -> bool:
@@ -129,5 +129,6 @@ def _lazy_class(cls: type[VectorEnv[Any, Any, Any]]) -> type:
     return type(cls.__name__, (cls,), body)
 
 
-_LAZY = {cls: _lazy_class(cls) for cls in (SyncVectorEnv, AsyncVectorEnv)}
-_REAL_INIT: dict[type, Callable[..., None]] = {cls: cls.__init__ for cls in _LAZY}
+_CLASSES: tuple[Any, ...] = (SyncVectorEnv, AsyncVectorEnv)
+_LAZY: dict[Any, type] = {cls: _lazy_class(cls) for cls in _CLASSES}
+_REAL_INIT: dict[Any, Callable[..., None]] = {cls: cls.__init__ for cls in _LAZY}

@@ -18,6 +18,7 @@ from envhub_worker.jail.standins import Recording, recording
 from envhub_worker.protocol.manifest import TaskId
 
 EnvFn = Callable[[], Any]
+Picker = Callable[[Any], Any]
 _DUCK = ("num_envs", "reset", "step", "close")
 
 
@@ -49,8 +50,7 @@ class Task:
         if start == 0 and self.probe is not None:
             first, self.probe = self.probe, None
             env_fns[0] = lambda: first
-        vector = SyncVectorEnv(env_fns, copy=False, autoreset_mode=self.recording.autoreset_mode)
-        return vector
+        return SyncVectorEnv(env_fns, copy=False, autoreset_mode=self.recording.autoreset_mode)
 
     def learn_spaces(self) -> Any:
         """A vector environment, or one sub-environment, to read spaces and metadata from."""
@@ -88,7 +88,7 @@ def tasks_of(result: Any, n_envs: int, use_async_envs: bool, again: EnvFn) -> li
     return tasks
 
 
-def _entries(result: Mapping[Any, Any]) -> Iterator[tuple[str, TaskId, Any, EnvFn]]:
+def _entries(result: Mapping[Any, Any]) -> Iterator[tuple[str, TaskId, Any, Picker]]:
     for suite, group in result.items():
         if not isinstance(suite, str):
             raise ResultError(f"a suite's name is a str, make_env used {_described(suite)}")
@@ -102,7 +102,7 @@ def _entries(result: Mapping[Any, Any]) -> Iterator[tuple[str, TaskId, Any, EnvF
             yield suite, 0, group, _picker(suite)
 
 
-def _picker(*path: Any) -> Callable[[Any], Any]:
+def _picker(*path: Any) -> Picker:
     def pick(result: Any) -> Any:
         for key in path:
             result = result[key]
@@ -128,7 +128,7 @@ class _Maker:
         self._again = again
         self._seen: list[Any] = []
 
-    def task(self, suite: str, task: TaskId, env: Any, pick: Callable[[Any], Any]) -> Task:
+    def task(self, suite: str, task: TaskId, env: Any, pick: Picker) -> Task:
         if isinstance(env, VectorEnv) or _is_duck(env):
             made = recording(env)
             return Task(suite, task, recording=made, vector=None if made else env)
@@ -140,7 +140,7 @@ class _Maker:
             f"{_described(env)}"
         )
 
-    def _multiplied(self, first: Any, pick: Callable[[Any], Any]) -> Recording:
+    def _multiplied(self, first: Any, pick: Picker) -> Recording:
         def another() -> Any:
             env = pick(self._again())
             if any(env is seen for seen in self._seen):

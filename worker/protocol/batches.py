@@ -6,6 +6,7 @@ custom space, a tuple of members. Followed: ``gymnasium.vector.utils.iterate`` a
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from functools import singledispatch
 from typing import Any
@@ -23,7 +24,7 @@ def even_bounds(count: int, parts: int) -> list[tuple[int, int]]:
     """``count`` members over ``parts`` shards, as evenly as it goes: ``[(start, stop), ...]``."""
     size, larger = divmod(count, parts)
     starts = [index * size + min(index, larger) for index in range(parts + 1)]
-    return list(zip(starts, starts[1:], strict=False))
+    return list(itertools.pairwise(starts))
 
 
 @singledispatch
@@ -32,14 +33,14 @@ def split(space: gym.Space[Any], batch: Any, bounds: Bounds) -> list[Any]:
     return [batch[start:stop] for start, stop in bounds]
 
 
-@split.register
+@split.register(spaces.Dict)
 def _split_dict(space: spaces.Dict, batch: Any, bounds: Bounds) -> list[Any]:
     parts = {key: split(sub, batch[key], bounds) for key, sub in space.spaces.items()}
     return [{key: part[index] for key, part in parts.items()} for index in range(len(bounds))]
 
 
-@split.register
-def _split_tuple(space: spaces.Tuple, batch: Any, bounds: Bounds) -> list[Any]:
+@split.register(spaces.Tuple)
+def _split_tuple(space: spaces.Tuple[Any], batch: Any, bounds: Bounds) -> list[Any]:
     parts = [split(sub, item, bounds) for sub, item in zip(space.spaces, batch, strict=True)]
     return [tuple(part[index] for part in parts) for index in range(len(bounds))]
 
@@ -52,16 +53,42 @@ def join(space: gym.Space[Any], parts: Sequence[Any]) -> Any:
     return tuple(member for part in parts for member in part)
 
 
-@join.register
+@join.register(spaces.Dict)
 def _join_dict(space: spaces.Dict, parts: Sequence[Any]) -> Any:
     return {key: join(sub, [part[key] for part in parts]) for key, sub in space.spaces.items()}
 
 
-@join.register
-def _join_tuple(space: spaces.Tuple, parts: Sequence[Any]) -> Any:
+@join.register(spaces.Tuple)
+def _join_tuple(space: spaces.Tuple[Any], parts: Sequence[Any]) -> Any:
     return tuple(
         join(sub, [part[index] for part in parts]) for index, sub in enumerate(space.spaces)
     )
+
+
+@singledispatch
+def conforms(space: gym.Space[Any], batch: Any, count: int) -> bool:
+    """Whether a batch of ``count`` members has the structure, shapes and dtypes of the space.
+
+    Values are not looked at: many environments leave their own bounds.
+    """
+    if isinstance(space, _ARRAYS):
+        shape = (count, *(space.shape or ()))
+        return type(batch) is np.ndarray and batch.dtype == space.dtype and batch.shape == shape
+    return type(batch) is tuple and len(batch) == count
+
+
+@conforms.register(spaces.Dict)
+def _conforms_dict(space: spaces.Dict, batch: Any, count: int) -> bool:
+    if type(batch) is not dict or batch.keys() != space.spaces.keys():
+        return False
+    return all(conforms(sub, batch[key], count) for key, sub in space.spaces.items())
+
+
+@conforms.register(spaces.Tuple)
+def _conforms_tuple(space: spaces.Tuple[Any], batch: Any, count: int) -> bool:
+    if type(batch) is not tuple or len(batch) != len(space.spaces):
+        return False
+    return all(conforms(sub, item, count) for sub, item in zip(space.spaces, batch, strict=True))
 
 
 def join_infos(parts: Sequence[dict[Any, Any]], sizes: Sequence[int]) -> dict[Any, Any]:
@@ -110,13 +137,13 @@ def restore_batch(space: gym.Space[Any], batch: Any) -> Any:
     return batch
 
 
-@restore_batch.register
+@restore_batch.register(spaces.Dict)
 def _restore_batch_dict(space: spaces.Dict, batch: Any) -> Any:
     return {key: restore_batch(sub, batch[key]) for key, sub in space.spaces.items()}
 
 
-@restore_batch.register
-def _restore_batch_tuple(space: spaces.Tuple, batch: Any) -> Any:
+@restore_batch.register(spaces.Tuple)
+def _restore_batch_tuple(space: spaces.Tuple[Any], batch: Any) -> Any:
     pairs = zip(space.spaces, batch, strict=True)
     return tuple(restore_batch(sub, item) for sub, item in pairs)
 
@@ -127,13 +154,13 @@ def restore(space: gym.Space[Any], member: Any) -> Any:
     return member
 
 
-@restore.register
+@restore.register(spaces.Graph)
 def _restore_graph(space: spaces.Graph, member: Any) -> Any:
     is_graph = isinstance(member, tuple) and len(member) == len(GraphInstance._fields)
     return GraphInstance(*member) if is_graph else member
 
 
-@restore.register
+@restore.register(spaces.Dict)
 def _restore_dict(space: spaces.Dict, member: Any) -> Any:
     if not isinstance(member, dict):
         return member
@@ -143,14 +170,14 @@ def _restore_dict(space: spaces.Dict, member: Any) -> Any:
     }
 
 
-@restore.register
-def _restore_tuple(space: spaces.Tuple, member: Any) -> Any:
+@restore.register(spaces.Tuple)
+def _restore_tuple(space: spaces.Tuple[Any], member: Any) -> Any:
     if not isinstance(member, tuple) or len(member) != len(space.spaces):
         return member
     return tuple(restore(sub, item) for sub, item in zip(space.spaces, member, strict=True))
 
 
-@restore.register
+@restore.register(spaces.Sequence)
 def _restore_sequence(space: spaces.Sequence, member: Any) -> Any:
     if not isinstance(member, tuple) or space.stack:
         return member

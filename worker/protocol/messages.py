@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from functools import cache
 from typing import Any, ClassVar, TypeVar
 
 from envhub_worker.protocol.codec import Buffer, decode, encode
@@ -33,15 +32,34 @@ class Message:
 
 
 M = TypeVar("M", bound=Message)
+Checks = tuple[tuple[str, frozenset[type] | None], ...]
 KINDS: dict[int, type[Message]] = {}
+_CHECKS: dict[type[Message], Checks] = {}
+
+# a field's annotation, and the types that a decoded value of it may have
+_ACCEPTED: dict[str, frozenset[type] | None] = {
+    "int": frozenset({int}),
+    "bool": frozenset({bool}),
+    "str": frozenset({str}),
+    "bytes": frozenset({bytes}),
+    "int | None": frozenset({int, type(None)}),
+    "str | None": frozenset({str, type(None)}),
+    "tuple[int, ...]": frozenset({tuple}),
+    "tuple[object, ...]": frozenset({tuple}),
+    "dict[str, object]": frozenset({dict}),
+    "dict[object, object]": frozenset({dict}),
+    "dict[str, object] | None": frozenset({dict, type(None)}),
+    "object": None,
+}
 
 
 def _message(kind: int) -> Callable[[type[M]], type[M]]:
     def register(cls: type[M]) -> type[M]:
-        made = dataclass(frozen=True, slots=True)(cls)
-        made.kind = kind
-        KINDS[kind] = made
-        return made
+        cls.kind = kind
+        KINDS[kind] = cls
+        annotated = fields(cls)  # type: ignore[arg-type]
+        _CHECKS[cls] = tuple((item.name, _ACCEPTED[str(item.type)]) for item in annotated)
+        return cls
 
     return register
 
@@ -50,6 +68,7 @@ def _message(kind: int) -> Callable[[type[M]], type[M]]:
 
 
 @_message(1)
+@dataclass(frozen=True, slots=True)
 class Hello(Message):
     """The first request on every connection. Reply: ``Welcome`` or ``Refused``."""
 
@@ -60,6 +79,7 @@ class Hello(Message):
 
 
 @_message(2)
+@dataclass(frozen=True, slots=True)
 class Welcome(Message):
     """The agreed version, and what the worker server runs on."""
 
@@ -69,6 +89,7 @@ class Welcome(Message):
 
 
 @_message(3)
+@dataclass(frozen=True, slots=True)
 class Refused(Message):
     """The server did not do it. ``error`` is a name out of a table in the client.
 
@@ -82,8 +103,9 @@ class Refused(Message):
 
 
 @_message(4)
+@dataclass(frozen=True, slots=True)
 class OpenJail(Message):
-    """Fork a jail with ``hosts`` hosts for a snapshot. Reply: ``JailOpened``, ``Refused``, ``Died``.
+    """Fork a jail for a snapshot. Reply: ``JailOpened``, ``Refused`` or ``Died``.
 
     ``confinement`` holds the fields of ``Confinement``, with ``limits`` as a nested mapping.
     ``python`` is the interpreter that runs the repository; empty for the server's own.
@@ -98,6 +120,7 @@ class OpenJail(Message):
 
 
 @_message(5)
+@dataclass(frozen=True, slots=True)
 class JailOpened(Message):
     """The jail's number and its hosts' numbers."""
 
@@ -108,6 +131,7 @@ class JailOpened(Message):
 
 
 @_message(6)
+@dataclass(frozen=True, slots=True)
 class StartHosts(Message):
     """Fork further hosts in an open jail. Reply: ``JailOpened`` with just the new ones."""
 
@@ -116,6 +140,7 @@ class StartHosts(Message):
 
 
 @_message(7)
+@dataclass(frozen=True, slots=True)
 class Relay(Message):
     """Hand the frames that follow to hosts: ``parts`` is ``((host, frames), ...)``.
 
@@ -128,6 +153,7 @@ class Relay(Message):
 
 
 @_message(8)
+@dataclass(frozen=True, slots=True)
 class Relayed(Message):
     """The hosts' replies: ``parts`` is the number of frames of each, in the request's order."""
 
@@ -135,6 +161,7 @@ class Relayed(Message):
 
 
 @_message(9)
+@dataclass(frozen=True, slots=True)
 class Died(Message):
     """A process of the jail ended. Trust: ``tail`` is the jail's own output, escaped."""
 
@@ -148,6 +175,7 @@ class Died(Message):
 
 
 @_message(10)
+@dataclass(frozen=True, slots=True)
 class CloseJail(Message):
     """End a jail and everything in it. Reply: ``Done``, once it is gone."""
 
@@ -155,11 +183,13 @@ class CloseJail(Message):
 
 
 @_message(11)
+@dataclass(frozen=True, slots=True)
 class Done(Message):
     """It is done, and there is nothing to say about it."""
 
 
 @_message(12)
+@dataclass(frozen=True, slots=True)
 class ReadOutput(Message):
     """Ask for the last lines that a jail printed. Reply: ``Output``."""
 
@@ -167,6 +197,7 @@ class ReadOutput(Message):
 
 
 @_message(13)
+@dataclass(frozen=True, slots=True)
 class Output(Message):
     """The last lines of a jail's output, control characters escaped."""
 
@@ -174,11 +205,13 @@ class Output(Message):
 
 
 @_message(14)
+@dataclass(frozen=True, slots=True)
 class GetStatus(Message):
     """Ask for the server's jails. Reply: ``Status``."""
 
 
 @_message(15)
+@dataclass(frozen=True, slots=True)
 class Status(Message):
     """One mapping per jail: ``jail``, ``name``, ``pids``, ``busy_s``, ``operation``."""
 
@@ -189,6 +222,7 @@ class Status(Message):
 
 
 @_message(32)
+@dataclass(frozen=True, slots=True)
 class Load(Message):
     """Import the entry file and call its ``make_env``. Reply: ``Loaded`` or ``Raised``.
 
@@ -202,6 +236,7 @@ class Load(Message):
 
 
 @_message(33)
+@dataclass(frozen=True, slots=True)
 class Loaded(Message):
     """What the repository's ``make_env`` returned: see ``manifest.decode_manifest``."""
 
@@ -209,6 +244,7 @@ class Loaded(Message):
 
 
 @_message(34)
+@dataclass(frozen=True, slots=True)
 class Build(Message):
     """Build sub-environments ``start`` to ``stop`` of a task as ``env``. Reply: ``Built``.
 
@@ -223,6 +259,7 @@ class Build(Message):
 
 
 @_message(35)
+@dataclass(frozen=True, slots=True)
 class Built(Message):
     """The slice is ready: see ``manifest.decode_env``."""
 
@@ -230,6 +267,7 @@ class Built(Message):
 
 
 @_message(36)
+@dataclass(frozen=True, slots=True)
 class Reset(Message):
     """``seeds`` is None or one seed or None per sub-environment of the slice; so is ``mask``."""
 
@@ -240,6 +278,7 @@ class Reset(Message):
 
 
 @_message(37)
+@dataclass(frozen=True, slots=True)
 class ResetDone(Message):
     """Batched observation and infos of the slice."""
 
@@ -248,6 +287,7 @@ class ResetDone(Message):
 
 
 @_message(38)
+@dataclass(frozen=True, slots=True)
 class Step(Message):
     """The slice's batch of actions."""
 
@@ -256,6 +296,7 @@ class Step(Message):
 
 
 @_message(39)
+@dataclass(frozen=True, slots=True)
 class StepDone(Message):
     """Batched results of the slice."""
 
@@ -267,6 +308,7 @@ class StepDone(Message):
 
 
 @_message(40)
+@dataclass(frozen=True, slots=True)
 class Call(Message):
     """``VectorEnv.call``: a method or attribute of every sub-environment. Reply: ``Value``."""
 
@@ -277,6 +319,7 @@ class Call(Message):
 
 
 @_message(41)
+@dataclass(frozen=True, slots=True)
 class SetAttr(Message):
     """One value per sub-environment of the slice. Reply: ``Value``."""
 
@@ -286,6 +329,7 @@ class SetAttr(Message):
 
 
 @_message(42)
+@dataclass(frozen=True, slots=True)
 class Render(Message):
     """``VectorEnv.render``. Reply: ``Value`` with a tuple of frames or None."""
 
@@ -293,6 +337,7 @@ class Render(Message):
 
 
 @_message(43)
+@dataclass(frozen=True, slots=True)
 class GetOwn(Message):
     """An attribute of the vector environment itself. Reply: ``Value``, or ``Method``."""
 
@@ -301,11 +346,13 @@ class GetOwn(Message):
 
 
 @_message(44)
+@dataclass(frozen=True, slots=True)
 class Method(Message):
     """The attribute is callable; ``CallOwn`` calls it."""
 
 
 @_message(45)
+@dataclass(frozen=True, slots=True)
 class CallOwn(Message):
     """Call a method of the vector environment itself. Reply: ``Value``."""
 
@@ -316,6 +363,7 @@ class CallOwn(Message):
 
 
 @_message(46)
+@dataclass(frozen=True, slots=True)
 class GetRandom(Message):
     """Ask for each sub-environment's generator. Reply: ``Value``, a tuple of state mappings."""
 
@@ -323,6 +371,7 @@ class GetRandom(Message):
 
 
 @_message(47)
+@dataclass(frozen=True, slots=True)
 class Close(Message):
     """Close an environment. Reply: ``Value`` with None."""
 
@@ -330,6 +379,7 @@ class Close(Message):
 
 
 @_message(48)
+@dataclass(frozen=True, slots=True)
 class Value(Message):
     """A result."""
 
@@ -337,6 +387,7 @@ class Value(Message):
 
 
 @_message(49)
+@dataclass(frozen=True, slots=True)
 class Raised(Message):
     """The repository's code raised. ``builtin`` is its nearest builtin ancestor."""
 
@@ -363,8 +414,8 @@ def pack(
     Raises:
         LocalProtocolError: A field holds what the wire cannot carry; nothing was sent.
     """
-    names = _names(type(message))
-    value = [message.kind, request_id, *[getattr(message, name) for name in names]]
+    values = [getattr(message, name) for name, _ in _CHECKS[type(message)]]
+    value = [message.kind, request_id, *values]
     return encode(value, pickler=pickler, limits=limits)
 
 
@@ -392,7 +443,7 @@ def unpack(
 
 
 def _check_fields(cls: type[Message], values: list[object]) -> None:
-    checks = _checks(cls)
+    checks = _CHECKS[cls]
     if len(values) != len(checks):
         raise RemoteProtocolError(
             f"{cls.__name__} has {len(checks)} fields, the peer sent {len(values)}"
@@ -402,32 +453,3 @@ def _check_fields(cls: type[Message], values: list[object]) -> None:
             raise RemoteProtocolError(
                 f"{cls.__name__}.{name} cannot be of type {type(value).__name__}"
             )
-
-
-@cache
-def _names(cls: type[Message]) -> tuple[str, ...]:
-    return tuple(field.name for field in fields(cls))  # type: ignore[arg-type]
-
-
-_ACCEPTED: dict[str, frozenset[type] | None] = {
-    "int": frozenset({int}),
-    "bool": frozenset({bool}),
-    "str": frozenset({str}),
-    "bytes": frozenset({bytes}),
-    "int | None": frozenset({int, type(None)}),
-    "str | None": frozenset({str, type(None)}),
-    "tuple[int, ...]": frozenset({tuple}),
-    "tuple[object, ...]": frozenset({tuple}),
-    "dict[str, object]": frozenset({dict}),
-    "dict[object, object]": frozenset({dict}),
-    "dict[str, object] | None": frozenset({dict, type(None)}),
-    "object": None,
-}
-
-
-@cache
-def _checks(cls: type[Message]) -> tuple[tuple[str, frozenset[type] | None], ...]:
-    return tuple(
-        (field.name, _ACCEPTED[str(field.type)])
-        for field in fields(cls)  # type: ignore[arg-type]
-    )

@@ -69,7 +69,7 @@ class PacketReader:
         rest = bytes(self._pending[size:])
         self._pending.clear()
         # numpy maps large blocks lazily: a length that is declared and never sent costs no memory
-        self._body = memoryview(np.empty(sum(self._head[1]), np.uint8))
+        self._body = np.empty(sum(self._head[1]), np.uint8).data
         self._filled = 0
         return memoryview(rest)
 
@@ -107,7 +107,8 @@ class PacketReader:
         return data[take:]
 
     def _take(self) -> Packet:
-        assert self._head is not None and self._body is not None
+        assert self._head is not None
+        assert self._body is not None
         request_id, lengths = self._head
         frames: list[Buffer] = []
         start = 0

@@ -1,0 +1,211 @@
+"""``make_env``: reference -> snapshot -> sandbox -> proxies."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from envhub_sandbox import inprocess, snapshot_store
+from envhub_sandbox.config import plain_config
+from envhub_sandbox.deadline import Deadline
+from envhub_sandbox.errors import PolicyError
+from envhub_sandbox.jail_sources import JailSource, OwnJails, SharedJail
+from envhub_sandbox.manifest_cache import ManifestCache, manifest_key
+from envhub_sandbox.policy import Limits, Policy, Timeouts, limits_from, policy_from, timeouts_from
+from envhub_sandbox.provenance import provenance_of
+from envhub_sandbox.reference import HubRef, is_local
+from envhub_sandbox.remote_env import RemoteEnv
+from envhub_sandbox.repository import LoadArguments, LoadedJail, Repository
+from envhub_sandbox.sandboxes.base import Sandbox
+from envhub_sandbox.snapshot import Snapshot, fetch, local
+from envhub_sandbox.suites import EnvSuites
+from envhub_sandbox.vector_env import SandboxVectorEnv
+from envhub_worker.protocol.manifest import EnvManifest, Manifest
+
+
+def make_env(
+    cfg: Any,
+    n_envs: int = 1,
+    use_async_envs: bool = False,
+    hub_cache_dir: str | Path | None = None,
+    trust_remote_code: bool = False,
+    *,
+    sandbox: str | Sandbox | None = "process",
+    env_kwargs: Mapping[str, Any] | None = None,
+    policy: Policy | Mapping[str, Any] | None = None,
+    timeouts: Timeouts | Mapping[str, Any] | None = None,
+    limits: Limits | Mapping[str, Any] | None = None,
+    token: str | bool | None = None,
+    endpoint: str | None = None,
+    python: str | Path | None = None,
+    num_workers: int | None = None,
+) -> EnvSuites:
+    """Make the vector environments of a repository, without its code entering this process.
+
+    Args:
+        cfg: A hub reference (``"org/repo@commit:path"``), a local folder (``"./my-env"``), or a
+            ``HubEnvConfig``-like object with ``hub_path``, whose ``vars()`` the repository's
+            ``make_env`` gets as ``cfg``.
+        n_envs: Number of sub-environments, passed to the repository's ``make_env``.
+        use_async_envs: Passed on likewise; sub-environments may then run in several processes.
+        hub_cache_dir: huggingface_hub's ``cache_dir``.
+        trust_remote_code: Only for ``sandbox=None``.
+        sandbox: ``"process"``, or None to run the code here, as LeRobot does.
+        env_kwargs: Further keyword arguments for the repository's ``make_env``.
+        policy: What the code may reach; see ``Policy``.
+        timeouts: How long operations may take; see ``Timeouts``.
+        limits: Hard caps; replaces ``policy.limits``.
+        token: As in huggingface_hub.
+        endpoint: As in huggingface_hub.
+        python: The interpreter that runs the repository; this one by default.
+        num_workers: Processes over which the sub-environments are spread; by default one, or with
+            ``use_async_envs`` as many as there are cores.
+
+    Returns:
+        ``{suite: {task_id: VectorEnv}}``. Environments of a known pin start no process before
+        they are used.
+
+    Raises:
+        HubReferenceError: ``cfg`` cannot be read.
+        SnapshotError: The files cannot be had, or are not what the commit says.
+        PolicyError: An unknown or impossible policy, limit or timeout.
+        SandboxUnavailableError: This host cannot enforce the policy.
+        LoadError: The repository failed to load, or returned something unusable.
+        WorkerError: The worker did not come up, died, or took too long.
+        RuntimeError: ``sandbox=None`` without ``trust_remote_code=True``.
+    """
+    reference, config = _reference(cfg)
+    if n_envs < 1:
+        raise ValueError("`n_envs` must be at least 1")
+    if sandbox is None and not trust_remote_code:
+        raise inprocess.refusal(reference)
+    chosen_policy = policy_from(policy, limits_from(limits))
+    chosen_timeouts = timeouts_from(timeouts)
+    place = None if sandbox is None else _sandbox(sandbox)
+    snapshot = _snapshot(reference, hub_cache_dir, token, endpoint)
+    if place is None:
+        envs = inprocess.make(snapshot, n_envs, use_async_envs, config, dict(env_kwargs or {}))
+        return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))
+    repository = Repository(
+        snapshot,
+        LoadArguments(
+            n_envs=n_envs,
+            use_async_envs=use_async_envs,
+            cfg=None if config is None else plain_config(config),
+            env_kwargs=dict(env_kwargs or {}),
+        ),
+        chosen_policy,
+        chosen_timeouts,
+        place,
+        _interpreter(python),
+        snapshot_store.cache_root() / "snapshots",
+    )
+    return _Maker(repository, num_workers).make()
+
+
+class _Maker:
+    """Makes the proxies, from the remembered manifest or from a first jail."""
+
+    def __init__(self, repository: Repository, num_workers: int | None) -> None:
+        self._repository = repository
+        self._num_workers = num_workers
+        load = repository.arguments.message()
+        key = manifest_key(repository.snapshot, load, repository.policy, repository.python)
+        self._cache = ManifestCache(snapshot_store.cache_root() / "manifests", key)
+
+    def make(self) -> EnvSuites:
+        repository = self._repository
+        manifest = self._cache.load(max_elements=repository.policy.limits.elements)
+        if manifest is not None:
+            return self._suites(manifest, None)
+        with repository.named():
+            loaded = repository.open(Deadline(repository.timeouts.startup_s))
+        self._cache.save(loaded.value)
+        try:
+            return self._suites(loaded.manifest, loaded)
+        except BaseException:
+            repository.close(loaded)
+            raise
+
+    def _suites(self, manifest: Manifest, loaded: LoadedJail | None) -> EnvSuites:
+        repository = self._repository
+        shared = None if manifest.lazy or len(manifest.envs) == 1 else self._shared(loaded)
+        remotes = [self._remote(env, shared) for env in manifest.envs]
+        if loaded is not None and shared is None:
+            self._use(loaded, remotes)
+        envs: dict[str, dict[Any, Any]] = {}
+        for remote in remotes:
+            env = remote.manifest
+            envs.setdefault(env.suite, {})[env.task] = SandboxVectorEnv(remote)
+        return EnvSuites(
+            envs,
+            lambda: provenance_of(repository.snapshot, manifest, repository.report),
+            shared.close if shared else lambda: None,
+        )
+
+    def _shared(self, loaded: LoadedJail | None) -> SharedJail:
+        shared = SharedJail(self._repository, self._cache.forget)
+        if loaded is not None:
+            shared.provide(loaded)
+        return shared
+
+    def _remote(self, env: EnvManifest, shared: SharedJail | None) -> RemoteEnv:
+        own = OwnJails(self._repository, self._cache.forget)
+        source: JailSource = own if shared is None else shared
+        return RemoteEnv(source, env, _shards(env, self._num_workers))
+
+    def _use(self, loaded: LoadedJail, remotes: list[RemoteEnv]) -> None:
+        """The jail that told the manifest becomes the only task's; a suite holds none in stock."""
+        if len(remotes) == 1:
+            with self._repository.named():
+                remotes[0].adopt(loaded)
+        else:
+            self._repository.close(loaded)
+
+
+def _shards(env: EnvManifest, num_workers: int | None) -> int:
+    if not env.shardable:
+        return 1
+    if num_workers is not None:
+        return max(1, min(num_workers, env.num_envs))
+    return 1 if env.sync else min(len(os.sched_getaffinity(0)), env.num_envs)
+
+
+def _reference(cfg: Any) -> tuple[str, Any]:
+    """The reference in ``cfg``, and the config object if it is one."""
+    if isinstance(cfg, str):
+        return cfg, None
+    if isinstance(cfg, os.PathLike):
+        return os.path.abspath(cfg), None
+    hub_path = getattr(cfg, "hub_path", None)
+    if not isinstance(hub_path, str):
+        raise TypeError(
+            "cfg is a hub reference, a folder, or an object with a hub_path, not "
+            f"{type(cfg).__module__}.{type(cfg).__qualname__}"
+        )
+    return hub_path, cfg
+
+
+def _snapshot(
+    reference: str, hub_cache_dir: str | Path | None, token: str | bool | None, endpoint: str | None
+) -> Snapshot:
+    if is_local(reference):
+        return local(reference)
+    ref = HubRef.parse(reference)
+    return fetch(ref, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
+
+
+def _sandbox(sandbox: str | Sandbox) -> Sandbox:
+    if not isinstance(sandbox, str):
+        return sandbox
+    if sandbox == "process":
+        from envhub_sandbox.sandboxes.process import PROCESS
+
+        return PROCESS
+    raise PolicyError(f"sandbox is {sandbox!r}; it is 'process', or None to run the code here")
+
+
+def _interpreter(python: str | Path | None) -> str:
+    return "" if python is None else os.path.abspath(os.path.expanduser(python))

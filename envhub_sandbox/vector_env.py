@@ -1,0 +1,454 @@
+"""The Gymnasium face of an environment that lives in a jail. Knows no sockets.
+
+Followed: ``gymnasium.vector.AsyncVectorEnv`` for the calls and their errors, ``SyncVectorEnv`` for
+the results.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable, Sequence
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.error import (
+    AlreadyPendingCallError,
+    ClosedEnvironmentError,
+    NoAsyncCallError,
+)
+from gymnasium.vector import VectorEnv
+
+from envhub_sandbox.actions import batch_of
+from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
+from envhub_sandbox.remote_env import RemoteEnv
+from envhub_worker.protocol import batches
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.spaces import OpaqueSpace
+
+Result = tuple[Any, Any, Any, Any, dict[str, Any]]
+Bounds = tuple[int, int]
+
+
+class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
+    """A vector environment whose code runs in a confined process.
+
+    Everything that ``VectorEnv`` has, and ``AsyncVectorEnv``'s ``*_async`` and ``*_wait``. Arrays
+    that it returns belong to the caller: writable, and never changed by a later step. One thread
+    at a time; ``close`` may come from any.
+
+    Attributes:
+        num_envs: Number of sub-environments.
+        closed: Whether ``close`` has been called.
+        metadata: With ``"autoreset_mode"``, as in Gymnasium.
+        sandbox_report: What confines it: one mapping per layer, once it runs.
+    """
+
+    def __init__(self, remote: RemoteEnv) -> None:
+        manifest = remote.manifest
+        self._remote = remote
+        self._manifest = manifest
+        self._timeouts = remote.repository.timeouts
+        self._waiting: str | None = None
+        self._restores = batches.restores(manifest.single_observation_space)
+        self.closed = False
+        self.num_envs = manifest.num_envs
+        self.single_observation_space = manifest.single_observation_space
+        self.single_action_space = manifest.single_action_space
+        self.observation_space = manifest.observation_space
+        self.action_space = manifest.action_space
+        self.metadata = _metadata(manifest)
+        self.render_mode = manifest.render_mode
+        self.spec = _spec(manifest)
+        # a proxy that nobody holds any more must not keep processes alive
+        weakref.finalize(self, remote.close).atexit = False
+
+    # --- reset and step ------------------------------------------------------------------------
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Reset all sub-environments, or those of ``options["reset_mask"]``.
+
+        Args:
+            seed: One seed (sub-environment ``i`` gets ``seed + i``), one each, or None.
+            options: Handed to each sub-environment; ``"reset_mask"`` is bool ``(num_envs,)``.
+
+        Returns:
+            Batched observation ``(num_envs, *single_observation_space.shape)``, and infos.
+
+        Raises:
+            WorkerTimeoutError: Longer than ``Timeouts.reset_s``; call it again.
+            WorkerDiedError: The worker process ended.
+            RemoteEnvError: The environment raised; it is still usable.
+        """
+        self.reset_async(seed=seed, options=options)
+        return self.reset_wait()
+
+    def reset_async(
+        self,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> None:
+        """Send the reset; ``reset_wait`` returns its results."""
+        self._refuse_if_busy("reset_async")
+        options = None if options is None else dict(options)
+        mask = None if options is None else options.pop("reset_mask", None)
+        if mask is not None:
+            _check_mask(mask, self.num_envs)
+        seeds = self._seeds(seed)
+        self._remote.recover()
+
+        def message(number: int, bounds: Bounds) -> m.Message:
+            start, stop = bounds
+            some = seeds[start:stop] if self._manifest.shardable and seeds is not None else seeds
+            return m.Reset(number, some, options, None if mask is None else mask[start:stop])
+
+        self._submit("reset", message)
+
+    def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
+        """The results of ``reset_async``; ``timeout`` in seconds, else ``Timeouts.reset_s``."""
+        replies = self._collect("reset", timeout, self._timeouts.reset_s, m.ResetDone)
+        observation = self._joined([reply.observation for reply in replies])
+        return observation, self._infos([reply.info for reply in replies])
+
+    def step(self, actions: Any) -> Result:
+        """Step every sub-environment.
+
+        Args:
+            actions: A batch for ``action_space``, as arrays, lists or torch tensors.
+
+        Returns:
+            observations ``(num_envs, *single_observation_space.shape)``, rewards float64
+            ``(num_envs,)``, terminations and truncations bool ``(num_envs,)``, infos.
+
+        Raises:
+            ActionError: A wrong shape or dtype; nothing was sent.
+            WorkerTimeoutError: Longer than ``Timeouts.step_s``; ``reset`` brings it back.
+            WorkerDiedError: The worker process ended.
+            RemoteEnvError: The environment raised; it is still usable.
+        """
+        self.step_async(actions)
+        return self.step_wait()
+
+    def step_async(self, actions: Any) -> None:
+        """Send the actions; ``step_wait`` returns the results."""
+        self._refuse_if_busy("step_async")
+        batch = self._batch(actions)
+        if len(self._remote.bounds) == 1:
+            self._submit("step", lambda number, _: m.Step(number, batch))
+            return
+        parts = batches.split(self.single_action_space, batch, self._remote.bounds)
+        by_bounds = dict(zip(self._remote.bounds, parts, strict=True))
+        self._submit("step", lambda number, bounds: m.Step(number, by_bounds[bounds]))
+
+    def step_wait(self, timeout: float | None = None) -> Result:
+        """The results of ``step_async``; ``timeout`` in seconds, else ``Timeouts.step_s``."""
+        replies = self._collect("step", timeout, self._timeouts.step_s, m.StepDone)
+        return (
+            self._joined([reply.observation for reply in replies]),
+            self._flags("rewards", [reply.rewards for reply in replies]),
+            self._flags("terminations", [reply.terminations for reply in replies]),
+            self._flags("truncations", [reply.truncations for reply in replies]),
+            self._infos([reply.info for reply in replies]),
+        )
+
+    # --- everything else -----------------------------------------------------------------------
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Call a method, or read an attribute, of every sub-environment: a tuple of results."""
+        self.call_async(name, *args, **kwargs)
+        return self.call_wait()
+
+    def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
+        """Send the call; ``call_wait`` returns its results."""
+        self._refuse_if_busy("call_async")
+        self._submit("call", lambda number, _: m.Call(number, name, args, kwargs))
+
+    def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
+        """The results of ``call_async``; ``timeout`` in seconds, else ``Timeouts.call_s``."""
+        replies = self._collect("call", timeout, self._timeouts.call_s, m.Value)
+        if not self._manifest.shardable:
+            return cast("tuple[Any, ...]", replies[0].value)
+        return self._gathered("call", replies)
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """An attribute of every sub-environment."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of every sub-environment: one value each, or one for all."""
+        each = list(values) if isinstance(values, (list, tuple)) else [values] * self.num_envs
+        if len(each) != self.num_envs:
+            raise ValueError(
+                "Values must be a list or tuple with length equal to the number of environments. "
+                f"Got `{len(each)}` values for {self.num_envs} environments."
+            )
+        self._ask(
+            "set_attr",
+            lambda number, bounds: m.SetAttr(number, name, tuple(each[bounds[0] : bounds[1]])),
+        )
+
+    def render(self) -> tuple[Any, ...] | None:
+        """What each sub-environment renders; None where the environment gives None."""
+        replies = self._ask("render", lambda number, _: m.Render(number))
+        if not self._manifest.shardable:
+            return cast("tuple[Any, ...] | None", replies[0].value)
+        return self._gathered("render", replies)
+
+    @property
+    def np_random(self) -> Any:
+        """A copy of each sub-environment's generator, as ``SyncVectorEnv`` has them."""
+        if not self._manifest.shardable:
+            return VectorEnv.np_random.fget(self)  # type: ignore[attr-defined]
+        states = self._gathered(
+            "np_random", self._ask("np_random", lambda number, _: m.GetRandom(number))
+        )
+        return tuple(_generator(state) for state in states)
+
+    @np_random.setter
+    def np_random(self, value: np.random.Generator) -> None:
+        VectorEnv.np_random.fset(self, value)  # type: ignore[attr-defined]
+
+    @property
+    def np_random_seed(self) -> Any:
+        """The seed of each sub-environment's generator, as ``SyncVectorEnv`` has them."""
+        if not self._manifest.shardable:
+            return VectorEnv.np_random_seed.fget(self)  # type: ignore[attr-defined]
+        return self.get_attr("np_random_seed")
+
+    @property
+    def envs(self) -> tuple[SubEnvironment, ...]:
+        """A handle on each sub-environment, to read attributes as ``env.envs[0].task`` does."""
+        return tuple(SubEnvironment(self, index) for index in range(self.num_envs))
+
+    @property
+    def sandbox_report(self) -> list[dict[str, Any]]:
+        """One mapping per layer: ``layer``, ``enforced``, ``detail``. Empty before it runs."""
+        return [dict(layer) for layer in self._remote.repository.report]
+
+    def close(self, **kwargs: Any) -> None:
+        """Close the sub-environments and end their processes, in bounded time. Idempotent."""
+        if self.closed:
+            return
+        self.closed = True
+        self._remote.close()
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """There is nothing beyond ``close``."""
+
+    def __getattr__(self, name: str) -> Any:
+        """An attribute that the repository's vector environment has beyond Gymnasium's."""
+        manifest = self.__dict__.get("_manifest")
+        if manifest is None or name not in manifest.attributes:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        self._refuse_if_busy(name)
+        [reply] = self._own("get attribute", m.GetOwn, name)
+        if isinstance(reply, m.Value):
+            return reply.value
+        if not isinstance(reply, m.Method):
+            raise RemoteProtocolError(f"the worker answered GetOwn with {type(reply).__name__}")
+
+        def method(*args: Any, **kwargs: Any) -> Any:
+            self._refuse_if_busy(name)
+            [result] = self._own(name, m.CallOwn, name, args, kwargs)
+            return _typed(result, m.Value).value
+
+        return method
+
+    def __repr__(self) -> str:
+        return f"SandboxVectorEnv({self._remote.repository.label}, num_envs={self.num_envs})"
+
+    # --- inside --------------------------------------------------------------------------------
+
+    def _own(self, operation: str, kind: Callable[..., m.Message], *fields: Any) -> list[m.Message]:
+        return self._remote.request(
+            operation, lambda number, _: kind(number, *fields), self._timeouts.call_s
+        )
+
+    def _ask(self, operation: str, message: Callable[[int, Bounds], m.Message]) -> list[m.Value]:
+        self._refuse_if_busy(operation)
+        self._submit(operation, message)
+        return self._collect(operation, None, self._timeouts.call_s, m.Value)
+
+    def _submit(self, operation: str, message: Callable[[int, Bounds], m.Message]) -> None:
+        try:
+            self._remote.submit(operation, message)
+        except WorkerDiedError:
+            self._raise_if_closed()
+            raise
+        self._waiting = operation
+
+    def _collect(
+        self, operation: str, timeout: float | None, default: float | None, kind: type[m.M]
+    ) -> list[m.M]:
+        self._raise_if_closed()
+        if self._waiting != operation:
+            raise NoAsyncCallError(
+                f"Calling `{operation}_wait` without any prior call to `{operation}_async`.",
+                operation,
+            )
+        self._waiting = None
+        try:
+            replies = self._remote.collect(default if timeout is None else timeout)
+        except WorkerDiedError:
+            self._raise_if_closed()  # close() in another thread ended it under us
+            raise
+        return [_typed(reply, kind) for reply in replies]
+
+    def _refuse_if_busy(self, name: str) -> None:
+        self._raise_if_closed()
+        if self._waiting is not None:
+            raise AlreadyPendingCallError(
+                f"Calling `{name}` while waiting for a pending call to `{self._waiting}` to "
+                "complete.",
+                self._waiting,
+            )
+
+    def _raise_if_closed(self) -> None:
+        if self.closed:
+            raise ClosedEnvironmentError(
+                f"Trying to operate on `{type(self).__name__}`, after a call to `close()`."
+            )
+
+    def _batch(self, actions: Any) -> Any:
+        if isinstance(self.single_action_space, OpaqueSpace):
+            return actions
+        return batch_of(self.single_action_space, actions, self.num_envs)
+
+    def _seeds(self, seed: Any) -> Any:
+        """One seed or None per sub-environment, or None for none at all."""
+        if isinstance(seed, (int, np.integer)):
+            if not self._manifest.shardable:
+                return int(seed)
+            return [int(seed) + index for index in range(self.num_envs)]
+        if seed is None:
+            return None
+        seeds = [None if one is None else int(one) for one in seed]
+        if len(seeds) != self.num_envs:
+            raise ValueError(
+                "If seeds are passed as a list the length must match "
+                f"num_envs={self.num_envs} but got length={len(seeds)}."
+            )
+        return seeds
+
+    def _joined(self, parts: list[Any]) -> Any:
+        space = self.single_observation_space
+        if self._manifest.shardable:
+            for part, (start, stop) in zip(parts, self._remote.bounds, strict=True):
+                if not batches.conforms(space, part, stop - start):
+                    raise RemoteProtocolError(
+                        f"the worker sent an observation that is not a batch of {space}"
+                    )
+        joined = parts[0] if len(parts) == 1 else batches.join(space, parts)
+        return batches.restore_batch(space, joined) if self._restores else joined
+
+    def _flags(self, name: str, parts: list[Any]) -> Any:
+        for part, (start, stop) in zip(parts, self._remote.bounds, strict=True):
+            if len(getattr(part, "shape", ())) < 1 or part.shape[0] != stop - start:
+                raise RemoteProtocolError(f"the worker sent {name} that do not fit num_envs")
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def _infos(self, parts: list[dict[Any, Any]]) -> dict[Any, Any]:
+        sizes = [stop - start for start, stop in self._remote.bounds]
+        infos = parts[0] if len(parts) == 1 else batches.join_infos(parts, sizes)
+        final = infos.get("final_obs") if self._restores else None
+        if final is not None:
+            for index, member in enumerate(final):
+                final[index] = batches.restore(self.single_observation_space, member)
+        return infos
+
+    def _gathered(self, what: str, replies: list[m.Value]) -> tuple[Any, ...]:
+        gathered: list[Any] = []
+        for reply, (start, stop) in zip(replies, self._remote.bounds, strict=True):
+            if type(reply.value) is not tuple or len(reply.value) != stop - start:
+                raise RemoteProtocolError(f"the worker's {what} does not hold one result each")
+            gathered += reply.value
+        return tuple(gathered)
+
+
+class SubEnvironment:
+    """Reads attributes of one sub-environment: ``env.envs[0].task``, ``hasattr`` included."""
+
+    def __init__(self, vector: SandboxVectorEnv, index: int) -> None:
+        self._vector = vector
+        self._index = index
+
+    def __getattr__(self, name: str) -> Any:
+        """The attribute; methods are called without arguments, as ``get_attr`` does."""
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return self._vector.get_attr(name)[self._index]
+
+
+def _typed(reply: m.Message, kind: type[m.M]) -> m.M:
+    if not isinstance(reply, kind):
+        raise RemoteProtocolError(
+            f"the worker answered with {type(reply).__name__} where {kind.__name__} belongs"
+        )
+    return reply
+
+
+def _metadata(manifest: EnvManifest) -> dict[str, Any]:
+    mode: Any = manifest.autoreset_mode
+    if mode is None:
+        return dict(manifest.metadata)
+    if hasattr(gym.vector, "AutoresetMode"):
+        mode = gym.vector.AutoresetMode(mode)
+    return {**manifest.metadata, "autoreset_mode": mode}
+
+
+def _spec(manifest: EnvManifest) -> EnvSpec | None:
+    if manifest.spec is None or type(manifest.spec.get("id")) is not str:
+        return None
+    try:
+        return EnvSpec(**manifest.spec)
+    except Exception:  # an id that this Gymnasium cannot read: not worth failing for
+        return None
+
+
+def _check_mask(mask: Any, num_envs: int) -> None:
+    """``SyncVectorEnv.reset``'s checks, in its words."""
+    if not isinstance(mask, np.ndarray):
+        raise TypeError(f"`options['reset_mask']` must be a numpy array, got {type(mask)}")
+    if mask.shape != (num_envs,):
+        raise ValueError(
+            f"`options['reset_mask']` must have shape `({num_envs},)`, got {mask.shape}"
+        )
+    if mask.dtype != np.bool_:
+        raise TypeError(f"`options['reset_mask']` must have `dtype=np.bool_`, got {mask.dtype}")
+    if not np.any(mask):
+        raise ValueError(
+            "`options['reset_mask']` must contain a boolean array with at least one True value, "
+            f"got reset_mask={mask}"
+        )
+
+
+_BIT_GENERATORS = {
+    kind.__name__: kind
+    for kind in (
+        np.random.PCG64,
+        np.random.PCG64DXSM,
+        np.random.MT19937,
+        np.random.Philox,
+        np.random.SFC64,
+    )
+}
+
+
+def _generator(state: Any) -> np.random.Generator:
+    """A generator in a given state. Trust: the state is input from the worker."""
+    kind = _BIT_GENERATORS.get(str(state.get("bit_generator"))) if type(state) is dict else None
+    if kind is None:
+        raise RemoteProtocolError("the worker sent the state of an unknown random generator")
+    bits = kind()
+    try:
+        bits.state = state
+    except (TypeError, ValueError, KeyError, OverflowError) as error:
+        raise RemoteProtocolError(f"the worker sent a broken generator state: {error}") from error
+    return np.random.Generator(bits)
