@@ -24,7 +24,7 @@ def assert_same(expected: object, actual: object, what: str = "value") -> None:
 
 def differences(expected: Any, actual: Any, path: str = "value") -> Iterator[str]:
     """Where two values differ, in words; nothing if they are the same."""
-    if type(actual).__name__ in ("RemoteEnum", "RemoteObject"):
+    if type(actual).__name__ in ("RemoteEnum", "RemoteObject") and actual != expected:
         yield from _stand_in(expected, actual, path)
     elif type(expected) is not type(actual):
         yield f"{path}: expected {_brief(expected)}, got {_brief(actual)}"

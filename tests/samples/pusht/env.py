@@ -1,5 +1,9 @@
 """PushT: a camera and a robot state, as imitation learning uses it."""
 
+import os
+
+os.environ.setdefault("MUJOCO_GL", "egl")  # gym-pusht decides by it whether there is a screen
+
 import gym_pusht  # noqa: F401 (registers the environment)
 import gymnasium as gym
 
