@@ -33,8 +33,7 @@ class HubRef:
 
     Attributes:
         repo_id: ``"owner/name"``.
-        revision: A branch, tag, pull request (``"refs/pr/3"``) or commit; None for the default
-            branch.
+        revision: A branch, tag, pull request (``"refs/pr/3"``) or commit; None for ``main``.
         path: The entry file, relative to the repository's root, with ``/``.
         repo_type: ``"model"``, ``"space"`` or ``"dataset"``; None for "model first, then space".
 

@@ -1,0 +1,1 @@
+"""Hubs for tests: olah with real git repositories, and a stub that lies and fails."""

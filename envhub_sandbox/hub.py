@@ -1,0 +1,240 @@
+"""The Hub, through huggingface_hub 0.34 to 2.x: resolve, list, download.
+
+The client library is imported inside the functions: a pinned snapshot that is in the store
+needs none of it. What it downloads lies in its own cache and is not trusted here: the caller
+compares every file with the listing.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from traceback import walk_tb
+from typing import Any, NamedTuple
+from urllib.parse import parse_qsl, quote, urlsplit
+
+from envhub_sandbox.errors import HubReferenceError, SnapshotIntegrityError
+from envhub_sandbox.hashing import GIT_SHA1, SHA256
+from envhub_sandbox.hub_failures import HubFailure, Subject, explain
+from envhub_sandbox.reference_rules import is_commit
+from envhub_sandbox.snapshot_records import FileRecord
+
+_DEFAULT_ENDPOINT = "https://huggingface.co"
+_LIBRARY = {"library_name": "envhub-sandbox"}
+_xet_switch = threading.Lock()
+
+
+class Repository(NamedTuple):
+    """A repository's type and name."""
+
+    repo_type: str
+    repo_id: str
+
+
+def default_endpoint() -> str:
+    """The endpoint that huggingface_hub uses, without importing it."""
+    constants = sys.modules.get("huggingface_hub.constants")
+    chosen = getattr(constants, "ENDPOINT", None) or os.environ.get("HF_ENDPOINT")
+    return str(chosen or _DEFAULT_ENDPOINT).rstrip("/")
+
+
+def checked_endpoint(endpoint: str | None) -> str:
+    """The endpoint without a trailing slash.
+
+    Raises:
+        HubReferenceError: It is not an http(s) URL.
+    """
+    chosen = default_endpoint() if endpoint is None else endpoint.rstrip("/")
+    if not re.match(r"https?://[^/]", chosen):
+        raise HubReferenceError(
+            f"endpoint: {chosen!r} is not an http(s) URL such as {_DEFAULT_ENDPOINT!r}"
+        )
+    return chosen
+
+
+def checked_token(token: str | bool | None) -> str | bool | None:
+    """The token, stripped; the text of an error never shows it.
+
+    Raises:
+        HubReferenceError: It cannot be sent in an HTTP header, whose error would print it.
+    """
+    if not isinstance(token, str):
+        return token
+    stripped = token.strip()
+    if not re.fullmatch(r"[!-~]+", stripped):
+        raise HubReferenceError("token: it is empty or has characters that no token has")
+    return stripped
+
+
+@dataclass(frozen=True)
+class HubClient:
+    """One endpoint, one token, one Hub cache. Every method raises ``HubFailure``.
+
+    Attributes:
+        endpoint: Without a trailing slash.
+        token: As in huggingface_hub: None for the stored one, False for none.
+        cache_dir: huggingface_hub's ``cache_dir``; None for its default.
+    """
+
+    endpoint: str = field(repr=False)
+    token: str | bool | None = field(default=None, repr=False)
+    cache_dir: str | Path | None = None
+
+    @property
+    def public_endpoint(self) -> str:
+        """The endpoint without a user and password, for errors and as a key."""
+        return re.sub(r"//[^/]*@", "//", self.endpoint)
+
+    def resolve(self, repo: Repository, revision: str | None) -> str:
+        """Ask which full commit a revision is; None is ``main``, as in huggingface_hub."""
+        url = f"{self._api(repo)}/revision/{quote(revision or 'main', safe='')}"
+        with self._explained(repo, revision):
+            commit = self._get(url, {}).json()["sha"]
+            if not isinstance(commit, str) or not is_commit(commit):
+                raise ValueError("the answer has no full commit")
+        return commit
+
+    def listing(self, repo: Repository, commit: str) -> Iterator[FileRecord]:
+        """Yield the files of a commit with their sizes and digests, page by page."""
+        url = f"{self._api(repo)}/tree/{commit}"
+        query: dict[str, str] | None = {"recursive": "true", "expand": "false"}
+        while query is not None:
+            with self._explained(repo, commit):
+                response = self._get(url, query)
+                items, query = list(response.json()), _next_page(response, query)
+            for item in items:
+                record = _record_of(item, repo)
+                if record is not None:
+                    yield record
+
+    def download(self, repo: Repository, commit: str) -> Path:
+        """Download the whole repository into the Hub cache; its folder there."""
+        from huggingface_hub import snapshot_download
+
+        with self._explained(repo, commit):
+            return Path(_with_xet_or_without(snapshot_download, **self._arguments(repo, commit)))
+
+    def download_again(self, repo: Repository, commit: str, path: str) -> Path:
+        """Download one file anew, whatever the Hub cache has of it."""
+        from huggingface_hub import hf_hub_download
+
+        arguments = self._arguments(repo, commit)
+        with self._explained(repo, commit):
+            return Path(
+                _with_xet_or_without(
+                    hf_hub_download, filename=path, force_download=True, **arguments
+                )
+            )
+
+    def _arguments(self, repo: Repository, commit: str) -> dict[str, Any]:
+        return {
+            **repo._asdict(),
+            "revision": commit,
+            "cache_dir": self.cache_dir,
+            "token": self.token,
+            "endpoint": self.endpoint,
+            **_LIBRARY,
+        }
+
+    def _api(self, repo: Repository) -> str:
+        return f"{self.endpoint}/api/{repo.repo_type}s/{repo.repo_id}"
+
+    def _get(self, url: str, query: dict[str, str]) -> Any:
+        # HfApi.list_repo_tree has no timeout, and in 2.x retries a broken Hub for 24 s.
+        client: Any = import_module("huggingface_hub.utils")
+        timeout = import_module("huggingface_hub.constants").HF_HUB_ETAG_TIMEOUT
+        headers = client.build_hf_headers(token=self.token, **_LIBRARY)
+        response = client.get_session().get(url, headers=headers, params=query, timeout=timeout)
+        client.hf_raise_for_status(response)
+        return response
+
+    @contextmanager
+    def _explained(self, repo: Repository, revision: str | None) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:
+            subject = Subject(*repo, revision, self.public_endpoint)
+            raise explain(error, subject, self._secrets()) from error
+
+    def _secrets(self) -> tuple[str, ...]:
+        from huggingface_hub import get_token
+
+        token = self.token if isinstance(self.token, str) else get_token()
+        return (token,) if token else ()
+
+
+def _next_page(response: Any, query: dict[str, str]) -> dict[str, str] | None:
+    """The next page's query. Only that: a link to another host would take the token along."""
+    url = response.links.get("next", {}).get("url")
+    if url is None:
+        return None
+    following = dict(parse_qsl(urlsplit(url).query))
+    return following if following != query else None
+
+
+def _record_of(item: Any, repo: Repository) -> FileRecord | None:
+    try:
+        if item["type"] != "file":
+            return None
+        path, lfs = item["path"], item.get("lfs")
+        size, digest = (lfs["size"], lfs["oid"]) if lfs else (item["size"], item["oid"])
+        kind, length = (SHA256, 64) if lfs else (GIT_SHA1, 40)
+        digest = digest.removeprefix("sha256:")
+        if type(path) is str and type(size) is int and size >= 0 and _is_hex(digest, length):
+            path.encode()  # A lone surrogate cannot be a file's name.
+            return FileRecord(path, size, f"{kind}:{digest}")
+        raise ValueError("a field is not what it should be")
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise SnapshotIntegrityError(
+            f"{repo.repo_id}: the Hub's listing has an entry that cannot be read ({error!r}); "
+            "check that the endpoint is a Hugging Face Hub"
+        ) from error
+
+
+def _is_hex(text: str, length: int) -> bool:
+    return re.fullmatch(rf"[0-9a-f]{{{length}}}", text) is not None
+
+
+def _with_xet_or_without(download: Any, **arguments: Any) -> str:
+    """Download; where the Xet route fails (some mirrors announce it and lack it), over HTTP."""
+    try:
+        return str(download(**arguments))
+    except Exception as error:
+        if not _came_through_xet(error):
+            raise
+    with _xet_disabled():
+        return str(download(**arguments))
+
+
+def _came_through_xet(error: BaseException | None) -> bool:
+    """Whether the client was in a function of its Xet route when it failed."""
+    while error is not None:
+        for frame, _ in walk_tb(error.__traceback__):
+            module = str(frame.f_globals.get("__name__"))
+            if module.startswith("huggingface_hub.") and "xet" in frame.f_code.co_name:
+                return True
+        error = error.__cause__
+    return False
+
+
+@contextmanager
+def _xet_disabled() -> Iterator[None]:
+    from huggingface_hub import constants
+
+    with _xet_switch:
+        before = constants.HF_HUB_DISABLE_XET
+        constants.HF_HUB_DISABLE_XET = True
+        try:
+            yield
+        finally:
+            constants.HF_HUB_DISABLE_XET = before
+
+
+__all__ = ["HubClient", "HubFailure", "Repository", "checked_endpoint", "checked_token"]

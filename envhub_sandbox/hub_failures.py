@@ -1,0 +1,240 @@
+"""What the Hub client's exceptions mean to a user, in words that say what to do next.
+
+huggingface_hub 0.34 raises requests' exceptions, 1.x httpx's and 2.x httpx2's, often wrapped in
+``LocalEntryNotFoundError``. So the chain of causes is walked, and transports are recognised by
+the names of their classes.
+"""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator
+from enum import Enum, auto
+from typing import NamedTuple
+
+_LONGEST_QUOTE = 200
+
+
+class Kind(Enum):
+    """Why the Hub did not give something."""
+
+    NO_REPOSITORY = auto()
+    NO_REVISION = auto()
+    NO_ENTRY = auto()
+    GATED = auto()
+    DISABLED = auto()
+    UNAUTHORIZED = auto()
+    FORBIDDEN = auto()
+    NO_TOKEN = auto()
+    RATE_LIMITED = auto()
+    SERVER_ERROR = auto()
+    OFFLINE = auto()
+    TIMEOUT = auto()
+    UNREACHABLE = auto()
+    BROKEN_DOWNLOAD = auto()
+    DISK_FULL = auto()
+    OTHER = auto()
+
+
+ABSENT = frozenset({Kind.NO_REPOSITORY, Kind.NO_REVISION, Kind.NO_ENTRY})
+"""The repository is not there or not like this: one of another type may be."""
+
+UNREACHABLE = frozenset(
+    {Kind.OFFLINE, Kind.TIMEOUT, Kind.UNREACHABLE, Kind.RATE_LIMITED, Kind.SERVER_ERROR}
+)
+"""Nothing was learned about the repository: what the store has may still be what is wanted."""
+
+
+class HubFailure(Exception):
+    """A request to the Hub failed. ``what`` and ``advice`` are sentences without a full stop."""
+
+    def __init__(self, kind: Kind, what: str, advice: str) -> None:
+        super().__init__(what, advice)
+        self.kind = kind
+        self.what = what
+        self.advice = advice
+
+
+class Subject(NamedTuple):
+    """What was asked for, as it stands in messages."""
+
+    repo_type: str
+    repo_id: str
+    revision: str | None
+    endpoint: str
+
+    @property
+    def url(self) -> str:
+        """The repository's page."""
+        prefix = "" if self.repo_type == "model" else f"{self.repo_type}s/"
+        return f"{self.endpoint}/{prefix}{self.repo_id}"
+
+
+_LOG_IN = "log in with `hf auth login` (`huggingface-cli login` before 1.0) or pass `token`"
+
+# kind -> what happened, what to do. The fields are those of Subject, and `said`, `status`, `wait`.
+_WORDS: dict[Kind, tuple[str, str]] = {
+    Kind.NO_REPOSITORY: (
+        "there is no {repo_type} repository {repo_id} that you may see ({status})",
+        f"Check the spelling and the owner; if it is private, {_LOG_IN}",
+    ),
+    Kind.NO_REVISION: (
+        "the {repo_type} repository {repo_id} has no revision {revision!r}",
+        "Check the branch, tag or commit at {url}/commits/main",
+    ),
+    Kind.NO_ENTRY: (
+        "the {repo_type} repository {repo_id} lacks a file that its own listing names",
+        "Try again; if it stays, tell the repository's owner",
+    ),
+    Kind.GATED: (
+        "the {repo_type} repository {repo_id} is gated and you have no access yet{said}",
+        f"Accept its terms at {{url}}, then {_LOG_IN}",
+    ),
+    Kind.DISABLED: (
+        "the {repo_type} repository {repo_id} was disabled on the Hub{said}",
+        "Ask its owner, or use another repository",
+    ),
+    Kind.UNAUTHORIZED: (
+        "the Hub refused your token (401){said}",
+        f"It may be expired or of another endpoint: {_LOG_IN}; token=False sends none",
+    ),
+    Kind.FORBIDDEN: (
+        "your token may not read the {repo_type} repository {repo_id} (403){said}",
+        "Give the token read access to it at {endpoint}/settings/tokens, or ask its owner",
+    ),
+    Kind.NO_TOKEN: (
+        "token=True was given, but no token is stored on this machine",
+        f"To store one, {_LOG_IN}",
+    ),
+    Kind.RATE_LIMITED: (
+        "the Hub's rate limit is reached (429){said}",
+        f"Wait {{wait}} and try again; you get a higher limit if you {_LOG_IN}",
+    ),
+    Kind.SERVER_ERROR: (
+        "the Hub has a problem ({status}){said}",
+        "Try again later; see https://status.huggingface.co",
+    ),
+    Kind.OFFLINE: (
+        "HF_HUB_OFFLINE is set, so the Hub was not asked",
+        "Unset HF_HUB_OFFLINE to go online",
+    ),
+    Kind.TIMEOUT: (
+        "the Hub did not answer in time",
+        "Check the network and try again; HF_HUB_ETAG_TIMEOUT=30 waits longer",
+    ),
+    Kind.UNREACHABLE: (
+        "the Hub cannot be reached ({reason})",
+        "Check the network, the proxy settings and the endpoint",
+    ),
+    Kind.BROKEN_DOWNLOAD: (
+        "the download broke off or had the wrong length",
+        "Try again; if it stays, something between you and the Hub changes files",
+    ),
+    Kind.DISK_FULL: ("the disk is full", "Free space, or put the Hub cache elsewhere (HF_HOME)"),
+    Kind.OTHER: (
+        "the Hub client failed ({reason}){said}",
+        "Check the endpoint; if it is right, try again with HF_DEBUG=1",
+    ),
+}
+
+_BAD_TOKEN = "Invalid credentials in Authorization header"
+_TIMEOUT_CLASSES = frozenset({"Timeout", "TimeoutException", "TimeoutError"})
+_TRANSPORT_CLASSES = frozenset(
+    {"ConnectionError", "NetworkError", "TransportError", "ProtocolError", "ProxyError", "SSLError"}
+)
+
+
+def explain(error: BaseException, subject: Subject, secrets: tuple[str, ...] = ()) -> HubFailure:
+    """The failure that an exception of the Hub client stands for."""
+    kind, source = _classify(error)
+    response = getattr(source, "response", None)
+    fields = {
+        **subject._asdict(),
+        "url": subject.url,
+        "status": getattr(response, "status_code", "not found"),
+        "said": _said(response),
+        "wait": _wait(response),
+        "reason": type(source).__name__,
+    }
+    what, advice = (text.format(**fields) for text in _WORDS[kind])
+    return HubFailure(kind, redact(what, secrets), redact(advice, secrets))
+
+
+def redact(text: str, secrets: tuple[str, ...]) -> str:
+    """The text without the secrets, which a careless server may have echoed."""
+    for secret in secrets:
+        text = text.replace(secret, "***")
+    return text
+
+
+def _classify(error: BaseException) -> tuple[Kind, BaseException]:
+    for link in _chain(error):
+        kind = _kind_of(link)
+        if kind is not None:
+            return kind, link
+    return Kind.OTHER, error
+
+
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def _kind_of(error: BaseException) -> Kind | None:
+    names = {cls.__name__ for cls in type(error).__mro__}
+    if "LocalEntryNotFoundError" in names or "IncompleteSnapshotError" in names:
+        return None  # A wrapper: the reason is in its cause.
+    for name, kind in _KIND_OF_CLASS:
+        if name in names:
+            return kind
+    response = getattr(error, "response", None)
+    status = getattr(response, "status_code", None)
+    if status == 401 and _header(response, "X-Error-Message") != _BAD_TOKEN:
+        return Kind.NO_REPOSITORY  # What the Hub answers without a token for all it does not show.
+    if isinstance(status, int):
+        return _KIND_OF_STATUS.get(status, Kind.SERVER_ERROR if status >= 500 else Kind.OTHER)
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return Kind.DISK_FULL
+    if "Consistency check failed" in str(error) or "IncompleteRead" in str(error):
+        return Kind.BROKEN_DOWNLOAD
+    if names & _TIMEOUT_CLASSES:
+        return Kind.TIMEOUT
+    return Kind.UNREACHABLE if names & _TRANSPORT_CLASSES else None
+
+
+# Gated is a subclass of not found: first come the narrower ones.
+_KIND_OF_CLASS = (
+    ("GatedRepoError", Kind.GATED),
+    ("DisabledRepoError", Kind.DISABLED),
+    ("RepositoryNotFoundError", Kind.NO_REPOSITORY),
+    ("RevisionNotFoundError", Kind.NO_REVISION),
+    ("EntryNotFoundError", Kind.NO_ENTRY),
+    ("OfflineModeIsEnabled", Kind.OFFLINE),
+    ("LocalTokenNotFoundError", Kind.NO_TOKEN),
+)
+_KIND_OF_STATUS = {
+    401: Kind.UNAUTHORIZED,
+    403: Kind.FORBIDDEN,
+    404: Kind.NO_REPOSITORY,
+    408: Kind.TIMEOUT,
+    429: Kind.RATE_LIMITED,
+}
+
+
+def _said(response: object) -> str:
+    message = _header(response, "X-Error-Message")
+    words = "".join(c if c.isprintable() else " " for c in message)[:_LONGEST_QUOTE]
+    return f'; it said: "{words}"' if words else ""
+
+
+def _wait(response: object) -> str:
+    seconds = _header(response, "Retry-After")
+    return f"{int(seconds)} s" if seconds.isdecimal() else "a few minutes"
+
+
+def _header(response: object, name: str) -> str:
+    headers = getattr(response, "headers", None)
+    return str(headers.get(name) or "") if headers is not None else ""

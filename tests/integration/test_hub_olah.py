@@ -1,0 +1,240 @@
+"""The real huggingface_hub client against real git repositories, served on loopback."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox.errors import RepositoryUnavailableError
+from envhub_sandbox.reference import HubRef
+from envhub_sandbox.snapshot import Snapshot, fetch
+from tests.hub.olah_server import GitRepository, OlahServer
+from tests.hub.stub_hub import git_blob_id
+
+FILES = {
+    "env.py": "from pkg.maker import make_env\n",
+    "pkg/maker.py": "def make_env(n_envs=1, use_async_envs=False): ...\n",
+    "pkg/data/map.txt": "....\n",
+    "README.md": "---\nlicense: mit\n---\n",
+    "empty": "",
+}
+
+Fetch = Callable[..., Snapshot]
+
+
+@pytest.fixture
+def get(olah: OlahServer, hub_cache: Path) -> Fetch:
+    """``fetch`` from olah, with caches of this test only."""
+
+    def run(text: str) -> Snapshot:
+        return fetch(
+            HubRef.parse(text), hub_cache_dir=hub_cache, token=False, endpoint=olah.endpoint
+        )
+
+    return run
+
+
+def make(olah: OlahServer, name: str, repo_type: str = "model") -> GitRepository:
+    """A repository of its own for one test."""
+    return olah.repository(f"org/{name}", repo_type)
+
+
+def contents(snapshot: Snapshot) -> dict[str, bytes]:
+    """What lies on disk below the root."""
+    return {
+        str(path.relative_to(snapshot.root)): path.read_bytes()
+        for path in snapshot.root.rglob("*")
+        if path.is_file()
+    }
+
+
+def test_whole_repository_arrives_verified(olah: OlahServer, get: Fetch) -> None:
+    """Every file of the commit is there, in sub-folders too, with its git blob id."""
+    commit = make(olah, "whole").commit(FILES)
+    snapshot = get("org/whole")
+    expected = {path: text.encode() for path, text in FILES.items()}
+    assert contents(snapshot) == expected
+    assert (snapshot.repo_id, snapshot.repo_type) == ("org/whole", "model")
+    assert (snapshot.commit, snapshot.path) == (commit, "env.py")
+    assert {f.path: f.digest for f in snapshot.files} == {
+        path: f"git-sha1:{git_blob_id(content)}" for path, content in expected.items()
+    }
+
+
+def test_branch_tag_and_short_commit_name_the_full_commit(olah: OlahServer, get: Fetch) -> None:
+    """Whatever names a commit, the snapshot says which one it is."""
+    repository = make(olah, "names")
+    first = repository.commit({"env.py": "1"}, tag="v1")
+    second = repository.commit({"env.py": "2"})
+    other = repository.commit({"env.py": "3"}, branch="dev")
+    found = {text: get(f"org/names@{text}") for text in ("v1", "main", "dev", first[:8], second)}
+    assert {text: snapshot.commit for text, snapshot in found.items()} == {
+        "v1": first,
+        "main": second,
+        "dev": other,
+        first[:8]: first,
+        second: second,
+    }
+    assert contents(found["v1"]) == {"env.py": b"1"}
+    assert contents(found["dev"]) == {"env.py": b"3"}
+
+
+@pytest.mark.parametrize("repo_type", ["model", "space", "dataset"])
+def test_each_repository_type_loads(olah: OlahServer, get: Fetch, repo_type: str) -> None:
+    """Models, spaces and datasets load by their prefix."""
+    make(olah, f"typed-{repo_type}", repo_type).commit({"env.py": repo_type})
+    snapshot = get(f"{repo_type}s/org/typed-{repo_type}")
+    assert snapshot.repo_type == repo_type
+    assert contents(snapshot) == {"env.py": repo_type.encode()}
+
+
+def test_space_is_found_without_a_prefix(olah: OlahServer, get: Fetch) -> None:
+    """LeRobot's documentation has authors upload spaces: they load by plain name."""
+    make(olah, "only-space", "space").commit({"env.py": "s"})
+    assert get("org/only-space").repo_type == "space"
+
+
+def test_model_wins_over_a_space_of_the_same_name(olah: OlahServer, get: Fetch) -> None:
+    """Where both exist, the plain name means the model, as in LeRobot."""
+    make(olah, "both").commit({"env.py": "m"})
+    make(olah, "both", "space").commit({"env.py": "s"})
+    assert get("org/both").repo_type == "model"
+    assert get("spaces/org/both").repo_type == "space"
+
+
+def test_space_is_taken_where_the_model_lacks_the_entry(olah: OlahServer, get: Fetch) -> None:
+    """A model of weights beside a space of the same name does not hide the environment."""
+    make(olah, "weights").commit({"model.bin": "w"})
+    make(olah, "weights", "space").commit({"env.py": "s"})
+    assert get("org/weights").repo_type == "space"
+
+
+def test_lfs_file_is_verified_by_its_sha256(olah: OlahServer, get: Fetch) -> None:
+    """An LFS file arrives as its content, not as the pointer, and is checked by SHA-256."""
+    content = os.urandom(300_000)
+    make(olah, "lfs").commit({"env.py": ""}, lfs={"assets/mesh.bin": content})
+    snapshot = get("org/lfs")
+    assert (snapshot.root / "assets/mesh.bin").read_bytes() == content
+    record = next(f for f in snapshot.files if f.path == "assets/mesh.bin")
+    assert (record.size, record.digest.partition(":")[0]) == (len(content), "sha256")
+
+
+def test_entry_in_a_sub_folder(olah: OlahServer, get: Fetch) -> None:
+    """The path of the reference is the entry, and the whole repository comes along."""
+    make(olah, "sub").commit({"envs/a-b/my env.py": "1", "shared.py": "2"})
+    snapshot = get("org/sub:envs/a-b/my env.py")
+    assert snapshot.path == "envs/a-b/my env.py"
+    assert (snapshot.root / "shared.py").exists()
+
+
+def test_pinned_and_stored_costs_no_request(olah: OlahServer, get: Fetch) -> None:
+    """The second fetch of a full commit asks nobody."""
+    commit = make(olah, "pinned").commit(FILES)
+    first = get("org/pinned")
+    before = len(olah.requests())
+    assert get(f"org/pinned@{commit}") == first
+    assert len(olah.requests()) == before
+
+
+def test_branch_is_asked_for_every_time(olah: OlahServer, get: Fetch) -> None:
+    """A branch that moved is seen at once, and one that did not is not downloaded again."""
+    repository = make(olah, "moving")
+    repository.commit({"env.py": "1"})
+    first = get("org/moving")
+    before = len(olah.requests())
+    assert get("org/moving") == first
+    asked = olah.requests()[before:]
+    assert asked == ["GET /api/models/org/moving/revision/main"]
+    repository.commit({"env.py": "2"})
+    assert contents(get("org/moving")) == {"env.py": b"2"}
+
+
+def test_missing_entry_lists_the_python_files_before_downloading(
+    olah: OlahServer, get: Fetch
+) -> None:
+    """A wrong path is refused by the listing, with the paths that would work."""
+    make(olah, "listing").commit({"envs/cartpole.py": "", "tools/x.py": "", "big.txt": "b"})
+    before = len(olah.requests())
+    with pytest.raises(RepositoryUnavailableError) as caught:
+        get("models/org/listing:envs/cartpol.py")
+    message = str(caught.value)
+    assert "no file 'envs/cartpol.py'" in message
+    assert "':envs/cartpole.py'; it has 'envs/cartpole.py', 'tools/x.py'" in message
+    assert not any("/resolve/" in request for request in olah.requests()[before:])
+
+
+def test_missing_everywhere_mentions_model_and_space(olah: OlahServer, get: Fetch) -> None:
+    """Where neither exists, the error says that both were tried."""
+    with pytest.raises(RepositoryUnavailableError) as caught:
+        get("org/nowhere")
+    message = str(caught.value)
+    assert "no model repository org/nowhere" in message
+    assert "no space repository org/nowhere" in message
+    assert "'datasets/org/nowhere'" in message
+    assert type(caught.value.__cause__).__name__ == "RepositoryNotFoundError"
+
+
+def test_git_symlink_arrives_as_its_text_and_points_nowhere(olah: OlahServer, get: Fetch) -> None:
+    """A link in the repository becomes a regular file that holds the link's text."""
+    repository = make(olah, "linked")
+    repository.commit({"env.py": "1"})
+    (repository.folder / "outside").symlink_to("/etc/passwd")
+    repository.commit({"a.py": "2"})
+    snapshot = get("org/linked")
+    assert not (snapshot.root / "outside").is_symlink()
+    assert (snapshot.root / "outside").read_bytes() == b"/etc/passwd"
+
+
+def test_threads_share_one_snapshot(olah: OlahServer, get: Fetch) -> None:
+    """Concurrent fetches of the same commit all succeed and leave one copy."""
+    make(olah, "threads").commit(FILES)
+    with ThreadPoolExecutor(6) as pool:
+        snapshots = list(pool.map(get, ["org/threads"] * 6))
+    assert len(set(snapshots)) == 1
+    home = snapshots[0].root.parent
+    assert [path.name for path in home.parent.iterdir()] == [home.name]
+
+
+def test_processes_share_one_snapshot(
+    olah: OlahServer, hub_cache: Path, snapshot_store: Path
+) -> None:
+    """Concurrent processes all succeed and leave one copy."""
+    commit = make(olah, "processes").commit(FILES)
+    code = (
+        "import sys; from envhub_sandbox.snapshot import fetch; "
+        "from envhub_sandbox.reference import HubRef; "
+        "print(fetch(HubRef.parse('org/processes'), hub_cache_dir=sys.argv[1], token=False,"
+        " endpoint=sys.argv[2]).commit)"
+    )
+    command = [sys.executable, "-c", code, str(hub_cache), olah.endpoint]
+    running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    assert [process.communicate()[0].strip() for process in running] == [commit] * 3
+    homes = list(snapshot_store.glob("snapshots/*/model--org--processes/*"))
+    assert [home.name for home in homes] == [commit]
+
+
+def test_stopped_hub_serves_pins_from_the_store_and_nothing_stale(
+    tmp_path: Path, hub_cache: Path
+) -> None:
+    """Without its Hub a pin still loads, and a branch fails with the pins that would load."""
+    (tmp_path / "olah").mkdir()
+    python = os.environ.get("ENVHUB_TEST_OLAH_PYTHON", sys.executable)
+    server = OlahServer(tmp_path / "olah", python)
+    try:
+        commit = server.repository("org/gone").commit(FILES, tag="v1")
+        arguments = {"hub_cache_dir": hub_cache, "token": False, "endpoint": server.endpoint}
+        online = fetch(HubRef.parse("org/gone@v1"), **arguments)
+    finally:
+        server.stop()
+    assert fetch(HubRef.parse(f"org/gone@{commit}"), **arguments) == online
+    with pytest.raises(RepositoryUnavailableError) as caught:
+        fetch(HubRef.parse("org/gone@v1:pkg/maker.py"), **arguments)
+    assert "cannot be reached" in str(caught.value)
+    assert f"'org/gone@{commit}:pkg/maker.py' (v1, " in str(caught.value)
+    assert caught.value.__cause__ is not None
