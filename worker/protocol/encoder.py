@@ -149,7 +149,9 @@ def _write_other(encoder: Encoder, value: Any) -> object:
         return _write_enum(encoder, value)
     if isinstance(value, np.generic):
         return _write_scalar(encoder, value)
-    if isinstance(value, np.ndarray) and not isinstance(value, np.ma.MaskedArray):
+    if isinstance(value, np.ma.MaskedArray):
+        return _write_unknown(encoder, value)
+    if isinstance(value, np.ndarray):
         return _write_array(encoder, np.asarray(value))
     torch = sys.modules.get("torch")
     if torch is not None and isinstance(value, getattr(torch, "Tensor", ())):

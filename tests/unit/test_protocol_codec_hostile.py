@@ -1,0 +1,185 @@
+"""Malformed and oversized messages are refused, and the error says that the peer is to blame."""
+
+from __future__ import annotations
+
+import pickle
+import struct
+
+import msgpack
+import numpy as np
+import pytest
+
+from envhub_worker.protocol.codec import Buffer, RemoteObject, decode, encode
+from envhub_worker.protocol.errors import (
+    LocalProtocolError,
+    MessageTooLargeError,
+    RemoteProtocolError,
+)
+from envhub_worker.protocol.limits import WireLimits
+from tests.support.compare import assert_same
+from tests.support.wire import deep, ext, message, packed
+
+SMALL = WireLimits(
+    header_bytes=4096,
+    frame_bytes=100_000,
+    message_bytes=150_000,
+    frames=4,
+    depth=5,
+    items=100,
+    text_bytes=50,
+    int_bytes=16,
+    hashed_keys=80,
+)
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        [],
+        [b""],
+        [b"\0\0\0"],
+        message(b""),
+        [struct.pack("<I", 5) + b"\xc0"],
+        [struct.pack("<I", 2**32 - 1) + b"\xc0"],
+        message(b"\xc0\xc0"),
+        message(b"\xc0", b"tail"),
+        message(b"\xc0", b"", b"frame"),
+        message(b"\xc1"),
+        message(b"\x91"),
+        message(b"\xa5abc"),
+        message(b"\xa1\xff"),
+        message(b"\xd9\x02\xed\xa0"),
+        message(b"\xdd\xff\xff\xff\xff"),
+        message(b"\xdf\xff\xff\xff\xff"),
+        message(b"\xc6\xff\xff\xff\xff"),
+        message(b"\xc9\xff\xff\xff\xff\x01"),
+        message(b"\x82\xa1a\x01\xa1a\x02"),
+        message(b"\x82\x01\x01\xc3\x02"),
+        message(b"\x82\x01\x01\xcb" + struct.pack(">d", 1.0) + b"\x02"),
+        message(b"\x81\x90\x01"),
+        message(b"\x81\x80\x01"),
+        message(b"\xd6\xff\0\0\0\0"),
+        message(b"\xd7\xff" + bytes(8)),
+        message(b"\xc7\x0c\xff" + bytes(12)),
+        message(b"\xc7\x04\xff" + bytes(4)),
+        message(b"\xc8\x00\x04\xff" + bytes(4)),
+        message(b"\xc9\x00\x00\x00\x04\xff" + bytes(4)),
+        message(b"\xd4\x00\x00"),
+        message(b"\xd4\x7f\x00"),
+        message(b"\xd4\x80\x00"),
+        message(b"\x92" + msgpack.packb([[]] * 40) + b"\xd6\xff" + bytes(4)),
+        packed(ext(6, b"x")),
+        packed(ext(15)),
+        packed(ext(26)),
+        packed(ext(16)),
+        packed([1, ext(16)]),
+        packed([ext(16), ext(16)]),
+        packed([ext(17), ext(17)]),
+        packed({"a": ext(16)}),
+        packed([[ext(18)], ext(18)]),
+        packed([ext(16, b"x"), 1]),
+        packed([ext(17), 1, 1]),
+        packed([ext(18), 1, True]),
+        packed([ext(17), [1]]),
+        packed([ext(17), {}]),
+        packed([ext(19), 1, 2]),
+        packed([ext(19), 1, 2, 0]),
+        packed([ext(19), 1, 2, "3"]),
+        packed([ext(19), 1, 2, True]),
+        packed([ext(20), 1]),
+        packed([ext(21, b"x"), 1]),
+        packed([ext(21, struct.pack("<Q", 2)), 1]),
+        packed([ext(21, struct.pack("<QQ", 0, 2**63))]),
+        packed([ext(21, struct.pack("<QQ", 2**63, 2)), 1]),
+        packed([ext(22), 1]),
+        packed([ext(22)]),
+        packed([ext(23, b"float32")]),
+        packed([ext(23, b"float32"), 1.0]),
+        packed([ext(23, b"qint8"), ext(1, bytes(2))]),
+        packed([ext(23, b"float32"), ext(1, b"\x0b\x01" + bytes(8))]),
+        packed([ext(24), "a", "b"]),
+        packed([ext(24), "a", 1, 2]),
+        packed([ext(25), "a"]),
+        packed([ext(25), "a", b"b"]),
+        packed([ext(25), "a", ext(25)]),
+        packed(ext(1)),
+        packed(ext(1, b"\x0a\x01" + struct.pack("<Q", 3))),
+        packed(ext(2, b"\x0a")),
+        packed(ext(3, bytes(1025))),
+        packed(ext(4, bytes(15))),
+        packed(ext(5, pickle.dumps(1))),
+    ],
+    ids=lambda frames: b"|".join(frames)[:24].hex() or "none",
+)
+def test_malformed_messages_are_refused(frames: list[Buffer]) -> None:
+    """Whatever is wrong with a message, the error says that the peer is."""
+    with pytest.raises(RemoteProtocolError):
+        decode(frames)
+
+
+@pytest.mark.parametrize(
+    ("value", "limit"),
+    [
+        (np.zeros(5000, np.uint8), "header_bytes"),
+        ([np.zeros(100_001, np.uint8)], "frame_bytes"),
+        ([np.zeros(80_000, np.uint8)] * 2, "message_bytes"),
+        ([np.zeros(20_000, np.uint8)] * 4, "frames"),
+        (deep(6), "depth"),
+        (list(range(100)), "items"),
+        ({f"{i}": i for i in range(50)}, "items"),
+        ("x" * 51, "text_bytes"),
+        (2**130, "int_bytes"),
+    ],
+)
+def test_every_limit_holds(value: object, limit: str) -> None:
+    """Messages over a limit are refused by its name, on both sides."""
+    with pytest.raises(MessageTooLargeError, match=limit):
+        decode(encode(value), limits=SMALL)
+    with pytest.raises(LocalProtocolError):
+        encode(value, limits=SMALL)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        np.zeros(4000, np.uint8),
+        [np.zeros(100_000, np.uint8)],
+        [np.zeros(20_000, np.uint8)] * 3,
+        deep(5),
+        list(range(99)),
+        {f"{i}": i for i in range(49)},
+        "x" * 50,
+        2**126,
+    ],
+)
+def test_values_at_a_limit_pass(value: object) -> None:
+    """The limits are the largest values that pass."""
+    assert_same(value, decode(encode(value, limits=SMALL), limits=SMALL))
+
+
+def test_many_keys_that_are_no_text_are_refused() -> None:
+    """Python randomises the hash of text only; other keys are limited in number."""
+    limits = WireLimits(hashed_keys=100)
+    assert len(decode(encode(dict.fromkeys(map(str, range(101)))), limits=limits)) == 101
+    with pytest.raises(MessageTooLargeError, match="hashed_keys"):
+        decode(encode(dict.fromkeys(range(101), 0)), limits=limits)
+    with pytest.raises(MessageTooLargeError, match="hashed_keys"):
+        decode(encode([set(range(70)), frozenset(range(70))]), limits=limits)
+
+
+def test_colliding_keys_are_refused() -> None:
+    """Keys with one and the same hash make a dict quadratic: a few may be chance, many are not."""
+    prime = 2**61 - 1
+    colliding = {prime * i: 0 for i in range(100)}
+    assert len({hash(key) for key in colliding}) == 1
+    with pytest.raises(RemoteProtocolError, match="collide"):
+        decode(encode(colliding))
+
+
+def test_hostile_description_is_cleaned_by_the_receiver() -> None:
+    """The receiver does not rely on the sender for bounds and escapes."""
+    remote = decode(packed([ext(25), "a\x1b]0;x\x07" * 1000, "\r\x9b31m" * 10_000]))
+    assert isinstance(remote, RemoteObject)
+    assert remote.type_name.isprintable()
+    assert remote.text.isprintable()
+    assert len(repr(remote)) < 3000
