@@ -59,7 +59,9 @@ class TestWhereTheCodeRuns:
         try:
             make_env_of(sample("marker"))
         finally:
-            for name in [n for n in sys.modules if n.startswith("reference_samples_marker")] + ["worker"]:
+            for name in [n for n in sys.modules if n.startswith("reference_samples_marker")] + [
+                "worker"
+            ]:
                 sys.modules.pop(name, None)
         assert marker.read_text().split() == [str(os.getpid())]
 
@@ -166,14 +168,18 @@ class TestLayouts:
             assert suites.env.get_attr("task") == ("stay_up",)
 
     def test_config_object(self) -> None:
-        """A config's attributes cross as plain attributes, also those that are no fields."""
+        """A config's attributes cross, also those that are no fields; dicts stay dicts."""
         cfg = SimpleNamespace(
             hub_path=str(sample("cfg_reader")), task="CartPole-v1", episode_length=3
         )
         cfg.camera = {"width": 64}
+        cfg.robot = SimpleNamespace(name="arm")
         with make_env(cfg, n_envs=2) as suites:
             env = suites.env
-            assert env.get_attr("told")[0] == ["camera", "episode_length", "hub_path", "task"]
+            names = ["camera", "episode_length", "hub_path", "robot", "task"]
+            assert env.get_attr("told") == (names, names)
+            assert env.get_attr("camera_width") == (64, 64)
+            assert env.get_attr("robot") == ("arm", "arm")
             *_, truncations, _ = roll(env, steps=3)
             assert truncations.all()
 
@@ -361,10 +367,10 @@ class TestWhatGoesWrong:
     @pytest.mark.parametrize(
         ("ending", "code", "signal"), [("exit", 7, None), ("kill", None, "SIGKILL")]
     )
-    def test_death_in_a_step_is_told_and_reset_brings_the_env_back(
+    def test_death_in_a_step_is_told(
         self, ending: str, code: int | None, signal: str | None, use_async_envs: bool
     ) -> None:
-        """The step raises how the process ended; ``reset`` starts a new one."""
+        """The step raises how the process ended, and so does everything after it."""
         made = make_env(
             sample("exits"),
             n_envs=2,
@@ -378,6 +384,26 @@ class TestWhatGoesWrong:
             with pytest.raises(WorkerDiedError) as caught:
                 env.step([0, 1])
             assert (caught.value.exit_code, caught.value.signal) == (code, signal)
+            for operation in (lambda: env.step([0, 0]), env.reset, env.render):
+                with pytest.raises(WorkerDiedError, match="died"):
+                    operation()
+
+    @pytest.mark.parametrize("use_async_envs", [False, True])
+    def test_reset_brings_the_env_back_if_the_policy_says_so(self, use_async_envs: bool) -> None:
+        """With ``restart="on_reset"`` a reset after a death starts a fresh process."""
+        made = make_env(
+            sample("exits"),
+            n_envs=2,
+            use_async_envs=use_async_envs,
+            policy={"restart": "on_reset"},
+        )
+        with made as suites:
+            env = suites.env
+            for _ in range(2):
+                env.reset(seed=0)
+                env.step([0, 0])
+                with pytest.raises(WorkerDiedError):
+                    env.step([1, 0])
             observations, _ = env.reset(seed=0)
             assert observations.tolist() == [[0.0], [0.0]]
             assert env.step([0, 0])[0].tolist() == [[1.0], [1.0]]

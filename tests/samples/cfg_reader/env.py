@@ -8,7 +8,8 @@ class Configured(gym.Wrapper):
 
     def __init__(self, cfg) -> None:
         super().__init__(gym.make(cfg.task, max_episode_steps=cfg.episode_length))
-        self.camera_width = cfg.camera["width"] if cfg.camera is not None else 0
+        self.camera_width = cfg.camera["width"]  # a dict
+        self.robot = cfg.robot.name  # an object
         self.told = sorted(vars(cfg))
 
 
