@@ -42,8 +42,9 @@ class RemoteEnum(RemoteObject):
 
 def one_line(text: str, max_chars: int = MAX_REPR_CHARS) -> str:
     """Returns text that a terminal or a log prints on one line and never obeys, bounded."""
-    kept = printable(text[:max_chars], max_chars).replace("\n", "\\n").replace("\t", "\\t")
-    return kept if len(text) <= max_chars else kept + "..."
+    line = printable(text[:max_chars], max_chars).replace("\n", "\\n").replace("\t", "\\t")
+    # Escapes are longer than what they stand for.
+    return line if len(text) <= max_chars >= len(line) else line[:max_chars] + "..."
 
 
 def describe(value: object) -> RemoteObject:

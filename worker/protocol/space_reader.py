@@ -135,6 +135,9 @@ def _read_box(
     dtype, size = _dtype(name, BOX_DTYPES), reader.shape(shape)
     bounds = [_expand(bound, size, dtype) for bound in (low, high)]
     masks = [_expand(mask, size, np.dtype(bool)) for mask in (below, above)]
+    # Says no to nan as well, which some versions of Gymnasium let pass.
+    if not (bounds[0] <= bounds[1]).all():
+        raise RemoteProtocolError("A Box's low is not below its high.")
     box = spaces.Box(low=bounds[0], high=bounds[1], shape=size, dtype=dtype.type)
     # Integer bounds cannot say "infinite"; these two do, and decide how samples are drawn.
     box.bounded_below, box.bounded_above = masks[0].copy(), masks[1].copy()
