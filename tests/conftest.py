@@ -1,10 +1,23 @@
-"""Every test run has a cache of its own."""
+"""What holds for every test: a cache of its own, and in CI no silent skip."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+pytest_plugins = ["tests.hub.fixtures"]
+
+# Reasons for which a test may be skipped in CI, each with the variable that permits it there.
+_PERMITTED = {"'torch'": "ENVHUB_CI_WITHOUT_TORCH", "needs torch": "ENVHUB_CI_WITHOUT_TORCH"}
+
+# A loaded machine is slow at random; what may be slow is bounded by pytest-timeout instead.
+settings.register_profile("local", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("ci", settings.get_profile("local"), derandomize=True)
+settings.load_profile("ci" if "ENVHUB_CI" in os.environ else "local")
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -13,3 +26,34 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ENVHUB_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Iterator[None]:
+    """In CI a skipped test is a failed one."""
+    report = yield
+    return _no_skips(report)  # type: ignore[return-value]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report() -> Iterator[None]:
+    """In CI a skipped module is a failed one."""
+    report = yield
+    return _no_skips(report)  # type: ignore[return-value]
+
+
+def _no_skips(report: pytest.TestReport | pytest.CollectReport) -> object:
+    skipped = report.outcome == "skipped" and not hasattr(report, "wasxfail")
+    if not skipped or "ENVHUB_CI" not in os.environ:
+        return report
+    reason = str(report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr)
+    if not any(text in reason and name in os.environ for text, name in _PERMITTED.items()):
+        report.outcome = "failed"
+        report.longrepr = f"{report.nodeid} must not be skipped in CI: {reason}"
+    return report
+
+
+@pytest.fixture(scope="session")
+def checkout() -> Path:
+    """The folder that holds README.md, docs/ and tests/."""
+    return Path(__file__).resolve().parent.parent

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,8 @@ from tests.hub.stub_hub import StubHub
 def olah(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OlahServer]:
     """A Hub with real git repositories; give each test's repository a name of its own."""
     python = os.environ.get("ENVHUB_TEST_OLAH_PYTHON", sys.executable)
+    if subprocess.run([python, "-c", "import olah"], capture_output=True, check=False).returncode:
+        pytest.skip(f"olah is missing from {python}: pip install olah")
     server = OlahServer(tmp_path_factory.mktemp("olah"), python)
     yield server
     server.stop()

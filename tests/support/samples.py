@@ -7,6 +7,7 @@ in-process user of Gymnasium would have, and so the oracle for the sandbox.
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import sys
 import types
 from collections.abc import Callable
@@ -14,13 +15,17 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import pytest
 
 SAMPLES = Path(__file__).resolve().parent.parent / "samples"
 EXAMPLES = SAMPLES.parent.parent / "examples"
 
+# what a requirement of a sample is called when it is imported, where that is another name
+_MODULES = {"gymnasium[box2d]": "Box2D", "gymnasium[mujoco]": "mujoco"}
+
 
 def sample(name: str) -> Path:
-    """The folder of a sample repository.
+    """The folder of a sample repository; the test is skipped if what it requires is missing.
 
     Raises:
         FileNotFoundError: There is none of that name.
@@ -28,6 +33,11 @@ def sample(name: str) -> Path:
     folder = SAMPLES / name
     if not folder.is_dir():
         raise FileNotFoundError(f"no sample repository named {name!r}")
+    requirements = folder / "requirements.txt"
+    for required in requirements.read_text().split() if requirements.exists() else ():
+        module = _MODULES.get(required, required.replace("-", "_"))
+        if importlib.util.find_spec(module) is None:
+            pytest.skip(f"sample {name} needs {required}: pip install '{required}'")
     return folder
 
 
