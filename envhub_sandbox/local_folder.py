@@ -43,14 +43,14 @@ def split_local(text: str, path: str) -> tuple[Path, str]:
     """
     folder = Path(os.path.abspath(os.path.expanduser(text)))
     if folder.is_dir():
-        return folder, path
+        return folder, os.path.normpath(path)
     if folder.is_file():
         return folder.parent, folder.name
     before, colon, after = text.rpartition(":")
     if colon and before and after:
         inner = Path(os.path.abspath(os.path.expanduser(before)))
         if inner.is_dir():
-            return inner, after
+            return inner, os.path.normpath(after)
     raise RepositoryUnavailableError(
         f"local folder {text!r}: there is no such folder or file here (looked for {folder}). "
         "Write './folder', './folder:path/env.py' or './folder/env.py'; a repository of the Hub "
@@ -92,7 +92,7 @@ def _inside(root: Path, item: os.DirEntry[str], name: str) -> Path:
         source = Path(os.path.realpath(item.path, strict=True))
     except OSError as error:
         raise SnapshotError(
-            f"local folder {root}: the link {name!r} is broken; remove it"
+            f"local folder {root}: the link {name!r} leads nowhere; remove it"
         ) from error
     if root != source and root not in source.parents:
         raise SnapshotError(

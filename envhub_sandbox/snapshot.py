@@ -8,7 +8,6 @@ read-only in a store of our own. A full commit that is in the store costs no req
 
 from __future__ import annotations
 
-import posixpath
 from dataclasses import replace
 from pathlib import Path
 
@@ -137,7 +136,7 @@ def local(
         SnapshotTooLargeError: Over the limits.
         SnapshotError: A link leaves the folder, or a file cannot be read.
     """
-    root, path = split_local(str(folder), posixpath.normpath(path))
+    root, path = split_local(str(folder), path)
     title = f"local folder {root}"
     try:
         found = within_limits(scan(root), limits, title)

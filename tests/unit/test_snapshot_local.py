@@ -1,0 +1,187 @@
+"""Local folders become snapshots, so that authors can try before they push."""
+
+from __future__ import annotations
+
+import os
+import socket
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox.errors import (
+    RepositoryUnavailableError,
+    SnapshotError,
+    SnapshotIntegrityError,
+    SnapshotTooLargeError,
+)
+from envhub_sandbox.snapshot import Snapshot, SnapshotLimits, local
+
+
+@pytest.fixture
+def folder(tmp_path: Path, snapshot_store: Path) -> Path:
+    """A small environment."""
+    folder = tmp_path / "my-env"
+    (folder / "sub").mkdir(parents=True)
+    (folder / "env.py").write_text("1")
+    (folder / "sub" / "other.py").write_text("2")
+    return folder
+
+
+def names(snapshot: Snapshot) -> list[str]:
+    """The files of a snapshot, as they lie on disk."""
+    found = [p for p in snapshot.root.rglob("*") if not p.is_dir()]
+    return sorted(str(path.relative_to(snapshot.root)) for path in found)
+
+
+def test_folder_becomes_a_read_only_copy(folder: Path) -> None:
+    """The snapshot has the folder's files, and later edits of the folder do not reach it."""
+    snapshot = local(folder)
+    assert (snapshot.repo_id, snapshot.repo_type) == (str(folder), "local")
+    assert snapshot.path == "env.py"
+    assert names(snapshot) == ["env.py", "sub/other.py"] == [f.path for f in snapshot.files]
+    (folder / "env.py").write_text("edited")
+    assert (snapshot.root / "env.py").read_text() == "1"
+    assert folder not in snapshot.root.parents
+
+
+def test_unchanged_content_is_the_same_snapshot(folder: Path) -> None:
+    """The commit is the content's: equal for a copy elsewhere, other after an edit."""
+    first = local(folder)
+    os.utime(folder / "env.py", (0, 0))
+    assert local(folder) == first
+    twin = folder.parent / "twin"
+    twin.mkdir()
+    (twin / "env.py").write_text("1")
+    (twin / "sub").mkdir()
+    (twin / "sub" / "other.py").write_text("2")
+    assert local(twin).root == first.root
+    (folder / "env.py").write_text("3")
+    second = local(folder)
+    assert second.commit != first.commit
+    assert second.commit.startswith("local-")
+    (folder / "env.py").rename(folder / "renamed.py")
+    assert local(folder, "renamed.py").commit not in (first.commit, second.commit)
+
+
+@pytest.mark.parametrize(
+    ("text", "path"),
+    [
+        ("{}", "env.py"),
+        ("{}/", "env.py"),
+        ("{}:sub/other.py", "sub/other.py"),
+        ("{}:./sub/other.py", "sub/other.py"),
+        ("{}/env.py", "env.py"),
+        ("./my-env", "env.py"),
+        ("./my-env:sub/other.py", "sub/other.py"),
+        ("my-env/env.py", "env.py"),
+        ("~/my-env", "env.py"),
+    ],
+)
+def test_forms_of_a_local_reference(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, text: str, path: str
+) -> None:
+    """A folder, a folder with a path, and a file all name an entry."""
+    monkeypatch.chdir(folder.parent)
+    monkeypatch.setenv("HOME", str(folder.parent))
+    snapshot = local(text.format(folder))
+    assert snapshot.path == path
+    assert snapshot.repo_id == str(folder)
+
+
+def test_file_in_a_sub_folder_takes_its_own_folder(folder: Path) -> None:
+    """A path to a file means the folder around it, nothing further up."""
+    snapshot = local(folder / "sub" / "other.py")
+    assert (snapshot.path, names(snapshot)) == ("other.py", ["other.py"])
+
+
+def test_missing_folder_says_what_to_write(folder: Path) -> None:
+    """A typo is answered with the forms that exist."""
+    with pytest.raises(RepositoryUnavailableError, match=r"no such folder.*'\./folder'"):
+        local(folder.parent / "my-enf")
+
+
+@pytest.mark.parametrize("path", ["envs.py", "../my-env/env.py", "/etc/passwd", "sub"])
+def test_missing_entry_lists_the_python_files(folder: Path, path: str) -> None:
+    """A path that is not a file of the folder gets the list of those that are."""
+    with pytest.raises(RepositoryUnavailableError, match=r"it has 'env\.py', 'sub/other\.py'"):
+        local(folder, path)
+
+
+def test_what_git_and_the_hub_would_leave_out_is_left_out(folder: Path) -> None:
+    """History, caches, virtual environments, sockets and pipes stay at home."""
+    for name in (".git/config", "__pycache__/env.pyc", ".venv/x", "sub/.pytest_cache/x", "a.pyc"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text("")
+    (folder / "myvenv").mkdir()
+    (folder / "myvenv" / "pyvenv.cfg").write_text("")
+    os.mkfifo(folder / "pipe")
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(os.path.relpath(folder / "socket"))
+        assert names(local(folder)) == ["env.py", "sub/other.py"]
+
+
+def test_link_inside_becomes_a_real_file(folder: Path) -> None:
+    """Links that stay inside arrive as what they point to, so that the tree needs no links."""
+    (folder / "link.py").symlink_to("sub/other.py")
+    (folder / "linked").symlink_to("sub")
+    snapshot = local(folder)
+    assert names(snapshot) == ["env.py", "link.py", "linked/other.py", "sub/other.py"]
+    assert not any(path.is_symlink() for path in snapshot.root.rglob("*"))
+    assert (snapshot.root / "link.py").read_text() == "2"
+
+
+@pytest.mark.parametrize("target", ["/etc/passwd", "../secret", "/etc", ".."])
+def test_link_that_leaves_the_folder_is_refused(folder: Path, target: str) -> None:
+    """Nothing outside the folder is copied in through a link."""
+    (folder.parent / "secret").write_text("s")
+    (folder / "link").symlink_to(target)
+    with pytest.raises(SnapshotError, match="'link' leaves the folder"):
+        local(folder)
+
+
+def test_link_that_leads_nowhere_is_named(folder: Path) -> None:
+    """A broken link is an error that names it."""
+    (folder / "link").symlink_to("gone")
+    with pytest.raises(SnapshotError, match="'link' leads nowhere"):
+        local(folder)
+
+
+@pytest.mark.parametrize("target", [".", "../sub", ".."])
+def test_link_loop_ends(folder: Path, target: str) -> None:
+    """A link to a folder above itself is refused instead of being followed for ever."""
+    (folder / "sub" / "loop").symlink_to(target)
+    with pytest.raises(SnapshotError, match="loop"):
+        local(folder)
+
+
+def test_folder_reached_through_a_link_works(folder: Path) -> None:
+    """The folder itself may be a link, as a checkout often is."""
+    (folder.parent / "alias").symlink_to(folder)
+    assert local(folder.parent / "alias").root == local(folder).root
+
+
+@pytest.mark.parametrize("name", ["max_files", "max_bytes", "max_file_bytes"])
+def test_folder_over_a_limit_is_refused(folder: Path, name: str) -> None:
+    """A home folder that was given by mistake is not copied."""
+    (folder / "env.py").write_text("22")
+    with pytest.raises(SnapshotTooLargeError, match=name):
+        local(folder, limits=SnapshotLimits(**{name: 1}))
+
+
+def test_edited_copy_is_refused(folder: Path) -> None:
+    """The copy in the store is verified at every use, as those from the Hub are."""
+    entry = local(folder).root / "env.py"
+    entry.chmod(0o644)
+    entry.write_text("x")
+    with pytest.raises(SnapshotIntegrityError, match="was changed"):
+        local(folder)
+
+
+def test_forgotten_copies_are_removed_with_the_next_new_one(folder: Path) -> None:
+    """Each edit makes a copy: those that nobody used for weeks do not pile up."""
+    old = local(folder)
+    os.utime(old.root.parent / "record.json", (0, 0))
+    (folder / "env.py").write_text("2")
+    new = local(folder)
+    assert not old.root.exists()
+    assert new.root.exists()

@@ -1,0 +1,123 @@
+"""Limits and names: what a listing may ask of this machine's disk."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
+from envhub_sandbox.snapshot_records import (
+    FileRecord,
+    SnapshotLimits,
+    check_names,
+    within_limits,
+)
+
+DIGEST = "sha256:" + "0" * 64
+
+
+def record(path: str, size: int = 1) -> FileRecord:
+    """A file of a listing."""
+    return FileRecord(path, size, DIGEST)
+
+
+@pytest.mark.parametrize("value", [0, -1, True, 1.5, "9", None])
+def test_limit_must_be_a_positive_int(value: object) -> None:
+    """A limit that could not be enforced cannot be made."""
+    with pytest.raises(PolicyError, match="max_files"):
+        SnapshotLimits(max_files=value)  # type: ignore[arg-type]
+
+
+def test_unknown_limit_is_refused() -> None:
+    """A misspelt limit is an error, not a limit that is silently absent."""
+    with pytest.raises(TypeError, match="max_size"):
+        SnapshotLimits(max_size=1)  # type: ignore[call-arg]
+
+
+def test_listing_exactly_at_the_limits_passes_sorted() -> None:
+    """Limits are inclusive, and the files come sorted by path."""
+    limits = SnapshotLimits(max_bytes=5, max_files=2, max_file_bytes=3)
+    files = [record("b", 3), record("a", 2)]
+    assert [file.path for file in within_limits(files, limits, "t")] == ["a", "b"]
+
+
+def test_limit_stops_reading_the_listing() -> None:
+    """An endless listing is read no further than the limit needs."""
+    read: list[int] = []
+
+    def endless() -> object:
+        while True:
+            read.append(1)
+            yield record(str(len(read)))
+
+    with pytest.raises(SnapshotTooLargeError, match=r"SnapshotLimits\(max_files=\.\.\.\)"):
+        within_limits(endless(), SnapshotLimits(max_files=3), "t")  # type: ignore[arg-type]
+    assert len(read) == 4
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "",
+        "/a",
+        "..",
+        "../a",
+        "a/../b",
+        "a/./b",
+        "a//b",
+        "a/",
+        "a\\b",
+        "a\x00b",
+        "a\nb",
+        "a\x1b[2J",
+        "a\u202eb",
+        "x" * 256,
+        "/".join("x" * 5 for _ in range(200)),
+        "/".join("x" for _ in range(65)),
+    ],
+)
+def test_hostile_name_is_refused(path: str) -> None:
+    """A name that could climb, hide, or break a file system names itself in the error."""
+    with pytest.raises(SnapshotError, match="refused"):
+        check_names([record("env.py"), record(path)], "t")
+
+
+@pytest.mark.parametrize("paths", [["a", "a"], ["a", "a/b"], ["a/b/c", "a/b"]])
+def test_names_that_clash_are_refused(paths: list[str]) -> None:
+    """Two files of one name, or a file that is also a folder, cannot both be laid out."""
+    with pytest.raises(SnapshotError, match=r"listed twice|both a file and a folder"):
+        check_names(map(record, paths), "t")
+
+
+def test_ordinary_names_pass() -> None:
+    """Dots, spaces, other scripts and names that differ by case only are fine."""
+    check_names(map(record, [".gitattributes", "A.py", "a.py", "my env/ж.txt", "..a"]), "t")
+
+
+@given(st.lists(st.text(min_size=1, max_size=12), max_size=4))
+def test_accepted_names_stay_below_the_root(names: list[str]) -> None:
+    """Whatever passes, joined to a root, lies below that root."""
+    root = Path("/store/tree")
+    try:
+        check_names(map(record, names), "t")
+    except SnapshotError:
+        return
+    for name in names:
+        assert root in (root / name).parents
+        assert ".." not in (root / name).parts
+
+
+def test_snapshot_module_imports_nothing_heavy() -> None:
+    """A pinned, stored snapshot needs neither the Hub client nor an HTTP library."""
+    code = (
+        "import sys, envhub_sandbox.snapshot;"
+        "print([m for m in ('huggingface_hub', 'requests', 'httpx', 'httpx2', 'numpy',"
+        " 'platformdirs') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
