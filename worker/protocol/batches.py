@@ -16,6 +16,8 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.spaces.graph import GraphInstance
 
+from envhub_worker.protocol.errors import RemoteProtocolError
+
 Bounds = Sequence[tuple[int, int]]
 _ARRAYS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
@@ -91,30 +93,47 @@ def _conforms_tuple(space: spaces.Tuple[Any], batch: Any, count: int) -> bool:
     return all(conforms(sub, item, count) for sub, item in zip(space.spaces, batch, strict=True))
 
 
+_MISFITS = (AttributeError, KeyError, OverflowError, TypeError, ValueError)
+
+
 def join_infos(parts: Sequence[dict[Any, Any]], sizes: Sequence[int]) -> dict[Any, Any]:
-    """The infos of all shards as ``VectorEnv._add_info`` would have built them in one go."""
-    present = [index for index, part in enumerate(parts) if part]
-    if not present:
-        return {}
+    """The infos of all shards as ``VectorEnv._add_info`` would have built them in one go.
+
+    Raises:
+        RemoteProtocolError: They are not what a vector environment's infos look like, or cannot
+            be one: one shard has numbers where another has text.
+    """
     joined: dict[Any, Any] = {}
     starts = np.cumsum([0, *sizes]).tolist()
-    for index in present:
-        window = slice(starts[index], starts[index] + sizes[index])
-        for key, value in parts[index].items():
-            _join_value(joined, key, value, window, starts[-1])
+    for part, start, size in zip(parts, starts, sizes, strict=False):
+        try:
+            _join_part(joined, part, slice(start, start + size), starts[-1])
+        except _MISFITS as error:
+            raise RemoteProtocolError(f"the shards' infos do not fit together: {error}") from error
     return joined
 
 
-def _join_value(joined: dict[Any, Any], key: Any, value: Any, window: slice, count: int) -> None:
-    if isinstance(value, dict):
-        nested = joined.setdefault(key, {})
-        for inner, item in value.items():
-            _join_value(nested, inner, item, window, count)
-        return
-    if key not in joined:
-        fill = None if value.dtype == object else 0
-        joined[key] = np.full((count, *value.shape[1:]), fill, dtype=value.dtype)
-    joined[key][window] = value
+def _join_part(joined: dict[Any, Any], part: dict[Any, Any], window: slice, count: int) -> None:
+    for key, value in part.items():
+        if isinstance(value, dict):
+            _join_part(joined.setdefault(key, {}), value, window, count)
+            continue
+        array = joined.setdefault(key, _blank(value, count))
+        if (array.dtype, array.shape[1:]) == (value.dtype, value.shape[1:]):
+            array[window] = value
+        else:  # the first sub-environment that has the key decides, as in Gymnasium
+            _place(array, value, part[f"_{key}"], window.start)
+
+
+def _blank(value: Any, count: int) -> Any:
+    if value.dtype == object and value.ndim == 1:
+        return np.full(count, None, dtype=object)
+    return np.zeros((count, *value.shape[1:]), dtype=value.dtype)
+
+
+def _place(array: Any, value: Any, mask: Any, start: int) -> None:
+    for index in np.flatnonzero(mask).tolist():
+        array[start + index] = value[index]
 
 
 def restores(space: gym.Space[Any]) -> bool:
