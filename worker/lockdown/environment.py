@@ -11,7 +11,9 @@ _INHERITED = ("LANG", "LC_ALL", "LC_CTYPE", "TZ")
 # A jail has no display, sound card or terminal; without these, libraries look for them.
 _HEADLESS = {
     "MPLBACKEND": "Agg",
+    "MUJOCO_GL": "egl",
     "PYGAME_HIDE_SUPPORT_PROMPT": "1",
+    "PYOPENGL_PLATFORM": "egl",
     "SDL_AUDIODRIVER": "dummy",
     "SDL_VIDEODRIVER": "dummy",
 }
@@ -45,6 +47,8 @@ def jail_environment(
         **_HEADLESS,
         "HOME": home,
         "LOGNAME": "sandbox",
+        # the snapshot is read-only, also for the repository's own child processes
+        "PYTHONDONTWRITEBYTECODE": "1",
         "TMPDIR": temporary,
         "USER": "sandbox",
         "XDG_CACHE_HOME": f"{home}/.cache",
