@@ -1,0 +1,78 @@
+# Functions of the steps; sourced.
+
+heading() {
+  printf '\n======== %s ========\n' "$*"
+}
+
+# The files that git knows, as they are in the working tree.
+copy_checkout() {
+  mkdir -p "$1"
+  git -c safe.directory='*' ls-files -z | xargs -0 cp --parents -t "$1"
+}
+
+# find_python 3.12: its path. A pyenv shim refuses to run a version that is not selected.
+find_python() {
+  local candidate
+  for candidate in "python$1" "${PYENV_ROOT:-$HOME/.pyenv}"/versions/"$1".*/bin/python \
+    "/opt/pyenv/versions/$1".*/bin/python; do
+    if "$candidate" -c 'import venv' 2>/dev/null; then
+      command -v "$candidate"
+      return
+    fi
+  done
+  echo "no Python $1 on PATH or in pyenv" >&2
+  return 1
+}
+
+# with_summary NAME COMMAND...: runs it, and keeps pytest's closing line for the end of the run.
+with_summary() {
+  local name=$1 log=$CI_WORK/$1.log
+  shift
+  "$@" 2>&1 | tee "$log"
+  grep -E '^=*.*[0-9]+ passed' "$log" | tail -1 | tr -d '=' >"$CI_WORK/$name.summary"
+}
+
+# make_venv PYTHON FOLDER: a virtual environment with uv in it.
+make_venv() {
+  "$1" -m venv "$2"
+  "$2/bin/python" -m pip install --quiet --disable-pip-version-check uv
+}
+
+# wheel: the wheel that the step "tests" built, or one built now.
+wheel() {
+  local found
+  found=$(ls "$CI_WORK"/tests/dist/*.whl "$CI_WORK"/dist/*.whl 2>/dev/null | head -1) || true
+  if [ -z "$found" ]; then
+    make_venv "$(find_python 3.11 || command -v python3)" "$CI_WORK/build" >&2
+    "$CI_WORK/build/bin/uv" pip install --quiet --python "$CI_WORK/build/bin/python" build >&2
+    "$CI_WORK/build/bin/python" -m build --wheel --outdir "$CI_WORK/dist" . >&2
+    found=$(ls "$CI_WORK"/dist/*.whl)
+  fi
+  echo "$found"
+}
+
+# smoke NAME PYTHON [OPTION...]: the wheel in an environment of its own, with a reduced set of
+# tests: the unit tests, and real environments that need nothing beyond gymnasium.
+smoke() {
+  local name=$1 python=$2 built
+  shift 2
+  built=$(wheel)
+  make_venv "$python" "$CI_WORK/$name"
+  local install=("$CI_WORK/$name/bin/uv" pip install --quiet --python "$CI_WORK/$name/bin/python")
+  "${install[@]}" "$@" "$built"
+  "${install[@]}" --group test
+  "$CI_WORK/$name/bin/uv" pip list --python "$CI_WORK/$name/bin/python" --format freeze |
+    grep -E '^(gymnasium|numpy|huggingface-hub|msgpack|pyzmq|cloudpickle|typer|click)=='
+  copy_tests "$CI_WORK/$name/checkout"
+  (
+    cd "$CI_WORK/$name/checkout"
+    with_summary "$name" "$CI_WORK/$name/bin/python" -m pytest -n 2 --dist worksteal \
+      tests/unit tests/integration/test_examples.py
+  )
+}
+
+# copy_tests FOLDER: what the tests need of the checkout, without the packages.
+copy_tests() {
+  mkdir -p "$1"
+  cp -R .ci docs examples tests ./*.md LICENSE pyproject.toml test "$1/"
+}

@@ -1,0 +1,16 @@
+# Style, and types of both packages; the folder of links gives each its import name.
+set -euo pipefail
+. "$(dirname "${BASH_SOURCE[0]}")/../lib.sh"
+make_venv "$(find_python 3.11 || command -v python3)" "$CI_WORK/lint"
+bin=$CI_WORK/lint/bin
+"$bin/uv" pip install --quiet --python "$bin/python" . --group lint
+"$bin/uv" pip uninstall --quiet --python "$bin/python" envhub-sandbox
+
+"$bin/ruff" check .
+"$bin/ruff" format --check .
+
+mkdir "$CI_WORK/types"
+ln -s "$PWD/envhub_sandbox" "$CI_WORK/types/envhub_sandbox"
+ln -s "$PWD/worker" "$CI_WORK/types/envhub_worker"
+MYPYPATH=$CI_WORK/types "$bin/mypy" --strict --config-file pyproject.toml \
+  --cache-dir "$CI_WORK/mypy" -p envhub_sandbox -p envhub_worker
