@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from envhub_sandbox.errors import RepositoryUnavailableError, SnapshotError
 from envhub_sandbox.hashing import SHA256, Mismatch, copy_verified, digest_of
-from envhub_sandbox.snapshot_records import FileRecord
+from envhub_sandbox.snapshot_records import MAX_DEPTH, FileRecord
 
 LEFT_OUT = frozenset(
     {
@@ -69,6 +69,8 @@ def scan(folder: Path) -> Iterator[LocalFile]:
 
 
 def _scan(root: Path, folder: Path, prefix: str, above: tuple[Path, ...]) -> Iterator[LocalFile]:
+    if len(above) > MAX_DEPTH:
+        raise SnapshotError(f"local folder {root}: {prefix!r} is over {MAX_DEPTH} folders deep")
     with os.scandir(folder) as listing:
         items = sorted(listing, key=lambda item: item.name)
     for item in items:

@@ -75,6 +75,7 @@ ANSWERS = [
     ("/tree/", 403, {"X-Error-Code": "GatedRepo"}, ["gated"]),
     ("/resolve/", 403, {"X-Error-Code": "GatedRepo"}, ["gated", "Accept its terms"]),
     ("/resolve/", 404, {"X-Error-Code": "EntryNotFound"}, ["its own listing names"]),
+    ("/resolve/", 403, {"X-Error-Message": "no read scope"}, ['(403); it said: "no read scope"']),
 ]
 
 

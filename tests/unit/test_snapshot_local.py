@@ -154,6 +154,13 @@ def test_link_loop_ends(folder: Path, target: str) -> None:
         local(folder)
 
 
+def test_bottomless_folder_is_refused(folder: Path) -> None:
+    """Depth is bounded before it could exhaust the stack."""
+    folder.joinpath(*["d"] * 80).mkdir(parents=True)
+    with pytest.raises(SnapshotError, match="is over 64 folders deep"):
+        local(folder)
+
+
 def test_folder_reached_through_a_link_works(folder: Path) -> None:
     """The folder itself may be a link, as a checkout often is."""
     (folder.parent / "alias").symlink_to(folder)

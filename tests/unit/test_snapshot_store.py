@@ -306,7 +306,8 @@ def test_copy_is_what_the_record_says_or_an_error(tmp_path: Path, kind: str) -> 
     record = FileRecord("x", len(data), digest_of(source, kind, len(data)))
     copy_verified(source, tmp_path / "good", record)
     assert (tmp_path / "good").read_bytes() == data
-    for number, other in enumerate([data + b"1", data[:-1], b"1" + data[1:]]):
+    flipped = bytes([data[0] ^ 1]) + data[1:]
+    for number, other in enumerate([data + b"1", data[:-1], flipped]):
         source.write_bytes(other)
         with pytest.raises(Mismatch):
             copy_verified(source, tmp_path / str(number), record)
