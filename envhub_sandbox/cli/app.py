@@ -1,0 +1,24 @@
+"""The command line's commands."""
+
+from __future__ import annotations
+
+import typer
+
+from envhub_sandbox.cli import cache, inspect, run, version
+from envhub_sandbox.cli.exits import EXIT_CODES
+
+app = typer.Typer(
+    name="envhub",
+    help="Run anybody's Gymnasium environment from the Hugging Face Hub, without letting its code "
+    "into your process.",
+    epilog=EXIT_CODES,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command("run", epilog=EXIT_CODES, no_args_is_help=True)(run.run)
+app.command("inspect", epilog=EXIT_CODES, no_args_is_help=True)(inspect.inspect)
+app.add_typer(cache.app, name="cache")
+app.command("version")(version.version)

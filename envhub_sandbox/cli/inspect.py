@@ -1,0 +1,130 @@
+"""``envhub inspect``: what a repository holds, without playing it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from envhub_sandbox.cli import options as opt
+from envhub_sandbox.cli.console import console, print_json, safe_line
+from envhub_sandbox.cli.exits import reported
+from envhub_sandbox.cli.progress import Bar
+from envhub_sandbox.cli.report import print_provenance
+from envhub_sandbox.cli.select import select
+
+_SPACES = ("single_observation_space", "single_action_space", "observation_space", "action_space")
+_SPACE_TEXT = 2000
+
+
+def inspect(
+    ref: opt.Ref,
+    json: opt.Json = False,
+    suite: opt.Suite = None,
+    task: opt.Task = None,
+    n_envs: opt.NEnvs = 1,
+    use_async: opt.UseAsync = False,
+    env_kwargs: opt.EnvKwargs = None,
+    python: opt.Python = None,
+    sandbox: opt.SandboxName = "process",
+    trust: opt.Trust = False,
+    profile: opt.Profile = None,
+    network: opt.Network = None,
+    gpu: opt.Gpu = False,
+    readable: opt.Readable = None,
+    variables: opt.Variables = None,
+    memory: opt.Memory = None,
+    disk: opt.Disk = None,
+    processes: opt.Processes = None,
+    cpu_time: opt.CpuTime = None,
+    timeout: opt.Timeout = None,
+    token: opt.Token = None,
+    endpoint: opt.Endpoint = None,
+    hub_cache_dir: opt.HubCacheDir = None,
+    debug: opt.Debug = False,
+) -> None:
+    """Print suites, tasks, spaces, metadata and provenance, without stepping anything.
+
+    The repository's make_env runs (in the sandbox) unless its answer is remembered.
+    """
+    with reported(debug=debug):
+        make = opt.MakeOptions(
+            ref=ref,
+            n_envs=n_envs,
+            use_async=use_async,
+            env_kwargs=env_kwargs,
+            python=python,
+            num_workers=None,
+            sandbox=sandbox,
+            trust=trust,
+            profile=profile,
+            network=network,
+            gpu=gpu,
+            readable=readable,
+            variables=variables,
+            memory=memory,
+            disk=disk,
+            processes=processes,
+            cpu_time=cpu_time,
+            timeout=timeout,
+            token=token,
+            endpoint=endpoint,
+            hub_cache_dir=hub_cache_dir,
+        )
+        _inspect(make, suite, task, as_json=json)
+
+
+def _inspect(
+    make: opt.MakeOptions, suites: list[str] | None, tasks: list[str] | None, *, as_json: bool
+) -> None:
+    arguments = make.arguments()
+    from envhub_sandbox.api import make_env
+
+    with Bar(quiet=as_json) as bar, make.foreign():
+        bar.begin(f"loading {make.ref}")
+        with make_env(**arguments) as envs:
+            found = [describe_env(*item) for item in select(envs, suites, tasks)]
+            provenance = envs.provenance
+    if as_json:
+        print_json({"reference": make.ref, "envs": found, "provenance": provenance})
+    else:
+        _print(found, provenance, in_process=make.in_process)
+
+
+def describe_env(suite: str, task: Any, env: Any) -> dict[str, Any]:
+    """One environment as data. Trust: all of it is input from the worker."""
+    from envhub_sandbox.rollout import autoreset_mode
+
+    metadata = dict(getattr(env, "metadata", None) or {})
+    metadata.pop("autoreset_mode", None)
+    spec = getattr(env, "spec", None)
+    return {
+        "suite": safe_line(suite),
+        "task": task if isinstance(task, int) else safe_line(task),
+        "num_envs": env.num_envs,
+        "spec_id": None if spec is None else safe_line(spec.id),
+        "autoreset_mode": autoreset_mode(env),
+        "render_mode": env.render_mode and safe_line(env.render_mode),
+        "metadata": metadata,
+        **{name: safe_line(getattr(env, name), _SPACE_TEXT) for name in _SPACES},
+    }
+
+
+def _print(found: list[dict[str, Any]], provenance: dict[str, Any], *, in_process: bool) -> None:
+    from rich.table import Table
+
+    out = console()
+    for env in found:
+        title = f"{env['suite']} / {env['task']}"
+        out.print(title if env["spec_id"] is None else f"{title}  ({env['spec_id']})", style="bold")
+        grid = Table.grid(padding=(0, 2))
+        grid.add_column(style="dim", no_wrap=True)
+        grid.add_column(overflow="fold")
+        grid.add_row("  sub-environments", str(env["num_envs"]))
+        grid.add_row("  observations", env["single_observation_space"])
+        grid.add_row("  actions", env["single_action_space"])
+        grid.add_row("  autoreset mode", env["autoreset_mode"] or "not stated")
+        grid.add_row("  render mode", env["render_mode"] or "None")
+        for key, value in env["metadata"].items():
+            grid.add_row(f"  {safe_line(key, 40)}", safe_line(value, 300))
+        out.print(grid)
+    out.print()
+    print_provenance(out, provenance, in_process=in_process)

@@ -1,0 +1,40 @@
+"""``envhub version``."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import PackageNotFoundError
+from importlib.metadata import version as installed
+from typing import Annotated
+
+import typer
+
+from envhub_sandbox.cli.console import print_json
+from envhub_sandbox.cli.exits import reported
+
+_PACKAGES = ("gymnasium", "numpy", "huggingface_hub", "pyzmq", "msgpack", "imageio-ffmpeg")
+
+
+def version(
+    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Print versions: ours, the protocol's, Python's and of the packages that matter."""
+    from envhub_sandbox import __version__
+    from envhub_worker.protocol.messages import VERSION
+
+    with reported(debug=False):
+        versions = {"envhub-sandbox": __version__, "protocol": VERSION}
+        versions |= {"python": platform.python_version(), "platform": platform.platform()}
+        versions |= {name: _installed(name) for name in _PACKAGES}
+        if json:
+            print_json(versions)
+        else:
+            for name, text in versions.items():
+                typer.echo(f"{name:<16} {text or 'not installed'}")
+
+
+def _installed(name: str) -> str | None:
+    try:
+        return installed(name)
+    except PackageNotFoundError:
+        return None
