@@ -1,0 +1,1 @@
+"""Attacks: each runs once without a sandbox, where it must succeed, and once inside of one."""
