@@ -61,30 +61,30 @@ class PacketReader:
         return self._body is not None and self._filled == self._body.nbytes
 
     def _fill_head(self, data: memoryview) -> memoryview:
-        self._pending += data
-        head = self._parse_head()
-        if head is None:
-            return data[data.nbytes :]
-        size, self._head = head
-        rest = bytes(self._pending[size:])
-        self._pending.clear()
-        # numpy maps large blocks lazily: a length that is declared and never sent costs no memory
-        self._body = np.empty(sum(self._head[1]), np.uint8).data
-        self._filled = 0
-        return memoryview(rest)
+        # not a byte of what follows: a chunk of many small packets would be copied for each
+        taken = data[: self._head_bytes() - len(self._pending)]
+        self._pending += taken
+        if len(self._pending) == self._head_bytes():
+            self._begin_body()
+        return data[taken.nbytes :]
 
-    def _parse_head(self) -> tuple[int, tuple[int, tuple[int, ...]]] | None:
+    def _head_bytes(self) -> int:
         if len(self._pending) < _PREFIX.size:
-            return None
+            return _PREFIX.size
         count, reserved, request_id = _PREFIX.unpack_from(self._pending)
         if count == 0 or count > self._limits.frames or reserved or request_id >= _MAX_ID:
             raise RemoteProtocolError(f"a packet of {count} frames is outside 1..the limit")
-        size = _PREFIX.size + 8 * count
-        if len(self._pending) < size:
-            return None
+        return _PREFIX.size + 8 * int(count)
+
+    def _begin_body(self) -> None:
+        count, _, request_id = _PREFIX.unpack_from(self._pending)
         lengths = struct.unpack_from(f"<{count}Q", self._pending, _PREFIX.size)
         self._check_lengths(lengths)
-        return size, (request_id, lengths)
+        self._head = request_id, lengths
+        self._pending.clear()
+        # numpy maps large blocks lazily: a length that is declared and never sent costs no memory
+        self._body = np.empty(sum(lengths), np.uint8).data
+        self._filled = 0
 
     def _check_lengths(self, lengths: tuple[int, ...]) -> None:
         limits = self._limits

@@ -1,0 +1,89 @@
+"""The table of an environment's life: what is legal, and what is not."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from envhub_worker.protocol.lifecycle import TABLE, Event, Lifecycle, State
+
+
+def after(*events: Event) -> State:
+    """The state that some events lead to."""
+    lifecycle = Lifecycle()
+    for event in events:
+        lifecycle.on(event)
+    return lifecycle.state
+
+
+def test_life_begins_without_a_process() -> None:
+    """A proxy that nobody has used is idle."""
+    assert after() is State.IDLE
+
+
+@pytest.mark.parametrize(("state", "event"), list(itertools.product(State, Event)))
+def test_table_decides_every_move(state: State, event: Event) -> None:
+    """What the table has, happens; what it has not is refused and changes nothing."""
+    lifecycle = Lifecycle()
+    lifecycle.state = state
+    if (state, event) in TABLE:
+        assert lifecycle.on(event) is TABLE[state, event]
+        assert lifecycle.state is TABLE[state, event]
+        return
+    with pytest.raises(RuntimeError, match=f"no move from {state.name} on {event.name}"):
+        lifecycle.on(event)
+    assert lifecycle.state is state
+
+
+@given(st.lists(st.sampled_from(Event), max_size=12))
+def test_close_is_legal_at_every_moment_and_final(events: list[Event]) -> None:
+    """Whatever has happened, an environment can be closed, and then nothing more happens."""
+    lifecycle = Lifecycle()
+    for event in events:
+        if (lifecycle.state, event) in TABLE:
+            lifecycle.on(event)
+    if lifecycle.state is not State.CLOSED:
+        lifecycle.on(Event.CLOSE)
+    assert lifecycle.state is State.CLOSED
+    assert not [event for event in Event if (State.CLOSED, event) in TABLE]
+
+
+def test_a_late_reply_is_never_the_answer_to_a_new_request() -> None:
+    """After a timeout nothing can be submitted before the late reply has come or been given up."""
+    assert after(Event.START, Event.SUBMIT, Event.TIMEOUT) is State.LATE
+    assert (State.LATE, Event.SUBMIT) not in TABLE
+    assert after(Event.START, Event.SUBMIT, Event.TIMEOUT, Event.REPLY) is State.READY
+    assert after(Event.START, Event.SUBMIT, Event.TIMEOUT, Event.FORGET) is State.IDLE
+
+
+def test_requests_are_answered_one_at_a_time() -> None:
+    """Nothing is submitted while a reply is awaited, and no reply comes unasked."""
+    assert (State.PENDING, Event.SUBMIT) not in TABLE
+    assert [state for state in State if (state, Event.REPLY) in TABLE] == [
+        State.PENDING,
+        State.LATE,
+    ]
+
+
+def test_death_is_survived_by_forgetting() -> None:
+    """A dead environment can only be given up or closed."""
+    assert {event for state, event in TABLE if state is State.DEAD} == {Event.FORGET, Event.CLOSE}
+
+
+def test_every_state_can_be_reached() -> None:
+    """No state of the table is dead text."""
+    reached = {State.IDLE}
+    while more := {TABLE[key] for key in TABLE if key[0] in reached} - reached:
+        reached |= more
+    assert reached == set(State)
+
+
+def test_states_and_events_read_as_words() -> None:
+    """The values are what users read in errors, so each is text of its own."""
+    for kind in (State, Event):
+        texts = [member.value for member in kind]
+        assert len(set(texts)) == len(texts)
+        assert all(text == text.strip() != "" for text in texts)

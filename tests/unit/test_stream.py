@@ -1,0 +1,167 @@
+"""Packets on a stream: cut anywhere they arrive whole; lies about lengths cost nothing."""
+
+from __future__ import annotations
+
+import itertools
+import struct
+import tracemalloc
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
+from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
+
+Plain = tuple[int, list[bytes]]
+LIMITS = WireLimits(header_bytes=1000, frame_bytes=10_000, message_bytes=12_000, frames=4)
+
+frames = st.lists(st.binary(max_size=200), min_size=1, max_size=4)
+packets = st.lists(st.tuples(st.integers(0, 2**63 - 1), frames), max_size=5)
+
+
+def head(count: int, *lengths: int, reserved: int = 0, request_id: int = 1) -> bytes:
+    """The beginning of a packet, which may lie."""
+    return struct.pack(f"<IIQ{len(lengths)}Q", count, reserved, request_id, *lengths)
+
+
+def on_the_wire(sent: list[Plain]) -> bytes:
+    """What some packets look like one after the other."""
+    return b"".join(bytes(part) for each in sent for part in pack_packet(*each))
+
+
+def plain(packet: Packet) -> Plain:
+    """A packet with its frames as bytes."""
+    return packet.request_id, [bytes(frame) for frame in packet.frames]
+
+
+def read(chunks: list[bytes], limits: WireLimits = LIMITS) -> list[Plain]:
+    """The packets that come out of a stream that arrives in these chunks."""
+    reader = PacketReader(limits)
+    return [plain(packet) for chunk in chunks for packet in reader.feed(chunk)]
+
+
+def cut(data: bytes, cuts: list[int]) -> list[bytes]:
+    """The data in pieces."""
+    places = sorted({0, len(data), *(place % (len(data) + 1) for place in cuts)})
+    return [data[start:stop] for start, stop in itertools.pairwise(places)]
+
+
+@given(packets, st.lists(st.integers(0, 2000), max_size=20))
+def test_packets_arrive_whole_however_the_stream_is_cut(sent: list[Plain], cuts: list[int]) -> None:
+    """What was packed comes out, in order, whatever the kernel makes of it."""
+    assert read(cut(on_the_wire(sent), cuts)) == sent
+
+
+@given(packets)
+def test_packets_arrive_byte_by_byte(sent: list[Plain]) -> None:
+    """The slowest of all streams."""
+    data = on_the_wire(sent)
+    assert read([data[i : i + 1] for i in range(len(data))]) == sent
+
+
+def test_empty_frames_complete_a_packet_at_once() -> None:
+    """Frames without bytes do not wait for the next packet."""
+    reader = PacketReader(LIMITS)
+    [packet] = reader.feed(on_the_wire([(3, [b"", b"", b""])]))
+    assert plain(packet) == (3, [b"", b"", b""])
+
+
+def test_half_a_packet_waits() -> None:
+    """Nothing comes out before the last byte is there."""
+    data = on_the_wire([(3, [b"head", b"body"])])
+    reader = PacketReader(LIMITS)
+    assert list(reader.feed(data[:-1])) == []
+    assert [plain(packet) for packet in reader.feed(data[-1:])] == [(3, [b"head", b"body"])]
+
+
+def test_frames_do_not_change_with_the_next_packet() -> None:
+    """The memory of a packet is its own."""
+    reader = PacketReader(LIMITS)
+    [first] = reader.feed(on_the_wire([(1, [b"first"])]))
+    list(reader.feed(on_the_wire([(2, [b"other"])])))
+    assert plain(first) == (1, [b"first"])
+
+
+def test_large_frames_are_not_copied_when_packed() -> None:
+    """The buffers to write are the caller's own."""
+    frame = bytearray(1000)
+    assert pack_packet(1, [b"", frame])[2] is frame
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        head(0),
+        head(5),
+        head(2**32 - 1),
+        head(1, reserved=1),
+        head(1, request_id=2**63),
+    ],
+    ids=["no frame", "too many frames", "endless frames", "reserved bits", "id out of range"],
+)
+def test_heads_that_break_the_rules_are_refused_at_once(data: bytes) -> None:
+    """The first sixteen bytes are enough to know."""
+    with pytest.raises(RemoteProtocolError):
+        read([data])
+
+
+@pytest.mark.parametrize(
+    "lengths",
+    [(1001,), (10, 10_001), (1000, 6000, 6000), (2**63, 1), (1, 2**64 - 1)],
+    ids=["header", "frame", "message", "absurd header", "absurd frame"],
+)
+def test_lengths_over_a_limit_are_refused_before_a_byte_of_them(lengths: tuple[int, ...]) -> None:
+    """A declared length is checked before anything of that size is allocated."""
+    with pytest.raises(MessageTooLargeError, match="over the limit"):
+        read([head(len(lengths), *lengths)])
+
+
+def test_lengths_at_the_limit_are_accepted() -> None:
+    """The limits are inclusive."""
+    sent = [(1, [bytes(1000), bytes(10_000), bytes(1000)])]
+    assert read([on_the_wire(sent)]) == sent
+
+
+def test_declared_and_never_sent_costs_no_memory() -> None:
+    """A host that promises 256 MB and sends nothing does not make anybody touch them."""
+    limits = WireLimits()
+    reader = PacketReader(limits)
+    before = resident_bytes()
+    assert list(reader.feed(head(2, 100, limits.frame_bytes - 1000))) == []
+    assert resident_bytes() - before < 64 * 1024 * 1024
+
+
+def resident_bytes() -> int:
+    """Memory of this process that is really there."""
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * 4096
+
+
+def test_many_small_packets_keep_nothing() -> None:
+    """A reader that has handed its packets out holds no memory of them."""
+    reader = PacketReader(LIMITS)
+    data = on_the_wire([(1, [bytes(500)])])
+    list(reader.feed(data))
+    tracemalloc.start()
+    for _ in range(2000):
+        list(reader.feed(data))
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert held < 500_000
+
+
+def test_a_flood_of_small_packets_is_read_in_linear_work() -> None:
+    """Two hundred thousand packets in one chunk come out one by one, without copying the rest."""
+    flood = head(1, 0) * 200_000
+    assert sum(1 for _ in PacketReader(LIMITS).feed(flood)) == 200_000
+
+
+@given(st.lists(st.binary(max_size=64), max_size=8))
+def test_arbitrary_bytes_raise_nothing_but_protocol_errors(chunks: list[bytes]) -> None:
+    """Noise is packets, or refused."""
+    try:
+        read(chunks)
+    except RemoteProtocolError:
+        return
