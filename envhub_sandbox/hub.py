@@ -137,7 +137,8 @@ class HubClient:
         return {
             **repo._asdict(),
             "revision": commit,
-            "cache_dir": self.cache_dir,
+            # Not every version expands "~" itself; one would make a folder of that name.
+            "cache_dir": None if self.cache_dir is None else os.path.expanduser(self.cache_dir),
             "token": self.token,
             "endpoint": self.endpoint,
             **_LIBRARY,

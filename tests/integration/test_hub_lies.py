@@ -92,6 +92,17 @@ def test_edited_hub_cache_is_repaired_from_the_hub(
     assert first.commit == get().commit
 
 
+def test_hub_cache_may_be_named_from_the_home_folder(
+    get: Fetch, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A ``~`` in hub_cache_dir is the home folder, in every version of the client."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    get(hub_cache_dir="~/hf")
+    assert (tmp_path / "hf" / "models--org--repo").is_dir()
+    assert not (tmp_path / "~").exists()
+
+
 def test_missing_file_in_the_hub_cache_is_fetched(
     get: Fetch, hub_cache: Path, snapshot_store: Path
 ) -> None:
