@@ -62,6 +62,7 @@ __all__ = [
     "WorkerError",
     "WorkerStartupError",
     "WorkerTimeoutError",
+    "name_source",
     "remote_error",
 ]
 
@@ -215,3 +216,10 @@ def _builtin_of(cls: type[RemoteEnvError]) -> str:
 def remote_error(builtin: str, type_name: str, message: str, traceback: str = "") -> RemoteEnvError:
     """The exception for a remote failure: the builtin's twin, or plain ``RemoteEnvError``."""
     return _TWINS.get(builtin, RemoteEnvError)(type_name, message, traceback)
+
+
+def name_source(error: EnvHubError, label: str) -> None:
+    """Prefix an error's text with where it came from, once."""
+    text = str(error.args[0]) if error.args else ""
+    if not text.startswith(label):
+        error.args = (f"{label}: {text}", *error.args[1:])

@@ -97,9 +97,13 @@ class RemoteJail:
             check(reply)
         return replies
 
-    def output(self, deadline: Deadline) -> str:
-        """The last lines that the jail printed."""
-        reply, _ = self.client.request(m.ReadOutput(self.number), deadline=deadline)
+    def output(self, operation: str, deadline: Deadline) -> str:
+        """The last lines that the jail printed.
+
+        Raises:
+            WorkerDiedError: The jail has ended, during ``operation``.
+        """
+        reply, _ = self.client.request(m.ReadOutput(self.number, operation), deadline=deadline)
         return expect(reply, m.Output).text
 
     def close(self, deadline: Deadline) -> None:
@@ -135,6 +139,19 @@ def check(reply: m.Message) -> None:
         raise death(reply)
     if isinstance(reply, m.Refused):
         raise refusal(reply)
+
+
+def typed(reply: m.Message, kind: type[m.M]) -> m.M:
+    """The reply, if it is of the kind that the request asks for.
+
+    Raises:
+        RemoteProtocolError: It is another message.
+    """
+    if not isinstance(reply, kind):
+        raise RemoteProtocolError(
+            f"the worker answered with {type(reply).__name__} where {kind.__name__} belongs"
+        )
+    return reply
 
 
 _LOADING = {

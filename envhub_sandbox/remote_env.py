@@ -9,9 +9,11 @@ from __future__ import annotations
 import contextlib
 import itertools
 import threading
+import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
+from envhub_sandbox.client import SESSION
 from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import (
     EnvHubError,
@@ -19,10 +21,14 @@ from envhub_sandbox.errors import (
     WorkerDiedError,
     WorkerError,
     WorkerTimeoutError,
+    name_source,
 )
-from envhub_sandbox.jail import check
+from envhub_sandbox.fast_lane import FastLane, JailGoneError, Outcome, decode_infos, deposit
+from envhub_sandbox.jail import check, typed
 from envhub_sandbox.jail_sources import JailSource
 from envhub_sandbox.repository import LoadedJail, Repository
+from envhub_sandbox.results import Results, StepResult
+from envhub_worker.protocol import batches, slabs
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.batches import even_bounds
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
@@ -36,6 +42,11 @@ _INTERRUPT_S = 10.0
 MessageFor = Callable[[int, tuple[int, int]], m.Message]
 """Makes the message for a shard out of the environment's number and the shard's bounds."""
 
+T = TypeVar("T")
+_CAUSE_S = 10.0
+_CAUSE_POLL_S = 0.01
+_BY_LANE = (0, "step")
+_EMPTY = (slabs.DONE, b"")
 _numbers = itertools.count(1)
 
 
@@ -60,6 +71,8 @@ class RemoteEnv:
         self._hosts: list[int] = []
         self._number = 0
         self._pending: tuple[int, str] | None = None
+        self._lane: FastLane | None = None
+        self.results = Results(manifest, self.bounds)
 
     @property
     def repository(self) -> Repository:
@@ -106,6 +119,94 @@ class RemoteEnv:
         self.submit(operation, message_for)
         return self.collect(timeout_s)
 
+    # --- steps ---------------------------------------------------------------------------------
+
+    def submit_step(self, actions: Any) -> None:
+        """Send a validated batch of actions, by the fast lane where there is one."""
+        with self._lock:
+            if self.lifecycle.state is not State.READY:
+                with self.repository.named():
+                    self._refuse_unless_usable("step")
+                    self._start()
+            if self._lane is None:
+                with self.repository.named():
+                    self._send("step", self._step_requests(actions))
+                return
+            self._lane.ask(actions)
+            self._pending = _BY_LANE
+            self.lifecycle.on(Event.SUBMIT)
+
+    def _step_requests(self, actions: Any) -> list[tuple[int, m.Message]]:
+        if len(self.bounds) == 1:
+            return [(self._hosts[0], m.Step(self._number, actions))]
+        parts = batches.split(self.manifest.single_action_space, actions, self.bounds)
+        return [
+            (host, m.Step(self._number, part))
+            for host, part in zip(self._hosts, parts, strict=True)
+        ]
+
+    def collect_step(self, timeout_s: float | None) -> StepResult:
+        """What ``VectorEnv.step`` returns; raises as ``collect`` does."""
+        with self._lock:
+            try:
+                deadline = Deadline(timeout_s)
+                if self._pending is _BY_LANE:
+                    return self._collect_by_lane(deadline, timeout_s)
+                replies = self._collect(deadline, timeout_s)
+                for reply in replies:
+                    check(reply)
+                return self.results.step([typed(reply, m.StepDone) for reply in replies])
+            except EnvHubError as error:
+                name_source(error, self.repository.label)
+                raise
+
+    def _collect_by_lane(self, deadline: Deadline, timeout_s: float | None) -> StepResult:
+        lane = self._lane
+        assert lane is not None
+        outcomes = self._finish(lambda: self._wait_on_lane(lane, deadline), timeout_s)
+        infos: dict[Any, Any] = {}
+        if any(outcome != _EMPTY for outcome in outcomes):
+            infos = self.results.lane_infos(self._lane_infos(outcomes))
+        return (lane.observation(), *lane.flags(), infos)
+
+    def _wait_on_lane(self, lane: FastLane, deadline: Deadline) -> list[Outcome]:
+        try:
+            return lane.wait(deadline)
+        except JailGoneError:
+            raise self._cause_of_death() from None
+
+    def _lane_infos(self, outcomes: list[Outcome]) -> list[Any]:
+        infos: list[Any] = []
+        for (kind, encoded), host in zip(outcomes, self._hosts, strict=True):
+            if kind == slabs.FETCH:
+                infos.append(self._fetch_infos(host))
+            elif not encoded:
+                infos.append({})
+            else:
+                message = decode_infos(encoded)
+                check(message)
+                infos.append(typed(message, m.Value).value)
+        return infos
+
+    def _fetch_infos(self, host: int) -> Any:
+        assert self._loaded is not None
+        deadline = Deadline(self.repository.timeouts.call_s)
+        request = (host, m.FetchInfos(self._number))
+        [reply] = self._loaded.jail.exchange("step", [request], deadline)
+        return typed(reply, m.Value).value
+
+    def _cause_of_death(self) -> Exception:
+        """Why the jail has ended: the server knows, at the latest when it has reaped it."""
+        assert self._loaded is not None
+        deadline = Deadline(_CAUSE_S)
+        while not deadline.passed:
+            try:
+                self._loaded.jail.output("step", deadline)
+            except EnvHubError as error:
+                return error
+            time.sleep(_CAUSE_POLL_S)
+        return WorkerDiedError("the worker process died during step", request="step")
+
     def recover(self) -> None:
         """Before a reset: catch up with a late reply, or give up the jail that owes it.
 
@@ -122,8 +223,12 @@ class RemoteEnv:
         loaded, pending = self._loaded, self._pending
         assert loaded is not None
         assert pending is not None
+        deadline = Deadline(_GRACE_S)
         try:
-            loaded.jail.receive(pending[0], Deadline(_GRACE_S))
+            if pending is _BY_LANE and self._lane is not None:
+                self._wait_on_lane(self._lane, deadline)
+            else:
+                loaded.jail.receive(pending[0], deadline)
         except EnvHubError:
             self._forget()
             return
@@ -155,12 +260,17 @@ class RemoteEnv:
         if loaded is None or pending is None:
             state = self.lifecycle.state.value
             raise WorkerError(f"there is no request to wait for: the environment is {state}")
+        return self._finish(lambda: loaded.jail.receive(pending[0], deadline), timeout_s)
+
+    def _finish(self, receive: Callable[[], T], timeout_s: float | None) -> T:
+        """Wait for the pending reply, and move on to the state that it leads to."""
+        assert self._pending is not None
         try:
-            replies = loaded.jail.receive(pending[0], deadline)
+            received = receive()
         except WorkerTimeoutError as error:
             self._moved(Event.TIMEOUT)
             raise WorkerTimeoutError(
-                f"{pending[1]} has not finished after {timeout_s} s; reset() brings the "
+                f"{self._pending[1]} has not finished after {timeout_s} s; reset() brings the "
                 "environment back, in a fresh process if it still does not answer"
             ) from error
         except EnvHubError:
@@ -168,7 +278,7 @@ class RemoteEnv:
             raise
         self._pending = None
         self._moved(Event.REPLY)
-        return replies
+        return received
 
     def _moved(self, event: Event) -> None:
         # close() may have come meanwhile, from another thread
@@ -201,7 +311,31 @@ class RemoteEnv:
             self._jails.give_back(loaded)
             raise
         self._loaded, self._hosts, self._number = loaded, hosts, number
+        self._lane = self._open_lane(loaded, deadline)
         self.lifecycle.on(Event.START)
+
+    def _open_lane(self, loaded: LoadedJail, deadline: Deadline) -> FastLane | None:
+        """Agree with the hosts on slabs and doorbells; None where frames have to serve."""
+        path = loaded.server.fd_path
+        if path is None or not self.manifest.shardable:
+            return None
+        manifest, jail = self.manifest, loaded.jail
+        lane = FastLane.for_spaces(manifest, self.bounds, loaded.server.process_fd)
+        if lane is None:
+            return None
+        try:
+            for shard, host in zip(lane.shards, self._hosts, strict=True):
+                lane.watch_jail(deposit(path, SESSION, jail.number, host, shard.fds))
+                shard.handed_over()
+            attach = m.Attach(self._number)
+            replies = jail.exchange("attach", [(host, attach) for host in self._hosts], deadline)
+        except BaseException:
+            lane.close()
+            raise
+        if any(typed(reply, m.Value).value is not True for reply in replies):
+            lane.close()
+            return None
+        return lane
 
     def _check_manifest(self, loaded: LoadedJail) -> None:
         key = (self.manifest.suite, self.manifest.task)
@@ -219,6 +353,7 @@ class RemoteEnv:
         if self._loaded is not None:
             self._jails.end(self._loaded)
             self._jails.give_back(self._loaded)
+        self._close_lane()
         self._loaded, self._pending = None, None
         self.lifecycle.on(Event.FORGET)
 
@@ -236,6 +371,7 @@ class RemoteEnv:
                 if state is State.READY:
                     self._close_politely(loaded)
                 self._jails.give_back(loaded)
+            self._close_lane()
         finally:
             self._lock.release()
 
@@ -249,8 +385,14 @@ class RemoteEnv:
         if self._lock.acquire(timeout=_INTERRUPT_S):
             try:
                 self._jails.give_back(loaded)
+                self._close_lane()
             finally:
                 self._lock.release()
+
+    def _close_lane(self) -> None:
+        lane, self._lane = self._lane, None
+        if lane is not None:
+            lane.close()
 
     def _close_politely(self, loaded: LoadedJail) -> None:
         """Let the repository's ``close`` run; whatever it does, the processes end after it."""

@@ -10,7 +10,7 @@ from typing import Any
 
 from envhub_sandbox.client import WorkerClient
 from envhub_sandbox.deadline import Deadline
-from envhub_sandbox.errors import EnvHubError, LoadError
+from envhub_sandbox.errors import EnvHubError, LoadError, name_source
 from envhub_sandbox.jail import RemoteJail, check, open_jail
 from envhub_sandbox.policy import Policy, Timeouts
 from envhub_sandbox.sandboxes.base import Sandbox, WorkerServer
@@ -206,10 +206,3 @@ class Repository:
             pass  # the server has gone, and the jail with it
         finally:
             client.close()
-
-
-def name_source(error: EnvHubError, label: str) -> None:
-    """Prefix an error's text with where it came from, once."""
-    text = str(error.args[0]) if error.args else ""
-    if not text.startswith(label):
-        error.args = (f"{label}: {text}", *error.args[1:])

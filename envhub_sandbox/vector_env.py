@@ -22,13 +22,13 @@ from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.actions import batch_of
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
+from envhub_sandbox.jail import typed
 from envhub_sandbox.remote_env import RemoteEnv
-from envhub_worker.protocol import batches
+from envhub_sandbox.results import StepResult
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest import EnvManifest
 from envhub_worker.protocol.spaces import OpaqueSpace
 
-Result = tuple[Any, Any, Any, Any, dict[str, Any]]
 Bounds = tuple[int, int]
 
 
@@ -52,7 +52,6 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         self._manifest = manifest
         self._timeouts = remote.repository.timeouts
         self._waiting: str | None = None
-        self._restores = batches.restores(manifest.single_observation_space)
         self.closed = False
         self.num_envs = manifest.num_envs
         self.single_observation_space = manifest.single_observation_space
@@ -114,10 +113,9 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
         """The results of ``reset_async``; ``timeout`` in seconds, else ``Timeouts.reset_s``."""
         replies = self._collect("reset", timeout, self._timeouts.reset_s, m.ResetDone)
-        observation = self._joined([reply.observation for reply in replies])
-        return observation, self._infos([reply.info for reply in replies])
+        return self._remote.results.reset(replies)
 
-    def step(self, actions: Any) -> Result:
+    def step(self, actions: Any) -> StepResult:
         """Step every sub-environment.
 
         Args:
@@ -140,23 +138,21 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         """Send the actions; ``step_wait`` returns the results."""
         self._refuse_if_busy("step_async")
         batch = self._batch(actions)
-        if len(self._remote.bounds) == 1:
-            self._submit("step", lambda number, _: m.Step(number, batch))
-            return
-        parts = batches.split(self.single_action_space, batch, self._remote.bounds)
-        by_bounds = dict(zip(self._remote.bounds, parts, strict=True))
-        self._submit("step", lambda number, bounds: m.Step(number, by_bounds[bounds]))
+        try:
+            self._remote.submit_step(batch)
+        except WorkerDiedError:
+            self._raise_if_closed()
+            raise
+        self._waiting = "step"
 
-    def step_wait(self, timeout: float | None = None) -> Result:
+    def step_wait(self, timeout: float | None = None) -> StepResult:
         """The results of ``step_async``; ``timeout`` in seconds, else ``Timeouts.step_s``."""
-        replies = self._collect("step", timeout, self._timeouts.step_s, m.StepDone)
-        return (
-            self._joined([reply.observation for reply in replies]),
-            self._flags("rewards", [reply.rewards for reply in replies]),
-            self._flags("terminations", [reply.terminations for reply in replies]),
-            self._flags("truncations", [reply.truncations for reply in replies]),
-            self._infos([reply.info for reply in replies]),
-        )
+        self._end_wait("step")
+        try:
+            return self._remote.collect_step(self._timeouts.step_s if timeout is None else timeout)
+        except WorkerDiedError:
+            self._raise_if_closed()  # close() in another thread ended it under us
+            raise
 
     # --- everything else -----------------------------------------------------------------------
 
@@ -175,7 +171,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         replies = self._collect("call", timeout, self._timeouts.call_s, m.Value)
         if not self._manifest.shardable:
             return cast("tuple[Any, ...]", replies[0].value)
-        return self._gathered("call", replies)
+        return self._remote.results.one_each("call", replies)
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """An attribute of every sub-environment."""
@@ -199,28 +195,24 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         replies = self._ask("render", lambda number, _: m.Render(number))
         if not self._manifest.shardable:
             return cast("tuple[Any, ...] | None", replies[0].value)
-        return self._gathered("render", replies)
+        return self._remote.results.one_each("render", replies)
 
-    @property
+    @property  # type: ignore[misc]  # there is nothing to set, as in SyncVectorEnv
     def np_random(self) -> Any:
-        """A copy of each sub-environment's generator, as ``SyncVectorEnv`` has them."""
-        if not self._manifest.shardable:
-            return VectorEnv.np_random.fget(self)  # type: ignore[attr-defined]
-        states = self._gathered(
-            "np_random", self._ask("np_random", lambda number, _: m.GetRandom(number))
-        )
+        """Copies of the generators: ``SyncVectorEnv`` has one for each sub-environment."""
+        replies = self._ask("np_random", lambda number, _: m.GetRandom(number))
+        if type(replies[0].value) is dict:
+            return _generator(replies[0].value)
+        states = self._remote.results.one_each("np_random", replies)
         return tuple(_generator(state) for state in states)
-
-    @np_random.setter
-    def np_random(self, value: np.random.Generator) -> None:
-        VectorEnv.np_random.fset(self, value)  # type: ignore[attr-defined]
 
     @property
     def np_random_seed(self) -> Any:
-        """The seed of each sub-environment's generator, as ``SyncVectorEnv`` has them."""
-        if not self._manifest.shardable:
-            return VectorEnv.np_random_seed.fget(self)  # type: ignore[attr-defined]
-        return self.get_attr("np_random_seed")
+        """Their seeds."""
+        replies = self._ask("np_random_seed", lambda number, _: m.GetOwn(number, "np_random_seed"))
+        if type(replies[0].value) is not tuple:
+            return replies[0].value
+        return self._remote.results.one_each("np_random_seed", replies)
 
     @property
     def envs(self) -> tuple[SubEnvironment, ...]:
@@ -257,7 +249,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         def method(*args: Any, **kwargs: Any) -> Any:
             self._refuse_if_busy(name)
             [result] = self._own(name, m.CallOwn, name, args, kwargs)
-            return _typed(result, m.Value).value
+            return typed(result, m.Value).value
 
         return method
 
@@ -287,6 +279,15 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     def _collect(
         self, operation: str, timeout: float | None, default: float | None, kind: type[m.M]
     ) -> list[m.M]:
+        self._end_wait(operation)
+        try:
+            replies = self._remote.collect(default if timeout is None else timeout)
+        except WorkerDiedError:
+            self._raise_if_closed()  # close() in another thread ended it under us
+            raise
+        return [typed(reply, kind) for reply in replies]
+
+    def _end_wait(self, operation: str) -> None:
         self._raise_if_closed()
         if self._waiting != operation:
             raise NoAsyncCallError(
@@ -294,12 +295,6 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
                 operation,
             )
         self._waiting = None
-        try:
-            replies = self._remote.collect(default if timeout is None else timeout)
-        except WorkerDiedError:
-            self._raise_if_closed()  # close() in another thread ended it under us
-            raise
-        return [_typed(reply, kind) for reply in replies]
 
     def _refuse_if_busy(self, name: str) -> None:
         self._raise_if_closed()
@@ -337,40 +332,6 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             )
         return seeds
 
-    def _joined(self, parts: list[Any]) -> Any:
-        space = self.single_observation_space
-        if self._manifest.shardable:
-            for part, (start, stop) in zip(parts, self._remote.bounds, strict=True):
-                if not batches.conforms(space, part, stop - start):
-                    raise RemoteProtocolError(
-                        f"the worker sent an observation that is not a batch of {space}"
-                    )
-        joined = parts[0] if len(parts) == 1 else batches.join(space, parts)
-        return batches.restore_batch(space, joined) if self._restores else joined
-
-    def _flags(self, name: str, parts: list[Any]) -> Any:
-        for part, (start, stop) in zip(parts, self._remote.bounds, strict=True):
-            if len(getattr(part, "shape", ())) < 1 or part.shape[0] != stop - start:
-                raise RemoteProtocolError(f"the worker sent {name} that do not fit num_envs")
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-    def _infos(self, parts: list[dict[Any, Any]]) -> dict[Any, Any]:
-        sizes = [stop - start for start, stop in self._remote.bounds]
-        infos = parts[0] if len(parts) == 1 else batches.join_infos(parts, sizes)
-        final = infos.get("final_obs") if self._restores else None
-        if final is not None:
-            for index, member in enumerate(final):
-                final[index] = batches.restore(self.single_observation_space, member)
-        return infos
-
-    def _gathered(self, what: str, replies: list[m.Value]) -> tuple[Any, ...]:
-        gathered: list[Any] = []
-        for reply, (start, stop) in zip(replies, self._remote.bounds, strict=True):
-            if type(reply.value) is not tuple or len(reply.value) != stop - start:
-                raise RemoteProtocolError(f"the worker's {what} does not hold one result each")
-            gathered += reply.value
-        return tuple(gathered)
-
 
 class SubEnvironment:
     """Reads attributes of one sub-environment: ``env.envs[0].task``, ``hasattr`` included."""
@@ -384,14 +345,6 @@ class SubEnvironment:
         if name.startswith("__"):
             raise AttributeError(name)
         return self._vector.get_attr(name)[self._index]
-
-
-def _typed(reply: m.Message, kind: type[m.M]) -> m.M:
-    if not isinstance(reply, kind):
-        raise RemoteProtocolError(
-            f"the worker answered with {type(reply).__name__} where {kind.__name__} belongs"
-        )
-    return reply
 
 
 def _metadata(manifest: EnvManifest) -> dict[str, Any]:

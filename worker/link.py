@@ -42,14 +42,28 @@ class HostLink:
         """Whether something waits to be sent."""
         return bool(self._unsent)
 
-    def send(self, request_id: int, frames: Sequence[Buffer], owner: Any) -> None:
-        """Queue a request and send what the socket takes."""
+    def send(
+        self, request_id: int, frames: Sequence[Buffer], owner: Any, fds: Sequence[int] = ()
+    ) -> None:
+        """Queue a request and send what the socket takes. ``fds`` go along; they stay yours."""
+        if fds:
+            self._send_fds(request_id, frames, fds)
+            self.pending[request_id] = owner
+            return
         self.pending[request_id] = owner
         for buffer in pack_packet(request_id, frames):
             view = memoryview(buffer).cast("B")
             if view.nbytes:
                 self._unsent.append(view)
         self.flush()
+
+    def _send_fds(self, request_id: int, frames: Sequence[Buffer], fds: Sequence[int]) -> None:
+        """Descriptors belong to a place in the stream, so their small packet goes in one piece."""
+        if self._unsent:
+            raise RuntimeError("the host is still being sent another request")
+        data = b"".join(map(bytes, pack_packet(request_id, frames)))
+        if socket.send_fds(self.sock, [data], fds) != len(data):
+            raise RuntimeError("the host does not read its stream")
 
     def flush(self) -> None:
         """Send what the socket takes. A host that is gone is noticed by its exit."""

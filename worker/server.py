@@ -19,6 +19,8 @@ from typing import Any
 import zmq
 
 from envhub_worker import __version__
+from envhub_worker.channel import close_fds
+from envhub_worker.deposits import Deposits
 from envhub_worker.jailspec import JailSpec, confinement_from_wire
 from envhub_worker.link import MAX_PENDING, HostLink
 from envhub_worker.output import OutputTail
@@ -39,6 +41,8 @@ from envhub_worker.spawner import (
 
 MAX_HOSTS = 64
 """Hosts of one jail: one per useful core, not one per sub-environment."""
+ATTACH = "attach"
+"""The operation that brings a host its descriptors."""
 MAX_JAILS = 256
 """Open jails of one server."""
 _POLL_MS = 1000
@@ -118,6 +122,8 @@ class Server:
         self._poller = zmq.Poller()
         self._callbacks: dict[Any, Callable[[], None]] = {}
         self._watch(self._router, self._serve_clients)
+        self._deposits = Deposits(str(runtime_dir / "fds"), self._pidfd_for)
+        self._watch(self._deposits.fileno(), self._deposits.accept)
         if client_pidfd is not None:
             self._watch(client_pidfd, self.stop)
 
@@ -168,6 +174,7 @@ class Server:
             self._kill(entry)
         for spawner in self._spawners.values():
             spawner.close()
+        self._deposits.close()
         self._router.close()
         self._context.term()
 
@@ -230,13 +237,13 @@ class Server:
         self._sessions[asker.identity] = request.session
         self._reply(asker, m.Welcome(m.VERSION, __version__, os.getpid()))
 
-    def _owned(self, asker: Asker, number: int) -> JailEntry | None:
+    def _owned(self, asker: Asker, number: int, operation: str = "") -> JailEntry | None:
         entry = self._jails.get(number)
         if entry is None or entry.session != self._sessions[asker.identity]:
             self._refuse(asker, "WorkerError", f"there is no jail {number}; it has been closed")
             return None
         if entry.death is not None:
-            self._reply(asker, entry.death)
+            self._reply(asker, _for_operation(entry.death, operation))
             return None
         return entry
 
@@ -305,22 +312,25 @@ class Server:
         entry = self._owned(asker, request.jail)
         if entry is None:
             return
-        links = self._relay_targets(entry, request, payload)
-        if links is None:
+        targets = self._relay_targets(entry, request, payload)
+        if targets is None:
             self._refuse(asker, "LocalProtocolError", "the parts of Relay do not fit its frames")
             return
-        if any(len(link.pending) >= MAX_PENDING for link, _ in links):
+        if any(len(entry.links[host].pending) >= MAX_PENDING for host, _ in targets):
             self._refuse(asker, "WorkerError", f"a host owes {MAX_PENDING} answers already")
             return
-        pending = Pending(asker, request.operation, [None] * len(links))
-        for index, (link, frames) in enumerate(links):
-            link.send(next(self._packet_ids), frames, (pending, index))
+        pending = Pending(asker, request.operation, [None] * len(targets))
+        for index, (host, frames) in enumerate(targets):
+            link = entry.links[host]
+            fds = self._deposits.take(entry.number, host) if request.operation == ATTACH else []
+            link.send(next(self._packet_ids), frames, (pending, index), fds)
+            close_fds(fds)
             self._follow_writes(link)
 
     def _relay_targets(
         self, entry: JailEntry, request: m.Relay, payload: list[bytes]
-    ) -> list[tuple[HostLink, list[bytes]]] | None:
-        links = []
+    ) -> list[tuple[int, list[bytes]]] | None:
+        targets = []
         start = 0
         for part in request.parts:
             if type(part) is not tuple or len(part) != 2 or part[0] not in entry.links:
@@ -328,9 +338,15 @@ class Server:
             host, count = part
             if type(count) is not int or not 1 <= count <= len(payload) - start:
                 return None
-            links.append((entry.links[host], payload[start : start + count]))
+            targets.append((host, payload[start : start + count]))
             start += count
-        return links if links and start == len(payload) else None
+        return targets if targets and start == len(payload) else None
+
+    def _pidfd_for(self, request: m.Deposit) -> int | None:
+        entry = self._jails.get(request.jail)
+        if entry is None or entry.session != request.session or entry.death is not None:
+            return None
+        return entry.jail.pidfd if request.host in entry.links and entry.jail.pidfd >= 0 else None
 
     def _follow_writes(self, link: HostLink) -> None:
         wanted = zmq.POLLIN | (zmq.POLLOUT if link.wants_write else 0)
@@ -348,7 +364,7 @@ class Server:
             self._kill(entry)
 
     def _read_output_request(self, asker: Asker, request: m.ReadOutput) -> None:
-        entry = self._owned(asker, request.jail)
+        entry = self._owned(asker, request.jail, request.operation)
         if entry is not None:
             entry.output.read()
             self._reply(asker, m.Output(entry.output.text()))
@@ -448,6 +464,7 @@ class Server:
         self._kill(entry)
 
     def _kill(self, entry: JailEntry) -> None:
+        self._deposits.drop(entry.number)
         self._unwatch(entry.control)
         entry.jail.kill()
 

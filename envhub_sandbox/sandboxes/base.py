@@ -11,11 +11,14 @@ class WorkerServer(Protocol):
 
     Attributes:
         endpoint: Its ZeroMQ endpoint.
+        fd_path: The socket that takes descriptors, or None where memory cannot be shared.
         process_fd: A descriptor that becomes readable when it ends.
     """
 
     @property
     def endpoint(self) -> str: ...  # noqa: D102
+    @property
+    def fd_path(self) -> str | None: ...  # noqa: D102
     @property
     def process_fd(self) -> int: ...  # noqa: D102
 

@@ -40,6 +40,11 @@ class ProcessServer:
     owner: int = field(default_factory=os.getpid)
     users: int = 0
 
+    @property
+    def fd_path(self) -> str:
+        """The socket that takes descriptors."""
+        return str(self.folder / "fds")
+
     def stop(self) -> None:
         """End it and everything below it, in bounded time. A fork of its owner does nothing."""
         if os.getpid() != self.owner:

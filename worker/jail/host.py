@@ -7,6 +7,7 @@ inherited stream, on the main thread (a repository may set signal handlers), and
 from __future__ import annotations
 
 import os
+import select
 import socket
 from collections.abc import Callable
 from typing import Any
@@ -15,24 +16,43 @@ import cloudpickle  # type: ignore[import-untyped]
 
 from envhub_worker.jail import describe, loader
 from envhub_worker.jail.failure import raised
+from envhub_worker.jail.lane import Lane
 from envhub_worker.jail.standins import standing_in
+from envhub_worker.jail.subenvs import SubEnvs
 from envhub_worker.jail.tasks import ResultError, Task, tasks_of
 from envhub_worker.jailspec import JailSpec
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol import slabs
 from envhub_worker.protocol.manifest import encode_env, encode_manifest
 from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
 
 _CHUNK = 1 << 20
+_MAX_FDS = 8
 
 
 def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
     """Serve until the other side closes the stream. Runs confined, as the jail's main program."""
     host = Host(spec.snapshot, spec.entry)
     reader = PacketReader()
-    while data := stream.recv(_CHUNK):
-        for packet in reader.feed(data):
-            _send(stream, packet.request_id, host.answer(packet))
-    return 0
+    poller = select.poll()
+    poller.register(stream, select.POLLIN)
+    while True:
+        if host.lane is not None:
+            poller.register(host.lane.bell, select.POLLIN)
+            host.lane.rest()
+        ready = [fd for fd, _ in poller.poll()]
+        if host.lane is not None and host.lane.bell in ready:
+            host.lane.wake()
+        if stream.fileno() in ready and not _serve(stream, reader, host):
+            return 0
+
+
+def _serve(stream: socket.socket, reader: PacketReader, host: Host) -> bool:
+    """Answer what has come; False at the end of the stream."""
+    data, host.descriptors, _, _ = socket.recv_fds(stream, _CHUNK, _MAX_FDS)
+    for packet in reader.feed(data):
+        _send(stream, packet.request_id, host.answer(packet))
+    return bool(data)
 
 
 def _send(stream: socket.socket, request_id: int, frames: list[Any]) -> None:
@@ -54,6 +74,8 @@ class Host:
         self._tasks: dict[tuple[str, Any], Task] = {}
         self._envs: dict[int, Any] = {}
         self._stage = ""
+        self.lane: Lane | None = None
+        self.descriptors: list[int] = []
 
     def answer(self, packet: Packet) -> list[Any]:
         """The reply's frames; whatever the repository raises becomes ``Raised``."""
@@ -92,15 +114,41 @@ class Host:
 
     def reset(self, request: m.Reset) -> m.Message:
         """``VectorEnv.reset``."""
+        env = self._envs[request.env]
+        if isinstance(env, SubEnvs):
+            infos = env.run_reset(request.seeds, request.options, request.mask)
+            return m.ResetDone(env.batch.observation(), infos)
         options = request.options
         if request.mask is not None:
             options = {**(options or {}), "reset_mask": request.mask}
-        observation, info = self._envs[request.env].reset(seed=request.seeds, options=options)
+        observation, info = env.reset(seed=request.seeds, options=options)
         return m.ResetDone(observation, info)
 
     def step(self, request: m.Step) -> m.Message:
         """``VectorEnv.step``."""
-        return m.StepDone(*self._envs[request.env].step(request.actions))
+        env = self._envs[request.env]
+        if not isinstance(env, SubEnvs):
+            return m.StepDone(*env.step(request.actions))
+        infos = env.run_step(request.actions)
+        batch = env.batch
+        flags = (batch.rewards, batch.terminations, batch.truncations)
+        return m.StepDone(batch.observation(), *flags, infos)
+
+    def attach(self, request: m.Attach) -> m.Message:
+        """Serve an environment's steps over slabs from now on."""
+        env = self._envs[request.env]
+        layout = None
+        if isinstance(env, SubEnvs) and not env.reward_shape:
+            spaces = env.single_observation_space, env.single_action_space
+            layout = slabs.layout_of(*spaces, env.num_envs)
+        if layout is None:
+            return m.Value(False)
+        self.lane = Lane(env, layout, self.descriptors)
+        return m.Value(True)
+
+    def fetch_infos(self, request: m.FetchInfos) -> m.Message:
+        """The last step's infos, which did not fit the slab."""
+        return m.Value({} if self.lane is None else self.lane.infos)
 
     def call(self, request: m.Call) -> m.Message:
         """``VectorEnv.call``."""
@@ -131,8 +179,10 @@ class Host:
         return m.Value(method(*request.args, **request.kwargs))
 
     def get_random(self, request: m.GetRandom) -> m.Message:
-        """The state of each sub-environment's random number generator."""
-        generators = _caller(self._envs[request.env])("np_random")
+        """The states of the random number generators: of all sub-environments, or just one."""
+        generators = self._envs[request.env].np_random
+        if not isinstance(generators, tuple):
+            return m.Value(generators.bit_generator.state)
         return m.Value(tuple(generator.bit_generator.state for generator in generators))
 
     def close(self, request: m.Close) -> m.Message:
@@ -174,4 +224,6 @@ _HANDLERS: dict[type[m.Message], Callable[[Host, Any], m.Message]] = {
     m.CallOwn: Host.call_own,
     m.GetRandom: Host.get_random,
     m.Close: Host.close,
+    m.Attach: Host.attach,
+    m.FetchInfos: Host.fetch_infos,
 }

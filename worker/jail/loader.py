@@ -67,7 +67,8 @@ def call_make_env(make_env: Callable[..., Any], request: Load) -> Any:
         "use_async_envs": request.use_async_envs,
     }
     if request.cfg is not None:
-        offered["cfg"] = attributes(request.cfg)
+        values = {key: _readable(value) for key, value in request.cfg.items()}
+        offered["cfg"] = types.SimpleNamespace(**values)
     parameters = _parameters(make_env)
     if parameters is None:
         return make_env(**offered, **request.env_kwargs)
@@ -76,10 +77,23 @@ def call_make_env(make_env: Callable[..., Any], request: Load) -> Any:
     return make_env(**(taken | request.env_kwargs))
 
 
-def attributes(value: object) -> Any:
-    """``{"a": {"b": 1}}`` as an object with ``.a.b``: a caller's config, as plain data."""
+class Attributes(dict[str, Any]):
+    """Part of a caller's config: ``cfg.camera["width"]`` and ``cfg.camera.width`` both work.
+
+    Whether the caller had a mapping or an object there is not known here, so it can be read as
+    either.
+    """
+
+    def __init__(self, values: dict[str, Any]) -> None:
+        super().__init__(values)
+        self.__dict__ = self
+
+
+def _readable(value: object) -> Any:
     if isinstance(value, dict) and all(isinstance(key, str) for key in value):
-        return types.SimpleNamespace(**{key: attributes(item) for key, item in value.items()})
+        return Attributes({key: _readable(item) for key, item in value.items()})
+    if isinstance(value, (list, tuple)):
+        return type(value)(map(_readable, value))
     return value
 
 

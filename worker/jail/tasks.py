@@ -12,9 +12,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import SyncVectorEnv, VectorEnv
+from gymnasium.vector import VectorEnv
 
 from envhub_worker.jail.standins import Recording, recording
+from envhub_worker.jail.subenvs import SubEnvs
 from envhub_worker.protocol.manifest import TaskId
 
 EnvFn = Callable[[], Any]
@@ -50,7 +51,7 @@ class Task:
         if start == 0 and self.probe is not None:
             first, self.probe = self.probe, None
             env_fns[0] = lambda: first
-        return SyncVectorEnv(env_fns, copy=False, autoreset_mode=self.recording.autoreset_mode)
+        return SubEnvs(env_fns, self.recording.autoreset_mode, self.recording.sync)
 
     def learn_spaces(self) -> Any:
         """A vector environment, or one sub-environment, to read spaces and metadata from."""

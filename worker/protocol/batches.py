@@ -118,6 +118,8 @@ def _join_part(joined: dict[Any, Any], part: dict[Any, Any], window: slice, coun
         if isinstance(value, dict):
             _join_part(joined.setdefault(key, {}), value, window, count)
             continue
+        if len(value) != window.stop - window.start:  # or its other dimensions cost nothing
+            raise ValueError(f"{key!r} does not have one entry per sub-environment")
         array = joined.setdefault(key, _blank(value, count))
         if (array.dtype, array.shape[1:]) == (value.dtype, value.shape[1:]):
             array[window] = value

@@ -191,9 +191,13 @@ class Done(Message):
 @_message(12)
 @dataclass(frozen=True, slots=True)
 class ReadOutput(Message):
-    """Ask for the last lines that a jail printed. Reply: ``Output``."""
+    """Ask for the last lines that a jail printed. Reply: ``Output``, or ``Died``.
+
+    ``operation`` is what ``Died`` then says the client was waiting for.
+    """
 
     jail: int
+    operation: str
 
 
 @_message(13)
@@ -216,6 +220,19 @@ class Status(Message):
     """One mapping per jail: ``jail``, ``name``, ``pids``, ``busy_s``, ``operation``."""
 
     jails: tuple[object, ...]
+
+
+@_message(16)
+@dataclass(frozen=True, slots=True)
+class Deposit(Message):
+    """Over the descriptor socket: descriptors for a host, which its next ``Attach`` brings to it.
+
+    Reply, over the same socket: one byte, with a pidfd of the jail.
+    """
+
+    session: bytes
+    jail: int
+    host: int
 
 
 # --- client and jail host ----------------------------------------------------------------------
@@ -365,7 +382,7 @@ class CallOwn(Message):
 @_message(46)
 @dataclass(frozen=True, slots=True)
 class GetRandom(Message):
-    """Ask for each sub-environment's generator. Reply: ``Value``, a tuple of state mappings."""
+    """Ask for the generators. Reply: ``Value``, one state each, or the one state there is."""
 
     env: int
 
@@ -374,6 +391,26 @@ class GetRandom(Message):
 @dataclass(frozen=True, slots=True)
 class Close(Message):
     """Close an environment. Reply: ``Value`` with None."""
+
+    env: int
+
+
+@_message(50)
+@dataclass(frozen=True, slots=True)
+class Attach(Message):
+    """Serve an environment's steps over the slabs and doorbells that come along.
+
+    The descriptors: request slab, reply slab, the host's doorbell, the client's doorbell.
+    Reply: ``Value``; False where the environment's spaces have no fixed layout.
+    """
+
+    env: int
+
+
+@_message(51)
+@dataclass(frozen=True, slots=True)
+class FetchInfos(Message):
+    """Ask for the last step's infos, which did not fit the slab. Reply: ``Value``."""
 
     env: int
 

@@ -1,0 +1,313 @@
+"""The client's end of the fast lane: steps over shared memory, straight to the jail's hosts.
+
+Each shard has two sealed memfds and two eventfds. A step costs one wake-up per shard and one copy
+out. Trust: the jail writes the reply slab whenever it likes, so every word is read once and
+bounded, and bytes are copied before they are looked at. ``F_SEAL_SHRINK`` keeps it from cutting
+the memory away under us (which would be a SIGBUS).
+"""
+
+from __future__ import annotations
+
+import fcntl
+import mmap
+import os
+import platform
+import select
+import socket
+from collections.abc import Sequence
+from contextlib import suppress
+from time import perf_counter_ns
+from typing import Any
+
+import numpy as np
+
+from envhub_sandbox.deadline import Deadline
+from envhub_sandbox.errors import RemoteProtocolError, WorkerTimeoutError
+from envhub_sandbox.spinning import SpinChooser
+from envhub_sandbox.tensors import to_tensor
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol import slabs
+from envhub_worker.protocol.manifest import EnvManifest
+
+_RING = (1).to_bytes(8, "little")
+_REPLY_SEALS = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW
+_FUTURE_WRITE = 0x10  # F_SEAL_FUTURE_WRITE, which fcntl does not name
+_RECHECK_MS = 2
+_CONNECT_S = 5.0
+# elsewhere a core may see the sequence word before the data it announces: sleep, do not poll
+_ORDERED_STORES = platform.machine() in ("x86_64", "AMD64")
+
+Outcome = tuple[int, bytes]
+"""``slabs.DONE``, ``RAISED`` or ``FETCH``, and the encoded infos or exception."""
+
+
+class JailGoneError(Exception):
+    """The jail has ended; the server knows why."""
+
+
+class LaneShard:
+    """The slabs and doorbells of one shard.
+
+    Attributes:
+        layout: Where everything lies.
+        fds: What the host gets: request slab, reply slab, its doorbell, ours.
+        bell: Our doorbell.
+    """
+
+    def __init__(self, layout: slabs.Layout) -> None:
+        self.layout = layout
+        self._request, request_fd = _slab("request", layout.request_bytes, _FUTURE_WRITE)
+        self._reply, reply_fd = _slab("reply", layout.reply_bytes, 0)
+        self._host_bell = os.eventfd(0, os.EFD_CLOEXEC)
+        self.bell = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._slab_fds = [request_fd, reply_fd]
+        self.fds = [request_fd, reply_fd, self._host_bell, self.bell]
+        self._asks = slabs.words(self._request)
+        self._tells = slabs.words(self._reply)
+        self._rows = [slabs.view(self._reply, leaf) for leaf in layout.observations]
+        self._results = np.frombuffer(self._reply, np.uint8, layout.results_bytes, layout.results)
+        self._views: dict[tuple[int, Any], Any] = {}
+        self._codes = [-1] * len(layout.actions)
+        self.sequence = 0
+
+    def handed_over(self) -> None:
+        """The host has its copies of the descriptors; the maps keep ours alive."""
+        while self._slab_fds:
+            os.close(self._slab_fds.pop())
+
+    def ask(self, leaves: Sequence[Any], spin_ns: int) -> None:
+        """Write a shard's actions and announce them."""
+        asks = self._asks
+        for index, leaf in enumerate(leaves):
+            found = self._views.get((index, leaf.dtype))
+            if found is None:
+                found = self._view(index, leaf.dtype)
+            if self._codes[index] != found[0]:
+                asks[slabs.DTYPES + index] = self._codes[index] = found[0]
+            found[1][...] = leaf
+        self.sequence += 1
+        asks[slabs.SPIN] = spin_ns
+        asks[slabs.SEQUENCE] = self.sequence
+        if self._tells[slabs.PARKED]:
+            os.write(self._host_bell, _RING)
+
+    def _view(self, index: int, dtype: Any) -> tuple[int, Any]:
+        code = slabs.DTYPE_CODES[dtype]
+        leaf = self.layout.actions[index]
+        made = self._views[index, dtype] = (code, slabs.view(self._request, leaf, dtype))
+        return made
+
+    def answered(self) -> bool:
+        """Whether the reply to the last request is there."""
+        return self._tells[slabs.SEQUENCE] == self.sequence
+
+    def park(self, parked: int) -> None:
+        """Say whether we sleep and want our doorbell rung."""
+        self._asks[slabs.PARKED] = parked
+
+    def silence(self) -> None:
+        """Take back a ring of our doorbell."""
+        with suppress(BlockingIOError):
+            os.read(self.bell, 8)
+
+    def outcome(self) -> Outcome:
+        """How the request went. Trust: input from the worker; the length is bounded here."""
+        tells = self._tells
+        kind, length = tells[slabs.OUTCOME], tells[slabs.LENGTH]
+        if kind not in (slabs.DONE, slabs.RAISED, slabs.FETCH) or length > slabs.INFO_BYTES:
+            raise RemoteProtocolError("the worker wrote an impossible reply into its slab")
+        start = self.layout.infos
+        return kind, self._reply[start : start + length] if length else b""
+
+    def rows(self) -> list[Any]:
+        """The observation's leaves: views that the next step changes."""
+        return self._rows
+
+    def results(self) -> Any:
+        """A copy of the block of rewards, terminations and truncations: uint8."""
+        return self._results.copy()
+
+    def close(self) -> None:
+        """Give everything back."""
+        self.handed_over()
+        os.close(self._host_bell)
+        os.close(self.bell)
+        self._asks.release()
+        self._tells.release()
+        # the maps go with the last array over them
+
+
+class FastLane:
+    """Steps of one environment, over all its shards.
+
+    Args:
+        manifest: Its spaces.
+        shards: One for each slice of the sub-environments, in order.
+        bounds: The slices.
+        process_fd: Readable once the worker server has ended.
+    """
+
+    def __init__(
+        self,
+        manifest: EnvManifest,
+        shards: list[LaneShard],
+        bounds: Sequence[tuple[int, int]],
+        process_fd: int,
+    ) -> None:
+        self.shards = shards
+        self._bounds = list(bounds)
+        self._count = manifest.num_envs
+        self._action_space = manifest.single_action_space
+        self._assemble = slabs.assembler(manifest.single_observation_space)
+        self._flat_actions = (
+            len(shards[0].layout.actions) == 1 and not shards[0].layout.actions[0].path
+        )
+        self._pidfds: list[int] = []
+        self._poller = select.poll()
+        self._poller.register(process_fd, select.POLLIN)
+        for shard in shards:
+            self._poller.register(shard.bell, select.POLLIN)
+        self._spin = SpinChooser(_ORDERED_STORES)
+        self._asked_ns = 0
+
+    @classmethod
+    def for_spaces(
+        cls, manifest: EnvManifest, bounds: Sequence[tuple[int, int]], process_fd: int
+    ) -> FastLane | None:
+        """A lane with fresh slabs, or None where the spaces have no fixed layout."""
+        spaces = manifest.single_observation_space, manifest.single_action_space
+        layouts = [slabs.layout_of(*spaces, stop - start) for start, stop in bounds]
+        known = [layout for layout in layouts if layout is not None]
+        if len(known) < len(layouts):
+            return None
+        return cls(manifest, [LaneShard(layout) for layout in known], bounds, process_fd)
+
+    def watch_jail(self, pidfd: int) -> None:
+        """End waits when the jail ends. Takes the descriptor over."""
+        self._pidfds.append(pidfd)
+        self._poller.register(pidfd, select.POLLIN)
+
+    def ask(self, actions: Any) -> None:
+        """Send a validated batch of actions to every shard."""
+        leaves = [actions] if self._flat_actions else slabs.flatten(self._action_space, actions)
+        self._asked_ns = perf_counter_ns()
+        spin_ns = self._spin.host_budget_ns
+        if len(self.shards) == 1:
+            self.shards[0].ask(leaves, spin_ns)
+            return
+        for shard, (start, stop) in zip(self.shards, self._bounds, strict=True):
+            shard.ask([leaf[start:stop] for leaf in leaves], spin_ns)
+
+    def wait(self, deadline: Deadline) -> list[Outcome]:
+        """Every shard's outcome.
+
+        Raises:
+            WorkerTimeoutError: The deadline came first.
+            JailGoneError: The jail has ended.
+            RemoteProtocolError: A shard wrote what the rules forbid.
+        """
+        for shard in self.shards:
+            if not shard.answered() and not self._spin_for(shard):
+                self._sleep_for(shard, deadline)
+        self._spin.measured(perf_counter_ns() - self._asked_ns)
+        return [shard.outcome() for shard in self.shards]
+
+    def _spin_for(self, shard: LaneShard) -> bool:
+        budget = self._spin.budget_ns
+        if not budget:
+            return False
+        until = perf_counter_ns() + budget
+        answered = shard.answered
+        while not answered():
+            if perf_counter_ns() > until:
+                return False
+        return True
+
+    def _sleep_for(self, shard: LaneShard, deadline: Deadline) -> None:
+        shard.park(1)
+        try:
+            # a ring may cross with our going to sleep: look again soon, once
+            timeout: int | None = _RECHECK_MS
+            while not shard.answered():
+                for fd, _ in self._poller.poll(timeout):
+                    if fd == shard.bell:
+                        shard.silence()
+                    elif not self._is_bell(fd) and not shard.answered():
+                        raise JailGoneError
+                if deadline.passed and not shard.answered():
+                    raise WorkerTimeoutError("the worker did not answer in time")
+                timeout = deadline.left_ms()
+        finally:
+            shard.park(0)
+
+    def _is_bell(self, fd: int) -> bool:
+        for shard in self.shards:
+            if shard.bell == fd:
+                shard.silence()
+                return True
+        return False
+
+    def observation(self) -> Any:
+        """The batched observation: fresh arrays that belong to the caller."""
+        if len(self.shards) == 1:
+            return self._assemble([rows.copy() for rows in self.shards[0].rows()])
+        joined = []
+        for index, leaf in enumerate(self.shards[0].layout.observations):
+            whole = np.empty((self._count, *leaf.shape[1:]), leaf.dtype)
+            for shard, (start, stop) in zip(self.shards, self._bounds, strict=True):
+                whole[start:stop] = shard.rows()[index]
+            joined.append(whole)
+        return self._assemble(joined)
+
+    def flags(self) -> tuple[Any, Any, Any]:
+        """Rewards float64, terminations and truncations bool: fresh arrays ``(num_envs,)``."""
+        if len(self.shards) == 1:
+            return _flags(self.shards[0].results(), self._count)
+        parts = [_flags(shard.results(), shard.layout.count) for shard in self.shards]
+        return tuple(np.concatenate(column) for column in zip(*parts, strict=True))  # type: ignore[return-value]
+
+    def close(self) -> None:
+        """Give everything back."""
+        for shard in self.shards:
+            shard.close()
+        while self._pidfds:
+            os.close(self._pidfds.pop())
+
+
+def _flags(block: Any, count: int) -> tuple[Any, Any, Any]:
+    # compared, not viewed: a hostile byte of 2 would make a bool that is neither
+    return (
+        block[: 8 * count].view(np.float64),
+        block[8 * count : 9 * count] != 0,
+        block[9 * count :] != 0,
+    )
+
+
+def decode_infos(encoded: bytes) -> m.Message:
+    """The message in a slab's info area. Trust: input from the worker, copied by now."""
+    return m.unpack([encoded], tensors=to_tensor)[1]
+
+
+def deposit(path: str, session: bytes, jail: int, host: int, fds: Sequence[int]) -> int:
+    """Hand descriptors to the server for a host; returns a pidfd of the jail.
+
+    Raises:
+        OSError: The server did not take them.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+        connection.settimeout(_CONNECT_S)
+        connection.connect(path)
+        [frame] = m.pack(m.Deposit(session, jail, host), 0)
+        socket.send_fds(connection, [frame], list(fds))
+        data, received, _, _ = socket.recv_fds(connection, 16, 1)
+    if data != b"k" or len(received) != 1:
+        raise ConnectionError("the worker server did not take the descriptors")
+    return received[0]
+
+
+def _slab(name: str, size: int, further_seals: int) -> tuple[mmap.mmap, int]:
+    fd = os.memfd_create(f"envhub-{name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    os.ftruncate(fd, size)
+    mapped = mmap.mmap(fd, size)
+    fcntl.fcntl(fd, fcntl.F_ADD_SEALS, _REPLY_SEALS | further_seals)
+    return mapped, fd

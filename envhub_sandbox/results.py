@@ -1,0 +1,95 @@
+"""Checks what the shards sent against what was declared, and joins it into one batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from envhub_sandbox.errors import RemoteProtocolError
+from envhub_worker.protocol import batches
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.manifest import EnvManifest
+
+StepResult = tuple[Any, Any, Any, Any, dict[Any, Any]]
+
+
+class Results:
+    """Joins the replies for one environment. Trust: input from the worker.
+
+    Args:
+        manifest: What the worker declared.
+        bounds: The slices of the sub-environments, in the order of the replies.
+    """
+
+    def __init__(self, manifest: EnvManifest, bounds: Sequence[tuple[int, int]]) -> None:
+        self._space = manifest.single_observation_space
+        self._declared = manifest.shardable
+        self._sizes = [stop - start for start, stop in bounds]
+        self._restores = batches.restores(self._space)
+
+    def step(self, replies: list[m.StepDone]) -> StepResult:
+        """What ``VectorEnv.step`` returns."""
+        return (
+            self._observation([reply.observation for reply in replies]),
+            self._per_env("rewards", [reply.rewards for reply in replies]),
+            self._per_env("terminations", [reply.terminations for reply in replies]),
+            self._per_env("truncations", [reply.truncations for reply in replies]),
+            self._infos([reply.info for reply in replies]),
+        )
+
+    def reset(self, replies: list[m.ResetDone]) -> tuple[Any, dict[Any, Any]]:
+        """What ``VectorEnv.reset`` returns."""
+        observation = self._observation([reply.observation for reply in replies])
+        return observation, self._infos([reply.info for reply in replies])
+
+    def lane_infos(self, parts: list[Any]) -> dict[Any, Any]:
+        """The infos that came by the fast lane."""
+        return self._infos([self._info(part) for part in parts])
+
+    def one_each(self, what: str, replies: list[m.Value]) -> tuple[Any, ...]:
+        """One value for each sub-environment."""
+        gathered: list[Any] = []
+        for reply, size in zip(replies, self._sizes, strict=True):
+            if type(reply.value) is not tuple or len(reply.value) != size:
+                raise RemoteProtocolError(f"the worker's {what} does not hold one result each")
+            gathered += reply.value
+        return tuple(gathered)
+
+    def _observation(self, parts: list[Any]) -> Any:
+        if self._declared:
+            for part, size in zip(parts, self._sizes, strict=True):
+                if not batches.conforms(self._space, part, size):
+                    raise RemoteProtocolError(
+                        f"the worker sent an observation that is not a batch of {self._space}"
+                    )
+        joined = parts[0] if len(parts) == 1 else batches.join(self._space, parts)
+        return batches.restore_batch(self._space, joined) if self._restores else joined
+
+    def _per_env(self, name: str, parts: list[Any]) -> Any:
+        for part, size in zip(parts, self._sizes, strict=True):
+            shape = getattr(part, "shape", None)
+            if not shape or shape[0] != size:
+                raise RemoteProtocolError(f"the worker sent {name} that do not fit num_envs")
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def _infos(self, parts: list[dict[Any, Any]]) -> dict[Any, Any]:
+        infos = parts[0] if len(parts) == 1 else self._joined_infos(parts)
+        final = infos.get("final_obs") if self._restores else None
+        if final is not None:
+            for index, member in enumerate(final):
+                final[index] = batches.restore(self._space, member)
+        return infos
+
+    def _joined_infos(self, parts: list[dict[Any, Any]]) -> dict[Any, Any]:
+        try:
+            return batches.join_infos(parts, self._sizes)
+        except (AttributeError, TypeError, ValueError) as error:
+            raise RemoteProtocolError(f"the shards' infos do not fit together: {error}") from error
+
+    @staticmethod
+    def _info(part: Any) -> dict[Any, Any]:
+        if type(part) is not dict:
+            raise RemoteProtocolError("the worker's infos are not a mapping")
+        return part

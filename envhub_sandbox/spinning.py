@@ -1,0 +1,75 @@
+"""Decides whether waiting awake pays, by measuring both.
+
+A wake-up costs some ten microseconds, so a reply that is nearly there is best waited for awake.
+With every core busy the same spinning takes the core from whoever computes the reply. So both
+ways are tried in turn, seldom, and the faster one is used; the interval between trials doubles
+while the answer stays the same. One decision serves both sides: the client's wait for the reply
+and the host's wait for the next request.
+"""
+
+from __future__ import annotations
+
+_TRIAL = 16
+"""Steps of one trial."""
+_FIRST_INTERVAL = 64
+_LONGEST_INTERVAL = 8192
+_MAX_BUDGET_NS = 200_000
+"""A reply that is further away than this is not worth waiting awake for."""
+_ADVANTAGE = 0.97
+"""Spinning must be this much faster to be chosen: it burns a core."""
+
+
+class SpinChooser:
+    """The chooser. ``measured`` is called once a step.
+
+    Attributes:
+        budget_ns: How long the client may wait awake; 0 for not at all.
+        host_budget_ns: Likewise the host, for the next request.
+    """
+
+    def __init__(self, allowed: bool) -> None:
+        self._allowed = allowed
+        self.budget_ns = 0
+        self._chosen = self._spinning = False
+        self._best = {False: 0.0, True: 0.0}
+        self._sum = 0
+        self._steps = 0
+        self._trials = 2 if allowed else 0
+        self._interval = _FIRST_INTERVAL
+        self._left = _TRIAL
+
+    @property
+    def host_budget_ns(self) -> int:
+        """Like the client's: the decision is one."""
+        return self.budget_ns
+
+    def measured(self, elapsed_ns: int) -> None:
+        """Take note of how long a step took, and decide when it is time to."""
+        if not self._allowed:
+            return
+        self._sum += elapsed_ns
+        self._steps += 1
+        if self._steps < self._left:
+            return
+        self._best[self._spinning] = self._sum / self._steps
+        self._sum = self._steps = 0
+        self._decide()
+
+    def _decide(self) -> None:
+        if self._trials:
+            self._trials -= 1
+            if self._trials:
+                self._use(not self._spinning, _TRIAL)
+                return
+            better = self._best[True] < self._best[False] * _ADVANTAGE
+            same, self._chosen = better == self._chosen, better
+            self._interval = min(self._interval * 2, _LONGEST_INTERVAL) if same else _FIRST_INTERVAL
+            self._use(better, self._interval)
+            return
+        self._trials = 2
+        self._use(self._spinning, _TRIAL)
+
+    def _use(self, spinning: bool, steps: int) -> None:
+        self._spinning = spinning
+        self._left = steps
+        self.budget_ns = _MAX_BUDGET_NS if spinning else 0

@@ -1,0 +1,83 @@
+"""The descriptor socket: how a client's slabs and doorbells get to a host.
+
+ZeroMQ carries no descriptors, so they come over a ``SOCK_SEQPACKET`` socket in the server's
+private folder and wait here until the host's ``Attach`` takes them along. One request a
+connection: nobody can keep it busy.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+
+from envhub_worker.channel import close_fds
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.errors import ProtocolError
+
+FDS = 4
+"""Descriptors of one deposit: request slab, reply slab, the host's doorbell, the client's."""
+_REQUEST_BYTES = 4096
+_WAIT_S = 1.0
+
+PidfdFor = Callable[[m.Deposit], int | None]
+"""The pidfd of the jail that a deposit is for, or None if the client may not have it."""
+
+
+class Deposits:
+    """Descriptors that wait for their host."""
+
+    def __init__(self, path: str, pidfd_for: PidfdFor) -> None:
+        self._pidfd_for = pidfd_for
+        self._waiting: dict[tuple[int, int], list[int]] = {}
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._listener.bind(path)
+        self._listener.listen(16)
+        self._listener.setblocking(False)
+
+    def fileno(self) -> int:
+        """Readable when a client is there."""
+        return self._listener.fileno()
+
+    def accept(self) -> None:
+        """Serve one client. Clients are ours: the folder is private and the session is checked."""
+        try:
+            connection, _ = self._listener.accept()
+        except OSError:
+            return
+        with connection:
+            connection.settimeout(_WAIT_S)
+            try:
+                self._serve(connection)
+            except (OSError, ProtocolError):
+                return  # the client sees the end of the connection
+
+    def _serve(self, connection: socket.socket) -> None:
+        data, fds, _, _ = socket.recv_fds(connection, _REQUEST_BYTES, FDS)
+        try:
+            _, request = m.unpack([data])
+            pidfd = self._pidfd_for(request) if isinstance(request, m.Deposit) else None
+            if pidfd is None or len(fds) != FDS:
+                return
+            assert isinstance(request, m.Deposit)
+            key = request.jail, request.host
+            close_fds(self._waiting.pop(key, []))
+            self._waiting[key], fds = fds, []
+            socket.send_fds(connection, [b"k"], [pidfd])
+        finally:
+            close_fds(fds)
+
+    def take(self, jail: int, host: int) -> list[int]:
+        """The descriptors for a host; the caller closes them."""
+        return self._waiting.pop((jail, host), [])
+
+    def drop(self, jail: int) -> None:
+        """Close what waits for a jail that has ended."""
+        for key in [key for key in self._waiting if key[0] == jail]:
+            close_fds(self._waiting.pop(key))
+
+    def close(self) -> None:
+        """Close everything."""
+        self._listener.close()
+        for fds in self._waiting.values():
+            close_fds(fds)
+        self._waiting.clear()

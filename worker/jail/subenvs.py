@@ -1,0 +1,222 @@
+"""The worker's own loop over plain sub-environments: ``SyncVectorEnv``, written into given memory.
+
+Observations, rewards and flags go straight to where they are read: no stacking, no deep copy.
+Everything but ``reset`` and ``step`` is ``SyncVectorEnv``'s own. The parity suite compares the two
+bit by bit. Followed: ``gymnasium.vector.SyncVectorEnv`` 1.4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import SyncVectorEnv
+from gymnasium.vector.utils import concatenate, create_empty_array, iterate
+
+from envhub_worker.protocol import slabs
+
+Store = Callable[[int, Any], None]
+_ARRAYS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+_SCALARS = frozenset({int, float, bool})
+
+
+class Batch:
+    """Where the results of one batch lie: arrays of its own, or views of a slab.
+
+    Attributes:
+        rewards: float64 ``(count, *reward_shape)``.
+        terminations, truncations: bool ``(count,)``.
+        store: Writes a sub-environment's observation into its row.
+    """
+
+    def __init__(self, space: gym.Space[Any], count: int, reward_shape: tuple[int, ...]) -> None:
+        self._space = space
+        self._count = count
+        self._members: list[Any] = [None] * count
+        self.rewards = np.zeros((count, *reward_shape))
+        self.terminations = np.zeros(count, np.bool_)
+        self.truncations = np.zeros(count, np.bool_)
+        layout = slabs.layout_of(space, spaces.Discrete(1), count)
+        if layout is None:
+            self.store: Store = self._members.__setitem__
+            return
+        self._use([np.zeros(leaf.shape, leaf.dtype) for leaf in layout.observations])
+
+    def _use(self, leaves: list[Any]) -> None:
+        self._leaves = leaves
+        self.store = _writer(self._space, iter(leaves))
+
+    def move(self, layout: slabs.Layout, reply: Any) -> None:
+        """Write into a reply slab from now on."""
+        start, count = layout.results, layout.count
+        block = np.frombuffer(reply, np.uint8, layout.results_bytes, start)
+        self.rewards = block[: 8 * count].view(np.float64)
+        self.terminations = block[8 * count : 9 * count].view(np.bool_)
+        self.truncations = block[9 * count :].view(np.bool_)
+        self._use([slabs.view(reply, leaf) for leaf in layout.observations])
+
+    def observation(self) -> Any:
+        """The batched observation; views of the arrays that the next step writes."""
+        if self._leaves is not None:
+            return slabs.assembler(self._space)(self._leaves)
+        empty: Any = create_empty_array(self._space, n=self._count, fn=np.zeros)
+        return concatenate(self._space, self._members, empty)
+
+    _leaves: list[Any] | None = None
+
+
+class SubEnvs(SyncVectorEnv):
+    """Plain sub-environments, driven with ``SyncVectorEnv``'s semantics.
+
+    Attributes:
+        batch: Where ``reset`` and ``step`` leave their results.
+        reward_shape: Of one sub-environment's reward; ``()`` but for multi-objective ones.
+    """
+
+    def __init__(
+        self, env_fns: Sequence[Callable[[], Any]], autoreset_mode: str, sync: bool
+    ) -> None:
+        super().__init__(env_fns, copy=False, autoreset_mode=autoreset_mode)
+        # AsyncVectorEnv stacks vector rewards, SyncVectorEnv refuses them
+        self.reward_shape = () if sync else _reward_shape(self.envs[0])
+        self.batch = Batch(self.single_observation_space, self.num_envs, self.reward_shape)
+        self._done = [False] * self.num_envs
+        self._mode = autoreset_mode
+        self._plain_actions = isinstance(self.single_action_space, _ARRAYS)
+
+    def run_reset(self, seeds: Any, options: dict[str, Any] | None, mask: Any) -> dict[Any, Any]:
+        """Reset the sub-environments that the mask names, or all; returns the infos.
+
+        Args:
+            seeds: One seed or None each, or None.
+            options: The same object for each.
+            mask: bool ``(num_envs,)`` or None. A shard's part of it may be all False.
+        """
+        chosen = range(self.num_envs) if mask is None else np.flatnonzero(mask).tolist()
+        for index in chosen:
+            self._done[index] = False
+            self.batch.terminations[index] = self.batch.truncations[index] = False
+        infos: dict[Any, Any] = {}
+        for index in chosen:
+            seed = None if seeds is None else seeds[index]
+            observation, info = self.envs[index].reset(seed=seed, options=options)
+            self.batch.store(index, observation)
+            if info:
+                add_info(infos, info, index, self.num_envs)
+        return infos
+
+    def run_step(self, actions: Any) -> dict[Any, Any]:
+        """Step every sub-environment, or reset it where its episode is over; returns the infos.
+
+        Args:
+            actions: A batch for the action space; rows are handed out as they are.
+        """
+        if self._mode == "Disabled" and any(self._done):
+            raise AssertionError(f"self._autoreset_envs={np.array(self._done)!r}")
+        batch, same_step, count = self.batch, self._mode == "SameStep", self.num_envs
+        store, rewards = batch.store, batch.rewards
+        terminations, truncations = batch.terminations, batch.truncations
+        done = [False] * count
+        infos: dict[Any, Any] = {}
+        for index, (action, env) in enumerate(zip(self._each(actions), self.envs, strict=True)):
+            if self._done[index]:
+                observation, info = env.reset()
+                rewards[index] = 0.0
+                terminations[index] = truncations[index] = False
+            else:
+                observation, reward, terminated, truncated, info = env.step(action)
+                rewards[index] = reward
+                terminations[index] = terminated
+                truncations[index] = truncated
+                if terminations[index] or truncations[index]:
+                    if same_step:
+                        final = {"final_obs": observation, "final_info": info}
+                        add_info(infos, final, index, count)
+                        observation, info = env.reset()
+                    else:
+                        done[index] = True
+            store(index, observation)
+            if info:
+                add_info(infos, info, index, count)
+        self._done = done
+        return infos
+
+    def _each(self, actions: Any) -> Iterator[Any]:
+        return iter(actions) if self._plain_actions else iterate(self.action_space, actions)
+
+
+def add_info(infos: dict[Any, Any], info: dict[Any, Any], index: int, count: int) -> dict[Any, Any]:
+    """``VectorEnv._add_info``, without its allocations."""
+    for key, value in info.items():
+        array: Any
+        if key == "final_obs":
+            array = infos.get(key)
+            if array is None:
+                array = np.full(count, None, dtype=object)
+            array[index] = value
+        elif isinstance(value, dict):
+            array = add_info(infos.get(key, {}), value, index, count)
+        else:
+            array = infos[key] if key in infos else _column(value, count)
+            array[index] = value
+        mask_key = f"_{key}"
+        mask = infos.get(mask_key)
+        if mask is None:
+            mask = np.zeros(count, np.bool_)
+        mask[index] = True
+        infos[key], infos[mask_key] = array, mask
+    return infos
+
+
+def _reward_shape(env: Any) -> tuple[int, ...]:
+    """MO-Gymnasium's environments declare a ``reward_space``."""
+    try:
+        return tuple(env.get_wrapper_attr("reward_space").shape)
+    except (AttributeError, TypeError):
+        return ()
+
+
+def _column(value: Any, count: int) -> Any:
+    """The array for a key that is seen first: its dtype is decided by this value."""
+    kind = type(value)
+    if kind in _SCALARS or issubclass(kind, np.number):
+        return np.zeros(count, dtype=kind)
+    if isinstance(value, np.ndarray):
+        return np.zeros((count, *value.shape), dtype=value.dtype)
+    return np.full(count, None, dtype=object)
+
+
+def _writer(space: gym.Space[Any], leaves: Iterator[Any]) -> Store:
+    """Writes one member of the space into row ``index`` of the leaves."""
+    if isinstance(space, spaces.Dict):
+        by_key = [(key, _writer(sub, leaves)) for key, sub in space.spaces.items()]
+
+        def write_dict(index: int, member: Any) -> None:
+            for key, write in by_key:
+                write(index, member[key])
+
+        return write_dict
+    if isinstance(space, spaces.Tuple):
+        in_order = [_writer(sub, leaves) for sub in space.spaces]
+
+        def write_tuple(index: int, member: Any) -> None:
+            for position, write in enumerate(in_order):
+                write(index, member[position])
+
+        return write_tuple
+    return _leaf_writer(next(leaves))
+
+
+def _leaf_writer(rows: Any) -> Store:
+    dtype, shape = rows.dtype, rows.shape[1:]
+
+    def write(index: int, member: Any) -> None:
+        if type(member) is np.ndarray and member.dtype == dtype and member.shape == shape:
+            rows[index] = member
+        else:  # the casts that SyncVectorEnv permits, and its errors for the others
+            np.stack([member], out=rows[index : index + 1])
+
+    return write

@@ -1,0 +1,205 @@
+"""The fast lane's shared memory: where everything lies. Pure arithmetic; each side does its own.
+
+Two slabs a shard. The *request* slab is written by the client and sealed against the jail's
+writes; the *reply* slab is written by the jail. Each starts with a header of 64-bit words, those
+that are polled on a cache line of their own, and holds its arrays at 64-byte boundaries. The
+client never follows an offset or a length that it has not computed or bounded itself.
+
+::
+
+    request   header | one area per action leaf
+    reply     header | rewards, terminations, truncations | observation leaves | infos, encoded
+
+Only ``step`` goes this way; everything else is a message.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+LINE = 64
+"""Bytes of a cache line: words that two cores poll must not share one."""
+INFO_BYTES = 64 * 1024
+"""Room for a step's infos, or for what it raised; larger infos are fetched with a message."""
+MAX_SLAB_BYTES = 1 << 31
+"""Above this the frames lane serves: a slab is pinned memory."""
+
+# word numbers in the headers (a word is 8 bytes, a line holds 8 of them)
+SEQUENCE = 0
+"""Counts requests, or replies; polled by the other side."""
+PARKED = 8
+"""1 while this slab's writer sleeps in poll and wants its doorbell rung."""
+OUTCOME = 16
+"""Reply: ``DONE``, ``RAISED`` or ``FETCH``."""
+LENGTH = 17
+"""Reply: bytes of the encoded infos, or of what was raised; 0 for an empty info."""
+SPIN = 16
+"""Request: nanoseconds that the shard may wait for the next request without sleeping."""
+DTYPES = 24
+"""Request: the dtype code of each action leaf, one word each, up to ``MAX_LEAVES``."""
+MAX_LEAVES = 64
+HEADER_WORDS = DTYPES + MAX_LEAVES
+HEADER_BYTES = HEADER_WORDS * 8
+
+DONE, RAISED, FETCH = 1, 2, 3
+"""The results and infos are in the slab; an encoded ``Raised`` is; the infos must be fetched."""
+
+ACTION_DTYPES = tuple(
+    np.dtype(name)
+    for name in (
+        *("bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
+        *("float16", "float32", "float64"),
+    )
+)
+"""An action keeps the dtype that the caller gave it; the code is the place in this table."""
+DTYPE_CODES = {dtype: code for code, dtype in enumerate(ACTION_DTYPES)}
+_ACTION_ITEM_BYTES = 8
+
+_LEAVES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One array of a batched space.
+
+    Attributes:
+        path: Keys and indices from the space's root.
+        dtype: Of the space.
+        shape: ``(count, *shape of a member)``.
+        offset: Bytes from the slab's start.
+    """
+
+    path: tuple[Any, ...]
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    offset: int
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where everything lies for ``count`` sub-environments.
+
+    Attributes:
+        count: Sub-environments of the shard.
+        actions: Leaves of the action space, in the request slab.
+        request_bytes: Size of the request slab.
+        results: Offset of the block of rewards (float64), terminations and truncations (bool).
+        results_bytes: Its size.
+        observations: Leaves of the observation space, in the reply slab.
+        infos: Offset of the encoded infos.
+        reply_bytes: Size of the reply slab.
+    """
+
+    count: int
+    actions: tuple[Leaf, ...]
+    request_bytes: int
+    results: int
+    results_bytes: int
+    observations: tuple[Leaf, ...]
+    infos: int
+    reply_bytes: int
+
+
+def layout_of(observation: gym.Space[Any], action: gym.Space[Any], count: int) -> Layout | None:
+    """The layout for ``count`` members of two single spaces, or None if they have no fixed one."""
+    observed, acted = list(_leaves(observation)), list(_leaves(action))
+    if None in observed or None in acted or max(len(observed), len(acted)) > MAX_LEAVES:
+        return None
+    actions, request_bytes = _placed(acted, count, HEADER_BYTES, _ACTION_ITEM_BYTES)
+    results = HEADER_BYTES
+    results_bytes = count * (8 + 1 + 1)
+    observations, infos = _placed(observed, count, _aligned(results + results_bytes), None)
+    made = Layout(
+        count=count,
+        actions=actions,
+        request_bytes=request_bytes,
+        results=results,
+        results_bytes=results_bytes,
+        observations=observations,
+        infos=infos,
+        reply_bytes=_aligned(infos + INFO_BYTES),
+    )
+    return made if max(made.request_bytes, made.reply_bytes) <= MAX_SLAB_BYTES else None
+
+
+def _leaves(space: gym.Space[Any], path: tuple[Any, ...] = ()) -> Iterator[Any]:
+    if isinstance(space, _LEAVES):
+        yield path, np.dtype(space.dtype), tuple(space.shape or ())
+    elif isinstance(space, spaces.Dict):
+        for key, sub in space.spaces.items():
+            yield from _leaves(sub, (*path, key))
+    elif isinstance(space, spaces.Tuple):
+        for index, sub in enumerate(space.spaces):
+            yield from _leaves(sub, (*path, index))
+    else:
+        yield None
+
+
+def _placed(
+    leaves: list[Any], count: int, start: int, item_bytes: int | None
+) -> tuple[tuple[Leaf, ...], int]:
+    placed = []
+    for path, dtype, shape in leaves:
+        placed.append(Leaf(path, dtype, (count, *shape), start))
+        start = _aligned(start + count * math.prod(shape) * (item_bytes or dtype.itemsize))
+    return tuple(placed), start
+
+
+def _aligned(offset: int) -> int:
+    return -(-offset // LINE) * LINE
+
+
+def view(buffer: Any, leaf: Leaf, dtype: np.dtype[Any] | None = None) -> Array:
+    """A leaf's array in a mapped slab."""
+    made: Array = np.ndarray(leaf.shape, dtype or leaf.dtype, buffer, leaf.offset)
+    return made
+
+
+def words(buffer: Any) -> memoryview:
+    """The header of a mapped slab, as words."""
+    return memoryview(buffer)[:HEADER_BYTES].cast("Q")
+
+
+def assembler(space: gym.Space[Any]) -> Callable[[list[Any]], Any]:
+    """A function that puts a flat list of leaves, in their order, into the space's structure."""
+    if isinstance(space, _LEAVES):
+        return _first
+    if isinstance(space, spaces.Dict):
+        keys = list(space.spaces)
+        if all(isinstance(sub, _LEAVES) for sub in space.spaces.values()):
+            return lambda leaves: dict(zip(keys, leaves, strict=True))
+    nested = _nested(space)
+    return lambda leaves: nested(iter(leaves))
+
+
+def _first(leaves: list[Any]) -> Any:
+    return leaves[0]
+
+
+def _nested(space: gym.Space[Any]) -> Callable[[Iterator[Any]], Any]:
+    if isinstance(space, spaces.Dict):
+        parts = {key: _nested(sub) for key, sub in space.spaces.items()}
+        return lambda leaves: {key: part(leaves) for key, part in parts.items()}
+    if isinstance(space, spaces.Tuple):
+        members = [_nested(sub) for sub in space.spaces]
+        return lambda leaves: tuple(member(leaves) for member in members)
+    return next
+
+
+def flatten(space: gym.Space[Any], batch: Any) -> list[Any]:
+    """The leaves of a batch in the order of ``Layout``: the inverse of ``assembler``."""
+    if isinstance(space, spaces.Dict):
+        return [leaf for key, sub in space.spaces.items() for leaf in flatten(sub, batch[key])]
+    if isinstance(space, spaces.Tuple):
+        pairs = zip(space.spaces, batch, strict=True)
+        return [leaf for sub, item in pairs for leaf in flatten(sub, item)]
+    return [batch]
