@@ -168,6 +168,15 @@ def test_uncopied_large_array_is_a_view_of_its_frame() -> None:
     assert np.shares_memory(through(source, copy=False), source)
 
 
+def test_misaligned_frames_give_aligned_arrays() -> None:
+    """A transport may cut frames out of one buffer anywhere; native code needs alignment."""
+    frame = memoryview(bytes(1 + 8 * LARGE))[1:]
+    reader = ArrayReader(b"", [frame], DEFAULT_LIMITS, copy=False)
+    array = reader.take(descriptor(11, LARGE, frame=True))
+    assert array.flags.aligned
+    assert not array.flags.writeable
+
+
 @pytest.mark.parametrize(
     "dtype", [object, "V4", [("a", "f4")], np.longdouble, np.clongdouble, "U300000", "S2000000"]
 )

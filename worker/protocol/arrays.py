@@ -104,7 +104,7 @@ class ArrayReader:
         frames: Bytes of large arrays, one each.
         limits: Cap on the bytes of one array.
         copy: Whether arrays have memory of their own and can be written. Otherwise they are
-            read-only, and the large ones are views of ``frames``.
+            read-only, and the large ones are views of ``frames`` where those are aligned.
     """
 
     __slots__ = ("_copy", "_frames", "_limits", "_next_byte", "_next_frame", "_tail")
@@ -126,12 +126,15 @@ class ArrayReader:
         dtype, shape, nbytes, own_frame = parse_descriptor(descriptor)
         if not nbytes:
             return np.empty(shape, dtype)
-        raw = self._frame(nbytes) if own_frame else self._slice(nbytes)
+        array: Array
+        if not own_frame:
+            array = np.ndarray(shape, dtype, self._slice(nbytes))
+        elif self._copy:
+            array = np.ndarray(shape, dtype, self._frame(nbytes)).copy()
+        else:
+            array = _read_only(np.ndarray(shape, dtype, self._frame(nbytes)))
         if dtype.kind in "bU":
-            _check_content(raw, dtype.kind)
-        array: Array = np.ndarray(shape, dtype, raw)
-        if own_frame:
-            return array.copy() if self._copy else _read_only(array)
+            _check_content(array)
         return array
 
     def finish(self) -> None:
@@ -243,9 +246,10 @@ def read_scalar(data: bytes) -> np.generic:
     dtype, offset = read_dtype(data[0], data, 1)
     if len(data) != offset + dtype.itemsize:
         raise RemoteProtocolError("A numpy scalar has a wrong number of bytes.")
+    flat = np.frombuffer(data, dtype, 1, offset)
     if dtype.kind in "bU":
-        _check_content(data[offset:], dtype.kind)
-    scalar: np.generic = np.frombuffer(data, dtype, 1, offset)[0]
+        _check_content(flat)
+    scalar: np.generic = flat[0]
     return scalar
 
 
@@ -324,22 +328,25 @@ def _sized_dtype(code: int, parameter: int) -> np.dtype[Any]:
 
 
 def _read_only(array: Array) -> Array:
+    """Returns the array protected from writing; a copy where a transport misaligned it."""
+    if not array.flags.aligned:
+        array = array.copy()
     array.flags.writeable = False
     return array
 
 
-def _check_content(raw: Buffer | bytearray, kind: str) -> None:
+def _check_content(array: Array) -> None:
     """Refuses bytes that are not values of their dtype.
 
     numpy counts a mask's True values by adding its bytes and writes that many elements, so
     that a boolean of 2 reaches outside of an array; a character beyond Unicode makes str fail.
     """
-    if kind == "U":
-        points = np.frombuffer(raw, np.uint32)
+    if array.dtype.kind == "U":
+        points = array.reshape(-1).view(np.uint32)
         if points.max() > 0x10FFFF or ((points >= 0xD800) & (points <= 0xDFFF)).any():
             raise RemoteProtocolError("A string array holds something that is no character.")
-    elif len(raw) <= 1024:
-        if bytes(raw).strip(b"\0\1"):
+    elif array.size <= 1024:
+        if array.tobytes().strip(b"\0\1"):
             raise RemoteProtocolError("A boolean is neither 0 nor 1.")
-    elif np.frombuffer(raw, np.uint8).max() > 1:
+    elif array.view(np.uint8).max() > 1:
         raise RemoteProtocolError("A boolean is neither 0 nor 1.")
