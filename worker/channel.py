@@ -82,7 +82,7 @@ class Channel:
 
     def drain(self) -> tuple[list[tuple[Message, list[int]]], bool]:
         """Everything that is there now, and whether the stream has ended."""
-        messages = []
+        messages: list[tuple[Message, list[int]]] = []
         with contextlib.suppress(BlockingIOError):
             while True:
                 received = self.receive()

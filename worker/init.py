@@ -32,22 +32,25 @@ from typing import Any, NoReturn
 from envhub_worker import launch
 from envhub_worker.channel import Channel, close_fds
 from envhub_worker.jailspec import JailSpec
-from envhub_worker.lockdown import process, sweep
-from envhub_worker.lockdown.report import LayerUnavailableError
-from envhub_worker.lockdown.scratch import Scratch
+from envhub_worker.lockdown import inner, process, sweep
+from envhub_worker.lockdown.context import Common, JailContext
+from envhub_worker.lockdown.plan import HostFacts, plan
+from envhub_worker.lockdown.report import Layer, LayerUnavailableError
 
 
-def run(parent: int, control: int, output: int, target: str) -> NoReturn:
-    """Be the init of a jail in this freshly forked child of ``parent``. Never returns."""
+def run(control: int, output: int, common: Common) -> NoReturn:
+    """Be the init of a jail in this freshly forked child of the zygote. Never returns."""
     code = 1
     try:
-        process.reset_signals()
-        process.die_with_parent(parent, signal.SIGTERM)
+        process.reset_signals(sweep.HANDLED)
+        # Without a pid namespace init must live long enough to end what it started.
+        signum = signal.SIGKILL if common.namespaced else signal.SIGTERM
+        process.die_with_parent(common.pid, signum)
         os.dup2(output, 1)
         os.dup2(output, 2)
         process.close_all_but({0, 1, 2, control})
         process.become_subreaper()
-        Init(Channel(socket.socket(fileno=control)), target).run()
+        Init(Channel(socket.socket(fileno=control)), common).run()
         code = 0
     except BaseException:
         traceback.print_exc()
@@ -69,9 +72,9 @@ class _Host:
 class Init:
     """The loop: requests from the server, reports of hosts, and their deaths."""
 
-    def __init__(self, channel: Channel, target: str) -> None:
+    def __init__(self, channel: Channel, common: Common) -> None:
         self._channel = channel
-        self._target = target
+        self._common = common
         self._hosts: dict[int, _Host] = {}
         self._running = True
         self._poller = select.poll()
@@ -81,8 +84,7 @@ class Init:
         received = self._channel.receive()
         if received is None:
             return
-        wakeup = sweep.child_signals()
-        signal.signal(signal.SIGTERM, self._stop)
+        wakeup = sweep.child_signals(self._stop)
         try:
             self._set_up(received[0])
             self._loop(wakeup)
@@ -92,13 +94,28 @@ class Init:
             sweep.kill_descendants(keep=())
 
     def _set_up(self, message: dict[str, Any]) -> None:
-        self._spec = JailSpec.from_wire(message["spec"])
-        self._scratch = Scratch(message["scratch"])
-        self._channel.send({"event": "ready", "report": []})
+        spec = JailSpec.from_wire(message["spec"])
+        facts = HostFacts(
+            machine=os.uname().machine,
+            root=self._common.config.user is not None,
+            landlock_abi=self._common.landlock_abi,
+            memory="watchdog",
+        )
+        wanted = plan(spec.confinement, facts)
+        scratch, view = inner.enter(spec, self._common, message["scratch"])
+        self._jail = JailContext(
+            spec=spec,
+            common=self._common,
+            plan=wanted,
+            scratch=scratch,
+            processes=spec.confinement.limits.processes,
+        )
+        working = Layer("working-view", True, f"the snapshot, writable as {view}")
+        report = [layer.to_wire() for layer in (*wanted.layers, working)]
+        self._channel.send({"event": "ready", "report": report})
 
     def _fail(self, error: LayerUnavailableError) -> None:
-        event = {"event": "failed", "layer": error.layer, "reason": error.reason}
-        self._channel.send({**event, "fix": error.fix})
+        self._channel.send({"event": "failed", **error.to_wire()})
 
     def _stop(self, *_: object) -> None:
         self._running = False
@@ -131,14 +148,7 @@ class Init:
 
     def _start(self, number: int, fds: list[int]) -> None:
         read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-        order = launch.Order(
-            parent=os.getpid(),
-            spec=self._spec,
-            scratch=self._scratch,
-            target=self._target,
-            fds=fds,
-            status=write,
-        )
+        order = launch.Order(parent=os.getpid(), jail=self._jail, fds=fds, status=write)
         pid = os.fork()
         if pid == 0:
             launch.run(order)

@@ -15,16 +15,19 @@ import socket
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NoReturn
 
 import numpy as np
+
 from envhub_worker.jailspec import JailSpec
-from envhub_worker.lockdown import process, rlimits
+from envhub_worker.lockdown import innermost, process, sweep
+from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.environment import jail_environment
 from envhub_worker.lockdown.report import Layer, LayerUnavailableError
-from envhub_worker.lockdown.scratch import Scratch
+
+_SELF_TEST = Layer("self-test", True, "the denials above were tried and held")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,17 +36,13 @@ class Order:
 
     Attributes:
         parent: Init's pid.
-        spec: The jail.
-        scratch: Its writable folders.
-        target: What to run once confined, as ``"module:function"`` or ``"file.py:function"``.
+        jail: The jail.
         fds: The stream to the server, then whatever the server passes through.
         status: Write end of the pipe for the report; closed before the target runs.
     """
 
     parent: int
-    spec: JailSpec
-    scratch: Scratch
-    target: str
+    jail: JailContext
     fds: list[int]
     status: int
 
@@ -65,13 +64,14 @@ def run(order: Order) -> NoReturn:
 
 def _run(order: Order) -> int:
     try:
-        layers = confine(order)
+        confine(order)
     except LayerUnavailableError as error:
-        _report(order.status, {"layer": error.layer, "reason": error.reason, "fix": error.fix})
+        _report(order.status, error.to_wire())
         return 1
-    _report(order.status, {"report": [layer.to_wire() for layer in layers]})
+    _report(order.status, {"report": [_SELF_TEST.to_wire()]})
     stream = socket.socket(fileno=order.fds[0])
-    return int(_resolve(order.target)(stream, order.spec, order.fds[1:]) or 0)
+    main = _resolve(order.jail.common.config.target)
+    return int(main(stream, order.jail.spec, order.fds[1:]) or 0)
 
 
 def _resolve(target: str) -> Callable[[socket.socket, JailSpec, list[int]], int | None]:
@@ -81,24 +81,20 @@ def _resolve(target: str) -> Callable[[socket.socket, JailSpec, list[int]], int 
     return getattr(importlib.import_module(place), function)  # type: ignore[no-any-return]
 
 
-def confine(order: Order) -> list[Layer]:
-    """Give up everything that the jail does not need; return what holds."""
+def confine(order: Order) -> None:
+    """Give up everything that the jail does not need."""
     process.die_with_parent(order.parent)
     os.setsid()
-    process.reset_signals()
-    process.close_all_but({0, 1, 2, order.status, *order.fds})
-    _forget_the_zygote(order)
-    rlimits.apply(rlimits.wanted(order.spec.confinement.limits, None))
-    process.set_no_new_privileges()
-    return [
-        Layer("rlimits", True, "core, file size, open files, locked memory, priorities"),
-        Layer("no-new-privileges", True, "set-user-id programs gain nothing"),
-    ]
+    process.reset_signals(sweep.HANDLED)
+    descriptors = {0, 1, 2, order.status, *order.fds}
+    process.close_all_but(descriptors)
+    _forget_the_zygote(order.jail)
+    innermost.enter(order.jail, descriptors)
 
 
-def _forget_the_zygote(order: Order) -> None:
+def _forget_the_zygote(jail: JailContext) -> None:
     """Own environment, folders and random numbers; a fork shares them all with its siblings."""
-    scratch, granted = order.scratch, order.spec.confinement.environment
+    scratch, granted = jail.scratch, jail.spec.confinement.environment
     built = jail_environment(os.environ, granted, scratch.home, scratch.temporary)
     os.environ.clear()
     os.environ.update(built)
@@ -106,10 +102,10 @@ def _forget_the_zygote(order: Order) -> None:
     os.umask(0o022)
     tempfile.tempdir = None
     random.seed()
-    np.random.seed()
+    np.random.seed(np.frombuffer(os.urandom(32), np.uint32))
 
 
-def _report(status: int, message: dict[str, object]) -> None:
+def _report(status: int, message: Mapping[str, object]) -> None:
     data = json.dumps(message).encode()
     os.write(status, data)  # far below the pipe's capacity: never partial
     os.close(status)

@@ -9,21 +9,24 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import select
 import signal
 import socket
 import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from envhub_worker import bootstrap
 from envhub_worker.channel import Channel, close_fds
 from envhub_worker.jailspec import JailSpec
+from envhub_worker.lockdown.context import ZygoteConfig
 from envhub_worker.lockdown.environment import zygote_environment
-from envhub_worker.lockdown.scratch import Scratch, link_snapshot, remove_tree
+from envhub_worker.lockdown.scratch import Scratch, remove_tree
+from envhub_worker.lockdown.user import unused_uid
 from envhub_worker.protocol.confinement import Confinement
 
 _END_S = 8.0
@@ -67,7 +70,7 @@ class JailExited:
 
 @dataclass(frozen=True)
 class Ready:
-    """The jail is set up. ``report``: the layers that hold for all of it."""
+    """A host of the jail is confined. ``report``: every layer that holds for it."""
 
     report: list[dict[str, Any]]
 
@@ -146,24 +149,58 @@ class Spawner:
         """
         self._jails: dict[int, Jail] = {}
         self._count = 0
+        self._pidfd = -1
         self._exited = False
         self._folder = Path(tempfile.mkdtemp(prefix="zygote-", dir=runtime_dir))
+        self._user = unused_uid() if os.geteuid() == 0 else None
+        self._scratches = self._make_scratches(confinement)
         self._log = self._folder / "log"
         self._channel, theirs = Channel.pair()
+        python = python or sys.executable
         with theirs:
-            self._process = self._execute(theirs.fileno(), python or sys.executable, target)
+            config = self._config(confinement, readable_roots, target, theirs.fileno())
+            self._process = self._execute(config, python)
 
-    def _execute(self, control: int, python: str, target: str) -> subprocess.Popen[bytes]:
-        config = {"control": control, "parent": os.getpid(), "target": target}
+    def _config(
+        self, confinement: Confinement, roots: Sequence[str], target: str, control: int
+    ) -> ZygoteConfig:
+        place = self._folder / "root"
+        place.mkdir()
+        return ZygoteConfig(
+            control=control,
+            parent=os.getpid(),
+            target=target,
+            profile=confinement.profile,
+            network=confinement.network,
+            gpu=confinement.gpu,
+            readable=confinement.readable,
+            roots=tuple(roots),
+            place=str(place),
+            canary=str(self._log),
+            user=self._user,
+        )
+
+    def _make_scratches(self, confinement: Confinement) -> Path | None:
+        """Where jails without a mount namespace have their writable folders, if they need one."""
+        if confinement.profile == "strict":
+            return None
+        if self._user is None:
+            return self._folder
+        # The jails' user may not cross root's runtime folder.
+        folder = Path(tempfile.mkdtemp(prefix="envhub-scratch-"))
+        folder.chmod(0o711)
+        return folder
+
+    def _execute(self, config: ZygoteConfig, python: str) -> subprocess.Popen[bytes]:
         with open(self._log, "ab") as log:
             return subprocess.Popen(
-                bootstrap.command(python, "zygote", json.dumps(config)),
+                bootstrap.command(python, "zygote", json.dumps(asdict(config))),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
                 cwd="/",
                 env=zygote_environment(os.environ, python),
-                pass_fds=[control],
+                pass_fds=[config.control],
                 start_new_session=True,
             )
 
@@ -177,29 +214,25 @@ class Spawner:
             return []
         self._channel.flush()
         messages, ended = self._channel.drain()
-        events = [event for message, fds in messages if (event := self._event(message, fds))]
-        if ended:
-            events += self._died()
-        return events
+        events = [self._take(message, fds) for message, fds in messages]
+        return events + self._died() if ended else events
 
-    def _event(self, message: dict[str, Any], fds: list[int]) -> SpawnerEvent | None:
-        if message["event"] == "ready":
+    def _take(self, message: dict[str, Any], fds: list[int]) -> SpawnerEvent:
+        kind = message["event"]
+        if kind == "ready":
+            self._pidfd = fds[0]
             return ZygoteReady()
-        jail = self._jails.get(message["id"])
-        if jail is None:
-            close_fds(fds)
-            return None
-        if message["event"] == "spawned":
+        if kind == "spawned":
+            jail = self._jails[message["id"]]
             jail._attach(fds[0])
             return JailSpawned(jail)
-        del self._jails[message["id"]]
+        jail = self._jails.pop(message["id"])
         jail._release()
         return JailExited(jail, message["code"], message["signal"])
 
     def _died(self) -> list[SpawnerEvent]:
         self._exited = True
-        code = self._reap_zygote()
-        events: list[SpawnerEvent] = [ZygoteDied(code, self._log_tail())]
+        events: list[SpawnerEvent] = [ZygoteDied(self._reap_zygote(), self._log_tail())]
         for jail in self._jails.values():
             jail._release()
             events.append(JailExited(jail, None, int(signal.SIGKILL)))
@@ -207,11 +240,18 @@ class Spawner:
         return events
 
     def _reap_zygote(self) -> int:
+        """Wait for the zygote, and with it for everything that it started."""
         try:
-            return self._process.wait(_END_S)
+            code = self._process.wait(_END_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
-            return self._process.wait()
+            code = self._process.wait()
+        if self._pidfd >= 0:
+            # Under namespaces it is a child of the process that we started, killed with it.
+            select.select([self._pidfd], [], [], _END_S)
+            os.close(self._pidfd)
+            self._pidfd = -1
+        return code
 
     def _log_tail(self) -> str:
         return self._log.read_bytes()[-_LOG_TAIL_BYTES:].decode(errors="replace")
@@ -225,8 +265,8 @@ class Spawner:
         if self._exited:
             raise RuntimeError("the zygote has gone")
         self._count += 1
-        folder = self._folder / f"jail-{self._count}"
-        jail = Jail(spec, folder)
+        folder = None if self._scratches is None else self._scratches / f"jail-{self._count}"
+        jail = Jail(spec, self, folder, self._user)
         self._jails[self._count] = jail
         self._channel.send({"op": "spawn", "id": self._count}, jail._theirs)
         jail._close_theirs()
@@ -237,12 +277,14 @@ class Spawner:
         for jail in self._jails.values():
             jail.kill()
         self._channel.close()
-        self._reap_zygote()
-        self._exited = True
+        if not self._exited:
+            self._reap_zygote()
+            self._exited = True
         for jail in self._jails.values():
             jail._release()
         self._jails.clear()
-        remove_tree(str(self._folder))
+        for folder in {self._folder, self._scratches or self._folder}:
+            remove_tree(str(folder))
 
 
 class Jail:
@@ -251,8 +293,11 @@ class Jail:
     After ``JailExited``, ``poll`` once more for its last events and close ``output``.
     """
 
-    def __init__(self, spec: JailSpec, folder: Path) -> None:
+    def __init__(
+        self, spec: JailSpec, spawner: Spawner, folder: Path | None, owner: int | None
+    ) -> None:
         self.spec = spec
+        self.spawner = spawner
         #: Read end of the pipe that holds the jail's stdout and stderr; non-blocking.
         self.output, output = os.pipe2(os.O_CLOEXEC)
         os.set_blocking(self.output, False)
@@ -263,14 +308,9 @@ class Jail:
         self._report: list[dict[str, Any]] = []
         self._channel, control = Channel.pair()
         self._theirs = (control.detach(), output)
-        self._make_scratch()
-
-    def _make_scratch(self) -> None:
-        scratch = Scratch(str(self._folder))
-        self._folder.mkdir(mode=0o700)
-        scratch.create()
-        link_snapshot(self.spec.snapshot, scratch.work)
-        self._channel.send({"spec": self.spec.to_wire(), "scratch": scratch.root})
+        if folder is not None:
+            Scratch.on_host(str(folder)).create(spec.snapshot, owner)
+        self._channel.send({"spec": spec.to_wire(), "scratch": str(folder)})
 
     def _close_theirs(self) -> None:
         close_fds(self._theirs)
@@ -279,6 +319,11 @@ class Jail:
         self._pidfd = pidfd
         if self._killed:
             self._signal_init()
+
+    @property
+    def pidfd(self) -> int:
+        """A pidfd of the jail's init, or -1 before it is known and after it has gone."""
+        return self._pidfd
 
     def fileno(self) -> int:
         """Readable when ``poll`` has something to say; -1 once the jail has gone."""
@@ -290,23 +335,23 @@ class Jail:
             return []
         self._channel.flush()
         messages, ended = self._channel.drain()
-        events = [self._event(message) for message, _ in messages]
+        events = [event for message, _ in messages for event in self._translate(message)]
         if ended:
             self._channel.close()
             events.append(Disconnected())
         return events
 
-    def _event(self, message: dict[str, Any]) -> JailEvent:
+    def _translate(self, message: dict[str, Any]) -> list[JailEvent]:
         kind = message["event"]
         if kind == "ready":
             self._report = message["report"]
-            return Ready(self._report)
+            return []
         if kind == "failed":
-            return Failed(message["layer"], message["reason"], message["fix"])
+            return [Failed(message["layer"], message["reason"], message["fix"])]
         if kind == "host_started":
             report = self._report + message["report"]
-            return HostStarted(message["host"], message["pid"], report)
-        return HostExited(message["host"], message["code"], message["signal"], message["reason"])
+            return [Ready(report), HostStarted(message["host"], message["pid"], report)]
+        return [HostExited(message["host"], message["code"], message["signal"], message["reason"])]
 
     def start_host(self, fds: Sequence[int] = ()) -> tuple[int, socket.socket]:
         """Ask for a host in this jail; it starts once the jail is ready.
@@ -339,8 +384,10 @@ class Jail:
 
     def _signal_init(self) -> None:
         if self._pidfd >= 0:
+            # Without a pid namespace, init must itself end what it started.
+            signum = signal.SIGTERM if self._folder else signal.SIGKILL
             with contextlib.suppress(ProcessLookupError):
-                signal.pidfd_send_signal(self._pidfd, signal.SIGTERM)
+                signal.pidfd_send_signal(self._pidfd, signum)
 
     def _release(self) -> None:
         """Everything in the jail is dead: give back its files and the handle on its init.
@@ -350,4 +397,5 @@ class Jail:
         if self._pidfd >= 0:
             os.close(self._pidfd)
             self._pidfd = -1
-        remove_tree(str(self._folder))
+        if self._folder is not None:
+            remove_tree(str(self._folder))

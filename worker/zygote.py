@@ -8,8 +8,12 @@ argv: one JSON object with the fields of ``ZygoteConfig``. Requests on its contr
 
     {"op": "spawn", "id": N} + [init's control socket, the jail's output pipe]
 
-Events: ``{"event": "ready"}``, ``{"event": "spawned", "id": N}`` + [pidfd of the init],
-``{"event": "exited", "id": N, "code": C | null, "signal": S | null}``.
+Events::
+
+    {"event": "ready"} + [pidfd of the zygote]
+    {"event": "spawned", "id": N} + [pidfd of the init]
+    {"event": "exited", "id": N, "code": C | null, "signal": S | null}
+
 The end of the channel ends the zygote and everything below it.
 """
 
@@ -25,11 +29,12 @@ import signal
 import socket
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from envhub_worker import init
 from envhub_worker.channel import Channel, close_fds
-from envhub_worker.lockdown import process, sweep
+from envhub_worker.lockdown import namespaces, outer, process, sweep
+from envhub_worker.lockdown.context import Common, ZygoteConfig
+from envhub_worker.lockdown.report import LayerUnavailableError
 
 # What nearly every host imports anyway. pyzmq is left out on purpose: a jail holds no ZeroMQ
 # socket, and a context started here would not survive the fork.
@@ -49,52 +54,61 @@ _PRELOAD = (
 _END_S = 5.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class ZygoteConfig:
-    """How the zygote is started.
-
-    Attributes:
-        control: Descriptor of its control socket.
-        parent: The server's pid.
-        target: What a host runs once it is confined, as ``"module:function"``.
-    """
-
-    control: int
-    parent: int
-    target: str
-
-
 def main(argv: Sequence[str]) -> int:
     """Preload, then fork an init for each request until the server goes away."""
-    config = ZygoteConfig(**json.loads(argv[0]))
+    config = ZygoteConfig.from_wire(json.loads(argv[0]))
     process.die_with_parent(config.parent, signal.SIGTERM)
     process.close_all_but({0, 1, 2, config.control})
+    channel = Channel(socket.socket(fileno=config.control))
+    try:
+        common = outer.enter(config)
+    except LayerUnavailableError as error:
+        refuse(channel, error)
+        return 0
     process.become_subreaper()
-    for module in _PRELOAD:
-        importlib.import_module(module)
+    preload(config.target)
     gc.collect()
     gc.freeze()
-    Zygote(config).run()
+    Zygote(channel, common).run()
     return 0
+
+
+def preload(target: str) -> None:
+    """Import what every host needs, the code that serves it included: ours, and inert."""
+    for module in _PRELOAD:
+        importlib.import_module(module)
+    place, _, _ = target.partition(":")
+    if not place.endswith(".py"):
+        importlib.import_module(place)
+
+
+def refuse(channel: Channel, error: LayerUnavailableError) -> None:
+    """Answer every request, on the init's own channel, with what this host cannot enforce."""
+    while received := channel.receive():
+        message, (control, output) = received
+        init = Channel(socket.socket(fileno=control))
+        init.send({"event": "failed", **error.to_wire()})
+        init.close()
+        os.close(output)
+        channel.send({"event": "exited", "id": message["id"], "code": 1, "signal": None})
 
 
 class Zygote:
     """The loop: requests from the server, and the deaths of inits."""
 
-    def __init__(self, config: ZygoteConfig) -> None:
-        self._config = config
-        self._channel = Channel(socket.socket(fileno=config.control))
+    def __init__(self, channel: Channel, common: Common) -> None:
+        self._channel = channel
+        self._common = common
         self._inits: dict[int, int] = {}
         self._running = True
 
     def run(self) -> None:
         """Serve until the channel ends or SIGTERM comes; then end everything below."""
-        wakeup = sweep.child_signals()
-        signal.signal(signal.SIGTERM, self._stop)
+        wakeup = sweep.child_signals(self._stop)
         poller = select.poll()
         poller.register(self._channel, select.POLLIN)
         poller.register(wakeup, select.POLLIN)
-        self._channel.send({"event": "ready"})
+        self._tell_ready()
         while self._running:
             ready = [fd for fd, _ in poller.poll()]
             if wakeup in ready:
@@ -103,6 +117,12 @@ class Zygote:
             if self._channel.fileno() in ready:
                 self._serve()
         self._end()
+
+    def _tell_ready(self) -> None:
+        # Our own death is told by this handle; the pid that the server started may only wait.
+        pidfd = os.pidfd_open(os.getpid())
+        self._channel.send({"event": "ready"}, [pidfd])
+        os.close(pidfd)
 
     def _stop(self, *_: object) -> None:
         self._running = False
@@ -116,11 +136,10 @@ class Zygote:
             self._spawn(message["id"], fds)
 
     def _spawn(self, jail: int, fds: list[int]) -> None:
-        parent = os.getpid()
         control, output = fds
-        pid = os.fork()
+        pid = namespaces.fork_in_new_pid_namespace() if self._common.namespaced else os.fork()
         if pid == 0:
-            init.run(parent, control, output, self._config.target)
+            init.run(control, output, self._common)
         close_fds(fds)
         self._inits[pid] = jail
         pidfd = os.pidfd_open(pid)

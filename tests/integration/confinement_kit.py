@@ -8,9 +8,11 @@ import select
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +92,11 @@ class Cell:
         lines = self._streams[host]
         lines.write(json.dumps(source) + "\n")
         lines.flush()
-        return json.loads(lines.readline() or '{"error": "the host has gone"}')
+        try:
+            answer = lines.readline()
+        except ConnectionError:
+            answer = ""
+        return json.loads(answer or '{"error": "the host has gone"}')
 
     def hang_up(self, host: int = 1) -> None:
         """Close the host's stream, so that it ends."""
@@ -134,11 +140,27 @@ class Cell:
 def spawner_in(folder: Path, confinement: Confinement, **options: Any) -> Iterator[Spawner]:
     """A spawner whose hosts run ``serve_source``."""
     options.setdefault("target", TARGET)
-    spawner = Spawner(confinement, runtime_dir=folder, readable_roots=[str(folder)], **options)
+    confinement = with_kit(confinement)
+    options.setdefault("readable_roots", [str(folder)])
+    spawner = Spawner(confinement, runtime_dir=folder, **options)
     try:
         yield spawner
     finally:
         spawner.close()
+
+
+def with_kit(confinement: Confinement) -> Confinement:
+    """The same, and the jail may read this file."""
+    kit = os.path.abspath(__file__)
+    return replace(confinement, readable=(*confinement.readable, kit))
+
+
+@contextmanager
+def open_folder() -> Iterator[Path]:
+    """A folder that other users may cross, unlike pytest's: under root a jail is another user."""
+    with tempfile.TemporaryDirectory(prefix="confinement-") as name:
+        os.chmod(name, 0o755)
+        yield Path(name)
 
 
 def make_snapshot(folder: Path) -> str:
@@ -162,7 +184,9 @@ def cell_in(folder: Path, confinement: Confinement, **options: Any) -> Iterator[
 
 def new_cell(spawner: Spawner, snapshot: str, confinement: Confinement) -> Cell:
     """A further jail of ``spawner``, without hosts."""
-    spec = JailSpec(snapshot=snapshot, entry="env.py", confinement=confinement, name="test")
+    spec = JailSpec(
+        snapshot=snapshot, entry="env.py", confinement=with_kit(confinement), name="test"
+    )
     return Cell(spawner, spawner.spawn(spec))
 
 
@@ -184,6 +208,7 @@ __all__ = [
     "execute",
     "make_snapshot",
     "new_cell",
+    "open_folder",
     "serve_source",
     "spawner_in",
     "unconfined",

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -21,19 +22,32 @@ from confinement_kit import (
     cell_in,
     make_snapshot,
     new_cell,
+    open_folder,
     spawner_in,
     wait_until,
 )
+
 from envhub_worker.protocol.confinement import Confinement, Limits
 from envhub_worker.spawner import Spawner, ZygoteDied
 
-CONFINEMENT = Confinement(profile="no-userns", environment={"GRANTED": "yes"})
+
+@pytest.fixture(params=["strict", "no-userns"])
+def confinement(request: pytest.FixtureRequest) -> Confinement:
+    """Both structures: with a pid namespace that ends everything, and without."""
+    return Confinement(profile=request.param, environment={"GRANTED": "yes"})
 
 
 @pytest.fixture
-def cell(tmp_path: Path) -> Iterator[Cell]:
+def folder() -> Iterator[Path]:
+    """A folder that a jail's user may cross."""
+    with open_folder() as folder:
+        yield folder
+
+
+@pytest.fixture
+def cell(folder: Path, confinement: Confinement) -> Iterator[Cell]:
     """A jail with one host."""
-    with cell_in(tmp_path, CONFINEMENT) as cell:
+    with cell_in(folder, confinement) as cell:
         yield cell
 
 
@@ -70,12 +84,12 @@ def test_host_sees_only_the_built_environment(cell: Cell, monkeypatch: pytest.Mo
     assert "PYTEST_CURRENT_TEST" not in raw
 
 
-def test_host_holds_only_the_named_descriptors(tmp_path: Path) -> None:
+def test_host_holds_only_the_named_descriptors(folder: Path, confinement: Confinement) -> None:
     """Standard streams, its stream and what was passed through; stdin is empty."""
     source = "import os, sys; result = [len(os.listdir('/proc/self/fd')), sys.stdin.read()]"
     read, write = os.pipe()
-    with spawner_in(tmp_path, CONFINEMENT) as spawner:
-        cell = new_cell(spawner, make_snapshot(tmp_path), CONFINEMENT)
+    with spawner_in(folder, confinement) as spawner:
+        cell = new_cell(spawner, make_snapshot(folder), confinement)
         cell.start((write,))
         # 0, 1, 2, the stream, the passed pipe, and the listing's own descriptor.
         assert cell.run(source) == {"result": [6, ""]}
@@ -135,10 +149,10 @@ def test_signal_that_ends_a_host_is_told(cell: Cell) -> None:
     assert exited.reason == "signal"
 
 
-def test_killed_host_takes_its_children_along(cell: Cell, tmp_path: Path) -> None:
+def test_killed_host_takes_its_children_along(cell: Cell, folder: Path) -> None:
     """kill_host ends the host and a child in a session of its own; others go on."""
     second = cell.start()
-    mark = str(tmp_path / "mark")
+    mark = str(folder / "mark")
     child = f"['/bin/sh', '-c', 'sleep 1000; : {mark}']"
     cell.run(f"import subprocess; subprocess.Popen({child}, start_new_session=True)")
     wait_until(lambda: processes_that_mention(mark), "the child never came")
@@ -159,9 +173,9 @@ if os.fork() == 0:
 """
 
 
-def test_killed_jail_leaves_no_daemon(cell: Cell, tmp_path: Path) -> None:
+def test_killed_jail_leaves_no_daemon(cell: Cell, folder: Path) -> None:
     """A double-forked daemon in its own session dies with its jail, and its files go."""
-    mark = str(tmp_path / "mark")
+    mark = str(folder / "mark")
     cell.run(DAEMON.format(mark=mark))
     wait_until(lambda: processes_that_mention(mark), "the daemon never came")
     cell.jail.kill()
@@ -170,9 +184,9 @@ def test_killed_jail_leaves_no_daemon(cell: Cell, tmp_path: Path) -> None:
     wait_until(lambda: not processes_that_mention(mark), "the daemon lived on")
 
 
-def test_last_host_takes_daemons_along(cell: Cell, tmp_path: Path) -> None:
+def test_last_host_takes_daemons_along(cell: Cell, folder: Path) -> None:
     """When no host is left, nothing else of the jail runs on."""
-    mark = str(tmp_path / "mark")
+    mark = str(folder / "mark")
     cell.run(DAEMON.format(mark=mark))
     wait_until(lambda: processes_that_mention(mark), "the daemon never came")
     cell.hang_up()
@@ -188,12 +202,12 @@ def test_jail_can_start_hosts_after_its_last_one_ended(cell: Cell) -> None:
     assert cell.run("result = 'again'", second) == {"result": "again"}
 
 
-def test_close_leaves_no_process_and_no_file(tmp_path: Path) -> None:
+def test_close_leaves_no_process_and_no_file(folder: Path, confinement: Confinement) -> None:
     """After close, no process mentions the runtime folder and nothing is left in it."""
-    runtime = tmp_path / "runtime"
+    runtime = folder / "runtime"
     runtime.mkdir()
-    with spawner_in(runtime, CONFINEMENT) as spawner:
-        cell = new_cell(spawner, make_snapshot(tmp_path), CONFINEMENT)
+    with spawner_in(runtime, confinement, readable_roots=[str(folder)]) as spawner:
+        cell = new_cell(spawner, make_snapshot(folder), confinement)
         cell.start()
         assert cell.run("result = 1") == {"result": 1}
         zygote = spawner._process.pid
@@ -201,12 +215,12 @@ def test_close_leaves_no_process_and_no_file(tmp_path: Path) -> None:
     assert list(runtime.iterdir()) == []
 
 
-def test_dead_zygote_is_told_with_its_log(tmp_path: Path) -> None:
+def test_dead_zygote_is_told_with_its_log(folder: Path, confinement: Confinement) -> None:
     """An interpreter without numpy ends the zygote; the log says why."""
-    bare = tmp_path / "bare"
+    bare = folder / "bare"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(bare)], check=True)
     spawner = Spawner(
-        CONFINEMENT, runtime_dir=tmp_path, readable_roots=[], python=str(bare / "bin/python")
+        confinement, runtime_dir=folder, readable_roots=[], python=str(bare / "bin/python")
     )
     wait_until(lambda: any(isinstance(e, ZygoteDied) for e in _keep(spawner)), "it lives")
     died = next(event for event in _SEEN if isinstance(event, ZygoteDied))
@@ -229,7 +243,7 @@ sys.path.insert(0, {kit!r})
 from pathlib import Path
 from confinement_kit import *
 from envhub_worker.protocol.confinement import Confinement
-confinement = Confinement(profile="no-userns")
+confinement = Confinement(profile={profile!r})
 with spawner_in(Path({folder!r}), confinement) as spawner:
     cell = new_cell(spawner, make_snapshot(Path({folder!r})), confinement)
     cell.start()
@@ -239,11 +253,13 @@ with spawner_in(Path({folder!r}), confinement) as spawner:
 """
 
 
-def test_killed_server_leaves_no_process(tmp_path: Path) -> None:
+def test_killed_server_leaves_no_process(folder: Path, confinement: Confinement) -> None:
     """SIGKILL of the server ends zygote, init, host and a daemon of the jail."""
-    mark = str(tmp_path / "mark")
+    mark = str(folder / "mark")
     kit = str(Path(__file__).parents[1] / "integration")
-    source = SERVER.format(kit=kit, folder=str(tmp_path), daemon=DAEMON.format(mark=mark))
+    daemon = DAEMON.format(mark=mark)
+    profile = confinement.profile
+    source = SERVER.format(kit=kit, folder=str(folder), profile=profile, daemon=daemon)
     server = subprocess.Popen([sys.executable, "-c", source], stdout=subprocess.PIPE)
     assert server.stdout is not None
     assert server.stdout.readline() == b"up\n"
@@ -272,19 +288,19 @@ def alive(pid: int) -> bool:
         return False
 
 
-def test_cpu_limit_is_told(tmp_path: Path) -> None:
+def test_cpu_limit_is_told(folder: Path, confinement: Confinement) -> None:
     """A host that burns its CPU seconds ends with the reason cpu-limit."""
-    confinement = Confinement(profile="no-userns", limits=Limits(cpu_s=1))
-    with cell_in(tmp_path, confinement) as cell:
+    confinement = replace(confinement, limits=Limits(cpu_s=1))
+    with cell_in(folder, confinement) as cell:
         cell.run("while True: pass")
         assert cell.wait_for(HostExited).reason == "cpu-limit"
 
 
-def test_requests_wait_for_the_zygote(tmp_path: Path) -> None:
+def test_requests_wait_for_the_zygote(folder: Path, confinement: Confinement) -> None:
     """Many jails asked for before the zygote is up all come."""
-    with spawner_in(tmp_path, CONFINEMENT) as spawner:
-        snapshot = make_snapshot(tmp_path)
-        cells = [new_cell(spawner, snapshot, CONFINEMENT) for _ in range(5)]
+    with spawner_in(folder, confinement) as spawner:
+        snapshot = make_snapshot(folder)
+        cells = [new_cell(spawner, snapshot, confinement) for _ in range(5)]
         for cell in cells:
             cell.start()
         assert [cell.run("result = 1") for cell in cells] == [{"result": 1}] * 5

@@ -7,7 +7,8 @@ import os
 import signal
 from collections.abc import Iterable
 
-from envhub_worker.lockdown.syscalls import CLOSE_RANGE, prctl, syscall
+from envhub_worker.lockdown.kernel import prctl, syscall
+from envhub_worker.lockdown.syscalls import number
 
 _PR_SET_PDEATHSIG = 1
 _PR_SET_DUMPABLE = 4
@@ -61,7 +62,7 @@ def close_all_but(keep: Iterable[int]) -> None:
 
 def _close_range(low: int, high: int) -> None:
     try:
-        syscall(CLOSE_RANGE, low, high, 0)
+        syscall(number("close_range"), low, high, 0)
     except OSError as error:
         if error.errno != errno.ENOSYS:
             raise
@@ -70,15 +71,16 @@ def _close_range(low: int, high: int) -> None:
                 os.closerange(fd, fd + 1)
 
 
-def reset_signals() -> None:
-    """Default dispositions and an empty mask, as a program finds them after a plain exec."""
+def reset_signals(handled: Iterable[int]) -> None:
+    """Dispositions and mask as a Python program finds them after a plain exec.
+
+    Args:
+        handled: The signals that this program has set a handler for. (Asking for all 64 costs
+            more than the rest of a fork.)
+    """
     signal.set_wakeup_fd(-1)
-    for signum in signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP}:
-        if signal.getsignal(signum) not in (signal.SIG_DFL, None):
-            signal.signal(signum, signal.SIG_DFL)
-    # CPython's own two choices at start-up.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGPIPE, signal.SIG_IGN)
+    for signum in handled:
+        signal.signal(signum, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
 
 

@@ -39,3 +39,7 @@ class LayerUnavailableError(Exception):
         self.layer = layer
         self.reason = reason
         self.fix = fix
+
+    def to_wire(self) -> dict[str, str]:
+        """Plain data: ``{"layer", "reason", "fix"}``."""
+        return {"layer": self.layer, "reason": self.reason, "fix": self.fix}

@@ -8,38 +8,50 @@ import secrets
 import stat
 from dataclasses import dataclass
 
+from envhub_worker.lockdown.root_plan import HOME, SHARED_MEMORY, TEMPORARY, WORK
+
 
 @dataclass(frozen=True)
 class Scratch:
-    """Absolute paths of one jail's writable folders, all below ``root``."""
+    """Absolute paths of one jail's writable folders.
 
-    root: str
+    Attributes:
+        home: The private home.
+        temporary: For temporary files.
+        work: The working directory: shows the snapshot's files, takes new ones.
+        shared_memory: Where ``shm_open`` puts its files, or None for the host's own.
+    """
 
-    @property
-    def home(self) -> str:
-        """The private home."""
-        return f"{self.root}/home"
+    home: str
+    temporary: str
+    work: str
+    shared_memory: str | None = None
 
-    @property
-    def temporary(self) -> str:
-        """The folder for temporary files."""
-        return f"{self.root}/tmp"
+    @classmethod
+    def in_namespace(cls) -> Scratch:
+        """Where a jail with a mount namespace of its own finds them."""
+        return cls(HOME, TEMPORARY, WORK, SHARED_MEMORY)
 
-    @property
-    def work(self) -> str:
-        """The working directory: shows the snapshot's files, takes new ones."""
-        return f"{self.root}/work"
+    @classmethod
+    def on_host(cls, folder: str) -> Scratch:
+        """The folders that ``create`` makes in ``folder``."""
+        return cls(f"{folder}/home", f"{folder}/tmp", f"{folder}/work")
 
-    def create(self) -> None:
-        """Make the folders, readable by nobody else; ``root`` must exist."""
-        for folder in (self.home, self.temporary, f"{self.temporary}/runtime", self.work):
+    def create(self, snapshot: str, owner: int | None) -> None:
+        """Make the folders, readable by nobody else, and link the snapshot into ``work``.
+
+        Args:
+            snapshot: Its top-level entries appear as symbolic links.
+            owner: The user and group to give the folders to, or None to keep them.
+        """
+        parent = os.path.dirname(self.home)
+        runtime = f"{self.temporary}/runtime"
+        for folder in (parent, self.home, self.temporary, runtime, self.work):
             os.mkdir(folder, 0o700)
-
-
-def link_snapshot(snapshot: str, work: str) -> None:
-    """Show the snapshot's top-level entries in ``work`` as symbolic links."""
-    for name in os.listdir(snapshot):
-        os.symlink(f"{snapshot}/{name}", f"{work}/{name}")
+            if owner is not None:
+                os.chown(folder, owner, owner)
+        for name in os.listdir(snapshot):
+            os.symlink(f"{snapshot}/{name}", f"{self.work}/{name}")
 
 
 def remove_tree(path: str) -> None:

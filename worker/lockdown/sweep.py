@@ -6,15 +6,24 @@ import contextlib
 import os
 import signal
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 
 _ROUNDS_S = 5.0
 
 
-def child_signals() -> int:
-    """A descriptor that becomes readable when a child changes state, or a handled signal comes."""
+#: The signals that ``child_signals`` sets handlers for.
+HANDLED = (signal.SIGCHLD, signal.SIGTERM)
+
+
+def child_signals(stop: Callable[..., None]) -> int:
+    """A descriptor that becomes readable when a child changes state, or SIGTERM comes.
+
+    Args:
+        stop: The handler of SIGTERM.
+    """
     read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     signal.signal(signal.SIGCHLD, lambda *_: None)
+    signal.signal(signal.SIGTERM, stop)
     signal.set_wakeup_fd(write, warn_on_full_buffer=False)
     return read
 

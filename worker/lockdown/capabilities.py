@@ -1,0 +1,43 @@
+"""Giving up every capability: a jail that keeps one remounts /usr writable."""
+
+from __future__ import annotations
+
+import errno
+
+from envhub_worker.lockdown.kernel import capget, capset, prctl
+
+_PR_CAPBSET_DROP = 24
+_PR_CAP_AMBIENT = 47
+_PR_CAP_AMBIENT_CLEAR_ALL = 4
+
+CAP_SETPCAP = 8
+CAP_SYS_PTRACE = 19
+
+
+def drop_all(keep: int = 0) -> None:
+    """Empty the bounding, ambient, inheritable, permitted and effective sets.
+
+    Args:
+        keep: Mask of capabilities that stay permitted and effective, if they are.
+    """
+    effective, permitted, _ = capget()
+    if effective >> CAP_SETPCAP & 1:
+        _empty_the_bounding_set()
+    prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL)
+    capset(effective & keep, permitted & keep, 0)
+
+
+def held() -> int:
+    """Mask of what this thread has, may have or may pass on."""
+    effective, permitted, inheritable = capget()
+    return effective | permitted | inheritable
+
+
+def _empty_the_bounding_set() -> None:
+    for capability in range(64):
+        try:
+            prctl(_PR_CAPBSET_DROP, capability)
+        except OSError as error:
+            if error.errno != errno.EINVAL:
+                raise
+            return  # the first that this kernel does not know

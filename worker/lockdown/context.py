@@ -1,0 +1,93 @@
+"""What the stages of lockdown hand down: zygote to init, init to host."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from envhub_worker.jailspec import JailSpec
+from envhub_worker.lockdown.plan import Plan
+from envhub_worker.lockdown.scratch import Scratch
+
+
+@dataclass(frozen=True, kw_only=True)
+class ZygoteConfig:
+    """How a zygote is started.
+
+    Attributes:
+        control: Descriptor of its control socket.
+        parent: The server's pid.
+        target: What a host runs once it is confined, as ``"module:function"``.
+        profile: The profile of its jails.
+        network: Their network.
+        gpu: Whether they get the GPU.
+        readable: Further paths that they read.
+        roots: Folders that snapshots lie in.
+        place: An empty folder of the zygote's own.
+        canary: A file that exists and that no jail may read.
+        user: The user to become where the server is root, else None.
+    """
+
+    control: int
+    parent: int
+    target: str
+    profile: str
+    network: str
+    gpu: bool
+    readable: tuple[str, ...]
+    roots: tuple[str, ...]
+    place: str
+    canary: str
+    user: int | None
+
+    @classmethod
+    def from_wire(cls, data: dict[str, Any]) -> ZygoteConfig:
+        """From ``dataclasses.asdict`` after a trip through JSON."""
+        paths = {name: tuple(data[name]) for name in ("readable", "roots")}
+        return cls(**{**data, **paths})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Common:
+    """What a zygote hands to each of its inits.
+
+    Attributes:
+        config: Its own start.
+        pid: The zygote's pid as an init sees it as its parent.
+        namespaced: Whether the jails have namespaces.
+        trees: Read-only trees of the private root.
+        roots: The snapshot folders, symbolic links resolved.
+        devices: Device nodes that may be used.
+        covered: (files, folders) of /proc to hide.
+        landlock_abi: 0 where there is none.
+        program: The compiled system call filter.
+    """
+
+    config: ZygoteConfig
+    pid: int
+    namespaced: bool
+    trees: tuple[str, ...]
+    roots: tuple[str, ...]
+    devices: tuple[str, ...]
+    covered: tuple[list[str], list[str]]
+    landlock_abi: int
+    program: bytes
+
+
+@dataclass(frozen=True, kw_only=True)
+class JailContext:
+    """What init knows and its hosts need.
+
+    Attributes:
+        spec: The jail.
+        common: What the zygote gives.
+        plan: Which layers hold.
+        scratch: The writable folders.
+        processes: Cap for ``RLIMIT_NPROC``.
+    """
+
+    spec: JailSpec
+    common: Common
+    plan: Plan
+    scratch: Scratch
+    processes: int

@@ -1,0 +1,97 @@
+"""A jail's own confinement, by its init: what all hosts of the jail have in common."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+from envhub_worker.jailspec import JailSpec
+from envhub_worker.lockdown import capabilities, mounts, namespaces, process
+from envhub_worker.lockdown.capabilities import CAP_SYS_PTRACE
+from envhub_worker.lockdown.context import Common
+from envhub_worker.lockdown.report import LayerUnavailableError
+from envhub_worker.lockdown.root_plan import within
+from envhub_worker.lockdown.scratch import Scratch
+
+
+def enter(spec: JailSpec, common: Common, folder: str) -> tuple[Scratch, str]:
+    """Confine this init; it keeps just enough to measure and end what it starts.
+
+    Args:
+        spec: The jail.
+        common: What the zygote gives.
+        folder: A private folder of the host for a jail without a mount namespace.
+
+    Returns:
+        The jail's writable folders, and how the working one shows the snapshot.
+
+    Raises:
+        LayerUnavailableError: The host lacks a layer that the profile names.
+    """
+    if not common.namespaced:
+        process.set_no_new_privileges()
+        _check_readable(spec)
+        process.set_dumpable(False)
+        return Scratch.on_host(folder), "links"
+    try:
+        view = _mount(spec, common)
+    except OSError as error:
+        where = f" at {error.filename}" if error.filename else ""
+        raise LayerUnavailableError(
+            "mount-namespace", f"{error.strerror}{where}", "This kernel is not supported yet."
+        ) from error
+    _check_readable(spec)
+    _leave_the_zygote()
+    return Scratch.in_namespace(), view
+
+
+def _mount(spec: JailSpec, common: Common) -> str:
+    limits = spec.confinement.limits
+    _check_snapshot(spec, common)
+    namespaces.unshare_for_jail(common.config.network)
+    view = mounts.mount_jail(
+        spec.snapshot,
+        common.roots,
+        common.trees,
+        size=limits.disk_bytes,
+        inodes=limits.disk_files,
+    )
+    mounts.mount_proc()
+    mounts.cover_proc(*common.covered)
+    if common.config.network == "loopback":
+        namespaces.raise_loopback()
+    return view
+
+
+def _check_snapshot(spec: JailSpec, common: Common) -> None:
+    if not any(within(spec.snapshot, path) for path in (*common.roots, *common.trees)):
+        raise LayerUnavailableError(
+            "mount-namespace",
+            f"the snapshot {spec.snapshot} is in none of the readable roots",
+            "Start the worker with --readable-root for the folder that snapshots lie in.",
+        )
+
+
+def _check_readable(spec: JailSpec) -> None:
+    entry = os.path.join(spec.snapshot, spec.entry)
+    if not os.access(entry, os.R_OK):
+        raise LayerUnavailableError(
+            "unprivileged-user",
+            f"the jail's user may not read {entry}",
+            "Make the snapshot's files and folders readable to others, or start as a plain user.",
+        )
+
+
+def _leave_the_zygote() -> None:
+    """Own no namespace any more: the next user namespace is below the one that owns them.
+
+    What init keeps there lets it measure hosts that would rather not be measured, and puts it
+    out of their reach.
+    """
+    namespaces.enter_user_namespace(namespaces.INSIDE_UID, namespaces.INSIDE_UID)
+    namespaces.forbid_user_namespaces()
+    capabilities.drop_all(keep=1 << CAP_SYS_PTRACE)
+    process.set_no_new_privileges()
+    process.set_dumpable(False)
+    # The change of credentials disarmed it.
+    process.die_with_parent(0, signal.SIGKILL)

@@ -1,0 +1,132 @@
+"""The zygote's own confinement, once: what all its jails have in common.
+
+Under ``strict`` the zygote becomes the first process of its own namespaces with a private root,
+so that a jail is a matter of a few cheap mounts, and the zygote's death is every jail's death.
+As root it first becomes a user that owns nothing; the root is built before, while folders like
+/root can still be crossed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import pwd
+import signal
+import sys
+from collections.abc import Iterable
+
+from envhub_worker.lockdown import landlock, mounts, namespaces, process, root_plan, user
+from envhub_worker.lockdown.context import Common, ZygoteConfig
+from envhub_worker.lockdown.kernel import CLONE_NEWNS, unshare
+from envhub_worker.lockdown.report import LayerUnavailableError
+from envhub_worker.lockdown.seccomp import compile_filter
+
+
+def enter(config: ZygoteConfig) -> Common:
+    """Confine this process as far as its jails have it in common.
+
+    Under ``strict`` it returns in a child of the process that called: that one only waits.
+
+    Raises:
+        LayerUnavailableError: The host lacks a layer that the profile names.
+    """
+    namespaced = config.profile == "strict"
+    plan = _plan_root(config)
+    if namespaced:
+        _enter_namespaces(config, plan)
+        mounts.mount_proc()
+        covered = mounts.proc_to_cover()
+    else:
+        if config.user is not None:
+            _become(config)
+        covered = ([], [])
+    return Common(
+        config=config,
+        pid=0 if namespaced else os.getpid(),
+        namespaced=namespaced,
+        trees=plan.trees,
+        roots=plan.roots,
+        devices=plan.devices,
+        covered=covered,
+        landlock_abi=landlock.version(),
+        program=compile_filter(os.uname().machine, namespaced=namespaced, network=config.network),
+    )
+
+
+def _plan_root(config: ZygoteConfig) -> root_plan.RootPlan:
+    return root_plan.plan_root(
+        interpreter_paths(),
+        config.readable,
+        config.roots,
+        private=[*_homes(), config.place],
+        gpu=config.gpu,
+        network=config.network,
+        host=root_plan.real_host(),
+    )
+
+
+def _homes() -> list[str]:
+    # HOME is not ours to ask: the zygote's environment is built.
+    with contextlib.suppress(KeyError):
+        return [pwd.getpwuid(os.getuid()).pw_dir]
+    return []
+
+
+def interpreter_paths() -> list[str]:
+    """Everything that this interpreter and this package are loaded from."""
+    package = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+    prefixes = [sys.prefix, sys.base_prefix, sys.exec_prefix, sys.base_exec_prefix]
+    binaries = [os.path.dirname(sys.executable), os.path.dirname(os.path.realpath(sys.executable))]
+    return [*prefixes, *binaries, *filter(os.path.isabs, sys.path), package, *_mapped_folders()]
+
+
+def _mapped_folders() -> Iterable[str]:
+    """Folders of the shared libraries in use (an interpreter of nix or conda has its own)."""
+    with open("/proc/self/maps") as maps:
+        paths = {line.split(maxsplit=5)[5].rstrip("\n") for line in maps if "/" in line}
+    return {os.path.dirname(path) for path in paths if path.startswith("/") and ".so" in path}
+
+
+def _enter_namespaces(config: ZygoteConfig, plan: root_plan.RootPlan) -> None:
+    try:
+        if config.user is not None:
+            unshare(CLONE_NEWNS)
+            mounts.enter_root(plan, config.place)
+            _become(config)
+        namespaces.enter_user_namespace(os.getuid(), os.getgid())
+        namespaces.unshare_for_zygote(config.network)
+        if config.user is None:
+            mounts.enter_root(plan, config.place)
+        _be_the_first_process()
+    except OSError as error:
+        raise _mounts_unavailable(error) from error
+
+
+def _become(config: ZygoteConfig) -> None:
+    assert config.user is not None
+    user.become(config.user)
+    process.die_with_parent(config.parent)
+
+
+def _be_the_first_process() -> None:
+    """Go on as the first process of the new pid namespace; this one stays to be its parent."""
+    child = os.fork()
+    if child:
+        process.close_all_but({2})
+        _, status = os.waitpid(child, 0)
+        code = os.waitstatus_to_exitcode(status)
+        os._exit(code if code >= 0 else 128 - code)
+    # The parent lives outside, where its pid means nothing to us: 0 stands for it.
+    process.die_with_parent(0, signal.SIGKILL)
+
+
+def _mounts_unavailable(error: OSError) -> LayerUnavailableError:
+    answer = errno.errorcode.get(error.errno or 0, "?")
+    where = f" at {error.filename}" if error.filename else ""
+    return LayerUnavailableError(
+        "mount-namespace",
+        f"the kernel answers {answer}{where}",
+        "A user namespace that may not mount is a restricted one: see the fix for "
+        '"user-namespace" in `envhub doctor`, or choose Policy(profile="no-userns").',
+    )

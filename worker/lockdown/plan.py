@@ -1,0 +1,197 @@
+"""From what is permitted and what the host has to an ordered list of layers. Pure.
+
+A layer that the profile names and the host lacks raises: nothing degrades silently. Layers that
+a weaker profile goes without are listed too, with what stays possible.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from envhub_worker.lockdown.report import Layer, LayerUnavailableError
+from envhub_worker.lockdown.syscalls import NUMBERS
+from envhub_worker.protocol.confinement import MIB, Confinement
+
+PROFILES = ("strict", "no-userns", "container")
+NETWORKS = ("none", "loopback", "host")
+
+# Without a mount namespace Landlock must itself guard truncation, and without a pid namespace
+# signals: from these ABIs on it does.
+_LANDLOCK_FOR_TRUNCATION = 3
+_LANDLOCK_FOR_SIGNALS = 6
+
+
+@dataclass(frozen=True, kw_only=True)
+class HostFacts:
+    """What decides, of this host.
+
+    Attributes:
+        machine: As ``os.uname`` says it.
+        root: Whether the server runs as root.
+        landlock_abi: 0 where there is none.
+        memory: What caps memory: ``"cgroup-v2"``, ``"cgroup-v1"`` or ``"watchdog"``.
+    """
+
+    machine: str
+    root: bool
+    landlock_abi: int
+    memory: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What the stages of lockdown do.
+
+    Attributes:
+        namespaced: Enter namespaces and a private root.
+        landlock: Restrict files (and TCP, signals, abstract sockets as the ABI allows).
+        layers: All of it in order, for the report.
+    """
+
+    namespaced: bool
+    landlock: bool
+    layers: tuple[Layer, ...]
+
+
+def plan(confinement: Confinement, facts: HostFacts) -> Plan:
+    """The layers for ``confinement`` on a host like ``facts``.
+
+    Raises:
+        LayerUnavailableError: The profile names a layer that the host lacks.
+    """
+    _check_names(confinement)
+    _check_seccomp(facts)
+    namespaced = confinement.profile == "strict"
+    landlock = _wants_landlock(confinement, facts)
+    if not namespaced and confinement.network == "loopback":
+        raise LayerUnavailableError(
+            "network-namespace",
+            f"the profile {confinement.profile} has no network of its own to give",
+            'Use the profile "strict", or network="none".',
+        )
+    layers = [
+        *_user_layers(facts, namespaced),
+        *(_namespace_layers(confinement) if namespaced else _without_namespaces(confinement)),
+        Layer("capabilities", True, "none in any set"),
+        Layer("no-new-privileges", True, "set-user-id programs gain nothing"),
+        _landlock_layer(landlock, facts),
+        Layer("seccomp", True, _seccomp_detail(facts, namespaced)),
+        Layer("rlimits", True, _rlimits_detail(confinement)),
+        *_limit_layers(confinement, facts, namespaced),
+    ]
+    return Plan(namespaced=namespaced, landlock=landlock, layers=tuple(layers))
+
+
+def _check_names(confinement: Confinement) -> None:
+    for name, value, known in (
+        ("profile", confinement.profile, PROFILES),
+        ("network", confinement.network, NETWORKS),
+    ):
+        if value not in known:
+            raise LayerUnavailableError(
+                name, f"there is no {name} {value!r}", f"Choose one of {', '.join(known)}."
+            )
+
+
+def _check_seccomp(facts: HostFacts) -> None:
+    if facts.machine not in NUMBERS:
+        raise LayerUnavailableError(
+            "seccomp",
+            f"no system call table for {facts.machine}",
+            "Run on x86-64 or aarch64, or in a container on such a host.",
+        )
+
+
+def _wants_landlock(confinement: Confinement, facts: HostFacts) -> bool:
+    needed = {"strict": 1, "no-userns": _LANDLOCK_FOR_SIGNALS, "container": 0}
+    least = needed[confinement.profile]
+    if facts.landlock_abi < least:
+        have = f"ABI {facts.landlock_abi}" if facts.landlock_abi else "none"
+        raise LayerUnavailableError(
+            "landlock",
+            f"the profile {confinement.profile} needs Landlock ABI {least}, this kernel has {have}",
+            "ABI 1 came with Linux 5.13, 6 with 6.12; it must be in the kernel's lsm= list, and a "
+            "container's seccomp profile must allow it.",
+        )
+    return facts.landlock_abi > 0
+
+
+def _user_layers(facts: HostFacts, namespaced: bool) -> list[Layer]:
+    layers = []
+    if facts.root:
+        layers.append(Layer("unprivileged-user", True, "a user id that owns and runs nothing"))
+    if namespaced:
+        layers.append(Layer("user-namespace", True, "one user, and no capability over any other"))
+    return layers
+
+
+def _namespace_layers(confinement: Confinement) -> list[Layer]:
+    limits = confinement.limits
+    return [
+        Layer("pid-namespace", True, "sees, signals and outlives no process but its own"),
+        Layer("mount-namespace", True, "a private read-only root; other files do not exist"),
+        Layer(
+            "scratch",
+            True,
+            f"one tmpfs of {limits.disk_bytes // MIB} MiB and {limits.disk_files} files",
+        ),
+        _network_layer(confinement.network),
+        Layer("ipc-namespace", True, "its own System V and POSIX objects"),
+        Layer("uts-namespace", True, "a host name that says nothing"),
+        Layer("cgroup-namespace", True, "does not see where it is counted"),
+    ]
+
+
+def _network_layer(network: str) -> Layer:
+    if network == "host":
+        return Layer("network-namespace", False, "the host's network, by explicit choice")
+    device = "only a loopback device" if network == "loopback" else "no device that is up"
+    return Layer("network-namespace", True, device)
+
+
+def _without_namespaces(confinement: Confinement) -> list[Layer]:
+    why = f"the profile {confinement.profile} goes without"
+    return [
+        Layer("pid-namespace", False, f"{why}: processes of the host are visible"),
+        Layer("mount-namespace", False, f"{why}: names and sizes of the host's files are visible"),
+        _bare_network_layer(confinement.network),
+    ]
+
+
+def _bare_network_layer(network: str) -> Layer:
+    if network == "host":
+        return Layer("network", False, "the host's network, by explicit choice")
+    return Layer("network", True, "no socket can be made but connected local pairs")
+
+
+def _landlock_layer(landlock: bool, facts: HostFacts) -> Layer:
+    if not landlock:
+        return Layer("landlock", False, "this kernel or container has none")
+    abi = facts.landlock_abi
+    scope = ", TCP" * (abi >= 4) + ", signals and abstract sockets" * (abi >= 6)
+    return Layer("landlock", True, f"ABI {abi}: files{scope}")
+
+
+def _seccomp_detail(facts: HostFacts, namespaced: bool) -> str:
+    extra = "" if namespaced else "; changes of mode, owner and time are accepted and ignored"
+    return f"allow-list for {facts.machine}{extra}"
+
+
+def _rlimits_detail(confinement: Confinement) -> str:
+    limits = confinement.limits
+    cpu = "" if limits.cpu_s is None else f", {limits.cpu_s} CPU seconds"
+    return f"{limits.processes} processes, {limits.open_files} open files{cpu}, no core dumps"
+
+
+def _limit_layers(confinement: Confinement, facts: HostFacts, namespaced: bool) -> list[Layer]:
+    amount = f"{confinement.limits.memory_bytes // MIB} MiB"
+    detail = {
+        "cgroup-v2": f"{amount}, counted by the kernel (cgroup v2)",
+        "cgroup-v1": f"{amount}, counted by the kernel (cgroup v1)",
+        "watchdog": f"{amount}, measured by the jail's init; bursts between two looks overshoot",
+    }
+    layers = [Layer("memory", True, detail[facts.memory])]
+    if not namespaced:
+        disk = f"{confinement.limits.disk_bytes // MIB} MiB, measured by the jail's init"
+        layers.append(Layer("scratch", True, disk))
+    return layers

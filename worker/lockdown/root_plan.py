@@ -1,0 +1,183 @@
+"""What of the host's file system a jail sees: a pure plan, built by ``mounts``.
+
+Everything that is not named here does not exist in a jail.
+"""
+
+from __future__ import annotations
+
+import os
+import posixpath
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from envhub_worker.lockdown.namespaces import INSIDE_UID
+
+HOME = "/sandbox/home"
+WORK = "/sandbox/work"
+TEMPORARY = "/tmp"
+SHARED_MEMORY = "/dev/shm"
+
+#: Mount points that each jail fills for itself.
+OWN_FOLDERS = (HOME, WORK, TEMPORARY, SHARED_MEMORY, "/proc", "/.scratch")
+
+_SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32")
+_ETC_FOLDERS = ("/etc/alternatives", "/etc/fonts", "/etc/glvnd", "/etc/vulkan", "/etc/OpenCL")
+_ETC_FILES = ("/etc/ld.so.cache", "/etc/localtime", "/etc/mime.types", "/etc/os-release")
+_NETWORK_FILES = ("/etc/resolv.conf", "/etc/hosts", "/etc/services", "/etc/gai.conf")
+_NETWORK_FOLDERS = ("/etc/ssl", "/etc/pki", "/etc/ca-certificates")
+_SYS_FOLDERS = ("/sys/devices/system/cpu", "/sys/devices/system/node")
+_DEVICES = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom")
+
+_TEXTS = {
+    "/etc/passwd": f"sandbox:x:{INSIDE_UID}:{INSIDE_UID}:sandbox:{HOME}:/bin/sh\n"
+    "nobody:x:65534:65534:nobody:/:/bin/false\n",
+    "/etc/group": f"sandbox:x:{INSIDE_UID}:\nnogroup:x:65534:\n",
+    "/etc/nsswitch.conf": "passwd: files\ngroup: files\nhosts: files dns\n",
+    "/etc/hosts": "127.0.0.1 localhost sandbox\n::1 localhost\n",
+}
+_DEV_LINKS = {
+    "/dev/fd": "/proc/self/fd",
+    "/dev/stdin": "/proc/self/fd/0",
+    "/dev/stdout": "/proc/self/fd/1",
+    "/dev/stderr": "/proc/self/fd/2",
+}
+
+
+@dataclass(frozen=True)
+class RootPlan:
+    """What to put into an empty root, in this order.
+
+    Attributes:
+        folders: Empty folders (mount points).
+        trees: Paths that appear where they are on the host, read-only, with all below them.
+        roots: The same for folders that snapshots lie in; a jail covers them up again.
+        devices: Device nodes that appear where they are.
+        copies: Small files whose content is copied.
+        links: Symbolic links: path to target.
+        texts: Files of our own: path to content.
+    """
+
+    folders: tuple[str, ...]
+    trees: tuple[str, ...]
+    roots: tuple[str, ...]
+    devices: tuple[str, ...]
+    copies: tuple[str, ...]
+    links: dict[str, str]
+    texts: dict[str, str]
+
+
+@dataclass(frozen=True)
+class HostFiles:
+    """The few questions that the plan asks about the host's files.
+
+    Attributes:
+        exists: Whether a path exists.
+        readlink: A symbolic link's target, or None for anything else.
+        listdir: Names in a folder; empty where there is none.
+    """
+
+    exists: Callable[[str], bool]
+    readlink: Callable[[str], str | None]
+    listdir: Callable[[str], list[str]]
+
+
+def plan_root(
+    interpreter: Iterable[str],
+    readable: Iterable[str],
+    roots: Iterable[str],
+    *,
+    private: Iterable[str],
+    gpu: bool,
+    network: str,
+    host: HostFiles,
+) -> RootPlan:
+    """The root for all jails of one zygote.
+
+    Args:
+        interpreter: Paths that the interpreter needs: prefixes, ``sys.path``, this package.
+        readable: Paths that the caller grants by name.
+        roots: Folders that snapshots lie in; each jail later sees only its own snapshot.
+        private: Folders that must never appear because an interpreter names something above
+            them (a ``sys.path`` entry that is somebody's home).
+        gpu: Add the device nodes and what drivers read.
+        network: ``"host"`` adds what name resolution and TLS read.
+        host: The host's files.
+    """
+    links: dict[str, str] = dict(_DEV_LINKS)
+    wanted = [path for path in interpreter if not _exposes(path, private)]
+    trees = [*wanted, *readable, *_ETC_FOLDERS, *_SYS_FOLDERS, *_SYSTEM]
+    copies = list(_ETC_FILES)
+    texts = dict(_TEXTS)
+    if gpu:
+        trees.append("/sys")
+    if network == "host":
+        copies += _NETWORK_FILES
+        trees += _NETWORK_FOLDERS
+        del texts["/etc/hosts"]
+
+    def real(paths: Iterable[str]) -> tuple[str, ...]:
+        resolved = [_resolve(path, links, host) for path in paths]
+        return outermost(path for path in resolved if host.exists(path))
+
+    return RootPlan(
+        folders=OWN_FOLDERS,
+        trees=real(trees),
+        roots=real(roots),
+        devices=(*_DEVICES, *(gpu_devices(host) if gpu else ())),
+        copies=tuple(path for path in copies if host.exists(path)),
+        links={path: target for path, target in links.items() if path not in ("/proc", "/")},
+        texts=texts,
+    )
+
+
+def gpu_devices(host: HostFiles) -> tuple[str, ...]:
+    """Render nodes (never the display ones), NVIDIA's and AMD's compute nodes."""
+    render = [f"/dev/dri/{name}" for name in host.listdir("/dev/dri") if name.startswith("renderD")]
+    names = host.listdir("/dev")
+    vendor = [f"/dev/{name}" for name in names if name.startswith("nvidia") or name == "kfd"]
+    plain = [path for path in vendor if not host.listdir(path)]
+    return tuple(sorted(render + plain))
+
+
+def outermost(paths: Iterable[str]) -> tuple[str, ...]:
+    """``paths`` in order, without those that lie in another one."""
+    kept: list[str] = []
+    for path in sorted(set(paths)):
+        if not any(within(path, other) for other in kept):
+            kept.append(path)
+    return tuple(kept)
+
+
+def within(path: str, folder: str) -> bool:
+    """Whether the normalised ``path`` is ``folder`` or below it."""
+    return path == folder or path.startswith(folder.rstrip("/") + "/")
+
+
+def _exposes(path: str, private: Iterable[str]) -> bool:
+    return any(within(folder, path) for folder in private)
+
+
+def _resolve(path: str, links: dict[str, str], host: HostFiles) -> str:
+    """The real path; every symbolic link on the way is noted in ``links``."""
+    current, pending = "/", path.strip("/").split("/")
+    for _ in range(256):  # more than the kernel's own limit of 40 links can need
+        if not pending:
+            break
+        step = posixpath.normpath(posixpath.join(current, pending.pop(0)))
+        target = host.readlink(step)
+        if target is None:
+            current = step
+            continue
+        links[step] = target
+        pending = target.strip("/").split("/") + pending
+        current = "/" if target.startswith("/") else posixpath.dirname(step)
+    return current
+
+
+def real_host() -> HostFiles:
+    """This host's files."""
+    return HostFiles(
+        exists=os.path.exists,
+        readlink=lambda path: os.readlink(path) if os.path.islink(path) else None,
+        listdir=lambda path: sorted(os.listdir(path)) if os.path.isdir(path) else [],
+    )

@@ -1,0 +1,204 @@
+"""Which system calls a jail may make: a table per profile. Pure.
+
+An allow-list: a call that the kernel headers of ``syscalls`` name and that is not here answers
+EPERM; one that they do not name answers ENOSYS, so that programs fall back.
+"""
+
+from __future__ import annotations
+
+import errno
+from dataclasses import dataclass
+
+_ERRNO = 0x00050000
+ALLOW = 0x7FFF0000
+KILL_PROCESS = 0x80000000
+EPERM = _ERRNO | errno.EPERM
+ENOSYS = _ERRNO | errno.ENOSYS
+#: Says that it worked and does nothing: libraries abort, or give up a copy, over an error.
+PRETEND = _ERRNO | 0
+
+
+@dataclass(frozen=True)
+class Check:
+    """Whether ``(args[arg] & mask) == value``; all 64 bits where ``wide``, else the low 32."""
+
+    arg: int
+    value: int
+    mask: int = 0xFFFFFFFF
+    wide: bool = False
+
+
+@dataclass(frozen=True)
+class ByArguments:
+    """The first rule whose checks all hold decides; else ``otherwise``."""
+
+    rules: tuple[tuple[tuple[Check, ...], int], ...]
+    otherwise: int
+
+
+Verdict = int | ByArguments
+
+_MEMORY = """
+    brk mmap munmap mremap mprotect madvise mincore msync mlock mlock2 munlock mlockall munlockall
+    membarrier pkey_alloc pkey_free pkey_mprotect memfd_create mseal get_mempolicy set_mempolicy
+    mbind
+"""
+_FILES = """
+    read write pread64 pwrite64 readv writev preadv pwritev preadv2 pwritev2 open openat creat
+    close close_range lseek stat lstat fstat newfstatat statx access faccessat faccessat2 getdents
+    getdents64 getcwd chdir fchdir mkdir mkdirat rmdir unlink unlinkat rename renameat renameat2
+    link linkat symlink symlinkat readlink readlinkat truncate ftruncate fallocate fadvise64
+    readahead copy_file_range sendfile splice tee dup dup2 dup3 flock fsync fdatasync
+    sync_file_range statfs fstatfs umask getxattr lgetxattr fgetxattr listxattr llistxattr
+    flistxattr pipe pipe2 eventfd eventfd2 signalfd signalfd4 timerfd_create timerfd_settime
+    timerfd_gettime epoll_create epoll_create1 epoll_ctl epoll_wait epoll_pwait epoll_pwait2 poll
+    ppoll select pselect6
+"""
+_PROCESSES = """
+    fork vfork execve execveat exit exit_group wait4 waitid getpid getppid gettid getpgid getpgrp
+    getsid setsid setpgid getuid geteuid getgid getegid getresuid getresgid getgroups setuid
+    setgid setreuid setregid setresuid setresgid setfsuid setfsgid setgroups capget capset
+    arch_prctl set_tid_address set_robust_list get_robust_list rseq restart_syscall futex
+    futex_waitv futex_wake futex_wait futex_requeue sched_yield sched_getaffinity sched_getparam
+    sched_getscheduler sched_getattr sched_get_priority_max sched_get_priority_min
+    sched_rr_get_interval getcpu getpriority ioprio_get getrlimit setrlimit getrusage times
+    sysinfo uname alarm pause nanosleep clock_nanosleep clock_gettime clock_getres gettimeofday
+    time getitimer setitimer timer_create timer_settime timer_gettime timer_getoverrun
+    timer_delete pidfd_open getrandom set_thread_area get_thread_area
+"""
+_SIGNALS = """
+    kill tkill tgkill rt_sigaction rt_sigprocmask rt_sigreturn rt_sigpending rt_sigsuspend
+    rt_sigtimedwait rt_sigqueueinfo rt_tgsigqueueinfo sigaltstack pidfd_send_signal
+"""
+_CONNECTED_SOCKETS = """
+    getsockname getpeername sendmsg sendmmsg recvfrom recvmsg recvmmsg setsockopt getsockopt
+    shutdown
+"""
+_OTHER_SOCKETS = "bind listen accept accept4 connect"
+# These reach beyond what Landlock guards, so they need a mount and an IPC namespace.
+_NAMESPACED = """
+    chmod fchmod fchmodat fchmodat2 chown fchown lchown fchownat utime utimes utimensat futimesat
+    setxattr lsetxattr fsetxattr removexattr lremovexattr fremovexattr openat2 inotify_init
+    inotify_init1 inotify_add_watch inotify_rm_watch shmget shmat shmctl shmdt semget semop
+    semtimedop semctl msgget msgsnd msgrcv msgctl mq_open mq_unlink mq_timedsend mq_timedreceive
+    mq_notify mq_getsetattr sched_setaffinity
+"""
+_MODES_AND_TIMES = """
+    chmod fchmod fchmodat fchmodat2 chown fchown lchown fchownat utime utimes utimensat futimesat
+"""
+
+_NAMESPACES = 0x7E020000  # every CLONE_NEW* that clone takes
+_S_IFMT, _S_IFIFO, _S_IFREG = 0o170000, 0o010000, 0o100000
+_AF_UNIX, _AF_INET, _AF_INET6 = 1, 2, 10
+_SOCK_STREAM, _SOCK_DGRAM, _SOCK_SEQPACKET, _SOCK_TYPE = 1, 2, 5, 0xF
+_EAFNOSUPPORT = _ERRNO | errno.EAFNOSUPPORT
+_ENOTTY = _ERRNO | errno.ENOTTY
+_TIOCSTI, _TIOCLINUX, _TIOCCONS, _TIOCSETD = 0x5412, 0x541C, 0x541D, 0x5423
+_FIOSETOWN, _SIOCSPGRP = 0x8901, 0x8902
+_F_SETOWN, _F_SETSIG, _F_SETOWN_EX, _F_SETLEASE, _F_NOTIFY = 8, 10, 15, 1024, 1026
+_PR_SET_DUMPABLE = 4
+_PERSONALITY_QUERY = 0xFFFFFFFF
+
+
+def table(*, namespaced: bool, network: str) -> dict[str, Verdict]:
+    """System call to verdict; what is missing is denied.
+
+    Args:
+        namespaced: A mount, pid and IPC namespace hold the jail, so that paths, processes and
+            IPC objects of the host are out of reach anyway.
+        network: ``"none"``, ``"loopback"`` or ``"host"``.
+    """
+    verdicts: dict[str, Verdict] = {}
+    for group in (_MEMORY, _FILES, _PROCESSES, _SIGNALS, _CONNECTED_SOCKETS):
+        verdicts |= dict.fromkeys(group.split(), ALLOW)
+    verdicts |= _filtered() | _pretended()
+    verdicts |= _sockets(namespaced, network)
+    verdicts |= dict.fromkeys(_NAMESPACED.split(), ALLOW) if namespaced else _without_namespaces()
+    return verdicts
+
+
+def _filtered() -> dict[str, Verdict]:
+    """Calls whose arguments decide, under every profile."""
+    own = ((Check(0, 0), Check(1, 0)), ALLOW)
+    return {
+        "clone": ByArguments((((Check(0, 0, _NAMESPACES),), ALLOW),), EPERM),
+        # Its flags lie in memory, where a filter cannot look; the C library falls back.
+        "clone3": ENOSYS,
+        "prctl": ByArguments((((Check(0, _PR_SET_DUMPABLE),), EPERM),), ALLOW),
+        "prlimit64": ByArguments((((Check(0, 0),), ALLOW),), EPERM),
+        "setpriority": ByArguments((own,), EPERM),
+        "ioprio_set": EPERM,
+        "personality": ByArguments(
+            (((Check(0, 0),), ALLOW), ((Check(0, _PERSONALITY_QUERY),), ALLOW)), EPERM
+        ),
+        "mknod": _mknod(1),
+        "mknodat": _mknod(2),
+        "ioctl": ByArguments(_ioctls(_TIOCSTI, _TIOCLINUX, _TIOCCONS, _TIOCSETD), ALLOW),
+        "fcntl": ALLOW,
+    }
+
+
+def _mknod(mode: int) -> ByArguments:
+    kinds = (_S_IFIFO, _S_IFREG, 0)
+    return ByArguments(
+        tuple(((Check(mode, kind, _S_IFMT),), ALLOW) for kind in kinds),
+        EPERM,
+    )
+
+
+def _ioctls(*denied: int) -> tuple[tuple[tuple[Check, ...], int], ...]:
+    # Types 'f' and 'X' change flags, encryption and verity of a file that is open for reading.
+    families = tuple(((Check(1, kind << 8, 0xFF00),), _ENOTTY) for kind in (ord("f"), ord("X")))
+    return families + tuple(((Check(1, request),), EPERM) for request in denied)
+
+
+def _pretended() -> dict[str, Verdict]:
+    # libzmq aborts on a failing sched_setscheduler; sync would stall the host's disks.
+    names = "sched_setscheduler sched_setparam sched_setattr sync syncfs"
+    return dict.fromkeys(names.split(), PRETEND)
+
+
+def _sockets(namespaced: bool, network: str) -> dict[str, Verdict]:
+    internet = network != "none"
+    verdicts: dict[str, Verdict] = {
+        "socket": ByArguments(_families(namespaced, internet), _EAFNOSUPPORT),
+        "socketpair": ByArguments(_pairs(namespaced), _EAFNOSUPPORT),
+        "sendto": ByArguments((((Check(4, 0, wide=True),), ALLOW),), EPERM),
+    }
+    if namespaced or internet:
+        verdicts |= dict.fromkeys([*_OTHER_SOCKETS.split(), "sendto"], ALLOW)
+    return verdicts
+
+
+def _families(namespaced: bool, internet: bool) -> tuple[tuple[tuple[Check, ...], int], ...]:
+    rules: list[tuple[tuple[Check, ...], int]] = []
+    if namespaced:
+        rules.append(((Check(0, _AF_UNIX),), ALLOW))
+    if internet:
+        for family in (_AF_INET, _AF_INET6):
+            # Protocols 0, TCP and UDP: MPTCP and raw sockets have their own numbers.
+            for kind, protocol in ((_SOCK_STREAM, 6), (_SOCK_DGRAM, 17)):
+                for allowed in (0, protocol):
+                    checks = (Check(0, family), Check(1, kind, _SOCK_TYPE), Check(2, allowed))
+                    rules.append((checks, ALLOW))
+    return tuple(rules)
+
+
+def _pairs(namespaced: bool) -> tuple[tuple[tuple[Check, ...], int], ...]:
+    # Without a mount namespace a datagram pair would send to any socket file of the host.
+    kinds = [_SOCK_STREAM, _SOCK_SEQPACKET, *([_SOCK_DGRAM] if namespaced else [])]
+    return tuple(((Check(0, _AF_UNIX), Check(1, kind, _SOCK_TYPE)), ALLOW) for kind in kinds)
+
+
+def _without_namespaces() -> dict[str, Verdict]:
+    fcntls = (_F_SETOWN, _F_SETSIG, _F_SETOWN_EX, _F_SETLEASE, _F_NOTIFY)
+    owners = _ioctls(_TIOCSTI, _TIOCLINUX, _TIOCCONS, _TIOCSETD, _FIOSETOWN, _SIOCSPGRP)
+    return {
+        **dict.fromkeys(_MODES_AND_TIMES.split(), PRETEND),
+        "fcntl": ByArguments(tuple(((Check(1, one),), EPERM) for one in fcntls), ALLOW),
+        "inotify_init": ENOSYS,
+        "inotify_init1": ENOSYS,
+        "ioctl": ByArguments(owners, ALLOW),
+        "openat2": ENOSYS,
+        "sched_setaffinity": ByArguments((((Check(0, 0),), ALLOW),), PRETEND),
+    }
