@@ -41,6 +41,7 @@ def make_env(
     endpoint: str | None = None,
     python: str | Path | None = None,
     num_workers: int | None = None,
+    lane: str = "auto",
 ) -> EnvSuites:
     """Make the vector environments of a repository, without its code entering this process.
 
@@ -62,6 +63,7 @@ def make_env(
         python: The interpreter that runs the repository; this one by default.
         num_workers: Processes over which the sub-environments are spread; by default one, or with
             ``use_async_envs`` as many as there are cores.
+        lane: ``"auto"`` steps over shared memory where that is possible, ``"frames"`` never does.
 
     Returns:
         ``{suite: {task_id: VectorEnv}}``. Environments of a known pin start no process before
@@ -77,6 +79,8 @@ def make_env(
         RuntimeError: ``sandbox=None`` without ``trust_remote_code=True``.
     """
     reference, config = _reference(cfg)
+    if lane not in _LANES:
+        raise PolicyError(f"lane is {lane!r}; it is one of {', '.join(_LANES)}")
     if n_envs < 1:
         raise ValueError("`n_envs` must be at least 1")
     if sandbox is None and not trust_remote_code:
@@ -101,8 +105,12 @@ def make_env(
         place,
         _interpreter(python),
         snapshot_store.cache_root() / "snapshots",
+        lane,
     )
     return _Maker(repository, num_workers).make()
+
+
+_LANES = ("auto", "frames")
 
 
 class _Maker:

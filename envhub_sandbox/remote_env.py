@@ -317,7 +317,7 @@ class RemoteEnv:
     def _open_lane(self, loaded: LoadedJail, deadline: Deadline) -> FastLane | None:
         """Agree with the hosts on slabs and doorbells; None where frames have to serve."""
         path = loaded.server.fd_path
-        if path is None or not self.manifest.shardable:
+        if path is None or not self.manifest.shardable or self.repository.lane == "frames":
             return None
         manifest, jail = self.manifest, loaded.jail
         lane = FastLane.for_spaces(manifest, self.bounds, loaded.server.process_fd)

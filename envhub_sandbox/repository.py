@@ -64,6 +64,7 @@ class Repository:
         sandbox: Where workers run.
         python: The interpreter of the jails; empty for ours.
         store: The folder that snapshots lie in.
+        lane: ``"auto"`` or ``"frames"``.
     """
 
     def __init__(
@@ -75,12 +76,14 @@ class Repository:
         sandbox: Sandbox,
         python: str,
         store: Path,
+        lane: str,
     ) -> None:
         self.snapshot = snapshot
         self.arguments = arguments
         self.policy = policy
         self.timeouts = timeouts
         self.python = python
+        self.lane = lane
         self.report: list[dict[str, Any]] = []
         self._sandbox = sandbox
         self._store = store
