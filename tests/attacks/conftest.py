@@ -1,0 +1,75 @@
+"""Fixtures of the attacks, and the table that a run of them writes.
+
+``ENVHUB_ATTACK_TABLE=docs/attacks.md pytest tests/attacks`` writes this user's columns of the
+table; run it as root and as a plain user for all of them.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox import snapshot_store
+from envhub_sandbox.sandboxes.process import PROCESS
+from tests.attacks import table
+from tests.attacks.harness import Arena, Row
+
+PROFILES = ("strict", "no-userns")
+_PROPERTY = "attack"
+_rows: list[Row] = []
+
+
+@pytest.fixture(scope="session")
+def _open_ground() -> Iterator[Path]:
+    """A folder that every user may enter. File modes shall not be what stops an attack."""
+    folder = Path(tempfile.mkdtemp(prefix="envhub-attacks-"))
+    folder.chmod(0o755)
+    yield folder
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _warm_server(_own_cache: None, _open_ground: Path) -> Iterator[None]:
+    """One worker server for all tests of this process: its zygotes stay warm between them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ENVHUB_CACHE", str(_open_ground / "cache"))
+        server = PROCESS.acquire(snapshot_store.cache_root() / "snapshots")
+        yield
+        PROCESS.release(server)
+
+
+@pytest.fixture
+def home(_open_ground: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A home of the caller's, outside of every snapshot, that everybody may enter and write."""
+    folder = Path(tempfile.mkdtemp(prefix="home-", dir=_open_ground))
+    folder.chmod(0o777)
+    monkeypatch.setenv("HOME", str(folder))
+    return folder
+
+
+@pytest.fixture(params=PROFILES)
+def arena(request: pytest.FixtureRequest) -> Iterator[Arena]:
+    """Where a test attacks, once for each profile."""
+    made = Arena(request.param, request.node.module.FAMILY)
+    yield made
+    for row in made.rows:
+        request.node.user_properties.append((_PROPERTY, asdict(row)))
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Collect the rows; with xdist they come from the workers through the reports."""
+    if report.when == "teardown":
+        _rows.extend(Row(**row) for name, row in report.user_properties if name == _PROPERTY)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Write the table, if asked to."""
+    path = os.environ.get("ENVHUB_ATTACK_TABLE")
+    if path and _rows and not hasattr(session.config, "workerinput"):
+        table.update(Path(path), _rows)

@@ -1,0 +1,271 @@
+"""Runs one payload twice, outside and inside of a sandbox, and keeps what became of it.
+
+A payload is a file in ``hostile/payloads``. What it says about itself is only a detail: whether
+an attack succeeded is decided by a function of the test that looks from outside, at a listener, a
+file, a victim, the process table, or (where something is to be stolen) for a random token in what
+came back through the channels that the repository has anyway.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import secrets
+import signal
+import subprocess
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import EnvHubError
+from tests.attacks.expectations import not_stopped
+from tests.support.processes import eventually
+
+HOSTILE = Path(__file__).with_name("hostile")
+USER = "root" if os.geteuid() == 0 else "user"
+TIMEOUTS = {"startup_s": 120.0, "call_s": 90.0, "reset_s": 90.0, "step_s": 90.0}
+_DEADLINE_S = 90.0
+
+Succeeded = Callable[["Run"], object]
+
+
+@dataclass
+class Run:
+    """One run of a payload.
+
+    Attributes:
+        alias: The name of its process; see ``pids``.
+        inside: Whether it ran in a sandbox.
+        value: What it returned.
+        error: The text of what it raised or how it died; empty otherwise.
+    """
+
+    alias: str
+    inside: bool
+    value: Any = None
+    error: str = ""
+
+    @property
+    def text(self) -> str:
+        """Everything that came back from it."""
+        return json.dumps(self.value, default=repr) + self.error
+
+    def pids(self) -> list[int]:
+        """Its live processes, by their name."""
+        return pids_named(self.alias)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table of attacks."""
+
+    attack: str
+    family: str
+    profile: str
+    user: str
+    control: str
+    inside: str
+    detail: str
+
+
+@dataclass
+class Arena:
+    """Where one test attacks: one profile, as the user that this process is.
+
+    Attributes:
+        profile: The policy's profile.
+        family: Heading in the table.
+        rows: What was found out, for the table.
+    """
+
+    profile: str
+    family: str
+    rows: list[Row] = field(default_factory=list)
+
+    def attack(
+        self,
+        title: str,
+        payload: str,
+        succeeded: Succeeded,
+        *,
+        inside: Mapping[str, Any] | None = None,
+        policy: Mapping[str, Any] | None = None,
+        limits: Mapping[str, Any] | None = None,
+        secret: str = "",
+        before: Callable[[], object] = lambda: None,
+        impossible: str = "",
+        **arguments: Any,
+    ) -> None:
+        """Run the payload as a control, where it must succeed, and inside, where it must not.
+
+        Args:
+            title: The attack's name in the table.
+            payload: File in ``hostile/payloads``.
+            succeeded: Looks from outside, while the payload's process is still there.
+            inside: Arguments that differ inside.
+            policy: Fields of the policy besides the profile.
+            limits: The policy's limits.
+            secret: What the control's process holds in its memory.
+            before: Runs before each half, to undo what the other one did.
+            impossible: Why there is no control here; the attack then counts as no proof.
+            **arguments: For the payload.
+        """
+        control = "not possible"
+        if not impossible:
+            before()
+            with control_run(payload, arguments, secret) as run:
+                assert succeeded(run), f"the control of {title!r} failed: {run.text[-3000:]}"
+            control = "succeeds"
+        before()
+        with self.inside(payload, {**arguments, **(inside or {})}, policy, limits) as run:
+            through = bool(succeeded(run))
+        self.judge(title, control, through, run.text, impossible)
+
+    def judge(
+        self, title: str, control: str, through: bool, detail: str, impossible: str = ""
+    ) -> None:
+        """Note what an attack did, and fail unless that is what is expected of this profile."""
+        verdict = "NOT STOPPED" if through else "no proof" if impossible else "stopped"
+        note = impossible or (_brief(detail) if not through else "")
+        self.rows.append(Row(title, self.family, self.profile, USER, control, verdict, note))
+        reason = not_stopped(title, self.profile, USER)
+        if reason is None:
+            assert not through, f"{title!r} succeeded inside ({self.profile}): {detail[-3000:]}"
+        else:
+            assert through, f"{title!r} is stopped now; expectations say otherwise: {reason}"
+
+    @contextlib.contextmanager
+    def inside(
+        self,
+        payload: str,
+        arguments: Mapping[str, Any],
+        policy: Mapping[str, Any] | None = None,
+        limits: Mapping[str, Any] | None = None,
+    ) -> Iterator[Run]:
+        """Run a payload in a jail of its own; the jail lives as long as the context."""
+        run = Run(new_alias(), True)
+        with self.environment(policy, limits) as env:
+            call(env, run, payload, arguments)
+            yield run
+
+    @contextlib.contextmanager
+    def environment(
+        self,
+        policy: Mapping[str, Any] | None = None,
+        limits: Mapping[str, Any] | None = None,
+        **options: Any,
+    ) -> Iterator[Any]:
+        """The hostile repository's environment, in a jail of its own."""
+        wanted = {"profile": self.profile, **(policy or {})}
+        options = {"policy": wanted, "limits": limits, "timeouts": TIMEOUTS, **options}
+        with make_env(str(HOSTILE), **options) as suites:
+            yield suites.env
+
+
+def call(env: Any, run: Run, payload: str, arguments: Mapping[str, Any]) -> None:
+    """Have a hostile environment run a payload, and note what became of it."""
+    try:
+        [run.value] = env.call("attack", payload, dict(arguments), run.alias)
+    except EnvHubError as error:
+        run.error = "".join(traceback.format_exception(error))
+
+
+@contextlib.contextmanager
+def control_run(payload: str, arguments: Mapping[str, Any], secret: str = "") -> Iterator[Run]:
+    """Run a payload in a plain interpreter, which lives as long as the context."""
+    run = Run(new_alias(), False)
+    process = start_control(payload, arguments, run.alias)
+    try:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdin.write(secret.encode() + b"\n")
+        process.stdin.flush()
+        answer = _last_line(process)
+        run.value, run.error = answer["value"], answer["error"]
+        yield run
+    finally:
+        process.stdin.close()
+        process.stdout.close()
+        _end(process, run.alias)
+
+
+def start_control(
+    payload: str, arguments: Mapping[str, Any], alias: str, **options: Any
+) -> subprocess.Popen[bytes]:
+    """The process that runs a payload without a sandbox, with this process's environment."""
+    words = [str(HOSTILE / "outside.py"), payload, json.dumps(dict(arguments)), alias]
+    return subprocess.Popen(
+        [sys.executable, *words],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+        **options,
+    )
+
+
+def _last_line(process: subprocess.Popen[bytes]) -> dict[str, Any]:
+    """The runner's line of JSON; whatever the payload prints comes before it."""
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.startswith(b'{"value"'):
+            return dict(json.loads(line))
+    return {"value": None, "error": f"the process ended: {process.wait()}"}
+
+
+def _end(process: subprocess.Popen[bytes], alias: str) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    kill_named(alias)
+
+
+def new_alias() -> str:
+    """A process name that nobody else has; the kernel keeps 15 bytes."""
+    return f"atk-{secrets.token_hex(4)}"
+
+
+def token() -> str:
+    """Something that is not known by chance."""
+    return secrets.token_hex(16)
+
+
+def pids_named(alias: str) -> list[int]:
+    """The live processes of a name, in any pid namespace below ours."""
+    found = []
+    for name in os.listdir("/proc"):
+        if name.isdigit() and _comm(name) == alias and _state(name) not in ("Z", "X", ""):
+            found.append(int(name))
+    return sorted(found)
+
+
+def kill_named(alias: str) -> None:
+    """End what a control left behind."""
+    for pid in pids_named(alias):
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    assert eventually(lambda: not pids_named(alias))
+
+
+def _comm(pid: str) -> str:
+    return _read(f"/proc/{pid}/comm").strip()
+
+
+def _state(pid: str) -> str:
+    return _read(f"/proc/{pid}/stat").rpartition(")")[2].strip()[:1]
+
+
+def _read(path: str) -> str:
+    with contextlib.suppress(OSError), open(path) as file:
+        return file.read()
+    return ""
+
+
+def _brief(detail: str) -> str:
+    """The last line of an error, or the start of an answer."""
+    lines = [line.strip() for line in detail.splitlines() if line.strip()]
+    return (lines[-1] if lines else "")[:120]

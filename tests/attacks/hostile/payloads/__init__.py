@@ -1,0 +1,1 @@
+"""One file per attack: ``attack(**arguments)`` returns what it got, or raises."""

@@ -1,0 +1,7 @@
+"""Delete a file."""
+
+import os
+
+
+def attack(path):
+    os.unlink(path)

@@ -1,0 +1,7 @@
+"""List a folder."""
+
+import os
+
+
+def attack(path):
+    return os.listdir(path)

@@ -1,0 +1,89 @@
+"""The table of attacks as a page: columns for a user and root under each profile.
+
+A run knows one user's columns; those of the other one are taken over from the page as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from tests.attacks.harness import Row
+
+_COLUMNS = (
+    "control, user",
+    "control, root",
+    "strict, user",
+    "strict, root",
+    "no-userns, user",
+    "no-userns, root",
+)
+_HEAD = """# Attacks
+
+Written by the attack suite (`ENVHUB_ATTACK_TABLE=docs/attacks.md pytest tests/attacks`, once as a
+plain user and once as root); do not edit by hand. Each attack runs twice in the same test: without
+a sandbox (the *control*), where it must succeed, and inside. Whether it succeeded is judged from
+outside the jail: by a listener, a file, a victim process, the process table, or a random token in
+what the repository returned. `docs/threat-model.md` explains what is not stopped.
+
+- **succeeds**: the control did what the attack wants.
+- **stopped**: the same payload did not do it inside.
+- **NOT STOPPED**: it did, and the suite asserts that it does.
+- **no proof**: the control is not possible for this user or on this host (the reason stands
+  below the table), so that nothing follows from its failing inside.
+"""
+_START = "| attack |"
+
+Page = dict[str, dict[str, dict[str, str]]]
+
+
+def update(path: Path, rows: Iterable[Row]) -> None:
+    """Write ``rows`` into the page at ``path``, over what they know better."""
+    page = _parse(path.read_text()) if path.exists() else {}
+    notes = _notes(path.read_text()) if path.exists() else {}
+    for row in rows:
+        cells = page.setdefault(row.family, {}).setdefault(row.attack, {})
+        cells[f"control, {row.user}"] = row.control
+        cells[f"{row.profile}, {row.user}"] = row.inside
+        if row.control == "not possible":
+            notes[f"{row.attack}, {row.user}"] = row.detail
+        else:
+            notes.pop(f"{row.attack}, {row.user}", None)
+    path.write_text(_page(page, notes))
+
+
+def attacks_on(page: str) -> set[str]:
+    """The titles of all attacks on a page."""
+    return {attack for family in _parse(page).values() for attack in family}
+
+
+def _page(page: Page, notes: dict[str, str]) -> str:
+    parts = [_HEAD]
+    for family in sorted(page):
+        parts.append(f"\n## {family}\n\n{_START} {' | '.join(_COLUMNS)} |")
+        parts.append("|---" * (len(_COLUMNS) + 1) + "|")
+        for attack in sorted(page[family]):
+            cells = [page[family][attack].get(column, "") for column in _COLUMNS]
+            parts.append(f"| {attack} | {' | '.join(cells)} |")
+    if notes:
+        parts.append("\n## Controls that are not possible\n")
+        parts += [f"- {name}: {notes[name]}" for name in sorted(notes)]
+    return "\n".join(parts) + "\n"
+
+
+def _parse(text: str) -> Page:
+    page: Page = {}
+    family = ""
+    for line in text.splitlines():
+        if line.startswith("## "):
+            family = line[3:]
+        elif line.startswith("| ") and not line.startswith(_START):
+            attack, *cells = (cell.strip() for cell in line.strip("|").split("|"))
+            page.setdefault(family, {})[attack] = dict(zip(_COLUMNS, cells, strict=True))
+    return page
+
+
+def _notes(text: str) -> dict[str, str]:
+    _, _, below = text.partition("\n## Controls that are not possible\n")
+    lines = [line[2:] for line in below.splitlines() if line.startswith("- ")]
+    return dict(line.split(": ", 1) for line in lines)
