@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from time import monotonic
 
+_LONGEST_WAIT_MS = 24 * 3600 * 1000
+"""One wait; who waits asks again afterwards. Infinity has no milliseconds."""
+
 
 class Deadline:
     """A point in time. ``Deadline(None)`` never comes."""
@@ -18,9 +21,9 @@ class Deadline:
         return None if self._at is None else max(0.0, self._at - monotonic())
 
     def left_ms(self) -> int | None:
-        """Milliseconds until it comes, rounded up; None for never."""
+        """Milliseconds until it comes, rounded up, or a day; None for never."""
         left = self.left_s()
-        return None if left is None else int(left * 1000) + 1
+        return None if left is None else int(min(left * 1000 + 1, _LONGEST_WAIT_MS))
 
     @property
     def passed(self) -> bool:

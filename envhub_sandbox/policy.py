@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from numbers import Real
 from typing import Any, TypeVar
 
 from envhub_sandbox.errors import PolicyError
@@ -18,7 +19,7 @@ __all__ = ["Limits", "Policy", "Timeouts", "limits_from", "policy_from", "timeou
 
 PROFILES = ("strict", "no-userns", "container")
 NETWORKS = ("none", "loopback", "host")
-RESTARTS = ("never", "on_reset", "transparent")
+RESTARTS = ("never", "on_reset")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +77,12 @@ class Policy:
         _one_of("profile", self.profile, PROFILES)
         _one_of("network", self.network, NETWORKS)
         _one_of("restart", self.restart, RESTARTS)
-        _check_limits(self.limits)
+        if not isinstance(self.gpu, bool):
+            raise PolicyError(f"policy: gpu is {self.gpu!r}; it is True or False")
+        # frozen: this is how a field gets the form that the rest relies on
+        object.__setattr__(self, "readable", _texts("readable", self.readable))
+        object.__setattr__(self, "environment", _texts("environment", self.environment))
+        object.__setattr__(self, "limits", _checked(self.limits))
         for path in self.readable:
             if not os.path.isabs(path):
                 raise PolicyError(f"policy: readable holds {path!r}; it takes absolute paths")
@@ -87,7 +93,7 @@ class Policy:
         return Confinement(
             profile=self.profile,
             network=self.network,
-            readable=tuple(self.readable),
+            readable=self.readable,
             gpu=self.gpu,
             environment=granted,
             limits=self.limits,
@@ -143,14 +149,28 @@ def _one_of(name: str, value: str, known: tuple[str, ...]) -> None:
 _OPTIONAL_LIMITS = frozenset({"cpu_s", "file_bytes"})
 
 
-def _check_limits(limits: Limits) -> None:
-    for item in fields(limits):
-        value = getattr(limits, item.name)
-        if value is None and item.name in _OPTIONAL_LIMITS:
-            continue
-        if not (_is_number(value) and value == int(value) and value > 0):
-            raise PolicyError(f"limits: {item.name} is {value!r}; it takes a whole number above 0")
+def _texts(name: str, value: object) -> tuple[str, ...]:
+    # a plain str is a sequence too, of letters
+    if not isinstance(value, (list, tuple)) or not all(isinstance(item, str) for item in value):
+        raise PolicyError(f"policy: {name} is {value!r}; it takes a tuple of strings")
+    return tuple(value)
+
+
+def _checked(limits: Limits) -> Limits:
+    if not isinstance(limits, Limits):
+        raise PolicyError(f"policy: limits takes a Limits, not {type(limits).__name__}")
+    return Limits(
+        **{item.name: _whole(item.name, getattr(limits, item.name)) for item in fields(limits)}
+    )
+
+
+def _whole(name: str, value: Any) -> Any:
+    if value is None and name in _OPTIONAL_LIMITS:
+        return None
+    if not (_is_number(value) and value > 0 and value // 1 == value):
+        raise PolicyError(f"limits: {name} is {value!r}; it takes a whole number above 0")
+    return int(value)
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    return isinstance(value, Real) and not isinstance(value, bool)

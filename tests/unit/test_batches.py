@@ -1,0 +1,246 @@
+"""Batches cut for shards and joined again: Gymnasium's own functions are the reference."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
+from hypothesis import given
+from hypothesis import strategies as st
+
+from envhub_worker.protocol import batches
+from envhub_worker.protocol.errors import RemoteProtocolError
+from tests.support.compare import assert_same
+
+NODES = spaces.Graph(spaces.Box(-1, 1, (2,)), spaces.Discrete(3))
+SINGLE_SPACES: dict[str, gym.Space[Any]] = {
+    "box": spaces.Box(-1, 1, (2, 3), np.float32),
+    "image": spaces.Box(0, 255, (4, 4, 3), np.uint8),
+    "scalar box": spaces.Box(-1, 1, (), np.float64),
+    "discrete": spaces.Discrete(5, start=2),
+    "multi-discrete": spaces.MultiDiscrete([3, 4]),
+    "multi-binary": spaces.MultiBinary((2, 2)),
+    "text": spaces.Text(5),
+    "graph": NODES,
+    "sequence": spaces.Sequence(spaces.Discrete(4)),
+    "sequence of graphs": spaces.Sequence(NODES),
+    "stacked sequence": spaces.Sequence(spaces.Box(0, 1, (2,)), stack=True),
+    "dict": spaces.Dict(
+        {"b": spaces.Discrete(3), "a": spaces.Dict({"image": spaces.Box(0, 1, (2,))})}
+    ),
+    "tuple": spaces.Tuple((spaces.Discrete(3), spaces.Dict({"text": spaces.Text(3), "g": NODES}))),
+}
+NUM_ENVS = 5
+SHARDS = st.integers(1, NUM_ENVS)
+NAMES = st.sampled_from(sorted(SINGLE_SPACES))
+
+
+def batch_of(space: gym.Space[Any], count: int, seed: int = 0) -> tuple[list[Any], Any]:
+    """Some members of a space, and Gymnasium's batch of them."""
+    space.seed(seed)
+    members = [space.sample() for _ in range(count)]
+    return members, concatenate(space, members, create_empty_array(space, count))
+
+
+def parts_of(space: gym.Space[Any], members: list[Any], bounds: batches.Bounds) -> list[Any]:
+    """What the shards of a vector environment would each answer."""
+    return [
+        concatenate(space, members[start:stop], create_empty_array(space, stop - start))
+        for start, stop in bounds
+    ]
+
+
+@given(st.integers(1, 200), st.data())
+def test_bounds_cover_everybody_once_and_evenly(count: int, data: st.DataObject) -> None:
+    """Shards follow each other, and differ by one sub-environment at most."""
+    parts = data.draw(st.integers(1, count))
+    bounds = batches.even_bounds(count, parts)
+    assert [index for start, stop in bounds for index in range(start, stop)] == list(range(count))
+    sizes = [stop - start for start, stop in bounds]
+    assert len(sizes) == parts
+    assert 0 <= max(sizes) - min(sizes) <= 1
+
+
+@given(NAMES, SHARDS, st.integers(0, 2**31))
+def test_split_gives_each_shard_its_members(name: str, shards: int, seed: int) -> None:
+    """The members of the slices, as Gymnasium iterates over them, are those of the batch."""
+    space = SINGLE_SPACES[name]
+    members, batch = batch_of(space, NUM_ENVS, seed)
+    bounds = batches.even_bounds(NUM_ENVS, shards)
+    found = [
+        member
+        for part, (start, stop) in zip(batches.split(space, batch, bounds), bounds, strict=True)
+        for member in iterate(batch_space(space, stop - start), part)
+    ]
+    assert_same(list(iterate(batch_space(space, NUM_ENVS), batch)), found)
+    assert len(found) == len(members)
+
+
+@given(NAMES, SHARDS, st.integers(0, 2**31))
+def test_join_is_the_batch_of_all_members(name: str, shards: int, seed: int) -> None:
+    """Joining what the shards answer gives what one process would have answered."""
+    space = SINGLE_SPACES[name]
+    members, batch = batch_of(space, NUM_ENVS, seed)
+    parts = parts_of(space, members, batches.even_bounds(NUM_ENVS, shards))
+    assert_same(batch, batches.join(space, parts))
+
+
+@pytest.mark.parametrize("name", SINGLE_SPACES)
+def test_batches_conform_to_their_space(name: str) -> None:
+    """A batch as Gymnasium makes it is accepted, for the right number of members only."""
+    space = SINGLE_SPACES[name]
+    _, batch = batch_of(space, 3)
+    assert batches.conforms(space, batch, 3)
+    assert not batches.conforms(space, batch, 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "batch"),
+    [
+        ("box", np.zeros((3, 2, 3), np.float64)),
+        ("box", np.zeros((3, 3, 2), np.float32)),
+        ("box", np.zeros((3, 2, 3), np.float32).tolist()),
+        ("box", None),
+        ("scalar box", np.zeros((3, 1))),
+        ("discrete", np.zeros(3, np.int32)),
+        ("discrete", np.zeros((3, 1), np.int64)),
+        ("text", ["a", "b", "c"]),
+        ("text", "abc"),
+        ("dict", {"b": np.zeros(3, np.int64)}),
+        ("dict", (np.zeros(3, np.int64), {})),
+        ("dict", {"b": np.zeros(3, np.int64), "a": {"image": np.zeros((3, 2), np.float64)}}),
+        ("tuple", (np.zeros(3, np.int64),)),
+        ("tuple", [np.zeros(3, np.int64), {}]),
+        ("tuple", (np.zeros(3, np.int64), {"text": ("a", "b", "c"), "g": ("a",)})),
+    ],
+)
+def test_other_structures_shapes_and_dtypes_do_not_conform(name: str, batch: object) -> None:
+    """What a lying worker may send instead of a batch is noticed."""
+    assert not batches.conforms(SINGLE_SPACES[name], batch, 3)
+
+
+def test_values_outside_the_bounds_conform() -> None:
+    """Environments leave their own bounds, and Gymnasium lets them."""
+    assert batches.conforms(SINGLE_SPACES["box"], np.full((1, 2, 3), 9, np.float32), 1)
+
+
+@pytest.mark.parametrize("name", SINGLE_SPACES)
+def test_members_get_their_classes_back(name: str) -> None:
+    """A graph crosses as a plain tuple, and comes out as Gymnasium's own class."""
+    space = SINGLE_SPACES[name]
+    _, batch = batch_of(space, 3)
+    assert_same(batch, batches.restore_batch(space, without_classes(batch)))
+    [member], _ = batch_of(space, 1)
+    assert_same(member, batches.restore(space, without_classes(member)))
+
+
+def without_classes(value: Any) -> Any:
+    """A value as it comes off the wire: named tuples are plain ones."""
+    if isinstance(value, dict):
+        return {key: without_classes(item) for key, item in value.items()}
+    if isinstance(value, tuple):
+        return tuple(map(without_classes, value))
+    return value
+
+
+@pytest.mark.parametrize("name", SINGLE_SPACES)
+def test_only_graphs_need_their_classes_back(name: str) -> None:
+    """Everything else is left alone, for speed."""
+    expected = name in {"graph", "sequence of graphs", "tuple"}
+    assert batches.restores(SINGLE_SPACES[name]) is expected
+
+
+@pytest.mark.parametrize("member", [None, 3, (1, 2), {"text": 1}, ({}, {}, {}, {})])
+@pytest.mark.parametrize("name", ["graph", "dict", "tuple", "sequence of graphs"])
+def test_lies_about_members_are_left_as_they_are(name: str, member: object) -> None:
+    """``final_obs`` is not checked against the space; restoring it raises nothing."""
+    assert batches.restore(SINGLE_SPACES[name], member) == member
+
+
+class TestJoinedInfos:
+    """Infos of shards against ``VectorEnv._add_info`` over all sub-environments at once."""
+
+    @staticmethod
+    def added(infos: list[dict[str, Any]]) -> dict[str, Any]:
+        """What Gymnasium makes of one info per sub-environment."""
+        env: gym.vector.VectorEnv[Any, Any, Any] = gym.vector.VectorEnv()
+        env.num_envs = len(infos)
+        made: dict[str, Any] = {}
+        for index, info in enumerate(infos):
+            made = env._add_info(made, info, index)
+        return made
+
+    @given(
+        st.lists(
+            st.dictionaries(
+                st.sampled_from("abc"),
+                st.one_of(st.none(), st.text(max_size=3), st.lists(st.integers(0, 3), max_size=2)),
+                max_size=3,
+            ),
+            min_size=NUM_ENVS,
+            max_size=NUM_ENVS,
+        ),
+        SHARDS,
+    )
+    def test_objects(self, infos: list[dict[str, Any]], shards: int) -> None:
+        """Text, None and lists are object arrays with masks, whoever had them first."""
+        self.check(infos, shards)
+
+    @given(
+        st.lists(
+            st.fixed_dictionaries(
+                {},
+                optional={
+                    "float": st.floats(allow_nan=False),
+                    "bool": st.booleans(),
+                    "int": st.integers(-5, 5),
+                    "array": st.lists(st.integers(0, 9), min_size=2, max_size=2).map(np.array),
+                    "nested": st.fixed_dictionaries({}, optional={"x": st.floats(0, 1)}),
+                },
+            ),
+            min_size=NUM_ENVS,
+            max_size=NUM_ENVS,
+        ),
+        SHARDS,
+    )
+    def test_numbers(self, infos: list[dict[str, Any]], shards: int) -> None:
+        """Numbers and arrays keep the dtype that Gymnasium gives them; masks are nested too."""
+        self.check(infos, shards)
+
+    def check(self, infos: list[dict[str, Any]], shards: int) -> None:
+        """Compare the joined infos of some shards with those of one process."""
+        bounds = batches.even_bounds(NUM_ENVS, shards)
+        parts = [self.added(infos[start:stop]) for start, stop in bounds]
+        joined = batches.join_infos(parts, [stop - start for start, stop in bounds])
+        expected = self.added(infos)
+        assert expected.keys() == joined.keys()
+        assert_same(expected, {key: joined[key] for key in expected})
+
+    @pytest.mark.parametrize(
+        "lie",
+        [
+            {"a": 3},
+            {"a": np.array(3)},
+            {"a": None},
+            {"a": np.zeros(5)},
+            {"a": np.zeros((0, 10**13)), "_a": np.array([True])},
+            {"a": {"b": "text"}},
+        ],
+        ids=["int", "0-d", "None", "too long", "absurd shape", "nested text"],
+    )
+    def test_lies_are_the_workers_fault(self, lie: dict[str, Any]) -> None:
+        """What no vector environment says is refused, and allocates nothing."""
+        honest = {"a": np.array([1.0]), "_a": np.array([True])}
+        for parts in ([honest, lie], [lie, honest]):
+            with pytest.raises(RemoteProtocolError, match="do not fit together"):
+                batches.join_infos(parts, [1, 1])
+
+    def test_another_type_without_a_mask_is_the_workers_fault(self) -> None:
+        """Values that have to be placed one by one need a mask that says which are there."""
+        parts = [{"a": np.array([1.0]), "_a": np.array([True])}, {"a": np.array(["text"])}]
+        with pytest.raises(RemoteProtocolError, match="do not fit together"):
+            batches.join_infos(parts, [1, 1])

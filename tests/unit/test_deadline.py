@@ -1,0 +1,31 @@
+"""Deadlines: asked for what is left, in any unit, for any length."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from envhub_sandbox.deadline import Deadline
+
+
+def test_no_timeout_never_comes() -> None:
+    """None waits for ever, in the words of those who wait."""
+    deadline = Deadline(None)
+    assert (deadline.left_s(), deadline.left_ms(), deadline.passed) == (None, None, False)
+
+
+def test_what_has_passed_has_nothing_left() -> None:
+    """What is left is never negative; a wait is at least a millisecond, not for ever."""
+    deadline = Deadline(-5.0)
+    assert (deadline.left_s(), deadline.left_ms(), deadline.passed) == (0.0, 1, True)
+
+
+@pytest.mark.parametrize("timeout_s", [1e6, 1e30, 1e308, math.inf])
+def test_far_deadlines_can_be_waited_for(timeout_s: float) -> None:
+    """Even infinity has milliseconds that poll() takes; who waits asks again afterwards."""
+    deadline = Deadline(timeout_s)
+    milliseconds = deadline.left_ms()
+    assert milliseconds is not None
+    assert 0 < milliseconds < 2**31
+    assert not deadline.passed
