@@ -1,0 +1,142 @@
+"""Actions: what the space could mean is taken as it is, everything else is refused here."""
+
+from __future__ import annotations
+
+import types
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
+from hypothesis import given
+from hypothesis import strategies as st
+
+from envhub_sandbox.actions import batch_of
+from envhub_sandbox.errors import ActionError
+from tests.support.compare import assert_same
+
+DISCRETE = spaces.Discrete(3)
+BOX = spaces.Box(-1, 1, (2,), np.float32)
+IMAGE = spaces.Box(0, 255, (2, 2), np.uint8)
+DICT = spaces.Dict({"move": BOX, "grip": DISCRETE})
+TUPLE = spaces.Tuple((DISCRETE, spaces.Dict({"x": BOX})))
+TEXT = spaces.Text(5)
+SINGLE_SPACES: dict[str, gym.Space[Any]] = {
+    "discrete": DISCRETE,
+    "box": BOX,
+    "image": IMAGE,
+    "scalar": spaces.Box(-1, 1, ()),
+    "multi-discrete": spaces.MultiDiscrete([3, 4]),
+    "multi-binary": spaces.MultiBinary(3),
+    "dict": DICT,
+    "tuple": TUPLE,
+    "text": TEXT,
+    "sequence": spaces.Sequence(DISCRETE),
+}
+
+
+@given(st.sampled_from(sorted(SINGLE_SPACES)), st.integers(1, 4), st.integers(0, 2**31))
+def test_samples_of_the_batched_space_are_taken_as_they_are(
+    name: str, count: int, seed: int
+) -> None:
+    """``env.action_space.sample()`` is always a batch."""
+    space = SINGLE_SPACES[name]
+    batched = batch_space(space, count)
+    batched.seed(seed)
+    sample = batched.sample()
+    assert_same(sample, batch_of(space, sample, count))
+
+
+@pytest.mark.parametrize(
+    ("space", "value", "expected"),
+    [
+        (DISCRETE, [0, 2], np.array([0, 2])),
+        (DISCRETE, (0, 2), np.array([0, 2])),
+        (DISCRETE, np.array([0, 2], np.int8), np.array([0, 2], np.int8)),
+        (DISCRETE, np.array([False, True]), np.array([False, True])),
+        (BOX, [[0.5, 1], [0, 0]], np.array([[0.5, 1], [0, 0]])),
+        (BOX, np.zeros((2, 2), np.float64), np.zeros((2, 2), np.float64)),
+        (BOX, np.zeros((2, 2), np.int64), np.zeros((2, 2), np.int64)),
+        (BOX, [np.zeros(2), np.ones(2)], np.array([[0.0, 0], [1, 1]])),
+        (TEXT, ["a", "b"], ("a", "b")),
+        (TUPLE, [[0, 1], {"x": np.zeros((2, 2))}], (np.array([0, 1]), {"x": np.zeros((2, 2))})),
+    ],
+)
+def test_lists_tuples_and_other_dtypes_are_taken(
+    space: gym.Space[Any], value: Any, expected: Any
+) -> None:
+    """Dtypes stay as they are: that is what an environment in this process would see."""
+    assert_same(expected, batch_of(space, value, 2))
+
+
+def test_mappings_of_any_class_become_dicts_in_the_spaces_order() -> None:
+    """Further keys are left out, as Gymnasium's own iteration does."""
+    value = types.MappingProxyType({"grip": [0, 1], "move": np.zeros((2, 2)), "more": 1})
+    made = batch_of(DICT, value, 2)
+    assert type(made) is dict
+    assert list(made) == list(DICT.spaces)
+
+
+def test_values_outside_the_bounds_are_the_environments_business() -> None:
+    """Only shapes and kinds of numbers are looked at."""
+    assert_same(np.array([7, -1]), batch_of(DISCRETE, [7, -1], 2))
+
+
+def test_tensors_are_taken() -> None:
+    """Torch tensors are arrays, with a gradient or without."""
+    torch = pytest.importorskip("torch")
+    value = torch.ones((2, 2), requires_grad=True)
+    assert_same(np.ones((2, 2), np.float32), batch_of(BOX, value, 2))
+
+
+@pytest.mark.parametrize(
+    ("space", "value", "complaint"),
+    [
+        (DISCRETE, [0, 1, 2], r"int64 of shape \(2,\).*got int64 of shape \(3,\)"),
+        (DISCRETE, 1, r"got int64 of shape \(\)"),
+        (DISCRETE, None, "got object"),
+        (DISCRETE, [0.5, 1.0], "got float64"),
+        (DISCRETE, ["0", "1"], "got <U1"),
+        (DISCRETE, [[0], [1]], r"got int64 of shape \(2, 1\)"),
+        (BOX, np.zeros((2, 3), np.float32), r"float32 of shape \(2, 2\).*got .* \(2, 3\)"),
+        (BOX, np.zeros(2, np.float32), r"got float32 of shape \(2,\)"),
+        (BOX, np.zeros((2, 2), complex), "got complex128"),
+        (BOX, np.full((2, 2), None), "got object"),
+        (BOX, [[0.5], [1, 2]], "no batch for"),
+        (IMAGE, np.zeros((2, 2, 2), np.float32), "got float32"),
+        (DICT, [0, 1], "expected a mapping .*, got builtins.list"),
+        (DICT, {"move": np.zeros((2, 2))}, "'grip'. missing"),
+        (DICT, {"move": np.zeros((2, 2)), "grip": [0]}, r"actions\['grip'\]: expected"),
+        (TUPLE, ([0, 1],), "expected a tuple of 2 batches .*, got builtins.tuple"),
+        (TUPLE, np.zeros((2, 2)), "got numpy.ndarray"),
+        (TUPLE, ([0, 1], {"x": np.zeros(2)}), r"actions\[1\]\['x'\]: expected"),
+        (TEXT, ["a"], "expected 2 members of .*, got 1"),
+        (TEXT, 5, "expected 2 members of .*, got builtins.int"),
+    ],
+)
+def test_other_shapes_dtypes_and_structures_are_refused(
+    space: gym.Space[Any], value: Any, complaint: str
+) -> None:
+    """The error names the place, what belongs there, and what was given."""
+    with pytest.raises(ActionError, match=complaint):
+        batch_of(space, value, 2)
+
+
+def test_objects_that_fail_to_be_arrays_are_refused() -> None:
+    """Whatever their own code raises, it is a clear error, with the cause kept."""
+
+    class Broken:
+        def __array__(self, dtype: Any = None, copy: Any = None) -> Any:
+            raise OSError("no")
+
+    with pytest.raises(ActionError, match=r"Broken is no batch for .*: no") as caught:
+        batch_of(BOX, Broken(), 2)
+    assert isinstance(caught.value.__cause__, OSError)
+
+
+def test_action_errors_are_value_errors() -> None:
+    """``except ValueError`` catches them, as with Gymnasium's own."""
+    with pytest.raises(ValueError, match="expected"):
+        batch_of(DISCRETE, [0], 2)

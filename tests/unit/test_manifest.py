@@ -1,0 +1,219 @@
+"""Manifests: what a repository returned arrives as it was; lies about it do not."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import pytest
+from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
+from hypothesis import given
+from hypothesis import strategies as st
+
+from envhub_worker.protocol.codec import decode, encode
+from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.manifest import (
+    MAX_ENVS,
+    MAX_NAME,
+    MAX_NAMES,
+    MAX_NUM_ENVS,
+    EnvManifest,
+    Manifest,
+    decode_env,
+    decode_manifest,
+    encode_env,
+    encode_manifest,
+)
+
+ELEMENTS = 10_000
+OBSERVATION = spaces.Dict({"b": spaces.Box(-1, 1, (3,)), "a": spaces.Text(4)})
+ACTION = spaces.Discrete(3, start=1)
+
+
+def an_env(**changed: Any) -> EnvManifest:
+    """A manifest of one environment, with some fields changed."""
+    fields: dict[str, Any] = {
+        "suite": "libero",
+        "task": 0,
+        "num_envs": 2,
+        "shardable": True,
+        "sync": False,
+        "single_observation_space": OBSERVATION,
+        "single_action_space": ACTION,
+        "observation_space": batch_space(OBSERVATION, 2),
+        "action_space": batch_space(ACTION, 2),
+        "autoreset_mode": "NextStep",
+        "metadata": {"render_fps": 30, "render_modes": ["rgb_array"]},
+        "render_mode": "rgb_array",
+        "spec": {"id": "X-v0", "max_episode_steps": 5},
+        "attributes": ("hub_config", "task"),
+        "type_name": "gymnasium.vector.AsyncVectorEnv",
+    }
+    return EnvManifest(**{**fields, **changed})
+
+
+def a_manifest(*envs: EnvManifest) -> Manifest:
+    """A manifest of some environments."""
+    return Manifest(
+        envs=envs or (an_env(),),
+        lazy=True,
+        interpreter={"version": "CPython 3.11.2"},
+        packages={"numpy": "2.4.6"},
+    )
+
+
+def value_of(manifest: Manifest | None = None) -> Any:
+    """The plain value of a manifest, as it comes off the wire."""
+    return decode(encode(encode_manifest(manifest or a_manifest())))
+
+
+def with_env(name: str, value: object) -> Any:
+    """A manifest whose environment says ``value`` for ``name``."""
+    made = value_of()
+    made["envs"][0][name] = value
+    return made
+
+
+def read(value: object) -> Manifest:
+    """What the client makes of a manifest."""
+    return decode_manifest(value, max_elements=ELEMENTS)
+
+
+@pytest.mark.parametrize(
+    "env",
+    [
+        an_env(),
+        an_env(task="pick cube"),
+        an_env(render_mode=None, spec=None, autoreset_mode=None, attributes=()),
+        an_env(autoreset_mode="SameStep", metadata={}),
+    ],
+)
+def test_manifests_arrive_as_they_were(env: EnvManifest) -> None:
+    """Every field comes back, spaces included, through real bytes."""
+    manifest = a_manifest(env, an_env(suite="other"))
+    assert read(value_of(manifest)) == manifest
+
+
+def test_one_environment_arrives_as_it_was() -> None:
+    """The reply to ``Build`` is read by the same rules."""
+    value = decode(encode(encode_env(an_env())))
+    assert decode_env(value, max_elements=ELEMENTS) == an_env()
+
+
+def test_every_field_crosses() -> None:
+    """A field that is added to a manifest is on the wire too."""
+    made = value_of()
+    assert set(made) == {field.name for field in dataclasses.fields(Manifest)}
+    assert set(made["envs"][0]) == {field.name for field in dataclasses.fields(EnvManifest)}
+
+
+@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(EnvManifest)])
+@pytest.mark.parametrize("lie", [b"bytes", 1.5, {3: 4}, [[]], object], ids=repr)
+def test_fields_of_another_type_are_refused(name: str, lie: object) -> None:
+    """No field takes a value of a type that it never has."""
+    with pytest.raises(RemoteProtocolError):
+        read(with_env(name, lie))
+
+
+@pytest.mark.parametrize(
+    ("name", "lie"),
+    [
+        ("num_envs", 0),
+        ("num_envs", -1),
+        ("num_envs", MAX_NUM_ENVS + 1),
+        ("num_envs", True),
+        ("task", True),
+        ("task", None),
+        ("task", "x" * (MAX_NAME + 1)),
+        ("suite", "x" * (MAX_NAME + 1)),
+        ("suite", None),
+        ("shardable", 1),
+        ("sync", None),
+        ("autoreset_mode", "Sometimes"),
+        ("autoreset_mode", 1),
+        ("metadata", None),
+        ("metadata", {"x" * (MAX_NAME + 1): 1}),
+        ("metadata", {str(number): 1 for number in range(MAX_NAMES + 1)}),
+        ("render_mode", 3),
+        ("spec", {1: 2}),
+        ("spec", "X-v0"),
+        ("attributes", ["a"]),
+        ("attributes", ("a", 1)),
+        ("attributes", ("a",) * (MAX_NAMES + 1)),
+        ("type_name", None),
+        ("single_action_space", None),
+        ("observation_space", {}),
+    ],
+)
+def test_impossible_values_are_refused(name: str, lie: object) -> None:
+    """Counts are bounded, names are short strings, modes are Gymnasium's."""
+    with pytest.raises(RemoteProtocolError):
+        read(with_env(name, lie))
+
+
+@pytest.mark.parametrize("lie", [None, [], (), {}, {"envs": ()}, "manifest", 3])
+def test_what_is_no_manifest_is_refused(lie: object) -> None:
+    """Neither another type, nor other fields."""
+    with pytest.raises(RemoteProtocolError):
+        read(lie)
+
+
+@pytest.mark.parametrize("name", ["envs", "lazy", "interpreter", "packages"])
+def test_missing_and_unknown_fields_are_refused(name: str) -> None:
+    """Exactly the fields of this version, no more and no fewer."""
+    missing, unknown = value_of(), value_of()
+    del missing[name]
+    unknown["extra"] = 1
+    for lie in (missing, unknown, {**value_of(), name: None}):
+        with pytest.raises(RemoteProtocolError):
+            read(lie)
+
+
+def test_a_manifest_without_environments_is_refused() -> None:
+    """There is always one."""
+    with pytest.raises(RemoteProtocolError, match="1 to 4096"):
+        read({**value_of(), "envs": ()})
+
+
+def test_more_environments_than_the_limit_are_refused() -> None:
+    """Before any of them is looked at."""
+    with pytest.raises(RemoteProtocolError, match="1 to 4096"):
+        read({**value_of(), "envs": (None,) * (MAX_ENVS + 1)})
+
+
+def test_a_task_named_twice_is_refused() -> None:
+    """One of the two would vanish in the mapping."""
+    made = value_of(a_manifest(an_env(), an_env()))
+    with pytest.raises(RemoteProtocolError, match="same task twice"):
+        read(made)
+
+
+def test_spaces_of_absurd_size_are_refused_before_they_are_built() -> None:
+    """The caller's limit on elements holds for every space of the manifest."""
+    large = an_env(observation_space=spaces.Box(0, 1, (ELEMENTS + 1,)))
+    with pytest.raises(RemoteProtocolError):
+        read(value_of(a_manifest(large)))
+
+
+def test_package_versions_are_short_text() -> None:
+    """They are printed in provenance."""
+    for lie in ({"numpy": 2}, {"numpy": "x" * (MAX_NAME + 1)}, {2: "numpy"}, []):
+        with pytest.raises(RemoteProtocolError):
+            read({**value_of(), "packages": lie})
+
+
+plain = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner),
+    max_leaves=10,
+)
+
+
+@given(st.sampled_from([field.name for field in dataclasses.fields(EnvManifest)]), plain)
+def test_arbitrary_fields_raise_nothing_but_protocol_errors(name: str, lie: object) -> None:
+    """Whatever a field holds, the manifest is read or refused."""
+    try:
+        read(with_env(name, lie))
+    except RemoteProtocolError:
+        return
