@@ -16,9 +16,11 @@ import numpy as np
 from gymnasium import spaces
 
 from envhub_sandbox.errors import ActionError
+from envhub_worker.protocol.slabs import DTYPE_CODES
 
 _INTEGERS = frozenset("iub")
 _NUMBERS = frozenset("fiub")
+_ARRAYS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 
 @singledispatch
@@ -56,13 +58,12 @@ def _batch_of_arrays(space: gym.Space[Any], value: Any, count: int, where: str =
     array = value if type(value) is np.ndarray else _array(space, value, where)
     shape = (count, *(space.shape or ()))
     dtype = np.dtype(space.dtype)
-    kinds = _NUMBERS if dtype.kind == "f" else _INTEGERS
-    if array.shape != shape or array.dtype.kind not in kinds:
+    if array.shape != shape or array.dtype.kind not in _kinds_for(space):
         raise ActionError(
             f"{where}: expected {dtype} of shape {shape} for {space} in {count} sub-environments, "
             f"got {array.dtype} of shape {array.shape}"
         )
-    return array
+    return _native(array)
 
 
 @batch_of.register(spaces.Dict)
@@ -91,6 +92,45 @@ def _batch_of_tuples(
         batch_of(sub, item, count, f"{where}[{index}]")
         for index, (sub, item) in enumerate(zip(space.spaces, value, strict=True))
     )
+
+
+class ActionReader:
+    """``batch_of`` for one environment, with what does not change worked out once.
+
+    Args:
+        space: The single action space.
+        count: Number of sub-environments.
+    """
+
+    def __init__(self, space: gym.Space[Any], count: int) -> None:
+        self._space = space
+        self._count = count
+        self._shape: tuple[int, ...] | None = None
+        self._dtypes: frozenset[Any] = frozenset()
+        if isinstance(space, _ARRAYS):
+            self._shape = (count, *(space.shape or ()))
+            kinds = _kinds_for(space)
+            self._dtypes = frozenset(dtype for dtype in DTYPE_CODES if dtype.kind in kinds)
+
+    def read(self, actions: Any) -> Any:
+        """The batch; raises as ``batch_of`` does."""
+        if type(actions) is np.ndarray and (
+            actions.shape == self._shape and actions.dtype in self._dtypes
+        ):
+            return actions
+        return batch_of(self._space, actions, self._count)
+
+
+def _native(array: Any) -> Any:
+    """The same numbers in a dtype that can cross: native byte order, at most 64 bits."""
+    if array.dtype in DTYPE_CODES:
+        return array
+    wide = array.dtype.itemsize > np.dtype(np.float64).itemsize
+    return array.astype(np.float64 if wide else array.dtype.newbyteorder("="))
+
+
+def _kinds_for(space: gym.Space[Any]) -> frozenset[str]:
+    return _NUMBERS if np.dtype(space.dtype).kind == "f" else _INTEGERS
 
 
 def _array(space: gym.Space[Any], value: Any, where: str) -> Any:

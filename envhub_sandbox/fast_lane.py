@@ -65,7 +65,9 @@ class LaneShard:
         self._asks = slabs.words(self._request)
         self._tells = slabs.words(self._reply)
         self._rows = [slabs.view(self._reply, leaf) for leaf in layout.observations]
-        self._results = np.frombuffer(self._reply, np.uint8, layout.results_bytes, layout.results)
+        count, start = layout.count, layout.results
+        self._rewards = np.frombuffer(self._reply, np.float64, count, start)
+        self._flags = np.frombuffer(self._reply, np.uint8, 2 * count, start + 8 * count)
         self._views: dict[tuple[int, Any], Any] = {}
         self._codes = [-1] * len(layout.actions)
         self.sequence = 0
@@ -123,9 +125,12 @@ class LaneShard:
         """The observation's leaves: views that the next step changes."""
         return self._rows
 
-    def results(self) -> Any:
-        """A copy of the block of rewards, terminations and truncations: uint8."""
-        return self._results.copy()
+    def results(self) -> tuple[Any, Any, Any]:
+        """Copies of rewards (float64), terminations and truncations (bool)."""
+        # cast, not viewed: a hostile byte of 2 would make a bool that is neither
+        flags = self._flags.astype(np.bool_)
+        count = self.layout.count
+        return self._rewards.copy(), flags[:count], flags[count:]
 
     def close(self) -> None:
         """Give everything back."""
@@ -262,9 +267,10 @@ class FastLane:
     def flags(self) -> tuple[Any, Any, Any]:
         """Rewards float64, terminations and truncations bool: fresh arrays ``(num_envs,)``."""
         if len(self.shards) == 1:
-            return _flags(self.shards[0].results(), self._count)
-        parts = [_flags(shard.results(), shard.layout.count) for shard in self.shards]
-        return tuple(np.concatenate(column) for column in zip(*parts, strict=True))  # type: ignore[return-value]
+            return self.shards[0].results()
+        columns = zip(*[shard.results() for shard in self.shards], strict=True)
+        rewards, terminations, truncations = map(np.concatenate, columns)
+        return rewards, terminations, truncations
 
     def close(self) -> None:
         """Give everything back."""
@@ -272,15 +278,6 @@ class FastLane:
             shard.close()
         while self._pidfds:
             os.close(self._pidfds.pop())
-
-
-def _flags(block: Any, count: int) -> tuple[Any, Any, Any]:
-    # compared, not viewed: a hostile byte of 2 would make a bool that is neither
-    return (
-        block[: 8 * count].view(np.float64),
-        block[8 * count : 9 * count] != 0,
-        block[9 * count :] != 0,
-    )
 
 
 def decode_infos(encoded: bytes) -> m.Message:

@@ -20,7 +20,7 @@ from gymnasium.error import (
 )
 from gymnasium.vector import VectorEnv
 
-from envhub_sandbox.actions import batch_of
+from envhub_sandbox.actions import ActionReader
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.jail import typed
 from envhub_sandbox.remote_env import RemoteEnv
@@ -52,6 +52,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         self._manifest = manifest
         self._timeouts = remote.repository.timeouts
         self._waiting: str | None = None
+        self._read_actions = _action_reader(manifest)
         self.closed = False
         self.num_envs = manifest.num_envs
         self.single_observation_space = manifest.single_observation_space
@@ -137,7 +138,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     def step_async(self, actions: Any) -> None:
         """Send the actions; ``step_wait`` returns the results."""
         self._refuse_if_busy("step_async")
-        batch = self._batch(actions)
+        batch = self._read_actions(actions)
         try:
             self._remote.submit_step(batch)
         except WorkerDiedError:
@@ -311,11 +312,6 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
                 f"Trying to operate on `{type(self).__name__}`, after a call to `close()`."
             )
 
-    def _batch(self, actions: Any) -> Any:
-        if isinstance(self.single_action_space, OpaqueSpace):
-            return actions
-        return batch_of(self.single_action_space, actions, self.num_envs)
-
     def _seeds(self, seed: Any) -> Any:
         """One seed or None per sub-environment, or None for none at all."""
         if isinstance(seed, (int, np.integer)):
@@ -345,6 +341,13 @@ class SubEnvironment:
         if name.startswith("__"):
             raise AttributeError(name)
         return self._vector.get_attr(name)[self._index]
+
+
+def _action_reader(manifest: EnvManifest) -> Callable[[Any], Any]:
+    space = manifest.single_action_space
+    if isinstance(space, OpaqueSpace):
+        return lambda actions: actions
+    return ActionReader(space, manifest.num_envs).read
 
 
 def _metadata(manifest: EnvManifest) -> dict[str, Any]:

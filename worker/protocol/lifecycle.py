@@ -15,6 +15,8 @@ class State(Enum):
     DEAD = "dead"
     CLOSED = "closed"
 
+    __hash__ = object.__hash__  # members are singletons; Enum's own hash is slow in Python
+
 
 class Event(Enum):
     """What happens to an environment."""
@@ -26,6 +28,8 @@ class Event(Enum):
     DEATH = "its jail ended"
     FORGET = "its jail was given up"
     CLOSE = "it was closed"
+
+    __hash__ = object.__hash__
 
 
 TABLE: dict[tuple[State, Event], State] = {
