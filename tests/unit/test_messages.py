@@ -1,0 +1,173 @@
+"""Messages: their bytes are kept, and only messages come out of bytes."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec import encode
+from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
+from tests.support.compare import assert_same
+from tests.support.wire import deep
+
+GOLDEN = Path(__file__).parent / "golden" / "messages"
+REQUEST_ID = 7
+
+# One message of each class, with every kind of content that its fields may have.
+SAMPLES: list[m.Message] = [
+    m.Hello(1, 1, bytes(range(16))),
+    m.Welcome(1, "0.1.0", 4242),
+    m.Refused("SandboxUnavailableError", "no user namespaces", "user-namespace", "sysctl ..."),
+    m.OpenJail("org/repo@abc:env.py", "", "/s", "env.py", {"limits": {"processes": 5}}, 2),
+    m.JailOpened(3, (1, 2), ({"layer": "seccomp", "enforced": True, "detail": "x"},)),
+    m.StartHosts(3, 1),
+    m.Relay(3, "step", ((1, 2), (2, 1))),
+    m.Relayed((2, 1)),
+    m.Died(1, "signal", None, "SIGKILL", "", "last words", "step"),
+    m.CloseJail(3),
+    m.Done(),
+    m.ReadOutput(3, "call"),
+    m.Output("printed"),
+    m.GetStatus(),
+    m.Status(({"jail": 3, "name": "a", "pids": (9,), "busy_s": 0.5, "operation": "step"},)),
+    m.Deposit(bytes(range(16)), 3, 1),
+    m.Load(4, True, {"task": "pick"}, {"seed": 1}),
+    m.Loaded({"envs": ()}),
+    m.Build(1, "suite", "task", 0, 2),
+    m.Built({"num_envs": 2}),
+    m.Reset(1, [5, None], {"key": "value"}, np.array([True, False])),
+    m.ResetDone(np.zeros((2, 3), np.float32), {"a": np.array([1]), "_a": np.array([True])}),
+    m.Step(1, np.array([0, 1])),
+    m.StepDone(
+        {"image": np.zeros((2, 1), np.uint8), "text": ("a", "b")},
+        np.array([0.5, -1.0]),
+        np.array([False, True]),
+        np.array([False, False]),
+        {},
+    ),
+    m.Call(1, "task", (1, "x"), {"flag": True}),
+    m.SetAttr(1, "gravity", (9.81, None)),
+    m.Render(1),
+    m.GetOwn(1, "hub_config"),
+    m.Method(),
+    m.CallOwn(1, "describe", (), {}),
+    m.GetRandom(1),
+    m.Close(1),
+    m.Value((None, "a", 1.5)),
+    m.Attach(1),
+    m.FetchInfos(1),
+    m.Raised("KeyError", "mypkg.Oops", "gone", "Traceback ...", "step"),
+]  # fmt: skip
+BY_NAME = {type(message).__name__: message for message in SAMPLES}
+
+
+def values_of(message: m.Message) -> dict[str, Any]:
+    """The fields of a message, since arrays have no ``==`` that compares."""
+    names = [field.name for field in dataclasses.fields(message)]  # type: ignore[arg-type]
+    return {name: getattr(message, name) for name in names}
+
+
+def test_every_message_has_a_sample_and_a_golden_file() -> None:
+    """A message that is added, or goes, is noticed here."""
+    assert set(BY_NAME) == {cls.__name__ for cls in m.KINDS.values()}
+    assert {path.stem for path in GOLDEN.glob("*.hex")} == set(BY_NAME)
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_bytes_are_golden(name: str) -> None:
+    """The wire never changes by accident; ``ENVHUB_WRITE_GOLDEN=1`` writes it down anew."""
+    frames = m.pack(BY_NAME[name], REQUEST_ID)
+    text = "".join(bytes(frame).hex() + "\n" for frame in frames)
+    path = GOLDEN / f"{name}.hex"
+    if "ENVHUB_WRITE_GOLDEN" in os.environ:
+        path.write_text(text)
+    assert path.read_text() == text
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_golden_bytes_are_read(name: str) -> None:
+    """What was once written is still understood, field by field."""
+    frames = [bytes.fromhex(line) for line in (GOLDEN / f"{name}.hex").read_text().split()]
+    request_id, message = m.unpack(frames)
+    assert request_id == REQUEST_ID
+    assert type(message) is type(BY_NAME[name])
+    assert_same(values_of(BY_NAME[name]), values_of(message))
+
+
+@pytest.mark.parametrize("request_id", [0, 1, 2**62])
+def test_request_ids_arrive(request_id: int) -> None:
+    """An id of any size in use comes back as it was."""
+    assert m.unpack(m.pack(m.Done(), request_id))[0] == request_id
+
+
+@pytest.mark.parametrize(
+    ("value", "complaint"),
+    [
+        ({}, "is a list"),
+        ([], "is a list"),
+        ([11], "is a list"),
+        ((11, 1), "is a list"),
+        ([999, 1], "unknown message kind"),
+        ([True, 1], "unknown message kind"),
+        ([11.0, 1], "unknown message kind"),
+        (["Done", 1], "unknown message kind"),
+        ([11, "1"], "unknown message kind"),
+        ([11, 1.0], "unknown message kind"),
+        ([11, 1, None], "Done has 0 fields, the peer sent 1"),
+        ([10, 1], "CloseJail has 1 fields, the peer sent 0"),
+        ([10, 1, "3"], "CloseJail.jail cannot be of type str"),
+        ([10, 1, True], "CloseJail.jail cannot be of type bool"),
+        ([10, 1, np.int64(3)], "CloseJail.jail cannot be of type int64"),
+        ([8, 1, [1]], "Relayed.parts cannot be of type list"),
+        ([33, 1, None], "Loaded.manifest cannot be of type NoneType"),
+        ([9, 1, 1, "exit", None, None, b"", "", ""], "Died.detail cannot be of type bytes"),
+    ],
+)
+def test_what_is_no_message_is_refused(value: object, complaint: str) -> None:
+    """A kind, an id, a count of fields or a type that does not fit is the peer's fault."""
+    with pytest.raises(RemoteProtocolError, match=complaint):
+        m.unpack(encode(value))
+
+
+@given(st.lists(st.binary(max_size=64), max_size=3))
+def test_arbitrary_bytes_raise_nothing_but_protocol_errors(frames: list[bytes]) -> None:
+    """Whatever arrives, it is a message or a RemoteProtocolError."""
+    try:
+        _, message = m.unpack(frames)
+    except RemoteProtocolError:
+        return
+    assert type(message) in m.KINDS.values()
+
+
+@given(st.sampled_from(sorted(BY_NAME)), st.integers(0, 2**32), st.integers(0, 255))
+def test_one_changed_byte_raises_nothing_but_protocol_errors(
+    name: str, place: int, byte: int
+) -> None:
+    """A golden message with one byte changed is another message, or refused."""
+    frames = [bytearray(frame) for frame in m.pack(BY_NAME[name], REQUEST_ID)]
+    frames[0][place % len(frames[0])] = byte
+    try:
+        _, message = m.unpack(frames)
+    except RemoteProtocolError:
+        return
+    assert type(message) in m.KINDS.values()
+
+
+def test_unsendable_fields_are_our_own_fault() -> None:
+    """What the wire cannot carry is refused before anything is sent."""
+    with pytest.raises(LocalProtocolError, match="nested deeper than 32"):
+        m.pack(m.Value(deep(100)), 1)
+
+
+def test_messages_cannot_be_changed() -> None:
+    """A decoded message stays what was checked."""
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        m.CloseJail(3).jail = 4  # type: ignore[misc]
