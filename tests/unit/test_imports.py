@@ -1,0 +1,334 @@
+"""Who may import whom: the arrows of docs/architecture.md, read off the source itself."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+import envhub_sandbox
+from tests.support.samples import sample
+
+WORKERS_OWN = {"cloudpickle", "envhub_worker", "gymnasium", "msgpack", "numpy", "zmq"}
+CLIENTS_OWN = {
+    *("cloudpickle", "envhub_sandbox", "envhub_worker", "gymnasium", "huggingface_hub", "msgpack"),
+    *("numpy", "packaging", "platformdirs", "psutil", "rich", "typer", "zmq"),
+}
+# used where they are installed, and only there
+OPTIONAL = {"envhub_sandbox.tensors": {"torch"}, "envhub_sandbox.video": {"imageio_ffmpeg"}}
+DESERIALISERS = {"_pickle", "copyreg", "dill", "joblib", "marshal", "pickle", "shelve"}
+
+# module: what it must know nothing of
+IGNORANT = {
+    "envhub_sandbox.vector_env": {"zmq", "socket", "subprocess", "envhub_sandbox.client"},
+    "envhub_sandbox.client": {"gymnasium"},
+    "envhub_sandbox.suites": {"zmq", "envhub_sandbox.client"},
+    "envhub_sandbox.policy": {"zmq", "gymnasium", "subprocess"},
+    "envhub_sandbox.reference": {"huggingface_hub", "zmq", "gymnasium"},
+    "envhub_sandbox.snapshot": {"zmq", "gymnasium", "importlib", "runpy"},
+}
+WITHOUT_IO = {"asyncio", "multiprocessing", "os", "select", "socket", "subprocess", "zmq"}
+ZEROMQ = {"envhub_sandbox.client", "envhub_worker.server"}
+# who runs code by a name that is not written in its source, and whose code that is
+IMPORTERS = {
+    "envhub_sandbox": "our own public names",
+    "envhub_sandbox.inprocess": "the repository's, with sandbox=None and trust_remote_code=True",
+    "envhub_worker.bootstrap": "our own programs",
+    "envhub_worker.jail.loader": "the repository's",
+    "envhub_worker.launch": "the program of a host, which the server names",
+    "envhub_worker.zygote": "a list of our own",
+}
+
+
+def folder(package: str) -> Path:
+    """Where an installed package lies."""
+    spec = importlib.util.find_spec(package)
+    assert spec is not None
+    assert spec.origin is not None
+    return Path(spec.origin).parent
+
+
+@cache
+def modules() -> dict[str, ast.Module]:
+    """Every module of both packages, parsed."""
+    found = {}
+    for package in ("envhub_sandbox", "envhub_worker"):
+        root = folder(package)
+        for path in sorted(root.rglob("*.py")):
+            parts = [package, *path.relative_to(root).with_suffix("").parts]
+            name = ".".join(part for part in parts if part != "__init__")
+            found[name] = ast.parse(path.read_text(), str(path))
+    return found
+
+
+@cache
+def imported(name: str) -> frozenset[str]:
+    """What a module imports anywhere in it, with full names; of ours, the modules."""
+    found: set[str] = set()
+    for node in ast.walk(modules()[name]):
+        if isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{name} has a relative import"
+            for alias in node.names:
+                full = f"{node.module}.{alias.name}"
+                found.add(full if full in modules() else str(node.module))
+    return frozenset(found)
+
+
+def arrows(package: str) -> Iterator[tuple[str, str]]:
+    """Every import of a module of ``package``."""
+    for name in modules():
+        if name.split(".")[0] == package:
+            for target in imported(name):
+                yield name, target
+
+
+def below(target: str, package: str) -> bool:
+    """Whether a module is a package or lies in it."""
+    return target == package or target.startswith(f"{package}.")
+
+
+def foreign(package: str, own: set[str]) -> list[tuple[str, str]]:
+    """Imports of a package that are neither the standard library's nor permitted."""
+    return [
+        (name, target)
+        for name, target in arrows(package)
+        if (top := target.split(".")[0]) not in sys.stdlib_module_names
+        and top not in own | OPTIONAL.get(name, set())
+    ]
+
+
+def test_both_packages_are_seen() -> None:
+    """The walk below finds something to look at."""
+    names = set(modules())
+    assert {"envhub_sandbox.api", "envhub_worker.server", "envhub_worker.jail.loader"} <= names
+
+
+def test_worker_is_self_contained() -> None:
+    """This one folder can be put in front of any interpreter that has five packages."""
+    assert foreign("envhub_worker", WORKERS_OWN) == []
+
+
+def test_client_needs_what_it_declares() -> None:
+    """Nothing is imported that pyproject.toml does not name."""
+    assert foreign("envhub_sandbox", CLIENTS_OWN) == []
+
+
+def test_client_knows_of_the_worker_only_the_protocol() -> None:
+    """What executes repositories cannot be reached from the caller's process by accident."""
+    wrong = [
+        (name, target)
+        for name, target in arrows("envhub_sandbox")
+        if below(target, "envhub_worker") and not below(target, "envhub_worker.protocol")
+    ]
+    assert wrong == []
+
+
+def test_protocol_knows_nobody_and_does_no_io() -> None:
+    """The wire is pure functions over values."""
+    wrong = [
+        (name, target)
+        for name, target in arrows("envhub_worker")
+        if below(name, "envhub_worker.protocol")
+        and (
+            target.split(".")[0] in WITHOUT_IO
+            or (below(target, "envhub_worker") and not below(target, "envhub_worker.protocol"))
+        )
+    ]
+    assert wrong == []
+
+
+def test_lockdown_knows_only_what_it_is_told() -> None:
+    """Its mechanisms depend on the protocol's words for permissions, and on each other."""
+    wrong = [
+        (name, target)
+        for name, target in arrows("envhub_worker")
+        if below(name, "envhub_worker.lockdown")
+        and below(target, "envhub_worker")
+        and not below(target, "envhub_worker.lockdown")
+        and target not in ("envhub_worker.jailspec", "envhub_worker.protocol.confinement")
+    ]
+    assert wrong == []
+
+
+def test_nobody_imports_the_jail() -> None:
+    """Only a forked, confined child loads it, by the name that the server gives."""
+    wrong = [
+        (name, target)
+        for package in ("envhub_sandbox", "envhub_worker")
+        for name, target in arrows(package)
+        if below(target, "envhub_worker.jail") and not below(name, "envhub_worker.jail")
+    ]
+    assert wrong == []
+
+
+def test_only_the_face_and_the_command_line_import_make_env() -> None:
+    """Everything else is below it."""
+    importers = {name for name, target in arrows("envhub_sandbox") if target.endswith(".api")}
+    assert {name for name in importers if not below(name, "envhub_sandbox.cli")} <= {
+        "envhub_sandbox"
+    }
+
+
+@pytest.mark.parametrize("name", IGNORANT)
+def test_modules_know_nothing_of_what_is_not_their_business(name: str) -> None:
+    """``vector_env`` knows no sockets, ``client`` no Gymnasium, and so on."""
+    known = [
+        (target, thing)
+        for target in imported(name)
+        for thing in IGNORANT[name]
+        if below(target, thing)
+    ]
+    assert known == []
+
+
+@pytest.mark.parametrize("package", ["envhub_sandbox", "envhub_worker"])
+def test_imports_have_a_direction(package: str) -> None:
+    """There is no cycle, not even one that a late import hides."""
+    graph = {
+        name: {target for target in imported(name) if target in modules() and target != package}
+        for name in modules()
+        if below(name, package) and name != package
+    }
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(f"a cycle of imports: {' <- '.join(error.args[1])}")
+
+
+def test_zeromq_is_one_module_on_each_side() -> None:
+    """Everything else speaks in messages."""
+    users = {
+        name
+        for package in ("envhub_sandbox", "envhub_worker")
+        for name, target in arrows(package)
+        if target == "zmq"
+    }
+    assert users == ZEROMQ
+
+
+def test_nothing_unpickles_but_the_jail() -> None:
+    """There is one ``loads`` of anything but JSON in the whole tree, and it is in the jail."""
+    assert list(loaders()) == [("envhub_worker.jail.host", "cloudpickle.loads")]
+
+
+_LOADERS = ("load", "loads", "Unpickler")
+
+
+def loaders() -> Iterator[tuple[str, str]]:
+    """Every mention of a function that makes objects out of bytes, whoever has it."""
+    for name, tree in modules().items():
+        aliases = {}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Import):
+                for alias in node.names:
+                    aliases[alias.asname or alias.name.split(".")[0]] = alias.name
+            elif isinstance(node, ast.ImportFrom):
+                top = str(node.module).split(".")[0]
+                for alias in node.names:
+                    if alias.name in _LOADERS and top not in ("envhub_sandbox", "envhub_worker"):
+                        yield name, f"{node.module}.{alias.name}"
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Attribute) and node.attr in _LOADERS:
+                base = ast.unparse(node.value)
+                if aliases.get(base, "") not in ("", "json"):
+                    yield name, f"{aliases[base]}.{node.attr}"
+
+
+def test_no_deserialiser_is_imported() -> None:
+    """Neither package has one at hand; cloudpickle is the client's way out, the jail's way in."""
+    found = [
+        (name, target)
+        for package in ("envhub_sandbox", "envhub_worker")
+        for name, target in arrows(package)
+        if target.split(".")[0] in DESERIALISERS
+    ]
+    assert found == []
+    users = {name for name in modules() if "cloudpickle" in imported(name)}
+    assert users == {"envhub_sandbox.jail", "envhub_worker.jail.host"}
+
+
+def test_only_the_loader_imports_by_computed_names() -> None:
+    """Nobody else could import a repository; each exception is listed with its reason."""
+    assert {name for name, tree in modules().items() if computes_imports(tree)} == set(IMPORTERS)
+
+
+def computes_imports(tree: ast.Module) -> bool:
+    """Whether a module executes code by a name that is not a literal."""
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Call):
+            continue
+        function = ast.unparse(node.func).rpartition(".")[2]
+        literal = bool(node.args) and isinstance(node.args[0], ast.Constant)
+        if function in ("import_module", "__import__") and not literal:
+            return True
+        if function in ("exec", "eval", "compile", "exec_module", "run_path", "run_module"):
+            base = ast.unparse(node.func)
+            if base not in ("re.compile",):
+                return True
+    return False
+
+
+def loaded_by(source: str) -> set[str]:
+    """The top-level modules in a fresh interpreter that has run ``source``."""
+    done = subprocess.run(
+        [sys.executable, "-c", f"{source}\nimport sys; print(*sys.modules)"],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    return {name.split(".")[0] for name in done.stdout.split()}
+
+
+def test_the_package_imports_nothing_heavy() -> None:
+    """Names are looked up when they are used."""
+    heavy = CLIENTS_OWN - {"envhub_sandbox"} | {"torch"}
+    assert not loaded_by("import envhub_sandbox") & heavy
+
+
+def test_every_public_name_is_there() -> None:
+    """What ``__all__`` promises can be had, and ``dir()`` shows it."""
+    for name in envhub_sandbox.__all__:
+        assert getattr(envhub_sandbox, name) is not None
+        assert name in dir(envhub_sandbox)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        envhub_sandbox.nothing  # noqa: B018
+
+
+def test_the_protocol_loads_neither_zeromq_nor_the_hub() -> None:
+    """Every module of it, in a fresh interpreter."""
+    names = [name for name in modules() if below(name, "envhub_worker.protocol")]
+    loaded = loaded_by("import " + ", ".join(names))
+    assert "numpy" in loaded
+    assert not loaded & {"zmq", "huggingface_hub", "envhub_sandbox", "torch", "psutil"}
+
+
+def test_the_command_line_helps_without_loading_anything_heavy() -> None:
+    """``envhub --help`` answers at once."""
+    loaded = loaded_by("import envhub_sandbox.cli")
+    assert not loaded & {"zmq", "huggingface_hub", "gymnasium", "numpy", "torch"}
+
+
+def test_a_repository_leaves_no_module_in_the_client() -> None:
+    """After make_env, reset and step nothing in ``sys.modules`` comes from its folder."""
+    source = f"""
+import sys
+from envhub_sandbox import make_env
+with make_env({str(sample("marker"))!r}) as suites:
+    suites.env.reset(seed=0)
+    suites.env.step(suites.env.action_space.sample()[:1])
+files = [getattr(module, "__file__", None) or "" for module in list(sys.modules.values())]
+assert not [file for file in files if "marker" in file or "snapshots" in file], files
+assert not [name for name in sys.modules if "hub_env" in name]
+assert not [path for path in sys.path if "marker" in path or "snapshots" in path]
+"""
+    assert "envhub_sandbox" in loaded_by(source)
