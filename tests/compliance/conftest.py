@@ -12,9 +12,9 @@ from tests.compliance.vector_env import Case, VectorEnvCompliance
 from tests.support.samples import reference, sample
 
 
-@pytest.fixture(scope="session", params=["default"])
+@pytest.fixture(scope="session", params=["auto", "frames"])
 def lane(request: pytest.FixtureRequest) -> str:
-    """The way that steps take between the client and the jail."""
+    """How steps travel: ``"auto"`` over shared memory where it can be, ``"frames"`` never."""
     return str(request.param)
 
 
@@ -28,6 +28,8 @@ def pair(request: pytest.FixtureRequest, case: Case, lane: str) -> Iterator[Pair
         n_envs=case.n_envs,
         use_async_envs=case.use_async_envs,
         env_kwargs=case.env_kwargs,
+        num_workers=case.num_workers,
+        lane=lane,
     )
     with suites:
         yield Pair(expected, suites.env)

@@ -16,7 +16,7 @@ class TestCounter(VectorEnvCompliance):
     """Every kind of value in the infos, episodes of two to six steps."""
 
     sample = "counter"
-    cases = cases(n_envs=(1, 3, 4))
+    cases = cases(n_envs=(1, 3, 4), use_async_envs=(False,)) + cases(use_async_envs=(True,))
     steps = 150
 
     def test_options_reach_the_sub_environments(self, pair: Pair) -> None:
@@ -88,6 +88,14 @@ class TestCounter(VectorEnvCompliance):
             pair.step(actions)
 
 
+class TestCounterInUnevenShards(VectorEnvCompliance):
+    """Four sub-environments over three processes."""
+
+    sample = "counter"
+    cases = cases(n_envs=(4,), use_async_envs=(True,), async_workers=3)
+    steps = 100
+
+
 class TestCartPole(VectorEnvCompliance):
     """Discrete actions, float32 observations, thousands of steps."""
 
@@ -95,12 +103,18 @@ class TestCartPole(VectorEnvCompliance):
     cases = cases(n_envs=(4,))
     steps = 3000
 
+    def test_lane_is_the_one_that_was_asked_for(self, pair: Pair, lane: str) -> None:
+        """Spaces with a fixed layout go over shared memory unless that is forbidden."""
+        pair.reset(seed=1)
+        in_use = pair.sandboxed._remote._lane is not None
+        assert in_use is (lane == "auto")
+
 
 class TestPendulum(VectorEnvCompliance):
     """Continuous actions, truncation."""
 
     sample = "pendulum"
-    cases = cases(n_envs=(3,))
+    cases = [*cases(n_envs=(1, 3), modes=("NextStep",)), *cases(modes=("SameStep",))]
     steps = 200
 
     def test_actions_keep_their_precision(self, pair: Pair) -> None:

@@ -26,16 +26,18 @@ MODES = ("NextStep", "SameStep", "Disabled")
 
 @dataclass(frozen=True)
 class Case:
-    """One way to build a sample."""
+    """One way to build a sample, and over how many processes to spread it."""
 
     n_envs: int = 3
     use_async_envs: bool = False
     env_kwargs: dict[str, Any] = field(default_factory=dict)
+    num_workers: int | None = None
 
     @property
     def label(self) -> str:
         """A readable test id."""
         words = [f"n{self.n_envs}", "async" if self.use_async_envs else "sync"]
+        words += [] if self.num_workers is None else [f"{self.num_workers}workers"]
         return "-".join([*words, *map(str, self.env_kwargs.values())])
 
 
@@ -43,11 +45,13 @@ def cases(
     n_envs: tuple[int, ...] = (3,),
     use_async_envs: tuple[bool, ...] = (False, True),
     modes: tuple[str, ...] = MODES,
+    async_workers: int = 2,
 ) -> list[Case]:
-    """The product of the arguments; no modes for a sample that has just one."""
-    kwargs: list[dict[str, Any]] = [{"autoreset_mode": mode} for mode in modes] or [{}]
-    product = itertools.product(n_envs, use_async_envs, kwargs)
-    return [Case(n, use_async, kw) for n, use_async, kw in product]
+    """The product of the arguments; async cases are spread over ``async_workers`` processes."""
+    return [
+        Case(n, is_async, {"autoreset_mode": mode}, async_workers if is_async else None)
+        for n, is_async, mode in itertools.product(n_envs, use_async_envs, modes)
+    ]
 
 
 class VectorEnvCompliance:
