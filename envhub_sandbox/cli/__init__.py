@@ -8,9 +8,11 @@ def main() -> None:
     import signal
     import sys
 
-    from envhub_sandbox.cli.app import app
-    from envhub_sandbox.cli.exits import Exit
-
     # so that a terminated run closes its environments and restores the terminal
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(Exit.TERMINATED))
-    app(prog_name="envhub")
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    try:
+        from envhub_sandbox.cli.app import app
+
+        app(prog_name="envhub")
+    except KeyboardInterrupt:  # while still importing; later, commands report it themselves
+        sys.exit(130)

@@ -78,7 +78,7 @@ def _inspect(
     arguments = make.arguments()
     from envhub_sandbox.api import make_env
 
-    with Bar(quiet=as_json) as bar, make.foreign():
+    with Bar(quiet=as_json) as bar, make.explained():
         bar.begin(f"loading {make.ref}")
         with make_env(**arguments) as envs:
             found = [describe_env(*item) for item in select(envs, suites, tasks)]

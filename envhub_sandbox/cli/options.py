@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,8 @@ from typing import Annotated, Any
 import typer
 
 from envhub_sandbox.cli.exits import ForeignError, UsageError
-from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.errors import EnvHubError, HubReferenceError, SnapshotError
+from envhub_sandbox.reference import is_local
 
 _CODE, _LIMITS, _HUB = "How it is built", "What it may do", "Where it comes from"
 _UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
@@ -227,10 +229,19 @@ class MakeOptions:
         }
 
     @contextlib.contextmanager
-    def foreign(self) -> Iterator[None]:
-        """Without a sandbox, whatever is raised is the repository's own."""
+    def explained(self) -> Iterator[None]:
+        """Say more of an error than who raised it could know.
+
+        A reference that is a folder here gets a hint. Without a sandbox, whatever is raised is the
+        repository's own.
+        """
         try:
             yield
+        except (HubReferenceError, SnapshotError) as error:
+            if not is_local(self.ref) and os.path.exists(self.ref.partition(":")[0]):
+                hint = f"There is such a folder here; for it, write './{self.ref}'."
+                error.args = (f"{error}\n{hint}",)
+            raise
         except Exception as error:
             if not self.in_process or isinstance(error, EnvHubError):
                 raise

@@ -147,7 +147,7 @@ class _Run:
         """Run, print what there is to print even if it fails midway, and raise what failed."""
         try:
             self._check_video()
-            with Bar(quiet=self._as_json) as bar, self._make.foreign():
+            with Bar(quiet=self._as_json) as bar, self._make.explained():
                 self._run(bar)
         except EnvHubError as error:
             self._print(error)
@@ -202,9 +202,13 @@ class _Run:
         from envhub_sandbox.rollout import rollout
         from envhub_sandbox.video import first_frame
 
+        filming = writer is not None
+
         def observe(counter: EpisodeCounter) -> None:
-            if writer is not None and (writer.frames == 0 or counter.wants(0)):
+            nonlocal filming
+            if writer is not None and filming:
                 writer.add(first_frame(env.render(), env.render_mode))
+                filming = counter.wants(0)  # so that the last episode's last frame is in
             bar.update(counter)
 
         play = self._play

@@ -1,0 +1,317 @@
+"""``envhub run`` and ``envhub inspect`` as a user types them, through a process of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.support.processes import descendants, eventually
+from tests.support.repositories import write_repository
+from tests.support.samples import EXAMPLES, sample
+
+_ONE_ENV = """
+import gymnasium as gym
+import numpy as np
+
+class One(gym.Env):
+    observation_space = gym.spaces.Box(-1, 1, (1,))
+    action_space = gym.spaces.Discrete(2)
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+    def step(self, action):
+        %s
+    def render(self):
+        %s
+
+def make_env(n_envs=1, use_async_envs=False, render_mode=None):
+    def one():
+        env = One()
+        env.render_mode = render_mode
+        return env
+    return gym.vector.SyncVectorEnv([one] * n_envs)
+"""
+
+
+def envhub(*arguments: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line to its end."""
+    return subprocess.run(
+        [sys.executable, "-m", "envhub_sandbox", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
+        env={**os.environ, "PYTHONIOENCODING": "utf-8", **variables},
+        timeout=240,
+        check=False,
+    )
+
+
+def document(*arguments: str | Path, code: int = 0) -> dict[str, Any]:
+    """The document of ``--json``, which is all that is on stdout."""
+    done = envhub(*arguments, "--json")
+    assert done.returncode == code, done.stderr
+    read: dict[str, Any] = json.loads(done.stdout, parse_constant=pytest.fail)
+    return read
+
+
+def one_env(folder: Path, step: str, render: str = "return None") -> Path:
+    """A repository whose environment does this in ``step`` and ``render``."""
+    return write_repository(folder, _ONE_ENV % (step, render))
+
+
+def test_a_run_prints_results_and_nothing_else() -> None:
+    """The table and the provenance on stdout, nothing on stderr, no escape sequences."""
+    done = envhub("run", EXAMPLES / "cartpole", "--episodes", "4", "--n-envs", "2")
+    assert (done.returncode, done.stderr) == (0, "")
+    for text in ("hub_env / 0", "steps/s", str(EXAMPLES / "cartpole"), "gymnasium", "seed 0"):
+        assert text in done.stdout
+    assert "\x1b" not in done.stdout
+
+
+def test_json_says_what_ran_and_how() -> None:
+    """Exactly the episodes asked for, provenance, the layers that held."""
+    found = document("run", EXAMPLES / "catch", "--episodes", "5", "--n-envs", "2")
+    [task] = found["tasks"]
+    assert (task["suite"], task["task"], task["num_envs"]) == ("hub_env", 0, 2)
+    assert [episode["sub_env"] for episode in task["episodes"]].count(0) == 3
+    assert len(task["episodes"]) == 5
+    assert task["length"] == {"mean": 46.0, "std": 0.0, "min": 46.0, "max": 46.0}
+    assert task["success_rate"] == task["return"]["mean"], "a caught ball is the only reward"
+    assert found["provenance"]["commit"].startswith("local-")
+    assert found["provenance"]["interpreter"]["executable"] == sys.executable
+    assert any(layer["enforced"] for layer in found["provenance"]["layers"])
+    assert found["error"] is None
+
+
+def test_the_seed_decides() -> None:
+    """The same one gives the same episodes, another one others."""
+
+    def episodes(seed: int) -> Any:
+        arguments = ("run", sample("counter"), "--episodes", "7", "-n", "3", "--seed", str(seed))
+        return document(*arguments)["tasks"][0]["episodes"]
+
+    assert episodes(3) == episodes(3)
+    assert episodes(3) != episodes(4)
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_autoreset_modes_agree(mode: str) -> None:
+    """The zero policy earns the same in the same episodes, whatever resets them."""
+    arguments = ("--policy", "zero", "--episodes", "8", "-n", "2", "--env-kwargs")
+    found = document("run", sample("counter"), *arguments, f"autoreset_mode={mode}")
+    default = document("run", sample("counter"), *arguments[:-1])
+    [task], [expected] = found["tasks"], default["tasks"]
+    assert task["autoreset_mode"] == mode
+
+    def by_env(episodes: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        return sorted(episodes, key=lambda episode: int(episode["sub_env"]))
+
+    assert by_env(task["episodes"]) == by_env(expected["episodes"])
+
+
+def test_vector_rewards_have_a_line_per_component() -> None:
+    """mo-gymnasium: the second component is minus the time that it took."""
+    done = document("run", sample("mo_gymnasium"), "--episodes", "4")
+    [task] = done["tasks"]
+    assert len(task["return"]) == 2
+    assert [e["return"][1] for e in task["episodes"]] == [-e["length"] for e in task["episodes"]]
+    assert "[1]" in envhub("run", sample("mo_gymnasium"), "--episodes", "1").stdout
+
+
+def test_every_task_of_a_suite_is_played() -> None:
+    """In order, and with selection only the chosen one."""
+    found = document("run", EXAMPLES / "two_tasks", "--episodes", "2")
+    assert [(task["suite"], task["task"]) for task in found["tasks"]] == [("maze", 0), ("maze", 1)]
+    chosen = document("run", EXAMPLES / "two_tasks", "--episodes", "1", "--task", "1")
+    assert [task["task"] for task in chosen["tasks"]] == [1]
+
+
+def test_arguments_reach_the_repository() -> None:
+    """``--env-kwargs`` changes the maze's size."""
+    small = document("inspect", EXAMPLES / "two_tasks", "--env-kwargs", "size=5")
+    large = document("inspect", EXAMPLES / "two_tasks", "--env-kwargs", '{"size": 9}')
+    assert small["envs"][0]["metadata"] == large["envs"][0]["metadata"]
+    refused = envhub("inspect", EXAMPLES / "two_tasks", "--env-kwargs", "nonsense=5")
+    assert refused.returncode == 4
+    assert "nonsense" in refused.stderr
+
+
+def test_inspect_steps_nothing(tmp_path: Path) -> None:
+    """Spaces and metadata of an environment that cannot be stepped."""
+    folder = one_env(tmp_path / "one", "raise RuntimeError('stepped')")
+    found = document("inspect", folder, "--n-envs", "3")
+    [env] = found["envs"]
+    assert env["num_envs"] == 3
+    assert env["single_action_space"] == "Discrete(2)"
+    assert env["action_space"] == "MultiDiscrete([2 2 2])"
+    text = envhub("inspect", folder).stdout
+    assert "Discrete(2)" in text
+    assert "NextStep" in text
+
+
+def test_a_video_is_written_and_plays(tmp_path: Path) -> None:
+    """One frame per state of the first sub-environment: resets included, its last frame too."""
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    path = tmp_path / "out.mp4"
+    arguments = ("--episodes", "4", "-n", "2", "--video", path)
+    found = document("run", EXAMPLES / "catch", *arguments)
+    assert found["tasks"][0]["video"] == str(path)
+    assert imageio_ffmpeg.count_frames_and_secs(str(path))[0] == 2 * (46 + 1)
+    meta = next(imageio_ffmpeg.read_frames(str(path)))
+    assert (meta["size"], meta["fps"]) == ((64, 64), 20.0)
+
+
+def test_each_task_has_its_video(tmp_path: Path) -> None:
+    """Numbered: names of tasks are a stranger's and make no file names."""
+    pytest.importorskip("imageio_ffmpeg")
+    arguments = ("--episodes", "1", "--video", tmp_path / "out.mp4")
+    assert envhub("run", EXAMPLES / "two_tasks", *arguments).returncode == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out-1.mp4", "out-2.mp4"]
+
+
+@pytest.mark.parametrize(
+    ("render", "says"),
+    [
+        ("return np.zeros((4, 4), np.uint8)", "(4, 4)"),
+        ("return np.zeros((4, 4, 3))", "float64"),
+        ("return 'text'", "a str"),
+        ("return None", "render_mode is None"),
+    ],
+)
+def test_frames_that_are_none_end_the_run(tmp_path: Path, render: str, says: str) -> None:
+    """With what came instead, and the code for what cannot be."""
+    pytest.importorskip("imageio_ffmpeg")
+    folder = one_env(
+        tmp_path / "one", "return np.zeros(1, np.float32), 0.0, True, False, {}", render
+    )
+    done = envhub("run", folder, "--video", tmp_path / "out.mp4")
+    assert done.returncode == 2
+    assert says in done.stderr
+
+
+OVER = "return np.zeros(1, np.float32), 1.0, True, False, {}"
+FAILURES: list[tuple[str, Sequence[str], int, str]] = [
+    ("raise ValueError('no such luck')", (), 1, "ValueError: no such luck"),
+    (OVER, ("--memory", "lots"), 2, "--memory"),
+    (OVER, ("--profile", "lax"), 2, "strict"),
+    (OVER, ("--task", "7"), 2, "hub_env/0"),
+    (OVER, ("--policy", "clever"), 2, "clever"),
+    (OVER, ("--sandbox", "none"), 2, "--trust-remote-code"),
+    (OVER, ("--video", "/nowhere/out.mp4"), 2, "/nowhere"),
+    ("import os; os._exit(3)", (), 5, "exit code 3"),
+    ("import time; time.sleep(600)", ("--timeout", "5"), 5, "5.0 s"),
+]
+
+
+@pytest.mark.parametrize(("step", "arguments", "code", "says"), FAILURES)
+def test_failures_have_a_code_and_a_message(
+    tmp_path: Path, step: str, arguments: Sequence[str], code: int, says: str
+) -> None:
+    """Nothing on stdout, no traceback, and the exit code that the documentation names."""
+    done = envhub("run", one_env(tmp_path / "one", step), *arguments)
+    assert (done.returncode, done.stdout) == (code, ""), done.stderr
+    assert says in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("reference", "code"), [("no spaces allowed", 2), ("org/repo/sub/dir", 2), ("./nowhere", 3)]
+)
+def test_references_that_lead_nowhere(tmp_path: Path, reference: str, code: int) -> None:
+    """A reference that cannot be read is usage; one that names nothing is not."""
+    done = envhub("run", reference)
+    assert (done.returncode, done.stdout) == (code, "")
+    assert done.stderr.startswith("Error: ")
+
+
+def test_a_repository_that_does_not_load(tmp_path: Path) -> None:
+    """The code for loading; the worker's traceback only with --debug."""
+    folder = write_repository(tmp_path / "bad", "import this_is_not_installed\n")
+    done = envhub("run", folder)
+    assert done.returncode == 4
+    assert "this_is_not_installed" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert "Traceback" in envhub("run", folder, "--debug").stderr
+
+
+def test_json_tells_of_a_failure_and_of_what_went_before(tmp_path: Path) -> None:
+    """The first task's results survive the second one's end."""
+    code = _ONE_ENV % ("raise ValueError('second')", "return None")
+    code += """
+class Fine(One):
+    def step(self, action):
+        return np.zeros(1, np.float32), 2.0, True, False, {}
+
+def make_env(n_envs=1, use_async_envs=False):
+    kinds = enumerate((Fine, One))
+    return {"s": {task: gym.vector.SyncVectorEnv([kind] * n_envs) for task, kind in kinds}}
+"""
+    found = document("run", write_repository(tmp_path / "two", code), "--episodes", "3", code=1)
+    assert [task["return"]["mean"] for task in found["tasks"]] == [2.0]
+    assert found["error"]["exit_code"] == 1
+    assert "second" in found["error"]["message"]
+    assert found["provenance"]["layers"]
+
+
+def test_hostile_names_and_messages_are_escaped(tmp_path: Path) -> None:
+    """Escape sequences and markup of a stranger reach the terminal as text."""
+    code = _ONE_ENV % (OVER, "return None")
+    code += """
+def make_env(n_envs=1, use_async_envs=False):
+    return {"\\x1b]0;owned\\x07": {"[red]x[/red]\\x1b[2J": gym.vector.SyncVectorEnv([One])}}
+"""
+    folder = write_repository(tmp_path / "evil", code)
+    for command in ("run", "inspect"):
+        done = envhub(command, folder)
+        assert done.returncode == 0, done.stderr
+        assert r"\x1b]0;owned\x07 / [red]x[/red]\x1b[2J" in done.stdout.replace("\n", "")
+        assert "\x1b" not in done.stdout + envhub(command, folder, "--json").stdout
+    noisy = envhub("run", sample("noisy"))
+    assert r"\x1b[2J" in noisy.stderr
+    assert "\x1b" not in noisy.stderr
+
+
+def test_stopping_early_is_said(tmp_path: Path) -> None:
+    """An environment that never ends can be tried with ``--steps``."""
+    folder = one_env(tmp_path / "one", "return np.zeros(1, np.float32), 1.0, False, False, {}")
+    done = envhub("run", folder, "--steps", "20")
+    assert done.returncode == 0
+    assert "0 (stopped)" in done.stdout
+    assert "stopped by --steps" in done.stderr
+    [task] = document("run", folder, "--steps", "20", "-n", "2")["tasks"]
+    assert (task["complete"], task["steps"], task["return"]) == (False, 40, None)
+
+
+def test_without_a_sandbox_it_runs_here_when_trusted(tmp_path: Path) -> None:
+    """And says that nothing confined it; its own errors are still its own."""
+    done = envhub("run", EXAMPLES / "cartpole", "--sandbox", "none", "--trust-remote-code")
+    assert done.returncode == 0, done.stderr
+    assert "nothing: the code ran in this process" in done.stdout
+    folder = one_env(tmp_path / "one", "return {}['missing']")
+    failed = envhub("run", folder, "--sandbox", "none", "--trust-remote-code")
+    assert failed.returncode == 1
+    assert "KeyError: 'missing'" in failed.stderr
+
+
+def test_the_client_never_imports_the_repository(tmp_path: Path) -> None:
+    """A marker written at import shows where the code ran."""
+    code = "import os, sys\nprint('imported by', sys.argv, flush=True)\n" + _ONE_ENV % (OVER, "")
+    code = code.replace("def render(self):\n        \n", "")
+    done = envhub("run", write_repository(tmp_path / "marker", code), "--episodes", "1")
+    assert done.returncode == 0, done.stderr
+    assert "imported by" not in done.stdout + done.stderr
+
+
+def test_nothing_is_left_running() -> None:
+    """After a run, as after a failed one."""
+    before = descendants()
+    envhub("run", EXAMPLES / "cartpole", "--episodes", "1")
+    envhub("run", sample("exits"), "--episodes", "1")
+    assert eventually(lambda: descendants() <= before)

@@ -1,0 +1,125 @@
+"""Ctrl-C, termination, closed pipes and terminals."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pty
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.support.processes import eventually
+from tests.support.samples import EXAMPLES, sample
+
+COMMAND = [sys.executable, "-m", "envhub_sandbox"]
+_STEPPING = """
+import gymnasium as gym
+import numpy as np
+import time
+
+class Endless(gym.Env):
+    observation_space = gym.spaces.Box(-1, 1, (1,))
+    action_space = gym.spaces.Discrete(2)
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(1, np.float32), {}
+    def step(self, action):
+        time.sleep(%s)
+        return np.zeros(1, np.float32), 1.0, False, False, {}
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([Endless] * n_envs)
+"""
+
+
+def below(pid: int) -> list[psutil.Process]:
+    """The processes below a process that may have gone."""
+    with contextlib.suppress(psutil.NoSuchProcess):
+        return psutil.Process(pid).children(recursive=True)
+    return []
+
+
+def gone(processes: list[psutil.Process]) -> bool:
+    """Whether none of them is still running."""
+    return not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in processes)
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "says"),
+    [(signal.SIGINT, 130, "Interrupted.\n"), (signal.SIGTERM, 143, "")],
+)
+@pytest.mark.parametrize("step_s", [0.001, 3600], ids=["stepping", "stuck in a step"])
+def test_an_interrupted_run_ends_and_leaves_nothing(
+    tmp_path: Path, number: signal.Signals, code: int, says: str, step_s: float
+) -> None:
+    """With its code, no traceback, and every process of the environment gone."""
+    (tmp_path / "env.py").write_text(_STEPPING % step_s)
+    folder = tmp_path / "tmp"
+    folder.mkdir()
+    with subprocess.Popen(
+        [*COMMAND, "run", str(tmp_path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "TMPDIR": str(folder)},
+    ) as process:
+        # the worker server, its zygote, and a jail below it
+        assert eventually(lambda: len(below(process.pid)) >= 3, 120)
+        processes = below(process.pid)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err) == (code, "", says)
+    assert eventually(lambda: gone(processes))
+    assert eventually(lambda: not list(folder.iterdir()))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("run", str(EXAMPLES / "cartpole"), "--episodes", "1"),
+        ("run", str(EXAMPLES / "cartpole"), "--episodes", "1", "--json"),
+        ("inspect", str(EXAMPLES / "cartpole")),
+        ("cache", "list", "--json"),
+        ("version",),
+    ],
+)
+def test_a_closed_pipe_is_no_traceback(arguments: tuple[str, ...]) -> None:
+    """``envhub ... | head`` ends quietly, with the code that programs in C would have."""
+    read, write = os.pipe()
+    os.close(read)
+    try:
+        done = subprocess.run(
+            [*COMMAND, *arguments], stdout=write, stderr=subprocess.PIPE, timeout=240, check=False
+        )
+    finally:
+        os.close(write)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_a_terminal_sees_progress_and_a_pipe_gets_the_results() -> None:
+    """The bar goes to stderr, is taken away in the end, and the cursor comes back."""
+    controller, terminal = pty.openpty()
+    arguments = ["run", str(sample("many_tasks")), "--episodes", "1", "--steps", "5"]
+    with subprocess.Popen(
+        [*COMMAND, *arguments, "--task", "0"],
+        stdout=subprocess.PIPE,
+        stderr=terminal,
+        env={**os.environ, "TERM": "xterm", "COLUMNS": "100"},
+    ) as process:
+        os.close(terminal)
+        seen = b""
+        with contextlib.suppress(OSError):  # EIO: the other end is closed
+            while chunk := os.read(controller, 65536):
+                seen += chunk
+        assert process.stdout is not None
+        out = process.stdout.read()
+    os.close(controller)
+    assert process.returncode == 0
+    assert b"loading" in seen
+    assert seen.rfind(b"\x1b[?25h") > seen.rfind(b"\x1b[?25l")
+    assert b"\x1b" not in out
+    assert b"steps/s" in out

@@ -1,0 +1,158 @@
+"""Options become arguments of ``make_env``, or a message that says what to write."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox.cli.exits import ForeignError, UsageError
+from envhub_sandbox.cli.options import MakeOptions, read_env_kwargs, read_size
+from envhub_sandbox.cli.select import select
+from envhub_sandbox.errors import HubReferenceError, RemoteEnvError
+
+NOTHING: dict[str, Any] = dict.fromkeys(
+    (
+        *("env_kwargs", "python", "num_workers", "profile", "network", "readable", "variables"),
+        *("memory", "disk", "processes", "cpu_time", "timeout", "token", "endpoint"),
+        "hub_cache_dir",
+    )
+)
+
+
+def options(**given: Any) -> MakeOptions:
+    """Options as typed; the others at their defaults."""
+    defaults = {"ref": "org/repo", "n_envs": 1, "use_async": False, "gpu": False}
+    return MakeOptions(**{**NOTHING, **defaults, "sandbox": "process", "trust": False, **given})
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [
+        ("1048576", 2**20),
+        ("512M", 512 * 2**20),
+        ("4g", 4 * 2**30),
+        ("1.5GiB", 3 * 2**29),
+        ("2 KB", 2048),
+        (None, None),
+    ],
+)
+def test_sizes_are_read(text: str | None, size: int | None) -> None:
+    """In the spellings that people use; units are powers of 1024."""
+    assert read_size("--memory", text) == size
+
+
+@pytest.mark.parametrize("text", ["", "M", "-1G", "4 gigs", "1e9", "nan"])
+def test_what_is_no_size_is_refused(text: str) -> None:
+    """With the option's name."""
+    with pytest.raises(UsageError, match="--memory"):
+        read_size("--memory", text)
+
+
+def test_env_kwargs_take_json_and_pairs() -> None:
+    """Values are JSON where they can be; later ones win."""
+    texts = [
+        '{"size": 8, "name": "a"}',
+        "size=9",
+        "mode=rgb_array",
+        "on=true",
+        "path=a=b",
+        "empty=",
+    ]
+    assert read_env_kwargs(texts) == {
+        "size": 9,
+        "name": "a",
+        "mode": "rgb_array",
+        "on": True,
+        "path": "a=b",
+        "empty": "",
+    }
+
+
+@pytest.mark.parametrize("text", ["size", "=3", "a b=3", "{", '{"a": }', "[1]"])
+def test_env_kwargs_that_are_neither_are_refused(text: str) -> None:
+    """With what to write instead, or what is wrong with the JSON."""
+    with pytest.raises(UsageError, match="--env-kwargs"):
+        read_env_kwargs([text])
+
+
+def test_only_what_was_given_reaches_the_policy() -> None:
+    """Defaults stay the library's."""
+    assert options().arguments()["policy"] == {}
+    assert options().arguments()["timeouts"] == {}
+    given = options(
+        memory="1G", cpu_time=5, network="loopback", gpu=True, readable=["/data"], variables=["A"]
+    )
+    assert given.arguments()["policy"] == {
+        "network": "loopback",
+        "gpu": True,
+        "readable": ("/data",),
+        "environment": ("A",),
+        "limits": {"memory_bytes": 2**30, "cpu_s": 5},
+    }
+
+
+def test_a_timeout_is_for_every_operation_but_close() -> None:
+    """Closing is bounded by itself."""
+    timeouts = options(timeout=7.5).arguments()["timeouts"]
+    assert timeouts == {"startup_s": 7.5, "reset_s": 7.5, "step_s": 7.5, "call_s": 7.5}
+
+
+def test_running_unprotected_needs_the_word() -> None:
+    """Before anything is fetched, and in the words of the command line."""
+    with pytest.raises(UsageError, match="--trust-remote-code"):
+        options(sandbox="none").arguments()
+    assert options(sandbox="none", trust=True).arguments()["sandbox"] is None
+
+
+def test_a_folder_written_like_a_repository_gets_a_hint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``examples/cartpole`` is a hub reference; the folder is ``./examples/cartpole``."""
+    (tmp_path / "examples" / "cartpole").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    with (
+        pytest.raises(HubReferenceError, match=r"write '\./examples/cartpole:env\.py'"),
+        options(ref="examples/cartpole:env.py").explained(),
+    ):
+        raise HubReferenceError("not found")
+    with (
+        pytest.raises(HubReferenceError, match=r"not found$"),
+        options(ref="examples/other").explained(),
+    ):
+        raise HubReferenceError("not found")
+
+
+def test_only_without_a_sandbox_are_strange_errors_the_repositorys() -> None:
+    """In the sandbox they would be bugs of ours, and must stay visible as such."""
+    with pytest.raises(ForeignError, match="KeyError: 'x'"), options(sandbox="none").explained():
+        raise KeyError("x")
+    with pytest.raises(KeyError), options().explained():
+        raise KeyError("x")
+    with pytest.raises(RemoteEnvError), options(sandbox="none").explained():
+        raise RemoteEnvError("Oops", "text")
+
+
+SUITES: dict[str, dict[Any, Any]] = {"a": {0: "a0", 1: "a1"}, "b": {"x": "bx", 0: "b0"}}
+
+
+@pytest.mark.parametrize(
+    ("suites", "tasks", "expected"),
+    [
+        (None, None, ["a0", "a1", "bx", "b0"]),
+        (["b"], None, ["bx", "b0"]),
+        (None, ["0"], ["a0", "b0"]),
+        (["b"], ["x"], ["bx"]),
+        (["a", "b"], ["1", "x"], ["a1", "bx"]),
+    ],
+)
+def test_selection_keeps_the_order(suites: Any, tasks: Any, expected: list[str]) -> None:
+    """Task ids may be numbers or text; on the command line both are text."""
+    assert [env for _, _, env in select(SUITES, suites, tasks)] == expected
+
+
+def test_a_selection_of_nothing_names_what_there_is() -> None:
+    """Escaped, since the names are the worker's."""
+    with pytest.raises(UsageError, match=r"a/0, .*evil\\x1b/0"):
+        select({**SUITES, "evil\x1b": {0: 1}}, ["c"], None)

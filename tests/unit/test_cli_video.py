@@ -1,0 +1,135 @@
+"""Frames are judged before they are encoded, and a written video can be read."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envhub_sandbox.video import (
+    MAX_SIDE,
+    VideoError,
+    VideoWriter,
+    check_target,
+    first_frame,
+    fps_of,
+)
+
+imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+
+
+def frame(height: int = 4, width: int = 6, value: int = 7) -> Any:
+    """A frame of one colour."""
+    return np.full((height, width, 3), value, np.uint8)
+
+
+@pytest.mark.parametrize(
+    "rendered",
+    [(frame(), frame(2, 2)), [frame()], np.stack([frame(), frame(value=9)]), frame()],
+)
+def test_the_first_sub_environment_is_taken(rendered: Any) -> None:
+    """From tuples, lists, stacked arrays, or an environment that draws all of them at once."""
+    assert np.array_equal(first_frame(rendered, "rgb_array"), frame())
+
+
+def test_odd_sides_repeat_their_last_line() -> None:
+    """Encoders want even sides; nothing is rescaled."""
+    picture = np.arange(5 * 3 * 3, dtype=np.uint8).reshape(5, 3, 3)
+    padded = first_frame((picture,), "rgb_array")
+    assert padded.shape == (6, 4, 3)
+    assert np.array_equal(padded[:5, :3], picture)
+    assert np.array_equal(padded[5, :3], picture[4])
+
+
+@pytest.mark.parametrize(
+    ("rendered", "says"),
+    [
+        (np.zeros((4, 6, 3), np.float32), "float32"),
+        (np.zeros((4, 6, 4), np.uint8), r"\(4, 6, 4\)"),
+        (np.zeros((4, 6), np.uint8), r"\(4, 6\)"),
+        (np.zeros((0, 6, 3), np.uint8), "6x0"),
+        (np.broadcast_to(np.uint8(0), (2, MAX_SIDE + 1, 3)), f"{MAX_SIDE + 1}x2"),
+        ("a text", "a str"),
+    ],
+)
+def test_what_is_no_frame_is_refused(rendered: Any, says: str) -> None:
+    """Wrong types, shapes and sizes, each by its name."""
+    with pytest.raises(VideoError, match=says):
+        first_frame((rendered,), "rgb_array")
+
+
+@pytest.mark.parametrize("rendered", [None, (None,), ()])
+def test_an_environment_that_draws_nothing_is_told_how(rendered: Any) -> None:
+    """The message names the option that may help."""
+    with pytest.raises(VideoError, match="--env-kwargs render_mode=rgb_array"):
+        first_frame(rendered, None)
+    with pytest.raises(VideoError, match="'human'"):
+        first_frame(rendered, "human")
+
+
+@pytest.mark.parametrize(
+    ("metadata", "fps"),
+    [
+        ({"render_fps": 12}, 12.0),
+        ({"render_fps": 29.97}, 29.97),
+        ({}, 30.0),
+        (None, 30.0),
+        ({"render_fps": float("nan")}, 30.0),
+        ({"render_fps": 0}, 30.0),
+        ({"render_fps": 1e9}, 30.0),
+        ({"render_fps": "fast"}, 30.0),
+    ],
+)
+def test_fps_is_sensible_whatever_the_metadata_says(metadata: Any, fps: float) -> None:
+    """The environment's own where it can be one."""
+    assert fps_of(metadata) == fps
+
+
+@pytest.mark.parametrize("size", [(64, 48), (2, 2), (130, 6)])
+def test_a_written_video_can_be_read(tmp_path: Path, size: tuple[int, int]) -> None:
+    """With its size, its rate and every frame."""
+    path = tmp_path / "out.mp4"
+    with VideoWriter(path, 10.0) as writer:
+        for value in range(0, 250, 10):
+            writer.add(frame(*size, value))
+    assert writer.frames == 25
+    assert imageio_ffmpeg.count_frames_and_secs(str(path))[0] == 25
+    meta = next(imageio_ffmpeg.read_frames(str(path)))
+    assert meta["size"] == size[::-1]
+    assert meta["fps"] == 10.0
+
+
+def test_a_name_cannot_be_an_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file that begins with a dash is a file."""
+    monkeypatch.chdir(tmp_path)
+    with VideoWriter(Path("-version.mp4"), 10.0) as writer:
+        writer.add(frame())
+    assert (tmp_path / "-version.mp4").stat().st_size > 0
+
+
+def test_frames_of_another_size_are_refused(tmp_path: Path) -> None:
+    """An encoder would read them as garbage."""
+    with VideoWriter(tmp_path / "out.mp4", 10.0) as writer:
+        writer.add(frame(4, 6))
+        with pytest.raises(VideoError, match=r"changed from \(6, 4\) to \(4, 4\)"):
+            writer.add(frame(4, 4))
+
+
+@pytest.mark.parametrize("name", ["out.txt", "nowhere/out.mp4", "folder.mp4"])
+def test_targets_that_cannot_work_are_refused_early(tmp_path: Path, name: str) -> None:
+    """Before any environment is run."""
+    (tmp_path / "folder.mp4").mkdir()
+    with pytest.raises(VideoError):
+        check_target(tmp_path / name)
+
+
+def test_a_missing_encoder_comes_with_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The extra that brings it is named."""
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(VideoError, match=r"pip install 'envhub-sandbox\[video\]'"):
+        check_target(tmp_path / "out.mp4")
