@@ -1,7 +1,8 @@
 """The first process of a jail: it sets the jail up, starts hosts in it, and ends them all.
 
 Trusted code. It reads its jail's specification from its control channel, which is the first
-message; then requests::
+message, ``{"spec": S, "scratch": folder | null, "cgroup": kind | null}`` with the descriptors of
+``cgroups.Group.open``; then requests::
 
     {"op": "start", "host": N} + [the host's stream, further descriptors...]
     {"op": "kill", "host": N}
@@ -10,10 +11,11 @@ Events::
 
     {"event": "ready", "report": [layer...]}
     {"event": "failed", "layer": L, "reason": R, "fix": F}                  and it exits
-    {"event": "host_started", "host": N, "pid": P, "report": [layer...]}
-    {"event": "host_exited", "host": N, "code": C | null, "signal": S | null, "reason": R}
+    {"event": "host_started", "host": N, "report": [layer...]} + [the host's pidfd]
+    {"event": "host_exited", "host": N, "code": C | null, "signal": S | null, "reason": R,
+     "detail": D}
 
-``pid`` is the one inside the jail. The end of the channel ends the jail.
+The end of the channel ends the jail.
 """
 
 from __future__ import annotations
@@ -26,14 +28,15 @@ import signal
 import socket
 import sys
 import traceback
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NoReturn
 
 from envhub_worker import launch
 from envhub_worker.channel import Channel, close_fds
 from envhub_worker.jailspec import JailSpec
-from envhub_worker.lockdown import inner, process, sweep
+from envhub_worker.lockdown import cgroups, inner, process, sweep
 from envhub_worker.lockdown.context import Common, JailContext
+from envhub_worker.lockdown.guard import Guard
 from envhub_worker.lockdown.plan import HostFacts, plan
 from envhub_worker.lockdown.report import Layer, LayerUnavailableError
 
@@ -61,16 +64,16 @@ def run(control: int, output: int, common: Common) -> NoReturn:
 
 @dataclass
 class _Host:
-    """A host as its init knows it."""
+    """A host as its init knows it. ``ended``: (reason, detail) of the end that we gave it."""
 
     number: int
     status: int
     report: bytes = b""
-    killed: bool = field(default=False)
+    ended: tuple[str, str] | None = None
 
 
 class Init:
-    """The loop: requests from the server, reports of hosts, and their deaths."""
+    """The loop: requests from the server, reports of hosts, limits, and deaths."""
 
     def __init__(self, channel: Channel, common: Common) -> None:
         self._channel = channel
@@ -78,6 +81,9 @@ class Init:
         self._hosts: dict[int, _Host] = {}
         self._running = True
         self._poller = select.poll()
+        self._events = -1
+        self._joins: list[int] = []
+        self._oom_kills = 0
 
     def run(self) -> None:
         """Set the jail up and serve until the channel ends."""
@@ -86,20 +92,22 @@ class Init:
             return
         wakeup = sweep.child_signals(self._stop)
         try:
-            self._set_up(received[0])
+            self._set_up(*received)
             self._loop(wakeup)
         except LayerUnavailableError as error:
-            self._fail(error)
+            self._channel.send({"event": "failed", **error.to_wire()})
         finally:
             sweep.kill_descendants(keep=())
 
-    def _set_up(self, message: dict[str, Any]) -> None:
+    def _set_up(self, message: dict[str, Any], fds: list[int]) -> None:
         spec = JailSpec.from_wire(message["spec"])
+        if fds:
+            self._events, *self._joins = fds
         facts = HostFacts(
             machine=os.uname().machine,
             root=self._common.config.user is not None,
             landlock_abi=self._common.landlock_abi,
-            memory="watchdog",
+            memory=message["cgroup"] or "watchdog",
         )
         wanted = plan(spec.confinement, facts)
         scratch, view = inner.enter(spec, self._common, message["scratch"])
@@ -108,14 +116,12 @@ class Init:
             common=self._common,
             plan=wanted,
             scratch=scratch,
-            processes=spec.confinement.limits.processes,
+            processes=inner.process_limit(spec.confinement.limits, wanted.namespaced),
         )
+        self._guard = Guard(self._jail, memory=not fds)
         working = Layer("working-view", True, f"the snapshot, writable as {view}")
         report = [layer.to_wire() for layer in (*wanted.layers, working)]
         self._channel.send({"event": "ready", "report": report})
-
-    def _fail(self, error: LayerUnavailableError) -> None:
-        self._channel.send({"event": "failed", **error.to_wire()})
 
     def _stop(self, *_: object) -> None:
         self._running = False
@@ -124,7 +130,7 @@ class Init:
         self._poller.register(self._channel, select.POLLIN)
         self._poller.register(wakeup, select.POLLIN)
         while self._running:
-            ready = [fd for fd, _ in self._poller.poll()]
+            ready = [fd for fd, _ in self._poller.poll(self._patience())]
             for fd in ready:
                 if fd == wakeup:
                     sweep.drain(wakeup)
@@ -134,6 +140,23 @@ class Init:
                     self._read_report(fd)
             if wakeup in ready:
                 self._reap()
+            if self._hosts:
+                self._look()
+
+    def _patience(self) -> float | None:
+        """Milliseconds until the next look at the limits; a jail without hosts needs none."""
+        left = self._guard.seconds_left() if self._hosts else None
+        return None if left is None else left * 1000 + 1
+
+    def _look(self) -> None:
+        if self._guard.seconds_left() == 0:
+            # A host that is still locking itself down runs our code, and cannot be measured yet.
+            starting = [pid for pid, host in self._hosts.items() if host.status >= 0]
+            over = self._guard.look(sweep.descendants(os.getpid(), starting))
+            if over is not None:
+                for host in self._hosts.values():
+                    host.ended = host.ended or over
+                sweep.kill_descendants(keep=())
 
     def _serve(self) -> None:
         received = self._channel.receive()
@@ -148,10 +171,13 @@ class Init:
 
     def _start(self, number: int, fds: list[int]) -> None:
         read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-        order = launch.Order(parent=os.getpid(), jail=self._jail, fds=fds, status=write)
+        order = launch.Order(
+            parent=os.getpid(), jail=self._jail, fds=fds, joins=self._joins, status=write
+        )
         pid = os.fork()
         if pid == 0:
             launch.run(order)
+        self._guard.ignore(fds)
         close_fds([*fds, write])
         self._hosts[pid] = _Host(number, read)
         self._poller.register(read, select.POLLIN)
@@ -159,7 +185,7 @@ class Init:
     def _kill(self, number: int) -> None:
         for pid, host in self._hosts.items():
             if host.number == number:
-                host.killed = True
+                host.ended = host.ended or ("killed", "")
                 # Not reaped yet, so the pid is still its own. Stopped, it cannot fork away.
                 os.kill(pid, signal.SIGSTOP)
                 sweep.kill_below(pid)
@@ -185,28 +211,39 @@ class Init:
         report = json.loads(host.report)
         if "layer" in report:
             raise LayerUnavailableError(**report)
-        fields = {"host": host.number, "pid": pid, "report": report["report"]}
-        self._channel.send({"event": "host_started", **fields})
+        pidfd = os.pidfd_open(pid)  # not reaped yet: even if it has ended, it is this one
+        fields = {"host": host.number, "report": report["report"]}
+        self._channel.send({"event": "host_started", **fields}, [pidfd])
+        os.close(pidfd)
 
     def _reap(self) -> None:
-        for pid, status in sweep.reap():
-            host = self._hosts.get(pid)
-            if host is None:
-                continue
-            if host.status >= 0:
-                self._read_report(host.status)
-                self._close_report(host)
-            del self._hosts[pid]
-            if not self._hosts:
-                sweep.kill_descendants(keep=())  # daemons do not outlive the last host
-            self._tell_exit(host, status)
+        ended = [(pid, status) for pid, status in sweep.reap(self._before_reaping)]
+        for pid, status in ended:
+            host = self._hosts.pop(pid, None)
+            if host is not None:
+                self._tell_exit(host, status)
+        if ended and not self._hosts:
+            sweep.kill_descendants(keep=())  # daemons do not outlive the last host
+
+    def _before_reaping(self, pid: int) -> None:
+        host = self._hosts.get(pid)
+        if host is not None and host.status >= 0:
+            self._read_report(host.status)
+            self._close_report(host)
 
     def _tell_exit(self, host: _Host, status: int) -> None:
         fields = process.exit_fields(status)
-        reason = "exit" if fields["signal"] is None else "signal"
-        if fields["signal"] == signal.SIGXCPU:
-            reason = "cpu-limit"
-        elif host.killed:
-            reason = "killed"
-        event = {"event": "host_exited", "host": host.number, "reason": reason}
+        reason, detail = host.ended or self._reason(fields["signal"])
+        event = {"event": "host_exited", "host": host.number, "reason": reason, "detail": detail}
         self._channel.send({**event, **fields})
+
+    def _reason(self, signum: int | None) -> tuple[str, str]:
+        if signum is None:
+            return "exit", ""
+        if signum == signal.SIGXCPU:
+            return "cpu-limit", f"{self._jail.spec.confinement.limits.cpu_s} CPU seconds used"
+        if signum == signal.SIGKILL and self._events >= 0:
+            before, self._oom_kills = self._oom_kills, cgroups.oom_kills(self._events)
+            if self._oom_kills > before:
+                return "out-of-memory", "the kernel ended it at the limit of its control group"
+        return "signal", ""

@@ -22,7 +22,7 @@ from typing import NoReturn
 import numpy as np
 
 from envhub_worker.jailspec import JailSpec
-from envhub_worker.lockdown import innermost, process, sweep
+from envhub_worker.lockdown import cgroups, innermost, process, sweep
 from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.environment import jail_environment
 from envhub_worker.lockdown.report import Layer, LayerUnavailableError
@@ -38,12 +38,14 @@ class Order:
         parent: Init's pid.
         jail: The jail.
         fds: The stream to the server, then whatever the server passes through.
+        joins: Where to join the jail's control group, if it has one.
         status: Write end of the pipe for the report; closed before the target runs.
     """
 
     parent: int
     jail: JailContext
     fds: list[int]
+    joins: list[int]
     status: int
 
 
@@ -85,6 +87,7 @@ def confine(order: Order) -> None:
     """Give up everything that the jail does not need."""
     process.die_with_parent(order.parent)
     os.setsid()
+    cgroups.join(order.joins)
     process.reset_signals(sweep.HANDLED)
     descriptors = {0, 1, 2, order.status, *order.fds}
     process.close_all_but(descriptors)

@@ -23,6 +23,7 @@ from typing import Any
 from envhub_worker import bootstrap
 from envhub_worker.channel import Channel, close_fds
 from envhub_worker.jailspec import JailSpec
+from envhub_worker.lockdown import cgroups, process
 from envhub_worker.lockdown.context import ZygoteConfig
 from envhub_worker.lockdown.environment import zygote_environment
 from envhub_worker.lockdown.scratch import Scratch, remove_tree
@@ -90,7 +91,7 @@ class HostStarted:
 
     Attributes:
         host_id: From ``Jail.start_host``.
-        pid: Its pid as the jail sees it.
+        pid: Its pid as this process sees it; 0 or less when it has already ended.
         report: Every layer that holds for it, the jail's own first.
     """
 
@@ -107,13 +108,16 @@ class HostExited:
         host_id: From ``Jail.start_host``.
         code: Its exit code, or None.
         signal: The number of the signal that ended it, or None.
-        reason: ``"exit"``, ``"signal"``, ``"out-of-memory"``, ``"cpu-limit"`` or ``"killed"``.
+        reason: ``"exit"``, ``"signal"``, ``"out-of-memory"``, ``"cpu-limit"``, ``"disk-limit"``
+            or ``"killed"``.
+        detail: The numbers, where a limit was the reason.
     """
 
     host_id: int
     code: int | None
     signal: int | None
     reason: str
+    detail: str = ""
 
 
 @dataclass(frozen=True)
@@ -154,6 +158,7 @@ class Spawner:
         self._folder = Path(tempfile.mkdtemp(prefix="zygote-", dir=runtime_dir))
         self._user = unused_uid() if os.geteuid() == 0 else None
         self._scratches = self._make_scratches(confinement)
+        self._cgroups = self._make_cgroups()
         self._log = self._folder / "log"
         self._channel, theirs = Channel.pair()
         python = python or sys.executable
@@ -190,6 +195,13 @@ class Spawner:
         folder = Path(tempfile.mkdtemp(prefix="envhub-scratch-"))
         folder.chmod(0o711)
         return folder
+
+    def _make_cgroups(self) -> cgroups.Tree | None:
+        hierarchy = cgroups.discover()
+        if hierarchy is not None:
+            with contextlib.suppress(OSError):
+                return cgroups.Tree(hierarchy, self._folder.name)
+        return None
 
     def _execute(self, config: ZygoteConfig, python: str) -> subprocess.Popen[bytes]:
         with open(self._log, "ab") as log:
@@ -267,10 +279,17 @@ class Spawner:
         self._count += 1
         folder = None if self._scratches is None else self._scratches / f"jail-{self._count}"
         jail = Jail(spec, self, folder, self._user)
+        jail._describe(self._make_group(spec))
         self._jails[self._count] = jail
         self._channel.send({"op": "spawn", "id": self._count}, jail._theirs)
         jail._close_theirs()
         return jail
+
+    def _make_group(self, spec: JailSpec) -> cgroups.Group | None:
+        if self._cgroups is not None:
+            with contextlib.suppress(OSError):
+                return self._cgroups.group(f"jail-{self._count}", spec.confinement.limits)
+        return None
 
     def close(self) -> None:
         """End every process of every jail and the zygote, reap, remove the files. Idempotent."""
@@ -283,6 +302,9 @@ class Spawner:
         for jail in self._jails.values():
             jail._release()
         self._jails.clear()
+        if self._cgroups is not None:
+            self._cgroups.remove()
+            self._cgroups = None
         for folder in {self._folder, self._scratches or self._folder}:
             remove_tree(str(folder))
 
@@ -306,11 +328,23 @@ class Jail:
         self._pidfd = -1
         self._killed = False
         self._report: list[dict[str, Any]] = []
+        self._group: cgroups.Group | None = None
         self._channel, control = Channel.pair()
         self._theirs = (control.detach(), output)
         if folder is not None:
             Scratch.on_host(str(folder)).create(spec.snapshot, owner)
-        self._channel.send({"spec": spec.to_wire(), "scratch": str(folder)})
+
+    def _describe(self, group: cgroups.Group | None) -> None:
+        """Tell init what it is for, on the channel that only the two of us hold."""
+        self._group = group
+        message = {
+            "spec": self.spec.to_wire(),
+            "scratch": str(self._folder),
+            "cgroup": group and group.kind,
+        }
+        fds = group.open() if group else []
+        self._channel.send(message, fds)
+        close_fds(fds)
 
     def _close_theirs(self) -> None:
         close_fds(self._theirs)
@@ -335,13 +369,13 @@ class Jail:
             return []
         self._channel.flush()
         messages, ended = self._channel.drain()
-        events = [event for message, _ in messages for event in self._translate(message)]
+        events = [event for message, fds in messages for event in self._translate(message, fds)]
         if ended:
             self._channel.close()
             events.append(Disconnected())
         return events
 
-    def _translate(self, message: dict[str, Any]) -> list[JailEvent]:
+    def _translate(self, message: dict[str, Any], fds: list[int]) -> list[JailEvent]:
         kind = message["event"]
         if kind == "ready":
             self._report = message["report"]
@@ -350,8 +384,11 @@ class Jail:
             return [Failed(message["layer"], message["reason"], message["fix"])]
         if kind == "host_started":
             report = self._report + message["report"]
-            return [Ready(report), HostStarted(message["host"], message["pid"], report)]
-        return [HostExited(message["host"], message["code"], message["signal"], message["reason"])]
+            pid = process.pid_of(fds[0])
+            close_fds(fds)
+            return [Ready(report), HostStarted(message["host"], pid, report)]
+        names = ("host", "code", "signal", "reason", "detail")
+        return [HostExited(*(message[name] for name in names))]
 
     def start_host(self, fds: Sequence[int] = ()) -> tuple[int, socket.socket]:
         """Ask for a host in this jail; it starts once the jail is ready.
@@ -397,5 +434,7 @@ class Jail:
         if self._pidfd >= 0:
             os.close(self._pidfd)
             self._pidfd = -1
+        if self._group is not None:
+            self._group.remove()
         if self._folder is not None:
             remove_tree(str(self._folder))

@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "integration"))
-from confinement_kit import (
+from envhub_worker.protocol.confinement import Confinement, Limits
+from envhub_worker.spawner import Spawner, ZygoteDied
+from tests.integration.confinement_kit import (
     Cell,
     HostExited,
     HostStarted,
@@ -26,9 +27,6 @@ from confinement_kit import (
     spawner_in,
     wait_until,
 )
-
-from envhub_worker.protocol.confinement import Confinement, Limits
-from envhub_worker.spawner import Spawner, ZygoteDied
 
 
 @pytest.fixture(params=["strict", "no-userns"])

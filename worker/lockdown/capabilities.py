@@ -11,20 +11,14 @@ _PR_CAP_AMBIENT = 47
 _PR_CAP_AMBIENT_CLEAR_ALL = 4
 
 CAP_SETPCAP = 8
-CAP_SYS_PTRACE = 19
 
 
-def drop_all(keep: int = 0) -> None:
-    """Empty the bounding, ambient, inheritable, permitted and effective sets.
-
-    Args:
-        keep: Mask of capabilities that stay permitted and effective, if they are.
-    """
-    effective, permitted, _ = capget()
-    if effective >> CAP_SETPCAP & 1:
+def drop_all() -> None:
+    """Empty the bounding, ambient, inheritable, permitted and effective sets."""
+    if capget()[0] >> CAP_SETPCAP & 1:
         _empty_the_bounding_set()
     prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL)
-    capset(effective & keep, permitted & keep, 0)
+    capset(0, 0, 0)
 
 
 def held() -> int:

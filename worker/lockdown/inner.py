@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 
 from envhub_worker.jailspec import JailSpec
 from envhub_worker.lockdown import capabilities, mounts, namespaces, process
-from envhub_worker.lockdown.capabilities import CAP_SYS_PTRACE
 from envhub_worker.lockdown.context import Common
 from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.root_plan import within
 from envhub_worker.lockdown.scratch import Scratch
+from envhub_worker.protocol.confinement import Limits
 
 
 def enter(spec: JailSpec, common: Common, folder: str) -> tuple[Scratch, str]:
-    """Confine this init; it keeps just enough to measure and end what it starts.
+    """Confine this init as far as all of its hosts are.
 
     Args:
         spec: The jail.
@@ -82,15 +83,27 @@ def _check_readable(spec: JailSpec) -> None:
         )
 
 
-def _leave_the_zygote() -> None:
-    """Own no namespace any more: the next user namespace is below the one that owns them.
+def process_limit(limits: Limits, namespaced: bool) -> int:
+    """``RLIMIT_NPROC`` of a host: it counts all of the user's threads in the user namespace."""
+    if namespaced:
+        return limits.processes + 1  # init
+    return limits.processes + _threads_of(os.getuid())
 
-    What init keeps there lets it measure hosts that would rather not be measured, and puts it
-    out of their reach.
-    """
+
+def _threads_of(uid: int) -> int:
+    threads = 0
+    for name in os.listdir("/proc"):
+        with contextlib.suppress(OSError):
+            if name.isdigit() and os.stat(f"/proc/{name}").st_uid == uid:
+                threads += len(os.listdir(f"/proc/{name}/task"))
+    return threads
+
+
+def _leave_the_zygote() -> None:
+    """Own no namespace any more: the next user namespace is below the one that owns them."""
     namespaces.enter_user_namespace(namespaces.INSIDE_UID, namespaces.INSIDE_UID)
     namespaces.forbid_user_namespaces()
-    capabilities.drop_all(keep=1 << CAP_SYS_PTRACE)
+    capabilities.drop_all()
     process.set_no_new_privileges()
     process.set_dumpable(False)
     # The change of credentials disarmed it.

@@ -50,6 +50,7 @@ _PROC_KEPT = frozenset(
         "self",
         "stat",
         "sys",
+        "sysvipc",
         "thread-self",
         "uptime",
         "version",

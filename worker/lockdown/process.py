@@ -84,6 +84,12 @@ def reset_signals(handled: Iterable[int]) -> None:
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
 
 
+def pid_of(pidfd: int) -> int:
+    """The pid behind ``pidfd`` as this process sees it; 0 or less when it has ended."""
+    with open(f"/proc/self/fdinfo/{pidfd}") as file:
+        return next(int(line.split()[1]) for line in file if line.startswith("Pid:"))
+
+
 def exit_fields(status: int) -> dict[str, int | None]:
     """``{"code", "signal"}`` of a wait status; exactly one is not None."""
     code = os.waitstatus_to_exitcode(status)

@@ -35,14 +35,16 @@ def drain(fd: int) -> None:
             pass
 
 
-def reap() -> Iterator[tuple[int, int]]:
-    """The pid and wait status of every child that has ended; orphans we adopted included."""
+def reap(before: Callable[[int], None] = lambda pid: None) -> Iterator[tuple[int, int]]:
+    """The pid and wait status of every child that has ended; orphans we adopted included.
+
+    Args:
+        before: Is told the pid while that still belongs to the dead child.
+    """
     with contextlib.suppress(ChildProcessError):
-        while True:
-            pid, status = os.waitpid(-1, os.WNOHANG)
-            if pid == 0:
-                return
-            yield pid, status
+        while ended := os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT):
+            before(ended.si_pid)
+            yield os.waitpid(ended.si_pid, 0)
 
 
 def descendants(root: int, keep: Collection[int] = ()) -> list[int]:

@@ -1,0 +1,209 @@
+"""Memory and process counts by the kernel, where this process may make control groups.
+
+As root under cgroup v1 or v2, or as a user who was delegated a v2 group. The server makes a
+group for each jail; a host joins it before anything else, through descriptors that the server
+opened. Where there is none, ``watchdog`` measures instead.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from envhub_worker.protocol.confinement import Limits
+
+_MOUNTS = "/proc/self/mountinfo"
+_OWN = "/proc/self/cgroup"
+_PREFIX = "envhub-"
+
+
+@dataclass(frozen=True)
+class Hierarchy:
+    """Where groups for jails can be made.
+
+    Attributes:
+        kind: ``"cgroup-v1"`` or ``"cgroup-v2"``.
+        folders: The folder of each controller; under v2 there is one.
+    """
+
+    kind: str
+    folders: tuple[str, ...]
+
+
+def find(mounts: str, own: str, *, root: bool) -> Hierarchy | None:
+    """Where to make groups. Pure.
+
+    Args:
+        mounts: Content of ``/proc/self/mountinfo``.
+        own: Content of ``/proc/self/cgroup``.
+        root: Whether we are root: then a v2 group may stand at the top, whatever our own is.
+    """
+    paths = dict(_own_paths(own))
+    points = dict(_mount_points(mounts))
+    if root and "memory" in points and "pids" in points:
+        folders = [points[name] + paths.get(name, "/") for name in ("memory", "pids")]
+        return Hierarchy("cgroup-v1", tuple(folder.rstrip("/") for folder in folders))
+    if "" in points:
+        own_path = "/" if root else paths.get("", "/")
+        return Hierarchy("cgroup-v2", ((points[""] + own_path).rstrip("/"),))
+    return None
+
+
+def _own_paths(own: str) -> list[tuple[str, str]]:
+    """(controller, path); the v2 hierarchy is the controller ''."""
+    entries = [line.split(":", 2) for line in own.splitlines()]
+    return [(name, path) for _, names, path in entries for name in names.split(",")]
+
+
+def _mount_points(mounts: str) -> list[tuple[str, str]]:
+    points = []
+    for line in mounts.splitlines():
+        left, _, right = line.partition(" - ")
+        kind, _, options = right.split(" ", 2)
+        place = left.split()[4]
+        if kind == "cgroup":
+            points += [(name, place) for name in options.rpartition(" ")[2].split(",")]
+        elif kind == "cgroup2":
+            points.append(("", place))
+    return points
+
+
+def discover() -> Hierarchy | None:
+    """The hierarchy of this process, if groups with limits can really be made in it."""
+    with open(_MOUNTS) as mounts, open(_OWN) as own:
+        hierarchy = find(mounts.read(), own.read(), root=os.geteuid() == 0)
+    if hierarchy is None or not all(os.access(path, os.W_OK) for path in hierarchy.folders):
+        return None
+    return hierarchy
+
+
+class Tree:
+    """The folder that holds the groups of one spawner's jails."""
+
+    def __init__(self, hierarchy: Hierarchy, name: str) -> None:
+        """Make the folder ``envhub-<our pid>-<name>``.
+
+        Raises:
+            OSError: The kernel refuses; use the watchdog.
+        """
+        self.kind = hierarchy.kind
+        self._folders = [f"{folder}/{_PREFIX}{os.getpid()}-{name}" for folder in hierarchy.folders]
+        _remove_abandoned(hierarchy.folders)
+        if self.kind == "cgroup-v2":
+            _enable(hierarchy.folders[0])
+        for folder in self._folders:
+            os.mkdir(folder)
+        if self.kind == "cgroup-v2":
+            _enable(self._folders[0])
+
+    def group(self, name: str, limits: Limits) -> Group:
+        """A new group with ``limits``.
+
+        Raises:
+            OSError: The kernel refuses.
+        """
+        return Group(self.kind, [f"{folder}/{name}" for folder in self._folders], limits)
+
+    def remove(self) -> None:
+        """Remove the folder and every group in it; their processes must have ended."""
+        for folder in self._folders:
+            _remove_tree(folder)
+
+
+def _remove_abandoned(folders: Sequence[str]) -> None:
+    """Remove what servers that were killed have left; the kernel keeps what is in use."""
+    for folder in folders:
+        for name in os.listdir(folder):
+            pid = name.removeprefix(_PREFIX).partition("-")[0]
+            if name.startswith(_PREFIX) and not os.path.exists(f"/proc/{pid}"):
+                _remove_tree(f"{folder}/{name}")
+
+
+def _remove_tree(folder: str) -> None:
+    with contextlib.suppress(FileNotFoundError):
+        groups = [entry.path for entry in os.scandir(folder) if entry.is_dir()]
+        _remove([*groups, folder])
+
+
+def _enable(folder: str) -> None:
+    with open(f"{folder}/cgroup.subtree_control") as file:
+        enabled = file.read().split()
+    for controller in ("memory", "pids"):
+        if controller not in enabled:
+            _write(f"{folder}/cgroup.subtree_control", f"+{controller}")
+
+
+class Group:
+    """The control group of one jail."""
+
+    def __init__(self, kind: str, folders: Sequence[str], limits: Limits) -> None:
+        self.kind = kind
+        self._folders = list(folders)
+        for folder in folders:
+            os.mkdir(folder)
+        try:
+            for path, text, required in _settings(kind, self._folders, limits):
+                with contextlib.suppress(*(() if required else (OSError,))):
+                    _write(path, text)
+        except OSError:
+            self.remove()
+            raise
+
+    def open(self) -> list[int]:
+        """Descriptors for init: where out-of-memory is counted, then where to join."""
+        name = "memory.events" if self.kind == "cgroup-v2" else "memory.oom_control"
+        events = os.open(f"{self._folders[0]}/{name}", os.O_RDONLY | os.O_CLOEXEC)
+        joins = [
+            os.open(f"{folder}/cgroup.procs", os.O_WRONLY | os.O_CLOEXEC)
+            for folder in self._folders
+        ]
+        return [events, *joins]
+
+    def remove(self) -> None:
+        """Remove the group; its processes must have ended."""
+        _remove(self._folders)
+
+
+def _settings(kind: str, folders: Sequence[str], limits: Limits) -> list[tuple[str, str, bool]]:
+    """(file, content, whether it must exist)."""
+    memory, processes = str(limits.memory_bytes), str(limits.processes)
+    if kind == "cgroup-v2":
+        return [
+            (f"{folders[0]}/memory.max", memory, True),
+            (f"{folders[0]}/memory.swap.max", "0", False),
+            (f"{folders[0]}/memory.oom.group", "1", False),
+            (f"{folders[0]}/pids.max", processes, True),
+        ]
+    return [
+        (f"{folders[0]}/memory.limit_in_bytes", memory, True),
+        (f"{folders[0]}/memory.memsw.limit_in_bytes", memory, False),
+        (f"{folders[1]}/pids.max", processes, True),
+    ]
+
+
+def join(fds: Sequence[int]) -> None:
+    """Put this process into the group whose ``cgroup.procs`` are open as ``fds``."""
+    for fd in fds:
+        os.write(fd, b"0")
+
+
+def oom_kills(events: int) -> int:
+    """How often the kernel ended a process of the group for its memory."""
+    for line in os.pread(events, 4096, 0).splitlines():
+        name, _, count = line.partition(b" ")
+        if name == b"oom_kill":
+            return int(count)
+    return 0
+
+
+def _write(path: str, text: str) -> None:
+    with open(path, "w") as file:
+        file.write(text)
+
+
+def _remove(folders: Sequence[str]) -> None:
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            os.rmdir(folder)
