@@ -14,8 +14,9 @@ import os
 import platform
 import select
 import socket
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from time import perf_counter_ns
 from typing import Any
 
@@ -27,6 +28,7 @@ from envhub_sandbox.spinning import SpinChooser
 from envhub_sandbox.tensors import to_tensor
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol import slabs
+from envhub_worker.protocol.columns import Column, columns_of
 from envhub_worker.protocol.manifest import EnvManifest
 
 _RING = (1).to_bytes(8, "little")
@@ -37,8 +39,9 @@ _CONNECT_S = 5.0
 # elsewhere a core may see the sequence word before the data it announces: sleep, do not poll
 _ORDERED_STORES = platform.machine() in ("x86_64", "AMD64")
 
-Outcome = tuple[int, bytes]
-"""``slabs.DONE``, ``RAISED`` or ``FETCH``, and the encoded infos or exception."""
+Outcome = tuple[int, m.Message | None]
+"""``slabs.DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``, and what came encoded."""
+_OUTCOMES = frozenset({slabs.DONE, slabs.RAISED, slabs.FETCH, slabs.COLUMNS})
 
 
 class JailGoneError(Exception):
@@ -64,7 +67,11 @@ class LaneShard:
         self.fds = [request_fd, reply_fd, self._host_bell, self.bell]
         self._asks = slabs.words(self._request)
         self._tells = slabs.words(self._reply)
-        self._rows = [slabs.view(self._reply, leaf) for leaf in layout.observations]
+        self._rows = [_safe_view(self._reply, leaf) for leaf in layout.observations]
+        self._take = [
+            _taker(rows, leaf) for rows, leaf in zip(self._rows, layout.observations, strict=True)
+        ]
+        self._columns: list[tuple[Column, Any]] = []
         count, start = layout.count, layout.results
         self._rewards = np.frombuffer(self._reply, np.float64, count, start)
         self._flags = np.frombuffer(self._reply, np.uint8, 2 * count, start + 8 * count)
@@ -113,17 +120,39 @@ class LaneShard:
             os.read(self.bell, 8)
 
     def outcome(self) -> Outcome:
-        """How the request went. Trust: input from the worker; the length is bounded here."""
-        tells = self._tells
-        kind, length = tells[slabs.OUTCOME], tells[slabs.LENGTH]
-        if kind not in (slabs.DONE, slabs.RAISED, slabs.FETCH) or length > slabs.INFO_BYTES:
+        """How the request went. Trust: input from the worker; the length is bounded here.
+
+        What came encoded is decoded at once, wanted or not: the columns that follow are its.
+        """
+        kind, length = self._tells[slabs.OUTCOME], self._tells[slabs.LENGTH]
+        if kind not in _OUTCOMES or length > slabs.INFO_BYTES:
             raise RemoteProtocolError("the worker wrote an impossible reply into its slab")
+        if not length:
+            return kind, None
         start = self.layout.infos
-        return kind, self._reply[start : start + length] if length else b""
+        message = m.unpack([self._reply[start : start + length]], tensors=to_tensor)[1]
+        if isinstance(message, m.Value) and type(message.value) is dict:
+            self._learn(message.value)
+        return kind, message
+
+    def _learn(self, infos: dict[Any, Any]) -> None:
+        start = self.layout.infos
+        columns = columns_of(infos) or ()
+        self._columns = [(column, column.view(self._reply, start)) for column in columns]
 
     def rows(self) -> list[Any]:
-        """The observation's leaves: views that the next step changes."""
+        """The observation's leaves: views that the next step changes; booleans as bytes."""
         return self._rows
+
+    def taken(self) -> list[Any]:
+        """Copies of the observation's leaves."""
+        return [take() for take in self._take]
+
+    def columns(self) -> dict[Any, Any]:
+        """Infos that came as columns: fresh arrays."""
+        if not self._columns:
+            raise RemoteProtocolError("the worker sent columns before their schema")
+        return {column.key: view.astype(column.dtype) for column, view in self._columns}
 
     def results(self) -> tuple[Any, Any, Any]:
         """Copies of rewards (float64), terminations and truncations (bool)."""
@@ -255,7 +284,7 @@ class FastLane:
     def observation(self) -> Any:
         """The batched observation: fresh arrays that belong to the caller."""
         if len(self.shards) == 1:
-            return self._assemble([rows.copy() for rows in self.shards[0].rows()])
+            return self._assemble(self.shards[0].taken())
         joined = []
         for index, leaf in enumerate(self.shards[0].layout.observations):
             whole = np.empty((self._count, *leaf.shape[1:]), leaf.dtype)
@@ -280,9 +309,13 @@ class FastLane:
             os.close(self._pidfds.pop())
 
 
-def decode_infos(encoded: bytes) -> m.Message:
-    """The message in a slab's info area. Trust: input from the worker, copied by now."""
-    return m.unpack([encoded], tensors=to_tensor)[1]
+def _safe_view(buffer: Any, leaf: slabs.Leaf) -> Any:
+    """A leaf's place; booleans as bytes, because a hostile one may be neither 0 nor 1."""
+    return slabs.view(buffer, leaf, np.dtype(np.uint8) if leaf.dtype.kind == "b" else None)
+
+
+def _taker(rows: Any, leaf: slabs.Leaf) -> Callable[[], Any]:
+    return partial(rows.astype, leaf.dtype) if leaf.dtype.kind == "b" else rows.copy
 
 
 def deposit(path: str, session: bytes, jail: int, host: int, fds: Sequence[int]) -> int:

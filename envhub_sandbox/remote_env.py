@@ -23,7 +23,7 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
     name_source,
 )
-from envhub_sandbox.fast_lane import FastLane, JailGoneError, Outcome, decode_infos, deposit
+from envhub_sandbox.fast_lane import FastLane, JailGoneError, Outcome, deposit
 from envhub_sandbox.jail import check, typed
 from envhub_sandbox.jail_sources import JailSource
 from envhub_sandbox.repository import LoadedJail, Repository
@@ -46,7 +46,7 @@ T = TypeVar("T")
 _CAUSE_S = 10.0
 _CAUSE_POLL_S = 0.01
 _BY_LANE = (0, "step")
-_EMPTY = (slabs.DONE, b"")
+_EMPTY = (slabs.DONE, None)
 _numbers = itertools.count(1)
 
 
@@ -166,7 +166,7 @@ class RemoteEnv:
         outcomes = self._finish(lambda: self._wait_on_lane(lane, deadline), timeout_s)
         infos: dict[Any, Any] = {}
         if any(outcome != _EMPTY for outcome in outcomes):
-            infos = self.results.lane_infos(self._lane_infos(outcomes))
+            infos = self.results.lane_infos(self._lane_infos(lane, outcomes))
         return (lane.observation(), *lane.flags(), infos)
 
     def _wait_on_lane(self, lane: FastLane, deadline: Deadline) -> list[Outcome]:
@@ -175,15 +175,16 @@ class RemoteEnv:
         except JailGoneError:
             raise self._cause_of_death() from None
 
-    def _lane_infos(self, outcomes: list[Outcome]) -> list[Any]:
+    def _lane_infos(self, lane: FastLane, outcomes: list[Outcome]) -> list[Any]:
         infos: list[Any] = []
-        for (kind, encoded), host in zip(outcomes, self._hosts, strict=True):
-            if kind == slabs.FETCH:
+        for (kind, message), shard, host in zip(outcomes, lane.shards, self._hosts, strict=True):
+            if kind == slabs.COLUMNS:
+                infos.append(shard.columns())
+            elif kind == slabs.FETCH:
                 infos.append(self._fetch_infos(host))
-            elif not encoded:
+            elif message is None:
                 infos.append({})
             else:
-                message = decode_infos(encoded)
                 check(message)
                 infos.append(typed(message, m.Value).value)
         return infos

@@ -16,6 +16,7 @@ import cloudpickle  # type: ignore[import-untyped]
 
 from envhub_worker.jail import describe, loader
 from envhub_worker.jail.failure import raised
+from envhub_worker.jail.infos import join
 from envhub_worker.jail.lane import Lane
 from envhub_worker.jail.standins import standing_in
 from envhub_worker.jail.subenvs import SubEnvs
@@ -28,6 +29,7 @@ from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
 
 _CHUNK = 1 << 20
 _MAX_FDS = 8
+_RECHECK_MS = 2
 
 
 def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
@@ -36,11 +38,14 @@ def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
     reader = PacketReader()
     poller = select.poll()
     poller.register(stream, select.POLLIN)
+    timeout: int | None = None
     while True:
         if host.lane is not None:
             poller.register(host.lane.bell, select.POLLIN)
             host.lane.rest()
-        ready = [fd for fd, _ in poller.poll()]
+        ready = [fd for fd, _ in poller.poll(timeout)]
+        # a request may cross with our going to sleep: look again soon, once
+        timeout = _RECHECK_MS if ready and host.lane is not None else None
         if host.lane is not None and host.lane.bell in ready:
             host.lane.wake()
         if stream.fileno() in ready and not _serve(stream, reader, host):
@@ -116,8 +121,8 @@ class Host:
         """``VectorEnv.reset``."""
         env = self._envs[request.env]
         if isinstance(env, SubEnvs):
-            infos = env.run_reset(request.seeds, request.options, request.mask)
-            return m.ResetDone(env.batch.observation(), infos)
+            pairs = env.run_reset(request.seeds, request.options, request.mask)
+            return m.ResetDone(env.batch.observation(), join(pairs, env.num_envs))
         options = request.options
         if request.mask is not None:
             options = {**(options or {}), "reset_mask": request.mask}
@@ -129,7 +134,7 @@ class Host:
         env = self._envs[request.env]
         if not isinstance(env, SubEnvs):
             return m.StepDone(*env.step(request.actions))
-        infos = env.run_step(request.actions)
+        infos = join(env.run_step(request.actions), env.num_envs)
         batch = env.batch
         flags = (batch.rewards, batch.terminations, batch.truncations)
         return m.StepDone(batch.observation(), *flags, infos)
@@ -148,7 +153,7 @@ class Host:
 
     def fetch_infos(self, request: m.FetchInfos) -> m.Message:
         """The last step's infos, which did not fit the slab."""
-        return m.Value({} if self.lane is None else self.lane.infos)
+        return m.Value({} if self.lane is None else self.lane.infos())
 
     def call(self, request: m.Call) -> m.Message:
         """``VectorEnv.call``."""

@@ -9,14 +9,15 @@ from __future__ import annotations
 import contextlib
 import mmap
 import os
+from dataclasses import replace
 from time import perf_counter_ns
 from typing import Any
 
 from envhub_worker.jail.failure import raised
+from envhub_worker.jail.infos import InfoWriter, Pairs, join
 from envhub_worker.jail.subenvs import SubEnvs
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol import slabs
-from envhub_worker.protocol.errors import ProtocolError
 
 _RING = (1).to_bytes(8, "little")
 
@@ -44,7 +45,8 @@ class Lane:
         self._assemble = slabs.assembler(env.single_action_space)
         self._served = 0
         self._views: dict[tuple[int, int], Any] = {}
-        self.infos: dict[Any, Any] = {}
+        self._pairs: Pairs = []
+        self._writer = InfoWriter(self._reply, layout.infos, layout.count)
         env.batch.move(layout, self._reply)
 
     def rest(self) -> None:
@@ -85,11 +87,14 @@ class Lane:
 
     def _run(self) -> tuple[int, int]:
         try:
-            self.infos = self._env.run_step(self._actions())
-            return self._put_infos() if self.infos else (slabs.DONE, 0)
+            pairs = self._pairs = self._env.run_step(self._actions())
+            return self._writer.write(pairs) if pairs else (slabs.DONE, 0)
         except BaseException as error:
-            [frame] = m.pack(raised(error, "step"), 0)
-            return slabs.RAISED, self._put(frame)
+            return slabs.RAISED, self._writer.put(_raised_frame(error))
+
+    def infos(self) -> dict[Any, Any]:
+        """The last step's infos."""
+        return join(self._pairs, self._layout.count)
 
     def _actions(self) -> Any:
         # copied, because an environment may keep its action and the client writes the next one
@@ -105,17 +110,11 @@ class Lane:
             self._views[index, code] = found
         return found
 
-    def _put_infos(self) -> tuple[int, int]:
-        try:
-            frames = m.pack(m.Value(self.infos), 0)
-        except ProtocolError as error:
-            [frame] = m.pack(raised(error, "step"), 0)
-            return slabs.RAISED, self._put(frame)
-        if len(frames) > 1 or memoryview(frames[0]).nbytes > slabs.INFO_BYTES:
-            return slabs.FETCH, 0
-        return slabs.DONE, self._put(frames[0])
 
-    def _put(self, frame: Any) -> int:
-        size = memoryview(frame).nbytes
-        self._reply[self._layout.infos : self._layout.infos + size] = frame
-        return size
+def _raised_frame(error: BaseException) -> Any:
+    """The encoded exception; without its traceback where that does not fit."""
+    message = raised(error, "step")
+    [frame] = m.pack(message, 0)
+    if len(frame) > slabs.INFO_BYTES:
+        [frame] = m.pack(replace(message, traceback=""), 0)
+    return frame

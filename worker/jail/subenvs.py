@@ -16,11 +16,11 @@ from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
+from envhub_worker.jail.infos import Pairs
 from envhub_worker.protocol import slabs
 
 Store = Callable[[int, Any], None]
 _ARRAYS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
-_SCALARS = frozenset({int, float, bool})
 
 
 class Batch:
@@ -87,7 +87,7 @@ class SubEnvs(SyncVectorEnv):
         self._mode = autoreset_mode
         self._plain_actions = isinstance(self.single_action_space, _ARRAYS)
 
-    def run_reset(self, seeds: Any, options: dict[str, Any] | None, mask: Any) -> dict[Any, Any]:
+    def run_reset(self, seeds: Any, options: dict[str, Any] | None, mask: Any) -> Pairs:
         """Reset the sub-environments that the mask names, or all; returns the infos.
 
         Args:
@@ -99,16 +99,16 @@ class SubEnvs(SyncVectorEnv):
         for index in chosen:
             self._done[index] = False
             self.batch.terminations[index] = self.batch.truncations[index] = False
-        infos: dict[Any, Any] = {}
+        infos: Pairs = []
         for index in chosen:
             seed = None if seeds is None else seeds[index]
             observation, info = self.envs[index].reset(seed=seed, options=options)
             self.batch.store(index, observation)
             if info:
-                add_info(infos, info, index, self.num_envs)
+                infos.append((index, info))
         return infos
 
-    def run_step(self, actions: Any) -> dict[Any, Any]:
+    def run_step(self, actions: Any) -> Pairs:
         """Step every sub-environment, or reset it where its episode is over; returns the infos.
 
         Args:
@@ -120,7 +120,7 @@ class SubEnvs(SyncVectorEnv):
         store, rewards = batch.store, batch.rewards
         terminations, truncations = batch.terminations, batch.truncations
         done = [False] * count
-        infos: dict[Any, Any] = {}
+        infos: Pairs = []
         for index, (action, env) in enumerate(zip(self._each(actions), self.envs, strict=True)):
             if self._done[index]:
                 observation, info = env.reset()
@@ -133,42 +133,18 @@ class SubEnvs(SyncVectorEnv):
                 truncations[index] = truncated
                 if terminations[index] or truncations[index]:
                     if same_step:
-                        final = {"final_obs": observation, "final_info": info}
-                        add_info(infos, final, index, count)
+                        infos.append((index, {"final_obs": observation, "final_info": info}))
                         observation, info = env.reset()
                     else:
                         done[index] = True
             store(index, observation)
             if info:
-                add_info(infos, info, index, count)
+                infos.append((index, info))
         self._done = done
         return infos
 
     def _each(self, actions: Any) -> Iterator[Any]:
         return iter(actions) if self._plain_actions else iterate(self.action_space, actions)
-
-
-def add_info(infos: dict[Any, Any], info: dict[Any, Any], index: int, count: int) -> dict[Any, Any]:
-    """``VectorEnv._add_info``, without its allocations."""
-    for key, value in info.items():
-        array: Any
-        if key == "final_obs":
-            array = infos.get(key)
-            if array is None:
-                array = np.full(count, None, dtype=object)
-            array[index] = value
-        elif isinstance(value, dict):
-            array = add_info(infos.get(key, {}), value, index, count)
-        else:
-            array = infos[key] if key in infos else _column(value, count)
-            array[index] = value
-        mask_key = f"_{key}"
-        mask = infos.get(mask_key)
-        if mask is None:
-            mask = np.zeros(count, np.bool_)
-        mask[index] = True
-        infos[key], infos[mask_key] = array, mask
-    return infos
 
 
 def _reward_shape(env: Any) -> tuple[int, ...]:
@@ -177,16 +153,6 @@ def _reward_shape(env: Any) -> tuple[int, ...]:
         return tuple(env.get_wrapper_attr("reward_space").shape)
     except (AttributeError, TypeError):
         return ()
-
-
-def _column(value: Any, count: int) -> Any:
-    """The array for a key that is seen first: its dtype is decided by this value."""
-    kind = type(value)
-    if kind in _SCALARS or issubclass(kind, np.number):
-        return np.zeros(count, dtype=kind)
-    if isinstance(value, np.ndarray):
-        return np.zeros((count, *value.shape), dtype=value.dtype)
-    return np.full(count, None, dtype=object)
 
 
 def _writer(space: gym.Space[Any], leaves: Iterator[Any]) -> Store:

@@ -38,7 +38,7 @@ SEQUENCE = 0
 PARKED = 8
 """1 while this slab's writer sleeps in poll and wants its doorbell rung."""
 OUTCOME = 16
-"""Reply: ``DONE``, ``RAISED`` or ``FETCH``."""
+"""Reply: ``DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``."""
 LENGTH = 17
 """Reply: bytes of the encoded infos, or of what was raised; 0 for an empty info."""
 SPIN = 16
@@ -49,8 +49,9 @@ MAX_LEAVES = 64
 HEADER_WORDS = DTYPES + MAX_LEAVES
 HEADER_BYTES = HEADER_WORDS * 8
 
-DONE, RAISED, FETCH = 1, 2, 3
-"""The results and infos are in the slab; an encoded ``Raised`` is; the infos must be fetched."""
+DONE, RAISED, FETCH, COLUMNS = 1, 2, 3, 4
+"""Results and encoded infos are in the slab; an encoded ``Raised`` is; the infos must be fetched;
+the infos are columns (see ``columns``)."""
 
 ACTION_DTYPES = tuple(
     np.dtype(name)
