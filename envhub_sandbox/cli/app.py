@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from envhub_sandbox.cli import cache, inspect, run, version
+from envhub_sandbox.cli import cache, doctor, inspect, run, version
 from envhub_sandbox.cli.exits import EXIT_CODES
 
 app = typer.Typer(
@@ -20,5 +20,6 @@ app = typer.Typer(
 )
 app.command("run", epilog=EXIT_CODES, no_args_is_help=True)(run.run)
 app.command("inspect", epilog=EXIT_CODES, no_args_is_help=True)(inspect.inspect)
+app.command("doctor")(doctor.doctor)
 app.add_typer(cache.app, name="cache")
 app.command("version")(version.version)

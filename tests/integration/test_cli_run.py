@@ -75,6 +75,13 @@ def test_a_run_prints_results_and_nothing_else() -> None:
     assert "\x1b" not in done.stdout
 
 
+def test_a_terminal_that_knows_only_ascii_is_no_error() -> None:
+    """What it cannot show is escaped."""
+    done = envhub("run", EXAMPLES / "cartpole", "--episodes", "1", PYTHONIOENCODING="ascii")
+    assert done.returncode == 0, done.stderr
+    assert "hub_env / 0" in done.stdout
+
+
 def test_json_says_what_ran_and_how() -> None:
     """Exactly the episodes asked for, provenance, the layers that held."""
     found = document("run", EXAMPLES / "catch", "--episodes", "5", "--n-envs", "2")

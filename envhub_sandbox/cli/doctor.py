@@ -1,0 +1,174 @@
+"""``envhub doctor``: what this host can enforce, found out by doing it.
+
+Each profile is tried with a jail of its own, set up exactly as for a repository, self-test
+included: nothing is concluded from versions or settings.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import tempfile
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from envhub_sandbox.cli.console import console, print_json, safe_line, safe_text
+from envhub_sandbox.cli.exits import Exit, describe, reported
+from envhub_sandbox.cli.progress import Bar
+from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError
+
+_ENV_PY = '''"""Does nothing: `envhub doctor` runs it to see what confines it."""
+
+import gymnasium as gym
+import numpy as np
+
+
+class Idle(gym.Env):
+    observation_space = gym.spaces.Box(0, 1, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), 0.0, False, False, {}
+
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([Idle] * n_envs)
+'''
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """What came of one profile.
+
+    Attributes:
+        profile: Its name.
+        available: A jail under it ran.
+        layers: One mapping per layer: ``layer``, ``enforced``, ``detail``.
+        first_step_s: Seconds from ``make_env`` to the first step's result.
+        problem: Why it is not available, and what to do.
+        code: The exit code for that.
+    """
+
+    profile: str
+    available: bool
+    layers: list[dict[str, Any]]
+    first_step_s: float | None
+    problem: str | None
+    code: Exit
+
+
+def doctor(
+    profile: Annotated[
+        str,
+        typer.Option(
+            metavar="strict|no-userns|container", help="The profile that decides the exit code."
+        ),
+    ] = "strict",
+    json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document on stdout.")
+    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Try what this host can enforce, say what is missing and how to get it.
+
+    Exits with 0 if the profile (strict by default) can be enforced, and with 6 if it cannot.
+    """
+    with reported(debug=debug):
+        from envhub_sandbox.policy import PROFILES, Policy
+
+        Policy(profile=profile)  # refuses a name that there is not, before anything is tried
+        with Bar(quiet=json) as bar, tempfile.TemporaryDirectory(prefix="envhub-doctor-") as folder:
+            (Path(folder) / "env.py").write_text(_ENV_PY)
+            findings = []
+            for name in PROFILES:
+                bar.begin(f"trying {name}")
+                findings.append(examine(folder, name))
+        if json:
+            print_json({"host": host(), "profiles": [asdict(finding) for finding in findings]})
+        else:
+            _print(findings)
+        decisive = next(finding for finding in findings if finding.profile == profile)
+        raise typer.Exit(decisive.code)
+
+
+def host() -> dict[str, Any]:
+    """Facts about this machine that explain the rest."""
+    return {
+        "system": f"{platform.system()} {platform.release()}",
+        "machine": platform.machine(),
+        "root": os.geteuid() == 0,
+        "python": f"{platform.python_implementation()} {platform.python_version()}",
+    }
+
+
+def examine(folder: str, profile: str) -> Finding:
+    """Run the idle environment under a profile."""
+    from envhub_sandbox.api import make_env
+
+    begun = time.perf_counter()
+    try:
+        with make_env(folder, policy={"profile": profile}) as suites:
+            env = suites.env
+            env.reset(seed=0)
+            env.step(env.action_space.sample())
+            taken = time.perf_counter() - begun
+            layers = [dict(layer) for layer in suites.provenance["layers"]]
+    except EnvHubError as error:
+        missing = isinstance(error, SandboxUnavailableError)
+        problem = describe(error).replace(f"{folder}:env.py: ", "")
+        return _finding(profile, problem=problem, code=Exit.SANDBOX if missing else Exit.WORKER)
+    return _finding(profile, layers=layers, first_step_s=taken)
+
+
+def _finding(
+    profile: str,
+    *,
+    layers: list[dict[str, Any]] | None = None,
+    first_step_s: float | None = None,
+    problem: str | None = None,
+    code: Exit = Exit.OK,
+) -> Finding:
+    return Finding(
+        profile=profile,
+        available=problem is None,
+        layers=layers or [],
+        first_step_s=first_step_s,
+        problem=problem,
+        code=code,
+    )
+
+
+def _print(findings: list[Finding]) -> None:
+    from rich.table import Table
+
+    out = console()
+    facts = host()
+    user = "root" if facts["root"] else "a plain user"
+    out.print(f"{facts['system']} on {facts['machine']}, as {user}, {facts['python']}")
+    for finding in findings:
+        out.print()
+        if finding.problem is not None:
+            out.print(f"{finding.profile}: not available here", style="bold red")
+            for line in safe_text(finding.problem).splitlines():
+                out.print(f"  {line}", soft_wrap=True)
+            continue
+        out.print(
+            f"{finding.profile}: available (first step after {finding.first_step_s:.2f} s)",
+            style="bold green",
+        )
+        grid = Table.grid(padding=(0, 2))
+        grid.add_column(no_wrap=True)
+        grid.add_column(no_wrap=True)
+        grid.add_column(overflow="fold")
+        for layer in finding.layers:
+            mark = "  holds" if layer.get("enforced") else "  none"
+            grid.add_row(mark, safe_line(layer.get("layer")), safe_line(layer.get("detail"), 300))
+        out.print(grid)
