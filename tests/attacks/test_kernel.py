@@ -1,0 +1,301 @@
+"""Reaching for the kernel: namespaces, mounts, rare system calls, other architectures' numbers."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.attacks.harness import USER, Arena, Run, control_run, new_alias, pids_named
+from tests.support.processes import eventually
+
+FAMILY = "The kernel"
+
+Look = Callable[[int, int], object]
+
+
+def child_differs(arena: Arena, title: str, payload: str, look: Look, **arguments: object) -> None:
+    """Attack in a child; ``look(child, parent)`` says whether it got what it wanted."""
+    child = new_alias()
+
+    def got(run: Run) -> bool:
+        # a child that was forked by hand takes its name a moment later
+        eventually(lambda: bool(pids_named(child)), 0.5 if run.inside else 10.0)
+        return any(look(pid, parent) for pid in pids_named(child) for parent in run.pids())
+
+    arena.attack(title, payload, got, before=lambda: end(child), alias=child, **arguments)
+
+
+def end(alias: str) -> None:
+    """The control's child has gone with its process group; wait for that."""
+    assert eventually(lambda: not pids_named(alias))
+
+
+def user_namespace(pid: int) -> str:
+    """Which user namespace a process is in."""
+    return os.readlink(f"/proc/{pid}/ns/user")
+
+
+def test_no_user_namespace_can_be_made(arena: Arena) -> None:
+    """unshare(CLONE_NEWUSER) leaves a process where it was."""
+    child_differs(
+        arena,
+        "user namespace: unshare",
+        "user_namespace",
+        lambda child, parent: user_namespace(child) != user_namespace(parent),
+    )
+
+
+@pytest.mark.parametrize("way", ["clone", "clone3"])
+def test_no_user_namespace_can_be_born_into(arena: Arena, way: str) -> None:
+    """Nor does a clone begin its life in another one."""
+    child_differs(
+        arena,
+        f"user namespace: {way}",
+        "clone_with_namespace",
+        lambda child, parent: user_namespace(child) != user_namespace(parent),
+        way=way,
+    )
+
+
+def mounts(pid: int) -> list[str]:
+    """A process's mounts."""
+    return Path(f"/proc/{pid}/mountinfo").read_text().splitlines()
+
+
+def root_options(pid: int) -> set[str]:
+    """What a process may do with its root: ``{"ro", "nosuid", ...}``."""
+    [line] = [line for line in mounts(pid) if line.split()[4] == "/"][-1:]
+    return set(line.split()[5].split(","))
+
+
+def root_of(pid: int) -> tuple[int, int]:
+    """Which folder is a process's root."""
+    status = os.stat(f"/proc/{pid}/root")
+    return status.st_dev, status.st_ino
+
+
+def test_nothing_can_be_mounted(arena: Arena) -> None:
+    """No new mount appears in any process of the jail."""
+    source = f"src-{new_alias()}"
+    child_differs(
+        arena,
+        "mount a tmpfs",
+        "mount_tmpfs",
+        lambda child, parent: any(source in line for line in mounts(child)),
+        source=source,
+    )
+
+
+def test_root_cannot_be_remounted(arena: Arena) -> None:
+    """The read-only root stays what it is."""
+    child_differs(
+        arena,
+        "remount the root",
+        "remount_root",
+        lambda child, parent: root_options(child) != root_options(parent),
+    )
+
+
+@pytest.mark.parametrize("call", ["chroot", "pivot_root"])
+def test_root_cannot_be_changed(arena: Arena, call: str) -> None:
+    """Nor can another folder take its place."""
+    child_differs(arena, call, call, lambda child, parent: root_of(child) != root_of(parent))
+
+
+def test_other_namespaces_cannot_be_entered(arena: Arena) -> None:
+    """setns into the client's namespaces fails, by /proc and by pidfd."""
+    child = new_alias()
+    with control_run("user_namespace", {"alias": child}):
+        [elsewhere] = pids_named(child)
+        assert user_namespace(elsewhere) != user_namespace(os.getpid())
+        joined = new_alias()
+        arena.attack(
+            "setns into the client's namespaces",
+            "enter_namespaces",
+            lambda run: any(
+                user_namespace(pid) != user_namespace(parent)
+                for pid in pids_named(joined)
+                for parent in run.pids()
+            ),
+            before=lambda: end(joined),
+            alias=joined,
+            pid=elsewhere,
+        )
+
+
+OBJECTS = {
+    "bpf": "bpf-map",
+    "io_uring": "[io_uring]",
+    "userfaultfd": "[userfaultfd]",
+    "perf_event": "[perf_event]",
+    "fanotify": "[fanotify]",
+    "fscontext": "[fscontext]",
+}
+
+
+@pytest.mark.parametrize("kind", list(OBJECTS))
+def test_kernel_objects_cannot_be_made(arena: Arena, kind: str) -> None:
+    """No descriptor of the kernel's larger machines appears among a jail's."""
+
+    def has_it(run: Run) -> bool:
+        return any(
+            OBJECTS[kind] in os.readlink(f"/proc/{pid}/fd/{fd}")
+            for pid in run.pids()
+            for fd in os.listdir(f"/proc/{pid}/fd")
+        )
+
+    with control_run("kernel_object", {"kind": kind}) as probe:
+        why = probe.error.strip().rpartition("\n")[2]
+    arena.attack(f"make: {kind}", "kernel_object", has_it, kind=kind, impossible=why)
+
+
+# Harmless even for root: every argument is a descriptor or a pointer that leads nowhere, or a
+# number that the kernel has no meaning for.
+CALLS: dict[str, list[int]] = {
+    "acct": [1],
+    "add_key": [1, 1, 1, 1, 0],
+    "bpf": [0, 1, 72],
+    "clone3": [1, 64],
+    "delete_module": [1, 0],
+    "fanotify_init": [-1, 0],
+    "finit_module": [-1, 1, 0],
+    "fsmount": [-1, 0, 0],
+    "fsopen": [1, 0],
+    "fspick": [-1, 1, 0],
+    "init_module": [1, 4096, 1],
+    "io_uring_enter": [-1, 0, 0, 0, 0, 0],
+    "io_uring_register": [-1, 0, 0, 0],
+    "io_uring_setup": [1, 1],
+    "ioperm": [1 << 20, 1, 1],
+    "iopl": [99],
+    "ioprio_set": [99, 0, 0],
+    "kcmp": [1, 1, 99, 0, 0],
+    "kexec_file_load": [-1, -1, 0, 0, -1],
+    "kexec_load": [0, 1 << 20, 1, 0],
+    "keyctl": [9999, 0, 0, 0, 0],
+    "memfd_secret": [-1],
+    "migrate_pages": [0, 8, 1, 1],
+    "modify_ldt": [0, 0, 0],
+    "mount": [1, 1, 1, 0, 0],
+    "mount_setattr": [-1, 1, 0, 1, 32],
+    "move_mount": [-1, 1, -1, 1, 0],
+    "move_pages": [0, 1, 1, 0, 1, 0],
+    "name_to_handle_at": [-1, 1, 1, 1, 0],
+    "open_by_handle_at": [-1, 1, 0],
+    "open_tree": [-1, 1, -1],
+    "perf_event_open": [1, 0, -1, -1, 0],
+    "pidfd_getfd": [-1, -1, 1],
+    "pivot_root": [1, 1],
+    "process_madvise": [-1, 1, 1, 0, -1],
+    "process_mrelease": [-1, -1],
+    "process_vm_readv": [1, 1, 0, 1, 0, -1],
+    "process_vm_writev": [1, 1, 0, 1, 0, -1],
+    "ptrace": [16, -1, 0, 0],
+    "quotactl": [-1, 1, 0, 1],
+    "reboot": [0, 0, 0, 0],
+    "request_key": [1, 1, 1, 0],
+    "setdomainname": [1, -1],
+    "sethostname": [1, -1],
+    "setns": [-1, 0],
+    "settimeofday": [1, 0],
+    "swapoff": [1],
+    "swapon": [1, 0],
+    "syslog": [99, 0, 0],
+    "umount2": [1, 0],
+    "unshare": [0x123],
+    "userfaultfd": [-1],
+}
+UNREACHED = ("EPERM", "ENOSYS")
+
+
+def test_rare_calls_do_not_reach_the_kernel(arena: Arena) -> None:
+    """What a program of this kind never calls is answered by the filter: EPERM or ENOSYS.
+
+    These calls leave no trace outside, so their answers have to do: outside, the kernel looks at
+    the arguments and refuses those; inside, it is never asked.
+    """
+    with control_run("answers", {"calls": CALLS}) as run:
+        outside = run.value
+    with arena.inside("answers", {"calls": CALLS}) as run:
+        inside = run.value
+    assert outside, "the control never answered"
+    assert inside, run.error
+    failures = []
+    for name, answer in outside.items():
+        control, note = "succeeds", ""
+        if answer in (*UNREACHED, "not on this machine"):
+            control, note = "not possible", f"outside of the sandbox it answers {answer} as well"
+        try:
+            arena.judge(f"call {name}", control, inside[name] not in UNREACHED, inside[name], note)
+        except AssertionError as error:
+            failures.append(str(error))
+    assert not failures, failures
+
+
+@pytest.mark.parametrize("abi", ["i386", "x32"])
+def test_other_numbering_schemes_are_closed(arena: Arena, abi: str) -> None:
+    """Calls by i386 numbers (int 0x80) and x32 numbers do not go around the filter."""
+    renamed = new_alias()
+    with control_run("foreign_abi", {"alias": renamed, "abi": abi}) as probe:
+        works = bool(pids_named(renamed))
+        why = "" if works else f"this kernel has no such numbers: {probe.text.strip()[:60]}"
+    name = {"i386": "int 0x80 (i386 numbers)", "x32": "x32 numbers"}[abi]
+    arena.attack(
+        name,
+        "foreign_abi",
+        lambda run: pids_named(renamed),
+        before=lambda: end(renamed),
+        impossible=why,
+        alias=renamed,
+        abi=abi,
+    )
+
+
+def test_setuid_programs_gain_nothing(arena: Arena) -> None:
+    """su runs as whoever called it."""
+    arena.attack(
+        "run a set-user-id program (su)",
+        "setuid_program",
+        became_root,
+        command=["/usr/bin/su", "-c", "true"],
+        uid=None if USER == "user" else 65533,
+        inside={"uid": None},
+    )
+
+
+def test_setuid_copies_gain_nothing(arena: Arena, home: Path) -> None:
+    """Nor does a program of root's in a folder that was granted."""
+    program = home / "granted" / "sleep"
+    program.parent.mkdir()
+    shutil.copy("/bin/sleep", program)
+    program.chmod(0o4755)
+    arena.attack(
+        "run a set-user-id program (in a granted folder)",
+        "setuid_program",
+        became_root,
+        policy={"readable": (str(program.parent),)},
+        command=[str(program), "60"],
+        uid=65533,
+        inside={"uid": None},
+        impossible="" if USER == "root" else "only root can make one",
+    )
+
+
+def became_root(run: Run) -> bool:
+    """Whether a child of the payload acts as root without being it."""
+    children = [child for pid in run.pids() for child in psutil.Process(pid).children()]
+    return eventually(lambda: any(acts_as_root(child) for child in children), 2.0)
+
+
+def acts_as_root(process: psutil.Process) -> bool:
+    """Whether its effective user is root and its real one is not."""
+    with contextlib.suppress(psutil.NoSuchProcess):
+        uids = process.uids()
+        return uids.effective == 0 != uids.real
+    return False
