@@ -114,7 +114,7 @@ class TestPendulum(VectorEnvCompliance):
     """Continuous actions, truncation."""
 
     sample = "pendulum"
-    cases = [*cases(n_envs=(1, 3), modes=("NextStep",)), *cases(modes=("SameStep",))]
+    cases = cases(n_envs=(1, 3), modes=("NextStep",)) + cases(modes=("SameStep",))
     steps = 200
 
     def test_actions_keep_their_precision(self, pair: Pair) -> None:
