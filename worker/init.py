@@ -34,7 +34,7 @@ from typing import Any, NoReturn
 from envhub_worker import launch
 from envhub_worker.channel import Channel, close_fds
 from envhub_worker.jailspec import JailSpec
-from envhub_worker.lockdown import cgroups, inner, process, sweep
+from envhub_worker.lockdown import inner, process, sweep
 from envhub_worker.lockdown.context import Common, JailContext
 from envhub_worker.lockdown.guard import Guard
 from envhub_worker.lockdown.plan import HostFacts, plan
@@ -81,9 +81,7 @@ class Init:
         self._hosts: dict[int, _Host] = {}
         self._running = True
         self._poller = select.poll()
-        self._events = -1
         self._joins: list[int] = []
-        self._oom_kills = 0
 
     def run(self) -> None:
         """Set the jail up and serve until the channel ends."""
@@ -101,8 +99,7 @@ class Init:
 
     def _set_up(self, message: dict[str, Any], fds: list[int]) -> None:
         spec = JailSpec.from_wire(message["spec"])
-        if fds:
-            self._events, *self._joins = fds
+        events, *self._joins = fds or [-1]
         facts = HostFacts(
             machine=os.uname().machine,
             root=self._common.config.user is not None,
@@ -118,7 +115,7 @@ class Init:
             scratch=scratch,
             processes=inner.process_limit(spec.confinement.limits, wanted.namespaced),
         )
-        self._guard = Guard(self._jail, memory=not fds)
+        self._guard = Guard(self._jail, events)
         working = Layer("working-view", True, f"the snapshot, writable as {view}")
         report = [layer.to_wire() for layer in (*wanted.layers, working)]
         self._channel.send({"event": "ready", "report": report})
@@ -145,8 +142,7 @@ class Init:
 
     def _patience(self) -> float | None:
         """Milliseconds until the next look at the limits; a jail without hosts needs none."""
-        left = self._guard.seconds_left() if self._hosts else None
-        return None if left is None else left * 1000 + 1
+        return self._guard.seconds_left() * 1000 + 1 if self._hosts else None
 
     def _look(self) -> None:
         if self._guard.seconds_left() == 0:
@@ -242,8 +238,4 @@ class Init:
             return "exit", ""
         if signum == signal.SIGXCPU:
             return "cpu-limit", f"{self._jail.spec.confinement.limits.cpu_s} CPU seconds used"
-        if signum == signal.SIGKILL and self._events >= 0:
-            before, self._oom_kills = self._oom_kills, cgroups.oom_kills(self._events)
-            if self._oom_kills > before:
-                return "out-of-memory", "the kernel ended it at the limit of its control group"
-        return "signal", ""
+        return self._guard.killed_by_kernel() or ("signal", "")

@@ -8,6 +8,7 @@ import signal
 import time
 from collections.abc import Collection
 
+from envhub_worker.lockdown import cgroups
 from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.watchdog import MemoryWatch, folder_usage, seconds_to_next_look
 from envhub_worker.protocol.confinement import MIB
@@ -15,43 +16,61 @@ from envhub_worker.protocol.confinement import MIB
 # Counting files may take long; it then happens the more seldom.
 _DISK_SHARE = 20
 _DISK_LOOK_S = 0.5
+# The kernel has already acted; this only ends what it left, and gives it its name.
+_EVENTS_LOOK_S = 0.5
 
 
 class Guard:
-    """Memory where no cgroup counts it, and scratch where no quota bounds it."""
+    """Memory, by its control group's account or by measuring; scratch where no quota bounds it."""
 
-    def __init__(self, jail: JailContext, *, memory: bool) -> None:
-        """A guard for ``jail``; ``memory`` says whether to measure that."""
+    def __init__(self, jail: JailContext, events: int) -> None:
+        """A guard for ``jail``.
+
+        Args:
+            jail: The jail.
+            events: Where its control group counts out-of-memory; -1 to measure instead.
+        """
         self._limits = jail.spec.confinement.limits
         tmpfs = jail.scratch.temporary if jail.plan.namespaced else None
-        self._memory = MemoryWatch(self._limits.memory_bytes, tmpfs) if memory else None
+        self._events = events
+        self._seen_kills = 0
+        self._memory = MemoryWatch(self._limits.memory_bytes, tmpfs)
         self._folder = None if jail.plan.namespaced else os.path.dirname(jail.scratch.home)
-        now = time.monotonic()
-        self._memory_due = now if memory else float("inf")
-        self._disk_due = now if self._folder else float("inf")
+        self._memory_due = time.monotonic()
+        self._disk_due = time.monotonic() if self._folder else float("inf")
 
-    def seconds_left(self) -> float | None:
-        """Until the next look; None when nothing is measured."""
-        due = min(self._memory_due, self._disk_due)
-        return None if due == float("inf") else max(0.0, due - time.monotonic())
+    def seconds_left(self) -> float:
+        """Until the next look."""
+        return max(0.0, min(self._memory_due, self._disk_due) - time.monotonic())
 
     def ignore(self, fds: list[int]) -> None:
         """Do not count these files: they are the client's."""
-        if self._memory is not None:
-            self._memory.ignore(fds)
+        self._memory.ignore(fds)
 
     def look(self, pids: Collection[int]) -> tuple[str, str] | None:
         """(reason, detail) when the jail must end, else None."""
         now = time.monotonic()
         verdict = None
-        if self._memory is not None and now >= self._memory_due:
-            verdict = self._look_at_memory(self._memory, pids)
+        if now >= self._memory_due:
+            verdict = self._look_at_events() if self._events >= 0 else self._look_at_memory(pids)
         if verdict is None and self._folder is not None and now >= self._disk_due:
             verdict = self._look_at_disk(self._folder)
         return verdict
 
-    def _look_at_memory(self, watch: MemoryWatch, pids: Collection[int]) -> tuple[str, str] | None:
-        used, hidden = watch.look(pids)
+    def killed_by_kernel(self) -> tuple[str, str] | None:
+        """Whether the kernel has ended a process of the control group for its memory."""
+        if self._events < 0 or cgroups.oom_kills(self._events) <= self._seen_kills:
+            return None
+        self._seen_kills = cgroups.oom_kills(self._events)
+        limit = self._limits.memory_bytes // MIB
+        return "out-of-memory", f"over {limit} MiB: the kernel ended one of its processes"
+
+    def _look_at_events(self) -> tuple[str, str] | None:
+        self._memory_due = time.monotonic() + _EVENTS_LOOK_S
+        return self.killed_by_kernel()
+
+    def _look_at_memory(self, pids: Collection[int]) -> tuple[str, str] | None:
+        used, hidden = self._memory.look(pids)
         for pid in hidden:
             # It runs a program that nobody may read, so that nobody can measure it.
             with contextlib.suppress(ProcessLookupError):
