@@ -1,9 +1,11 @@
-"""Put a new file somewhere."""
+"""Put a new file somewhere, whatever its folder's mode is."""
 
+import contextlib
 import os
 
 
 def attack(path, text):
-    os.makedirs(os.path.dirname(path), exist_ok=True)
+    with contextlib.suppress(OSError):
+        os.chmod(os.path.dirname(path), 0o777)
     with open(path, "w") as file:
         file.write(text)

@@ -1,7 +1,10 @@
-"""Move a file away."""
+"""Move a file away, whatever its folder's mode is."""
 
+import contextlib
 import os
 
 
 def attack(path):
+    with contextlib.suppress(OSError):
+        os.chmod(os.path.dirname(path), 0o777)
     os.rename(path, path + ".gone")
