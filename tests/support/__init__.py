@@ -1,1 +1,1 @@
-"""Helpers that several kinds of tests share."""
+"""What several kinds of tests share."""
