@@ -6,9 +6,12 @@ from __future__ import annotations
 def main() -> None:
     """Run the command line; never returns."""
     import io
+    import os
     import signal
     import sys
 
+    # its bars would get into ours, and into the stderr of scripts
+    os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal that knows ASCII only is no error
             stream.reconfigure(errors="backslashreplace")

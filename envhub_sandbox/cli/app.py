@@ -18,8 +18,8 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command("run", epilog=EXIT_CODES, no_args_is_help=True)(run.run)
-app.command("inspect", epilog=EXIT_CODES, no_args_is_help=True)(inspect.inspect)
+app.command("run", epilog=EXIT_CODES)(run.run)
+app.command("inspect", epilog=EXIT_CODES)(inspect.inspect)
 app.command("doctor")(doctor.doctor)
 app.add_typer(cache.app, name="cache")
 app.command("version")(version.version)

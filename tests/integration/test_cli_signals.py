@@ -8,6 +8,7 @@ import pty
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import psutil
@@ -58,23 +59,25 @@ def test_an_interrupted_run_ends_and_leaves_nothing(
 ) -> None:
     """With its code, no traceback, and every process of the environment gone."""
     (tmp_path / "env.py").write_text(_STEPPING % step_s)
-    folder = tmp_path / "tmp"
-    folder.mkdir()
-    with subprocess.Popen(
-        [*COMMAND, "run", str(tmp_path)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "TMPDIR": str(folder)},
-    ) as process:
+    with (
+        # a short name: socket paths have 108 bytes
+        tempfile.TemporaryDirectory(prefix="e", dir="/tmp") as folder,
+        subprocess.Popen(
+            [*COMMAND, "run", str(tmp_path)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "TMPDIR": folder},
+        ) as process,
+    ):
         # the worker server, its zygote, and a jail below it
         assert eventually(lambda: len(below(process.pid)) >= 3, 120)
         processes = below(process.pid)
         process.send_signal(number)
         out, err = process.communicate(timeout=60)
-    assert (process.returncode, out, err) == (code, "", says)
-    assert eventually(lambda: gone(processes))
-    assert eventually(lambda: not list(folder.iterdir()))
+        assert (process.returncode, out, err) == (code, "", says)
+        assert eventually(lambda: gone(processes))
+        assert eventually(lambda: not os.listdir(folder))
 
 
 @pytest.mark.parametrize(
