@@ -42,6 +42,7 @@ def make_env(
     python: str | Path | None = None,
     num_workers: int | None = None,
     lane: str = "auto",
+    copy: bool = True,
 ) -> EnvSuites:
     """Make the vector environments of a repository, without its code entering this process.
 
@@ -64,6 +65,8 @@ def make_env(
         num_workers: Processes over which the sub-environments are spread; by default one, or with
             ``use_async_envs`` as many as there are cores.
         lane: ``"auto"`` steps over shared memory where that is possible, ``"frames"`` never does.
+        copy: False lends observations instead of copying them, as in Gymnasium; still no later
+            step changes an array that somebody holds, but the worker could.
 
     Returns:
         ``{suite: {task_id: VectorEnv}}``. Environments of a known pin start no process before
@@ -106,6 +109,7 @@ def make_env(
         _interpreter(python),
         snapshot_store.cache_root() / "snapshots",
         lane,
+        copy,
     )
     return _Maker(repository, num_workers).make()
 

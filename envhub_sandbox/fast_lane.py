@@ -8,15 +8,12 @@ the memory away under us (which would be a SIGBUS).
 
 from __future__ import annotations
 
-import fcntl
-import mmap
 import os
 import platform
 import select
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from functools import partial
 from time import perf_counter_ns
 from typing import Any
 
@@ -24,6 +21,8 @@ import numpy as np
 
 from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import RemoteProtocolError, WorkerTimeoutError
+from envhub_sandbox.observations import RING, ObservationSlab
+from envhub_sandbox.slab import SEAL_FUTURE_WRITE, slab
 from envhub_sandbox.spinning import SpinChooser
 from envhub_sandbox.tensors import to_tensor
 from envhub_worker.protocol import messages as m
@@ -32,8 +31,6 @@ from envhub_worker.protocol.columns import Column, columns_of
 from envhub_worker.protocol.manifest import EnvManifest
 
 _RING = (1).to_bytes(8, "little")
-_REPLY_SEALS = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW
-_FUTURE_WRITE = 0x10  # F_SEAL_FUTURE_WRITE, which fcntl does not name
 _RECHECK_MS = 2
 _CONNECT_S = 5.0
 # elsewhere a core may see the sequence word before the data it announces: sleep, do not poll
@@ -51,26 +48,25 @@ class JailGoneError(Exception):
 class LaneShard:
     """The slabs and doorbells of one shard.
 
-    Attributes:
+    Args:
         layout: Where everything lies.
-        fds: What the host gets: request slab, reply slab, its doorbell, ours.
+        observations: The descriptor of the slab that all shards share.
+
+    Attributes:
+        fds: What the host gets: three slabs, its doorbell, ours.
         bell: Our doorbell.
     """
 
-    def __init__(self, layout: slabs.Layout) -> None:
+    def __init__(self, layout: slabs.Layout, observations: int) -> None:
         self.layout = layout
-        self._request, request_fd = _slab("request", layout.request_bytes, _FUTURE_WRITE)
-        self._reply, reply_fd = _slab("reply", layout.reply_bytes, 0)
+        self._request, request_fd = slab("request", layout.request_bytes, SEAL_FUTURE_WRITE)
+        self._reply, reply_fd = slab("reply", layout.reply_bytes)
         self._host_bell = os.eventfd(0, os.EFD_CLOEXEC)
         self.bell = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._slab_fds = [request_fd, reply_fd]
-        self.fds = [request_fd, reply_fd, self._host_bell, self.bell]
+        self.fds = [request_fd, reply_fd, observations, self._host_bell, self.bell]
         self._asks = slabs.words(self._request)
         self._tells = slabs.words(self._reply)
-        self._rows = [_safe_view(self._reply, leaf) for leaf in layout.observations]
-        self._take = [
-            _taker(rows, leaf) for rows, leaf in zip(self._rows, layout.observations, strict=True)
-        ]
         self._columns: list[tuple[Column, Any]] = []
         count, start = layout.count, layout.results
         self._rewards = np.frombuffer(self._reply, np.float64, count, start)
@@ -84,8 +80,8 @@ class LaneShard:
         while self._slab_fds:
             os.close(self._slab_fds.pop())
 
-    def ask(self, leaves: Sequence[Any], spin_ns: int) -> None:
-        """Write a shard's actions and announce them."""
+    def ask(self, leaves: Sequence[Any], slot: int, spin_ns: int) -> None:
+        """Write a shard's actions and announce them; its observations are to go to ``slot``."""
         asks = self._asks
         for index, leaf in enumerate(leaves):
             found = self._views.get((index, leaf.dtype))
@@ -96,6 +92,7 @@ class LaneShard:
             found[1][...] = leaf
         self.sequence += 1
         asks[slabs.SPIN] = spin_ns
+        asks[slabs.SLOT] = slot
         asks[slabs.SEQUENCE] = self.sequence
         if self._tells[slabs.PARKED]:
             os.write(self._host_bell, _RING)
@@ -140,14 +137,6 @@ class LaneShard:
         columns = columns_of(infos) or ()
         self._columns = [(column, column.view(self._reply, start)) for column in columns]
 
-    def rows(self) -> list[Any]:
-        """The observation's leaves: views that the next step changes; booleans as bytes."""
-        return self._rows
-
-    def taken(self) -> list[Any]:
-        """Copies of the observation's leaves."""
-        return [take() for take in self._take]
-
     def columns(self) -> dict[Any, Any]:
         """Infos that came as columns: fresh arrays."""
         if not self._columns:
@@ -176,45 +165,58 @@ class FastLane:
 
     Args:
         manifest: Its spaces.
-        shards: One for each slice of the sub-environments, in order.
-        bounds: The slices.
+        bounds: The slices of the sub-environments, one for each shard.
+        observed: Where the observations lie.
+        layouts: Where each shard's actions and results lie.
         process_fd: Readable once the worker server has ended.
     """
 
     def __init__(
         self,
         manifest: EnvManifest,
-        shards: list[LaneShard],
         bounds: Sequence[tuple[int, int]],
+        observed: slabs.ObservationLayout,
+        layouts: Sequence[slabs.Layout],
         process_fd: int,
     ) -> None:
-        self.shards = shards
+        self.observations = ObservationSlab(manifest.single_observation_space, observed)
+        self.shards = [LaneShard(layout, self.observations.fd) for layout in layouts]
         self._bounds = list(bounds)
-        self._count = manifest.num_envs
         self._action_space = manifest.single_action_space
-        self._assemble = slabs.assembler(manifest.single_observation_space)
-        self._flat_actions = (
-            len(shards[0].layout.actions) == 1 and not shards[0].layout.actions[0].path
-        )
+        leaves = layouts[0].actions
+        self._flat_actions = len(leaves) == 1 and not leaves[0].path
         self._pidfds: list[int] = []
         self._poller = select.poll()
         self._poller.register(process_fd, select.POLLIN)
-        for shard in shards:
+        for shard in self.shards:
             self._poller.register(shard.bell, select.POLLIN)
         self._spin = SpinChooser(_ORDERED_STORES)
         self._asked_ns = 0
 
     @classmethod
     def for_spaces(
-        cls, manifest: EnvManifest, bounds: Sequence[tuple[int, int]], process_fd: int
+        cls,
+        manifest: EnvManifest,
+        bounds: Sequence[tuple[int, int]],
+        process_fd: int,
+        *,
+        copy: bool,
     ) -> FastLane | None:
         """A lane with fresh slabs, or None where the spaces have no fixed layout."""
-        spaces = manifest.single_observation_space, manifest.single_action_space
-        layouts = [slabs.layout_of(*spaces, stop - start) for start, stop in bounds]
+        slots = 1 if copy else 1 + RING
+        space, count = manifest.single_observation_space, manifest.num_envs
+        observed = slabs.observation_layout(space, count, slots)
+        sizes = [stop - start for start, stop in bounds]
+        layouts = [slabs.layout_of(manifest.single_action_space, size) for size in sizes]
         known = [layout for layout in layouts if layout is not None]
-        if len(known) < len(layouts):
+        if observed is None or len(known) < len(layouts):
             return None
-        return cls(manifest, [LaneShard(layout) for layout in known], bounds, process_fd)
+        return cls(manifest, bounds, observed, known, process_fd)
+
+    def attach_message(self, env: int, shard: int) -> m.Attach:
+        """What tells a shard's host which rows of the batch are its own."""
+        layout = self.observations.layout
+        return m.Attach(env, self._bounds[shard][0], layout.count, layout.slots)
 
     def watch_jail(self, pidfd: int) -> None:
         """End waits when the jail ends. Takes the descriptor over."""
@@ -226,11 +228,12 @@ class FastLane:
         leaves = [actions] if self._flat_actions else slabs.flatten(self._action_space, actions)
         self._asked_ns = perf_counter_ns()
         spin_ns = self._spin.host_budget_ns
+        slot = self.observations.choose()
         if len(self.shards) == 1:
-            self.shards[0].ask(leaves, spin_ns)
+            self.shards[0].ask(leaves, slot, spin_ns)
             return
         for shard, (start, stop) in zip(self.shards, self._bounds, strict=True):
-            shard.ask([leaf[start:stop] for leaf in leaves], spin_ns)
+            shard.ask([leaf[start:stop] for leaf in leaves], slot, spin_ns)
 
     def wait(self, deadline: Deadline) -> list[Outcome]:
         """Every shard's outcome.
@@ -282,16 +285,8 @@ class FastLane:
         return False
 
     def observation(self) -> Any:
-        """The batched observation: fresh arrays that belong to the caller."""
-        if len(self.shards) == 1:
-            return self._assemble(self.shards[0].taken())
-        joined = []
-        for index, leaf in enumerate(self.shards[0].layout.observations):
-            whole = np.empty((self._count, *leaf.shape[1:]), leaf.dtype)
-            for shard, (start, stop) in zip(self.shards, self._bounds, strict=True):
-                whole[start:stop] = shard.rows()[index]
-            joined.append(whole)
-        return self._assemble(joined)
+        """The batched observation: arrays that no later step changes."""
+        return self.observations.take()
 
     def flags(self) -> tuple[Any, Any, Any]:
         """Rewards float64, terminations and truncations bool: fresh arrays ``(num_envs,)``."""
@@ -305,17 +300,9 @@ class FastLane:
         """Give everything back."""
         for shard in self.shards:
             shard.close()
+        self.observations.close()
         while self._pidfds:
             os.close(self._pidfds.pop())
-
-
-def _safe_view(buffer: Any, leaf: slabs.Leaf) -> Any:
-    """A leaf's place; booleans as bytes, because a hostile one may be neither 0 nor 1."""
-    return slabs.view(buffer, leaf, np.dtype(np.uint8) if leaf.dtype.kind == "b" else None)
-
-
-def _taker(rows: Any, leaf: slabs.Leaf) -> Callable[[], Any]:
-    return partial(rows.astype, leaf.dtype) if leaf.dtype.kind == "b" else rows.copy
 
 
 def deposit(path: str, session: bytes, jail: int, host: int, fds: Sequence[int]) -> int:
@@ -333,11 +320,3 @@ def deposit(path: str, session: bytes, jail: int, host: int, fds: Sequence[int])
     if data != b"k" or len(received) != 1:
         raise ConnectionError("the worker server did not take the descriptors")
     return received[0]
-
-
-def _slab(name: str, size: int, further_seals: int) -> tuple[mmap.mmap, int]:
-    fd = os.memfd_create(f"envhub-{name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-    os.ftruncate(fd, size)
-    mapped = mmap.mmap(fd, size)
-    fcntl.fcntl(fd, fcntl.F_ADD_SEALS, _REPLY_SEALS | further_seals)
-    return mapped, fd

@@ -321,15 +321,19 @@ class RemoteEnv:
         if path is None or not self.manifest.shardable or self.repository.lane == "frames":
             return None
         manifest, jail = self.manifest, loaded.jail
-        lane = FastLane.for_spaces(manifest, self.bounds, loaded.server.process_fd)
+        fd, copy = loaded.server.process_fd, self.repository.copy
+        lane = FastLane.for_spaces(manifest, self.bounds, fd, copy=copy)
         if lane is None:
             return None
         try:
             for shard, host in zip(lane.shards, self._hosts, strict=True):
                 lane.watch_jail(deposit(path, SESSION, jail.number, host, shard.fds))
                 shard.handed_over()
-            attach = m.Attach(self._number)
-            replies = jail.exchange("attach", [(host, attach) for host in self._hosts], deadline)
+            attach = [
+                (host, lane.attach_message(self._number, index))
+                for index, host in enumerate(self._hosts)
+            ]
+            replies = jail.exchange("attach", attach, deadline)
         except BaseException:
             lane.close()
             raise

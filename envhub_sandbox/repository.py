@@ -65,6 +65,7 @@ class Repository:
         python: The interpreter of the jails; empty for ours.
         store: The folder that snapshots lie in.
         lane: ``"auto"`` or ``"frames"``.
+        copy: Whether observations are copied for the caller, or lent.
     """
 
     def __init__(
@@ -77,6 +78,7 @@ class Repository:
         python: str,
         store: Path,
         lane: str,
+        copy: bool,
     ) -> None:
         self.snapshot = snapshot
         self.arguments = arguments
@@ -84,6 +86,7 @@ class Repository:
         self.timeouts = timeouts
         self.python = python
         self.lane = lane
+        self.copy = copy
         self.report: list[dict[str, Any]] = []
         self._sandbox = sandbox
         self._store = store

@@ -14,8 +14,8 @@ from envhub_worker.channel import close_fds
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import ProtocolError
 
-FDS = 4
-"""Descriptors of one deposit: request slab, reply slab, the host's doorbell, the client's."""
+FDS = 5
+"""Descriptors of one deposit: three slabs, the host's doorbell, the client's."""
 _REQUEST_BYTES = 4096
 _WAIT_S = 1.0
 

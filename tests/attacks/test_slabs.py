@@ -19,28 +19,40 @@ from gymnasium import spaces
 
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_sandbox.fast_lane import LaneShard
+from envhub_sandbox.observations import ObservationSlab
 from envhub_worker.protocol import slabs
 
 WAIT_S = 60
 
 
 @pytest.fixture
-def shard() -> Iterator[LaneShard]:
-    """The client's side of a shard of two sub-environments with boolean observations."""
-    layout = slabs.layout_of(spaces.Box(0, 1, (8,), np.bool_), spaces.Box(-1, 1, (2,)), 2)
+def observations() -> Iterator[ObservationSlab]:
+    """The slab of boolean observations of two sub-environments."""
+    space = spaces.Box(0, 1, (8,), np.bool_)
+    layout = slabs.observation_layout(space, 2, 1)
     assert layout is not None
-    made = LaneShard(layout)
+    made = ObservationSlab(space, layout)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def shard(observations: ObservationSlab) -> Iterator[LaneShard]:
+    """The client's side of the shard that has both of them."""
+    layout = slabs.layout_of(spaces.Box(-1, 1, (2,)), 2)
+    assert layout is not None
+    made = LaneShard(layout, observations.fd)
     yield made
     made.close()
 
 
 def attack(shard: LaneShard, code: str) -> str:
-    """Run code in a process that holds the descriptors ``request`` and ``reply``."""
-    request, reply = shard.fds[:2]
+    """Run code in a process that holds ``request``, ``reply`` and ``observations``."""
+    request, reply, observations = shard.fds[:3]
     layout = shard.layout
     head = f"""
 import ctypes, errno, mmap, os, struct
-request, reply = {request}, {reply}
+request, reply, observations = {request}, {reply}, {observations}
 request_bytes, reply_bytes = {layout.request_bytes}, {layout.reply_bytes}
 def outcome(call, *arguments, **keywords):
     try:
@@ -51,18 +63,13 @@ def outcome(call, *arguments, **keywords):
 """
     done = subprocess.run(
         [sys.executable, "-c", head + code],
-        pass_fds=(request, reply),
+        pass_fds=(request, reply, observations),
         capture_output=True,
         text=True,
         timeout=WAIT_S,
         check=True,
     )
     return done.stdout.strip()
-
-
-def ask_and_answer(shard: LaneShard) -> None:
-    """One request, so that there is something to answer."""
-    shard.ask([np.zeros((2, 2), np.float32)], 0)
 
 
 def test_unsealed_memory_kills_its_reader() -> None:
@@ -79,18 +86,18 @@ mapped[0]
     assert done.returncode == -signal.SIGBUS
 
 
-@pytest.mark.parametrize("name", ["request", "reply"])
+@pytest.mark.parametrize("name", ["request", "reply", "observations"])
 @pytest.mark.parametrize("size", ["0", "1 << 30"])
 def test_a_slab_cannot_be_cut_or_grown(shard: LaneShard, name: str, size: str) -> None:
-    """Neither slab changes its size, so the client cannot be made to fault."""
+    """No slab changes its size, so the client cannot be made to fault."""
+    before = [os.fstat(fd).st_size for fd in shard.fds[:3]]
     assert attack(shard, f"outcome(os.ftruncate, {name}, {size})") == "EPERM"
-    assert os.fstat(shard.fds[0]).st_size == shard.layout.request_bytes
-    assert os.fstat(shard.fds[1]).st_size == shard.layout.reply_bytes
+    assert [os.fstat(fd).st_size for fd in shard.fds[:3]] == before
 
 
 def test_the_seals_cannot_be_taken_off(shard: LaneShard) -> None:
     """Nobody can add or remove a seal any more."""
-    for name in ("request", "reply"):
+    for name in ("request", "reply", "observations"):
         assert attack(shard, f"import fcntl; outcome(fcntl.fcntl, {name}, 1033, 8)") == "EPERM"
 
 
@@ -129,7 +136,7 @@ print(libc.fallocate(reply, 3, 0, 4096), errno.errorcode.get(ctypes.get_errno())
 )
 def test_an_impossible_header_is_refused(shard: LaneShard, outcome: int, length: int) -> None:
     """Words out of range never become a slice or an allocation."""
-    ask_and_answer(shard)
+    shard.ask([np.zeros((2, 2), np.float32)], 0, 0)
     words = f"struct.pack('QQ', {outcome}, {length})"
     attack(shard, f"os.pwrite(reply, {words}, {slabs.OUTCOME * 8})")
     with pytest.raises(RemoteProtocolError):
@@ -139,7 +146,7 @@ def test_an_impossible_header_is_refused(shard: LaneShard, outcome: int, length:
 @pytest.mark.parametrize("bytes_", ["b'\\x80\\x04.'", "os.urandom(64)", "b'\\xff' * 64"])
 def test_garbage_for_infos_is_refused(shard: LaneShard, bytes_: str) -> None:
     """What lies in the info area is decoded by the same suspicious code as a message."""
-    ask_and_answer(shard)
+    shard.ask([np.zeros((2, 2), np.float32)], 0, 0)
     attack(
         shard,
         f"os.pwrite(reply, {bytes_}, {shard.layout.infos})\n"
@@ -151,7 +158,7 @@ def test_garbage_for_infos_is_refused(shard: LaneShard, bytes_: str) -> None:
 
 def test_columns_without_a_schema_are_refused(shard: LaneShard) -> None:
     """Columns are read by the client's own schema only, and there is none yet."""
-    ask_and_answer(shard)
+    shard.ask([np.zeros((2, 2), np.float32)], 0, 0)
     attack(shard, f"os.pwrite(reply, struct.pack('QQ', {slabs.COLUMNS}, 0), {slabs.OUTCOME * 8})")
     kind, message = shard.outcome()
     assert (kind, message) == (slabs.COLUMNS, None)
@@ -159,24 +166,32 @@ def test_columns_without_a_schema_are_refused(shard: LaneShard) -> None:
         shard.columns()
 
 
-def test_bytes_that_are_no_booleans_become_booleans(shard: LaneShard) -> None:
+def test_bytes_that_are_no_booleans_become_booleans(
+    shard: LaneShard, observations: ObservationSlab
+) -> None:
     """A flag or a boolean observation of 2 would be neither true nor false: it is made true."""
     layout = shard.layout
     os.pwrite(shard.fds[1], b"\x02" * 4, layout.results + 16)
-    os.pwrite(shard.fds[1], b"\x02" * 16, layout.observations[0].offset)
+    os.pwrite(observations.fd, b"\x02" * 16, 0)
     _, terminations, truncations = shard.results()
-    [observation] = shard.taken()
+    observation = observations.take()
     for array in (terminations, truncations, observation):
         assert array.dtype == np.bool_
         assert set(array.tobytes()) == {1}
 
 
-def test_what_the_caller_has_is_not_rewritten(shard: LaneShard) -> None:
+def test_what_the_caller_has_is_not_rewritten(
+    shard: LaneShard, observations: ObservationSlab
+) -> None:
     """Results are copies: a later write of the jail changes nothing that was handed out."""
     rewards, terminations, _ = shard.results()
-    [observation] = shard.taken()
-    attack(shard, "m = mmap.mmap(reply, reply_bytes); m[:] = b'\\x01' * reply_bytes")
+    observation = observations.take()
+    attack(
+        shard,
+        "m = mmap.mmap(reply, reply_bytes); m[:] = b'\\x01' * reply_bytes\n"
+        "os.pwrite(observations, b'\\x01' * 64, 0)",
+    )
     assert rewards.tolist() == [0.0, 0.0]
     assert not terminations.any()
     assert not observation.any()
-    assert shard.taken()[0].all()
+    assert observations.take().all()

@@ -31,43 +31,55 @@ LOOSE = [
 ]
 
 
-def extents(layout: slabs.Layout) -> list[tuple[int, int]]:
-    """Start and end of everything in the reply slab, in order."""
-    found = [(0, slabs.HEADER_BYTES), (layout.results, layout.results + layout.results_bytes)]
-    for leaf in layout.observations:
+def sizes(leaves: tuple[slabs.Leaf, ...]) -> list[tuple[int, int]]:
+    """Start and end of each leaf."""
+    found = []
+    for leaf in leaves:
         size = int(np.prod(leaf.shape)) * leaf.dtype.itemsize
         found.append((leaf.offset, leaf.offset + size))
-    return [*found, (layout.infos, layout.infos + slabs.INFO_BYTES)]
+    return found
+
+
+def assert_apart(areas: list[tuple[int, int]], total: int) -> None:
+    """Every area starts after the one before it has ended, aligned, and inside the slab."""
+    assert all(end <= start for (_, end), (start, _) in pairwise(areas))
+    assert all(start % slabs.LINE == 0 for start, _ in areas)
+    assert areas[-1][1] <= total
 
 
 @pytest.mark.parametrize("space", FIXED, ids=str)
 @pytest.mark.parametrize("count", [1, 3, 64])
 def test_nothing_in_a_slab_overlaps(space: gym.Space[Any], count: int) -> None:
-    """Every area starts after the one before it has ended, aligned, and inside the slab."""
-    layout = slabs.layout_of(space, space, count)
+    """Header, results, infos, leaves and slots lie apart."""
+    layout = slabs.layout_of(space, count)
+    observed = slabs.observation_layout(space, count, 3)
     assert layout is not None
-    found = extents(layout)
-    assert all(end <= start for (_, end), (start, _) in pairwise(found))
-    assert all(start % slabs.LINE == 0 for start, _ in found)
-    assert found[-1][1] <= layout.reply_bytes
-    for leaf in layout.actions:
+    assert observed is not None
+    results = (layout.results, layout.results + 10 * count)
+    infos = (layout.infos, layout.infos + slabs.INFO_BYTES)
+    assert_apart([(0, slabs.HEADER_BYTES), results, infos], layout.reply_bytes)
+    assert_apart(sizes(observed.leaves), observed.slot_bytes)
+    assert observed.slot_bytes % slabs.LINE == 0
+    assert layout.actions[0].offset >= slabs.HEADER_BYTES
+    for leaf in layout.actions:  # an action may come in a wider dtype than its space's
         assert leaf.offset + int(np.prod(leaf.shape)) * 8 <= layout.request_bytes
 
 
 @pytest.mark.parametrize("space", FIXED, ids=str)
 def test_a_batch_survives_its_leaves(space: gym.Space[Any]) -> None:
-    """Written leaf by leaf into a slab and assembled again, a batch is what it was."""
-    layout = slabs.layout_of(space, spaces.Discrete(2), 3)
+    """Written leaf by leaf into a slot and assembled again, a batch is what it was."""
+    layout = slabs.observation_layout(space, 3, 2)
     assert layout is not None
     batched = batch_space(space, 3)
     batched.seed(7)
     batch = batched.sample()
-    memory = bytearray(layout.reply_bytes)
-    views = [slabs.view(memory, leaf) for leaf in layout.observations]
+    memory = bytearray(2 * layout.slot_bytes)
+    views = [slabs.view(memory, leaf, base=layout.slot_bytes) for leaf in layout.leaves]
     for view, leaf in zip(views, slabs.flatten(space, batch), strict=True):
         view[...] = leaf
+    assert not any(memory[: layout.slot_bytes])
     again = slabs.assembler(space)(views)
-    assert gym.vector.utils.batch_space(space, 3).contains(again)
+    assert batched.contains(again)
     for one, other in zip(slabs.flatten(space, again), slabs.flatten(space, batch), strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -75,20 +87,21 @@ def test_a_batch_survives_its_leaves(space: gym.Space[Any]) -> None:
 @pytest.mark.parametrize("space", LOOSE, ids=str)
 def test_a_space_without_a_fixed_layout_has_no_slab(space: gym.Space[Any]) -> None:
     """Text, sequences and graphs go as frames."""
-    assert slabs.layout_of(space, BOX, 2) is None
-    assert slabs.layout_of(BOX, space, 2) is None
+    assert slabs.layout_of(space, 2) is None
+    assert slabs.observation_layout(space, 2, 1) is None
 
 
 def test_a_slab_over_the_limit_is_not_made() -> None:
     """Pinned memory has a bound; what is larger goes as frames."""
     huge = spaces.Box(0, 1, (slabs.MAX_SLAB_BYTES // 8, 2), np.float64)
-    assert slabs.layout_of(huge, BOX, 1) is None
+    assert slabs.layout_of(huge, 1) is None
+    assert slabs.observation_layout(huge, 1, 1) is None
 
 
 def test_too_many_leaves_have_no_slab() -> None:
     """The header has one word for the dtype of each action leaf."""
     many = spaces.Dict({str(i): spaces.Discrete(2) for i in range(slabs.MAX_LEAVES + 1)})
-    assert slabs.layout_of(BOX, many, 1) is None
+    assert slabs.layout_of(many, 1) is None
 
 
 def test_every_action_dtype_has_one_code() -> None:

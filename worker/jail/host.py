@@ -23,7 +23,6 @@ from envhub_worker.jail.subenvs import SubEnvs
 from envhub_worker.jail.tasks import ResultError, Task, tasks_of
 from envhub_worker.jailspec import JailSpec
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol import slabs
 from envhub_worker.protocol.manifest import encode_env, encode_manifest
 from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
 
@@ -142,13 +141,9 @@ class Host:
     def attach(self, request: m.Attach) -> m.Message:
         """Serve an environment's steps over slabs from now on."""
         env = self._envs[request.env]
-        layout = None
-        if isinstance(env, SubEnvs) and not env.reward_shape:
-            spaces = env.single_observation_space, env.single_action_space
-            layout = slabs.layout_of(*spaces, env.num_envs)
-        if layout is None:
+        if not isinstance(env, SubEnvs) or env.reward_shape:
             return m.Value(False)
-        self.lane = Lane(env, layout, self.descriptors)
+        self.lane = Lane(env, request, self.descriptors)
         return m.Value(True)
 
     def fetch_infos(self, request: m.FetchInfos) -> m.Message:

@@ -13,6 +13,8 @@ from dataclasses import replace
 from time import perf_counter_ns
 from typing import Any
 
+import numpy as np
+
 from envhub_worker.jail.failure import raised
 from envhub_worker.jail.infos import InfoWriter, Pairs, join
 from envhub_worker.jail.subenvs import SubEnvs
@@ -27,16 +29,24 @@ class Lane:
 
     Args:
         env: Its sub-environments.
-        layout: Where everything lies.
-        fds: Request slab, reply slab, our doorbell, the client's. Owned from now on.
+        attach: Which rows of the batch they are, and how many slots there are.
+        fds: Request slab, reply slab, observation slab, our doorbell, the client's. Owned from
+            now on.
     """
 
-    def __init__(self, env: SubEnvs, layout: slabs.Layout, fds: list[int]) -> None:
-        request, reply, self.bell, self._client_bell = fds
-        self._request = mmap.mmap(request, layout.request_bytes, prot=mmap.PROT_READ)
-        self._reply = mmap.mmap(reply, layout.reply_bytes)
-        os.close(request)
-        os.close(reply)
+    def __init__(self, env: SubEnvs, attach: m.Attach, fds: list[int]) -> None:
+        layout = slabs.layout_of(env.single_action_space, env.num_envs)
+        observed = slabs.observation_layout(
+            env.single_observation_space, attach.count, attach.slots
+        )
+        if layout is None or observed is None:
+            raise ValueError("these spaces have no fixed layout")
+        *slab_fds, self.bell, self._client_bell = fds
+        self._request = mmap.mmap(slab_fds[0], layout.request_bytes, prot=mmap.PROT_READ)
+        self._reply = mmap.mmap(slab_fds[1], layout.reply_bytes)
+        self._observations = mmap.mmap(slab_fds[2], observed.slots * observed.slot_bytes)
+        for fd in slab_fds:
+            os.close(fd)
         os.set_blocking(self.bell, False)
         self._asked = slabs.words(self._request)
         self._told = slabs.words(self._reply)
@@ -47,7 +57,22 @@ class Lane:
         self._views: dict[tuple[int, int], Any] = {}
         self._pairs: Pairs = []
         self._writer = InfoWriter(self._reply, layout.infos, layout.count)
-        env.batch.move(layout, self._reply)
+        self._slot = 0
+        self._move(attach.start, observed)
+
+    def _move(self, start: int, observed: slabs.ObservationLayout) -> None:
+        """Have the environment write into the slabs."""
+        batch, count, results = self._env.batch, self._layout.count, self._layout.results
+        block = np.frombuffer(self._reply, np.uint8, 10 * count, results)
+        batch.rewards = block[: 8 * count].view(np.float64)
+        batch.terminations = block[8 * count : 9 * count].view(np.bool_)
+        batch.truncations = block[9 * count :].view(np.bool_)
+        bases = [slot * observed.slot_bytes for slot in range(observed.slots)]
+        rows = [[self._rows(leaf, base, start) for leaf in observed.leaves] for base in bases]
+        batch.write_to(rows)
+
+    def _rows(self, leaf: slabs.Leaf, base: int, start: int) -> Any:
+        return slabs.view(self._observations, leaf, base=base)[start : start + self._layout.count]
 
     def rest(self) -> None:
         """Before sleeping: ask for the doorbell, and serve what came in the meantime."""
@@ -87,6 +112,10 @@ class Lane:
 
     def _run(self) -> tuple[int, int]:
         try:
+            slot = self._asked[slabs.SLOT]
+            if slot != self._slot:
+                self._env.batch.choose(slot)
+                self._slot = slot
             pairs = self._pairs = self._env.run_step(self._actions())
             return self._writer.write(pairs) if pairs else (slabs.DONE, 0)
         except BaseException as error:

@@ -39,33 +39,30 @@ class Batch:
         self.rewards = np.zeros((count, *reward_shape))
         self.terminations = np.zeros(count, np.bool_)
         self.truncations = np.zeros(count, np.bool_)
-        layout = slabs.layout_of(space, spaces.Discrete(1), count)
+        self._slots: list[tuple[list[Any], Store]] = []
+        self._slot = 0
+        layout = slabs.observation_layout(space, count, 1)
         if layout is None:
             self.store: Store = self._members.__setitem__
-            return
-        self._use([np.zeros(leaf.shape, leaf.dtype) for leaf in layout.observations])
+        else:
+            self.write_to([[np.zeros(leaf.shape, leaf.dtype) for leaf in layout.leaves]])
 
-    def _use(self, leaves: list[Any]) -> None:
-        self._leaves = leaves
-        self.store = _writer(self._space, iter(leaves))
+    def write_to(self, slots: list[list[Any]]) -> None:
+        """Write observations into these leaves from now on: one list for each slot."""
+        self._slots = [(leaves, _writer(self._space, iter(leaves))) for leaves in slots]
+        self.choose(0)
 
-    def move(self, layout: slabs.Layout, reply: Any) -> None:
-        """Write into a reply slab from now on."""
-        start, count = layout.results, layout.count
-        block = np.frombuffer(reply, np.uint8, layout.results_bytes, start)
-        self.rewards = block[: 8 * count].view(np.float64)
-        self.terminations = block[8 * count : 9 * count].view(np.bool_)
-        self.truncations = block[9 * count :].view(np.bool_)
-        self._use([slabs.view(reply, leaf) for leaf in layout.observations])
+    def choose(self, slot: int) -> None:
+        """Write the next observations into another slot."""
+        self._slot = slot
+        self.store = self._slots[slot][1]
 
     def observation(self) -> Any:
         """The batched observation; views of the arrays that the next step writes."""
-        if self._leaves is not None:
-            return slabs.assembler(self._space)(self._leaves)
+        if self._slots:
+            return slabs.assembler(self._space)(self._slots[self._slot][0])
         empty: Any = create_empty_array(self._space, n=self._count, fn=np.zeros)
         return concatenate(self._space, self._members, empty)
-
-    _leaves: list[Any] | None = None
 
 
 class SubEnvs(SyncVectorEnv):

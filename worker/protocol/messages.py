@@ -22,6 +22,8 @@ from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 
 VERSION = 1
 """The protocol's version: what ``Hello`` offers and ``Welcome`` agrees to."""
+FIRST_HOST_KIND = 32
+"""Kinds from here on are between client and jail host; a host may send no other."""
 
 
 class Message:
@@ -400,11 +402,15 @@ class Close(Message):
 class Attach(Message):
     """Serve an environment's steps over the slabs and doorbells that come along.
 
-    The descriptors: request slab, reply slab, the host's doorbell, the client's doorbell.
-    Reply: ``Value``; False where the environment's spaces have no fixed layout.
+    The descriptors: request slab, reply slab, observation slab, the host's doorbell, the
+    client's. The shard's rows of a batch of ``count`` begin at ``start``. Reply: ``Value``; False
+    where the environment has no fixed layout.
     """
 
     env: int
+    start: int
+    count: int
+    slots: int
 
 
 @_message(51)
@@ -474,7 +480,7 @@ def unpack(
     kind, request_id, *rest = value
     cls = KINDS.get(kind) if type(kind) is int else None
     if cls is None or type(request_id) is not int:
-        raise RemoteProtocolError(f"unknown message kind {str(kind)[:40]}")
+        raise RemoteProtocolError(f"unknown message kind {str(kind)[:40]!r}")
     _check_fields(cls, rest)
     return request_id, cls(*rest)
 

@@ -2,13 +2,16 @@
 
 Two slabs a shard. The *request* slab is written by the client and sealed against the jail's
 writes; the *reply* slab is written by the jail. Each starts with a header of 64-bit words, those
-that are polled on a cache line of their own, and holds its arrays at 64-byte boundaries. The
-client never follows an offset or a length that it has not computed or bounded itself.
+that are polled on a cache line of their own. All shards share the *observation* slab, and write
+their rows of the batch in it; it holds one batch, or several in turn (slots). Arrays lie at
+64-byte boundaries. The client never follows an offset or a length that it has not computed or
+bounded itself.
 
 ::
 
-    request   header | one area per action leaf
-    reply     header | rewards, terminations, truncations | observation leaves | infos, encoded
+    request       header | one area per action leaf
+    reply         header | rewards, terminations, truncations | infos, encoded
+    observations  slot 0: one area per leaf | slot 1 ...
 
 Only ``step`` goes this way; everything else is a message.
 """
@@ -43,9 +46,12 @@ LENGTH = 17
 """Reply: bytes of the encoded infos, or of what was raised; 0 for an empty info."""
 SPIN = 16
 """Request: nanoseconds that the shard may wait for the next request without sleeping."""
+SLOT = 17
+"""Request: the slot of the observation slab that the shard writes."""
 DTYPES = 24
 """Request: the dtype code of each action leaf, one word each, up to ``MAX_LEAVES``."""
 MAX_LEAVES = 64
+MAX_SLOTS = 16
 HEADER_WORDS = DTYPES + MAX_LEAVES
 HEADER_BYTES = HEADER_WORDS * 8
 
@@ -87,15 +93,13 @@ class Leaf:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where everything lies for ``count`` sub-environments.
+    """Where a shard's actions and results lie.
 
     Attributes:
         count: Sub-environments of the shard.
         actions: Leaves of the action space, in the request slab.
         request_bytes: Size of the request slab.
         results: Offset of the block of rewards (float64), terminations and truncations (bool).
-        results_bytes: Its size.
-        observations: Leaves of the observation space, in the reply slab.
         infos: Offset of the encoded infos.
         reply_bytes: Size of the reply slab.
     """
@@ -104,32 +108,48 @@ class Layout:
     actions: tuple[Leaf, ...]
     request_bytes: int
     results: int
-    results_bytes: int
-    observations: tuple[Leaf, ...]
     infos: int
     reply_bytes: int
 
 
-def layout_of(observation: gym.Space[Any], action: gym.Space[Any], count: int) -> Layout | None:
-    """The layout for ``count`` members of two single spaces, or None if they have no fixed one."""
-    observed, acted = list(_leaves(observation)), list(_leaves(action))
-    if None in observed or None in acted or max(len(observed), len(acted)) > MAX_LEAVES:
+@dataclass(frozen=True)
+class ObservationLayout:
+    """Where the observations of all shards lie: whole batches, one after the other.
+
+    Attributes:
+        count: Sub-environments of all shards together.
+        leaves: Leaves of the observation space in the first slot.
+        slots: Number of batches.
+        slot_bytes: Size of one.
+    """
+
+    count: int
+    leaves: tuple[Leaf, ...]
+    slots: int
+    slot_bytes: int
+
+
+def layout_of(action: gym.Space[Any], count: int) -> Layout | None:
+    """A shard's layout for a single action space, or None if it has no fixed one."""
+    leaves = list(_leaves(action))
+    if None in leaves or len(leaves) > MAX_LEAVES:
         return None
-    actions, request_bytes = _placed(acted, count, HEADER_BYTES, _ACTION_ITEM_BYTES)
-    results = HEADER_BYTES
-    results_bytes = count * (8 + 1 + 1)
-    observations, infos = _placed(observed, count, _aligned(results + results_bytes), None)
-    made = Layout(
-        count=count,
-        actions=actions,
-        request_bytes=request_bytes,
-        results=results,
-        results_bytes=results_bytes,
-        observations=observations,
-        infos=infos,
-        reply_bytes=_aligned(infos + INFO_BYTES),
-    )
-    return made if max(made.request_bytes, made.reply_bytes) <= MAX_SLAB_BYTES else None
+    actions, request_bytes = _placed(leaves, count, HEADER_BYTES, _ACTION_ITEM_BYTES)
+    infos = _aligned(HEADER_BYTES + count * (8 + 1 + 1))
+    if request_bytes > MAX_SLAB_BYTES:
+        return None
+    return Layout(count, actions, request_bytes, HEADER_BYTES, infos, infos + INFO_BYTES)
+
+
+def observation_layout(space: gym.Space[Any], count: int, slots: int) -> ObservationLayout | None:
+    """The layout for a single observation space, or None if it has no fixed one."""
+    leaves = list(_leaves(space))
+    if None in leaves or len(leaves) > MAX_LEAVES:
+        return None
+    placed, slot_bytes = _placed(leaves, count, 0, None)
+    if slot_bytes * slots > MAX_SLAB_BYTES:
+        return None
+    return ObservationLayout(count, placed, slots, max(slot_bytes, LINE))
 
 
 def _leaves(space: gym.Space[Any], path: tuple[Any, ...] = ()) -> Iterator[Any]:
@@ -159,9 +179,9 @@ def _aligned(offset: int) -> int:
     return -(-offset // LINE) * LINE
 
 
-def view(buffer: Any, leaf: Leaf, dtype: np.dtype[Any] | None = None) -> Array:
-    """A leaf's array in a mapped slab."""
-    made: Array = np.ndarray(leaf.shape, dtype or leaf.dtype, buffer, leaf.offset)
+def view(buffer: Any, leaf: Leaf, dtype: np.dtype[Any] | None = None, base: int = 0) -> Array:
+    """A leaf's array in a mapped slab; ``base`` is the offset of its slot."""
+    made: Array = np.ndarray(leaf.shape, dtype or leaf.dtype, buffer, base + leaf.offset)
     return made
 
 

@@ -1,0 +1,87 @@
+"""Observations out of shared memory: copies that the caller owns, or slots that it borrows.
+
+With one slot every batch is copied out. With a ring of slots (``copy=False``) a batch is handed
+out where it lies, and its slot is written again only when nobody holds an array of it any more:
+each array refers to its slot's ``memoryview``, whose reference count tells. When all are held, the
+batch goes through the spare slot and is copied.
+
+Trust: a borrowed batch lies in memory that the jail can still write.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from envhub_sandbox.slab import slab
+from envhub_worker.protocol import slabs
+
+RING = 4
+"""Slots that are handed out: the last two batches, and two that a caller keeps."""
+_SPARE = 0
+
+
+class ObservationSlab:
+    """The slab that all shards write their rows into.
+
+    Args:
+        space: The single observation space.
+        layout: Where everything lies.
+
+    Attributes:
+        fd: Its descriptor, for the hosts.
+        layout: Where everything lies.
+    """
+
+    def __init__(self, space: gym.Space[Any], layout: slabs.ObservationLayout) -> None:
+        self.layout = layout
+        size = layout.slots * layout.slot_bytes
+        self._memory, self.fd = slab("observations", size)
+        self._assemble = slabs.assembler(space)
+        whole = memoryview(self._memory)
+        self._slots = [
+            whole[index * layout.slot_bytes : (index + 1) * layout.slot_bytes]
+            for index in range(layout.slots)
+        ]
+        self._copies = [_copier(self._slots[_SPARE], leaf) for leaf in layout.leaves]
+        self._unheld = [sys.getrefcount(slot) for slot in self._slots]
+        self._chosen = _SPARE
+
+    def choose(self) -> int:
+        """The slot for the next batch: the lowest that nobody holds, so that few stay hot."""
+        self._chosen = _SPARE
+        for index in range(1, len(self._slots)):
+            if sys.getrefcount(self._slots[index]) == self._unheld[index]:
+                self._chosen = index
+                break
+        return self._chosen
+
+    def take(self) -> Any:
+        """The batch in the chosen slot, in the structure of the space."""
+        if self._chosen == _SPARE:
+            return self._assemble([copy() for copy in self._copies])
+        slot = self._slots[self._chosen]
+        return self._assemble([_borrowed(slot, leaf) for leaf in self.layout.leaves])
+
+    def close(self) -> None:
+        """Give the descriptor back; the memory goes with the last array over it."""
+        os.close(self.fd)
+
+
+def _copier(slot: memoryview, leaf: slabs.Leaf) -> Callable[[], Any]:
+    if leaf.dtype.kind == "b":
+        # a hostile byte of 2 would make a boolean that is neither
+        return partial(slabs.view(slot, leaf, np.dtype(np.uint8)).astype, np.bool_)
+    return slabs.view(slot, leaf).copy
+
+
+def _borrowed(slot: memoryview, leaf: slabs.Leaf) -> Any:
+    if leaf.dtype.kind == "b":
+        return slabs.view(slot, leaf, np.dtype(np.uint8)).astype(np.bool_)
+    return slabs.view(slot, leaf)

@@ -1,0 +1,78 @@
+"""``copy=False``: observations that are lent, and still never change under whoever holds them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.observations import RING
+from tests.support.compare import assert_same
+from tests.support.samples import sample
+
+STEPS = 40
+
+
+def rollout(keep: int, *, copy: bool, num_workers: int) -> tuple[list[Any], list[Any]]:
+    """Observations as they were when they came, and as they are at the end, for those kept."""
+    with make_env(
+        sample("counter"), n_envs=3, use_async_envs=True, copy=copy, num_workers=num_workers
+    ) as suites:
+        env = suites.env
+        env.reset(seed=3)
+        env.action_space.seed(3)
+        seen, kept = [], []
+        for _ in range(STEPS):
+            observation = env.step(env.action_space.sample())[0]
+            seen.append(_copied(observation))
+            kept.append(observation)
+            if len(kept) > keep:
+                kept.pop(0)
+            del observation
+        return seen, kept
+
+
+def _copied(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _copied(item) for key, item in value.items()}
+    if isinstance(value, tuple):
+        return tuple(map(_copied, value))
+    return np.array(value)
+
+
+@pytest.mark.parametrize("num_workers", [1, 3])
+@pytest.mark.parametrize("keep", [1, 2, RING, RING + 3, STEPS])
+def test_what_is_held_never_changes(keep: int, num_workers: int) -> None:
+    """However many batches a caller keeps, each stays as it was when it came."""
+    seen, kept = rollout(keep, copy=False, num_workers=num_workers)
+    assert_same(seen[-len(kept) :], [_copied(observation) for observation in kept])
+
+
+def test_lent_and_owned_observations_are_the_same() -> None:
+    """The option changes who owns the memory, and nothing else."""
+    lent, _ = rollout(1, copy=False, num_workers=1)
+    owned, _ = rollout(1, copy=True, num_workers=1)
+    assert_same(owned, lent)
+
+
+def test_a_view_holds_its_batch() -> None:
+    """A slice that outlives its array keeps the slot from being written again."""
+    with make_env(sample("cartpole"), n_envs=2, copy=False) as suites:
+        env = suites.env
+        env.reset(seed=1)
+        rows = [env.step([0, 1])[0][1, 1:3] for _ in range(3 * RING)]
+        values = [row.copy() for row in rows]
+        for _ in range(3 * RING):
+            env.step([1, 0])
+        np.testing.assert_array_equal(rows, values)
+
+
+def test_what_is_held_outlives_the_environment() -> None:
+    """Closing gives the processes back, not the memory that somebody still reads."""
+    with make_env(sample("cartpole"), n_envs=2, copy=False) as suites:
+        suites.env.reset(seed=1)
+        observation = suites.env.step([0, 1])[0]
+        before = observation.copy()
+    np.testing.assert_array_equal(observation, before)
