@@ -92,6 +92,7 @@ class Tree:
         self._folders = [f"{folder}/{_PREFIX}{os.getpid()}-{name}" for folder in hierarchy.folders]
         _remove_abandoned(hierarchy.folders)
         if self.kind == "cgroup-v2":
+            _step_aside(hierarchy.folders[0])
             _enable(hierarchy.folders[0])
         for folder in self._folders:
             os.mkdir(folder)
@@ -125,6 +126,21 @@ def _remove_tree(folder: str) -> None:
     with contextlib.suppress(FileNotFoundError):
         groups = [entry.path for entry in os.scandir(folder) if entry.is_dir()]
         _remove([*groups, folder])
+
+
+def _step_aside(folder: str) -> None:
+    """Move the processes of ``folder`` into a leaf below it.
+
+    A v2 group that holds processes may not limit groups below it, unless it is the top one.
+    """
+    with open(f"{folder}/cgroup.procs") as file:
+        pids = file.read().split()
+    if not pids or not os.path.exists(f"{folder}/cgroup.type"):
+        return  # the top one has no type
+    leaf = f"{folder}/{_PREFIX}{os.getpid()}-leaf"
+    os.makedirs(leaf, exist_ok=True)
+    for pid in pids:
+        _write(f"{leaf}/cgroup.procs", pid)
 
 
 def _enable(folder: str) -> None:

@@ -1,0 +1,118 @@
+"""What of the host's files a jail sees, over a host that is made up."""
+
+from __future__ import annotations
+
+import pytest
+
+from envhub_worker.lockdown.root_plan import HostFiles, RootPlan, gpu_devices, outermost, plan_root
+
+FOLDERS = {
+    "/",
+    "/usr",
+    "/usr/bin",
+    "/usr/lib",
+    "/etc/fonts",
+    "/opt/py",
+    "/opt/py/lib",
+    "/data/store",
+    "/home/ann",
+    "/home/ann/proj",
+    "/sys/devices/system/cpu",
+}
+FILES = {"/etc/ld.so.cache", "/etc/resolv.conf", "/etc/hosts"}
+LINKS = {"/bin": "usr/bin", "/lib": "usr/lib", "/python": "/opt/py", "/opt/py/current": "lib"}
+LISTINGS = {
+    "/dev": ["null", "nvidia0", "nvidiactl", "nvidia-caps", "kfd", "sda", "kvm"],
+    "/dev/nvidia-caps": ["nvidia-cap1"],
+    "/dev/dri": ["card0", "renderD128", "by-path"],
+}
+HOST = HostFiles(
+    exists=lambda path: path in FOLDERS | FILES,
+    readlink=LINKS.get,
+    listdir=lambda path: LISTINGS.get(path, []),
+)
+
+
+def root(
+    interpreter: tuple[str, ...] = (),
+    readable: tuple[str, ...] = (),
+    roots: tuple[str, ...] = (),
+    *,
+    gpu: bool = False,
+    network: str = "none",
+) -> RootPlan:
+    """The plan on ``HOST``, for ann."""
+    return plan_root(
+        interpreter,
+        readable,
+        roots,
+        private=["/home/ann", "/run/envhub/zygote"],
+        gpu=gpu,
+        network=network,
+        host=HOST,
+    )
+
+
+def test_root_without_wishes_is_the_system_only() -> None:
+    """System folders, what libraries read of /etc, plain devices; links as links."""
+    plan = root()
+    assert plan.trees == ("/etc/fonts", "/sys/devices/system/cpu", "/usr")
+    assert plan.copies == ("/etc/ld.so.cache",)
+    assert plan.devices == ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom")
+    assert plan.links["/bin"] == "usr/bin"
+    assert plan.links["/lib"] == "usr/lib"
+    assert plan.links["/dev/fd"] == "/proc/self/fd"
+    assert set(plan.texts) == {"/etc/passwd", "/etc/group", "/etc/nsswitch.conf", "/etc/hosts"}
+
+
+def test_interpreter_appears_where_it_is() -> None:
+    """Once, however many paths name it, with the links that lead to it."""
+    plan = root(interpreter=("/opt/py", "/opt/py/lib", "/python/current", "/usr/bin", "/nowhere"))
+    assert plan.trees == ("/etc/fonts", "/opt/py", "/sys/devices/system/cpu", "/usr")
+    assert plan.links["/python"] == "/opt/py"
+
+
+@pytest.mark.parametrize("path", ["/", "/home", "/home/ann", "/run", "/run/envhub"])
+def test_interpreter_cannot_open_a_home(path: str) -> None:
+    """A sys.path entry at or above a home is left out; a project below it is not."""
+    assert root(interpreter=(path, "/home/ann/proj")).trees == (
+        "/etc/fonts",
+        "/home/ann/proj",
+        "/sys/devices/system/cpu",
+        "/usr",
+    )
+
+
+def test_caller_may_grant_what_it_likes() -> None:
+    """An explicit grant is obeyed."""
+    assert "/home/ann" in root(readable=("/home/ann",)).trees
+
+
+def test_snapshot_roots_are_kept_apart() -> None:
+    """They are shown to the zygote and covered up in each jail."""
+    plan = root(roots=("/data/store",))
+    assert plan.roots == ("/data/store",)
+    assert "/data/store" not in plan.trees
+
+
+def test_gpu_adds_compute_nodes_and_what_drivers_read() -> None:
+    """Render nodes, not display nodes; never disks or kvm."""
+    assert gpu_devices(HOST) == (
+        "/dev/dri/renderD128",
+        "/dev/kfd",
+        "/dev/nvidia0",
+        "/dev/nvidiactl",
+    )
+    assert set(gpu_devices(HOST)) <= set(root(gpu=True).devices)
+
+
+def test_host_network_adds_name_resolution() -> None:
+    """The host's own hosts file then replaces ours."""
+    plan = root(network="host")
+    assert plan.copies == ("/etc/ld.so.cache", "/etc/resolv.conf", "/etc/hosts")
+    assert "/etc/hosts" not in plan.texts
+
+
+def test_outermost_keeps_no_path_within_another() -> None:
+    """By folder, not by prefix of the text."""
+    assert outermost(["/a/b", "/a", "/ab", "/c/d", "/c/d/e"]) == ("/a", "/ab", "/c/d")

@@ -1,0 +1,238 @@
+"""The system call filter, run in an interpreter over (architecture, number, arguments)."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from envhub_worker.lockdown import bpf, seccomp
+from envhub_worker.lockdown.bpf import Instruction
+from envhub_worker.lockdown.report import LayerUnavailableError
+from envhub_worker.lockdown.seccomp_policy import (
+    ALLOW,
+    ENOSYS,
+    EPERM,
+    KILL_PROCESS,
+    PRETEND,
+    ByArguments,
+    table,
+)
+from envhub_worker.lockdown.syscalls import NUMBERS
+from tests.unit.bpf_machine import run
+
+GOLDEN = Path(__file__).parent / "golden"
+ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
+I386 = 0x40000003
+NOT_SUPPORTED = 0x00050000 | errno.EAFNOSUPPORT
+NOT_A_TTY = 0x00050000 | errno.ENOTTY
+VARIANTS = [(True, "none"), (True, "loopback"), (True, "host"), (False, "none"), (False, "host")]
+
+machines = pytest.mark.parametrize("machine", ["x86_64", "aarch64"])
+
+
+class Filter:
+    """A compiled filter that answers by name."""
+
+    def __init__(self, machine: str, namespaced: bool, network: str = "none") -> None:
+        self.machine = machine
+        self.program: Sequence[Instruction] = seccomp.program(
+            machine, table(namespaced=namespaced, network=network)
+        )
+
+    def __call__(self, name: str, *args: int) -> int:
+        """The verdict for the call ``name`` with ``args``."""
+        return run(self.program, ARCH[self.machine], NUMBERS[self.machine][name], args)
+
+
+@machines
+@pytest.mark.parametrize(("namespaced", "network"), VARIANTS)
+def test_program_is_the_golden_one(machine: str, namespaced: bool, network: str) -> None:
+    """Any change of the compiled program shows in a review."""
+    name = f"seccomp-{machine}-{'namespaced' if namespaced else 'bare'}-{network}.txt"
+    program = seccomp.program(machine, table(namespaced=namespaced, network=network))
+    assert bpf.listing(program) == (GOLDEN / name).read_text()
+
+
+@machines
+@pytest.mark.parametrize(("namespaced", "network"), VARIANTS)
+def test_every_number_gets_the_verdict_of_the_table(
+    machine: str, namespaced: bool, network: str
+) -> None:
+    """The search tree agrees with the table for every number to well above the highest."""
+    verdicts = table(namespaced=namespaced, network=network)
+    program = seccomp.program(machine, verdicts)
+    names = {number: name for name, number in NUMBERS[machine].items()}
+    for number in range(600):
+        verdict = verdicts.get(names.get(number, ""), EPERM if number in names else ENOSYS)
+        if not isinstance(verdict, ByArguments):
+            assert run(program, ARCH[machine], number) == verdict, names.get(number, number)
+
+
+@machines
+def test_other_architectures_are_killed(machine: str) -> None:
+    """int 0x80 and the other machine's numbers mean other calls."""
+    check = Filter(machine, True)
+    for arch in {I386, *ARCH.values()} - {ARCH[machine]}:
+        assert run(check.program, arch, NUMBERS[machine]["read"]) == KILL_PROCESS
+
+
+def test_x32_numbers_are_killed() -> None:
+    """They reach the same calls under numbers that no table lists."""
+    check = Filter("x86_64", True)
+    for number in (0x40000000, 0x40000000 | NUMBERS["x86_64"]["ptrace"], 0xFFFFFFFF):
+        assert run(check.program, ARCH["x86_64"], number) == KILL_PROCESS
+
+
+DENIED = """
+    ptrace process_vm_readv process_vm_writev kcmp pidfd_getfd process_madvise perf_event_open bpf
+    userfaultfd io_uring_setup io_uring_enter io_uring_register keyctl add_key request_key mount
+    umount2 pivot_root chroot open_tree move_mount fsopen fsconfig fsmount fspick mount_setattr
+    open_tree_attr unshare setns swapon swapoff reboot kexec_load kexec_file_load init_module
+    finit_module delete_module acct quotactl quotactl_fd open_by_handle_at name_to_handle_at
+    settimeofday clock_settime clock_adjtime adjtimex syslog vhangup sethostname setdomainname
+    fanotify_init fanotify_mark move_pages migrate_pages remap_file_pages memfd_secret seccomp
+    landlock_restrict_self vmsplice lookup_dcookie io_setup io_submit process_mrelease
+    statmount listmount
+"""
+
+
+@machines
+@pytest.mark.parametrize("namespaced", [True, False])
+@pytest.mark.parametrize("name", DENIED.split())
+def test_dangerous_call_is_denied(machine: str, namespaced: bool, name: str) -> None:
+    """Under every profile and network."""
+    assert Filter(machine, namespaced, "host")(name) == EPERM
+
+
+@machines
+def test_clone3_falls_back_and_clone_makes_no_namespace(machine: str) -> None:
+    """The flags of clone3 lie in memory; those of clone are checked one by one."""
+    check = Filter(machine, True)
+    assert check("clone3") == ENOSYS
+    threads = 0x003D0F00
+    assert check("clone", threads) == ALLOW
+    assert check("clone", 17) == ALLOW  # SIGCHLD: a plain fork
+    for flag in (0x20000, 0x2000000, 0x4000000, 0x8000000, 0x10000000, 0x20000000, 0x40000000):
+        assert check("clone", threads | flag) == EPERM
+
+
+@machines
+@pytest.mark.parametrize("namespaced", [True, False])
+def test_socket_families_without_network(machine: str, namespaced: bool) -> None:
+    """Local sockets where no file of the host is in reach; nothing else, whatever the high bits."""
+    check = Filter(machine, namespaced)
+    assert check("socket", 1, 1) == (ALLOW if namespaced else NOT_SUPPORTED)
+    for family in (2, 10, 16, 17, 40, 44, 1 << 32 | 2):
+        assert check("socket", family, 1) == NOT_SUPPORTED
+    assert check("socketpair", 1, 1) == ALLOW
+    assert check("socketpair", 1, 1 | 0o2000000 | 0o4000) == ALLOW  # CLOEXEC, NONBLOCK
+    assert check("socketpair", 1, 2) == (ALLOW if namespaced else NOT_SUPPORTED)
+    assert check("socketpair", 2, 1) == NOT_SUPPORTED
+
+
+@machines
+@pytest.mark.parametrize("namespaced", [True, False])
+def test_internet_sockets_are_tcp_and_udp_only(machine: str, namespaced: bool) -> None:
+    """No raw, no MPTCP, no SCTP, no netlink, even on the host's network."""
+    check = Filter(machine, namespaced, "host")
+    for family in (2, 10):
+        for kind, protocol in ((1, 0), (1, 6), (2, 0), (2, 17), (1 | 0o2000000, 0)):
+            assert check("socket", family, kind, protocol) == ALLOW
+        for kind, protocol in ((1, 262), (3, 0), (3, 1), (2, 1), (5, 0), (1, 132)):
+            assert check("socket", family, kind, protocol) == NOT_SUPPORTED
+    assert check("socket", 16, 3) == NOT_SUPPORTED
+
+
+@machines
+def test_sending_to_an_address_is_denied_without_namespaces(machine: str) -> None:
+    """Both halves of the pointer count."""
+    check = Filter(machine, False)
+    assert check("sendto", 3, 0, 0, 0, 0) == ALLOW
+    assert check("sendto", 3, 0, 0, 0, 0x1000) == EPERM
+    assert check("sendto", 3, 0, 0, 0, 1 << 32) == EPERM
+    for name in ("bind", "connect", "listen", "accept4"):
+        assert check(name) == EPERM
+
+
+@machines
+@pytest.mark.parametrize("namespaced", [True, False])
+def test_only_own_limits_and_priority_change(machine: str, namespaced: bool) -> None:
+    """prlimit and setpriority of another process are denied."""
+    check = Filter(machine, namespaced)
+    assert check("prlimit64", 0) == ALLOW
+    assert check("prlimit64", 1) == EPERM
+    assert check("prlimit64", 1 << 32) == ALLOW  # the kernel reads 32 bits: that is 0
+    assert check("setpriority", 0, 0) == ALLOW
+    for which, who in ((0, 1), (1, 0), (2, 0)):
+        assert check("setpriority", which, who) == EPERM
+
+
+@machines
+def test_terminal_injection_and_file_flags_are_denied(machine: str) -> None:
+    """TIOCSTI and friends; FS_IOC_SETFLAGS and all of its kind; FIOCLEX and TCGETS go through."""
+    check = Filter(machine, True)
+    for request in (0x5412, 0x541C, 0x541D, 0x5423, 1 << 32 | 0x5412):
+        assert check("ioctl", 1, request) == EPERM
+    for request in (0x40086602, 0x40806685, 0x401C5820, 0xC0045877):
+        assert check("ioctl", 1, request) == NOT_A_TTY
+    for request in (0x5401, 0x5451, 0x5421, 0x541B):
+        assert check("ioctl", 1, request) == ALLOW
+
+
+@machines
+def test_hiding_from_the_watchdog_is_denied(machine: str) -> None:
+    """PR_SET_DUMPABLE would make a process unreadable; other options are harmless."""
+    check = Filter(machine, True)
+    assert check("prctl", 4, 0) == EPERM
+    assert check("prctl", 15) == ALLOW  # PR_SET_NAME
+
+
+@machines
+def test_scheduling_is_pretended(machine: str) -> None:
+    """libzmq aborts when sched_setscheduler fails."""
+    for name in ("sched_setscheduler", "sched_setattr", "sync"):
+        assert Filter(machine, True)(name) == PRETEND
+
+
+@machines
+def test_modes_and_times_are_pretended_without_a_mount_namespace(machine: str) -> None:
+    """Landlock cannot stop them there; programs that copy files go on."""
+    bare, namespaced = Filter(machine, False), Filter(machine, True)
+    for name in ("fchmod", "fchmodat", "fchmodat2", "fchown", "fchownat", "utimensat"):
+        assert bare(name) == PRETEND
+        assert namespaced(name) == ALLOW
+    for name in ("setxattr", "fsetxattr", "lremovexattr", "shmget", "semget", "msgget", "mq_open"):
+        assert bare(name) == EPERM
+        assert namespaced(name) == ALLOW
+    for name in ("inotify_init1", "openat2"):
+        assert bare(name) == ENOSYS
+
+
+@machines
+def test_signals_by_descriptor_owner_are_denied_without_a_pid_namespace(machine: str) -> None:
+    """F_SETOWN makes the kernel signal any process of the same user."""
+    check = Filter(machine, False)
+    for command in (8, 10, 15, 1024, 1026):
+        assert check("fcntl", 0, command) == EPERM
+    assert check("fcntl", 0, 2) == ALLOW
+    for request in (0x8901, 0x8902):
+        assert check("ioctl", 0, request) == EPERM
+    assert check("sched_setaffinity", 0) == ALLOW
+    assert check("sched_setaffinity", 1) == PRETEND
+
+
+@machines
+def test_only_plain_nodes_are_made(machine: str) -> None:
+    """Fifos and files; no device."""
+    check = Filter(machine, True)
+    for mode, verdict in ((0o10644, ALLOW), (0o100644, ALLOW), (0o644, ALLOW), (0o20644, EPERM)):
+        assert check("mknodat", 0, 0, mode) == verdict
+
+
+def test_unknown_machine_is_refused() -> None:
+    """No table, no jail."""
+    with pytest.raises(LayerUnavailableError, match="riscv64"):
+        seccomp.program("riscv64", {})
