@@ -62,7 +62,7 @@ SAMPLES: list[m.Message] = [
     m.GetRandom(1),
     m.Close(1),
     m.Value((None, "a", 1.5)),
-    m.Attach(1),
+    m.Attach(1, 2, 8, 5),
     m.FetchInfos(1),
     m.Raised("KeyError", "mypkg.Oops", "gone", "Traceback ...", "step"),
 ]  # fmt: skip
