@@ -168,7 +168,12 @@ class Init:
     def _start(self, number: int, fds: list[int]) -> None:
         read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         order = launch.Order(
-            parent=os.getpid(), jail=self._jail, fds=fds, joins=self._joins, status=write
+            parent=os.getpid(),
+            jail=self._jail,
+            fds=fds,
+            hosts=len(self._hosts) + 1,
+            joins=self._joins,
+            status=write,
         )
         pid = os.fork()
         if pid == 0:

@@ -21,6 +21,7 @@ from typing import NoReturn
 
 import numpy as np
 
+from envhub_worker import blas
 from envhub_worker.jailspec import JailSpec
 from envhub_worker.lockdown import cgroups, innermost, process, sweep
 from envhub_worker.lockdown.context import JailContext
@@ -38,6 +39,7 @@ class Order:
         parent: Init's pid.
         jail: The jail.
         fds: The stream to the server, then whatever the server passes through.
+        hosts: How many the jail has, this one included.
         joins: Where to join the jail's control group, if it has one.
         status: Write end of the pipe for the report; closed before the target runs.
     """
@@ -45,6 +47,7 @@ class Order:
     parent: int
     jail: JailContext
     fds: list[int]
+    hosts: int
     joins: list[int]
     status: int
 
@@ -70,6 +73,7 @@ def _run(order: Order) -> int:
     except LayerUnavailableError as error:
         _report(order.status, error.to_wire())
         return 1
+    blas.restore_threads(order.jail.common.set_blas_threads, order.hosts)
     _report(order.status, {"report": [_SELF_TEST.to_wire()]})
     stream = socket.socket(fileno=order.fds[0])
     main = _resolve(order.jail.common.config.target)

@@ -29,8 +29,9 @@ import signal
 import socket
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
-from envhub_worker import init
+from envhub_worker import blas, init
 from envhub_worker.channel import Channel, close_fds
 from envhub_worker.lockdown import namespaces, outer, process, sweep
 from envhub_worker.lockdown.context import Common, ZygoteConfig
@@ -67,6 +68,7 @@ def main(argv: Sequence[str]) -> int:
         return 0
     process.become_subreaper()
     preload(config.target)
+    common = replace(common, set_blas_threads=blas.find_setter())
     gc.collect()
     gc.freeze()
     Zygote(channel, common).run()

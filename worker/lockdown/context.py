@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,6 +62,7 @@ class Common:
         covered: (files, folders) of /proc to hide.
         landlock_abi: 0 where there is none.
         program: The compiled system call filter.
+        set_blas_threads: Sets OpenBLAS's threads, if that is what numpy uses.
     """
 
     config: ZygoteConfig
@@ -72,6 +74,7 @@ class Common:
     covered: tuple[list[str], list[str]]
     landlock_abi: int
     program: bytes
+    set_blas_threads: Callable[[int], None] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,59 @@
+"""Gives numpy's threads back to a host.
+
+The zygote loads OpenBLAS with ``OPENBLAS_NUM_THREADS=1``: its threads would neither survive the
+fork nor allow a user namespace. OpenBLAS reads that variable once, when it is loaded, so a host
+must ask the library itself.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from collections.abc import Callable, Mapping
+
+# numpy's wheels carry a build whose symbols have a prefix and a suffix.
+_SETTERS = (
+    "scipy_openblas_set_num_threads64_",
+    "openblas_set_num_threads64_",
+    "scipy_openblas_set_num_threads",
+    "openblas_set_num_threads",
+)
+_VARIABLES = ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS")
+# Each thread is one of the jail's processes.
+_MOST = 16
+
+
+def find_setter() -> Callable[[int], None] | None:
+    """The loaded OpenBLAS's function that sets its threads; None where numpy has another BLAS."""
+    with open("/proc/self/maps") as maps:
+        paths = {line.split(maxsplit=5)[5].strip() for line in maps if "openblas" in line}
+    for path in sorted(paths):
+        library = ctypes.CDLL(path)
+        for name in _SETTERS:
+            if hasattr(library, name):
+                setter = getattr(library, name)
+                setter.argtypes, setter.restype = [ctypes.c_int], None
+                return setter  # type: ignore[no-any-return]
+    return None
+
+
+def thread_count(environment: Mapping[str, str], cores: int, hosts: int) -> int:
+    """How many threads a host gets.
+
+    Args:
+        environment: The host's; the variables that OpenBLAS reads decide, where there is one.
+        cores: That this process may use.
+        hosts: Of the jail, this one included: they share the cores.
+    """
+    for name in _VARIABLES:
+        value = environment.get(name, "")
+        if value.isdigit() and int(value) > 0:
+            return int(value)
+    return max(1, min(cores // hosts, _MOST))
+
+
+def restore_threads(setter: Callable[[int], None] | None, hosts: int) -> None:
+    """Start the threads that a fresh interpreter would have; call it when confined."""
+    count = thread_count(os.environ, len(os.sched_getaffinity(0)), hosts)
+    if setter is not None and count > 1:
+        setter(count)
