@@ -20,7 +20,9 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.tensors import to_tensor
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.inert import one_line
 from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.text import printable
 
 
 class RemoteJail:
@@ -86,7 +88,10 @@ class RemoteJail:
         return replies
 
     def _unpack(self, frames: Sequence[Buffer]) -> m.Message:
-        return m.unpack(frames, limits=self._limits, tensors=to_tensor)[1]
+        message = m.unpack(frames, limits=self._limits, tensors=to_tensor)[1]
+        if message.kind < m.FIRST_HOST_KIND:  # a host that speaks in the server's name
+            raise RemoteProtocolError(f"a host sent {type(message).__name__}")
+        return message
 
     def exchange(
         self, operation: str, requests: Sequence[tuple[int, m.Message]], deadline: Deadline
@@ -163,6 +168,7 @@ _LOADING = {
 
 def raised(reply: m.Raised) -> EnvHubError:
     """The error for an exception of the repository. Trust: text from the worker."""
+    reply = _harmless(reply)
     if reply.stage not in _LOADING:
         return remote_error(reply.builtin, reply.type_name, reply.message, reply.traceback)
     what = _LOADING[reply.stage]
@@ -181,3 +187,14 @@ def raised(reply: m.Raised) -> EnvHubError:
         error = LoadError(f"{what}: {reply.type_name}: {reply.message}{trace}")
     error.__cause__ = cause
     return error
+
+
+def _harmless(reply: m.Raised) -> m.Raised:
+    """The same without what a terminal would obey, and no longer than anybody reads."""
+    return m.Raised(
+        reply.builtin,
+        one_line(reply.type_name, 512),
+        printable(reply.message),
+        printable(reply.traceback, 32_768),
+        reply.stage,
+    )

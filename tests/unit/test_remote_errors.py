@@ -1,0 +1,188 @@
+"""What a worker says went wrong becomes an error of ours, whatever the text is."""
+
+from __future__ import annotations
+
+import builtins
+import copy
+import pickle
+from typing import Any
+
+import pytest
+
+from envhub_sandbox import errors
+from envhub_sandbox.client import death, expect, refusal
+from envhub_sandbox.jail import RemoteJail, check, raised
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.limits import DEFAULT_LIMITS
+
+ESCAPE = "\x1b]0;owned\x07\x1b[2J\r"
+
+
+def a_raised(**changed: str) -> m.Raised:
+    """What a host says about an exception, with some fields changed."""
+    fields = {
+        "builtin": "ValueError",
+        "type_name": "mypkg.Oops",
+        "message": "no",
+        "traceback": "Traceback ...",
+        "stage": "step",
+    }
+    return m.Raised(**{**fields, **changed})
+
+
+@pytest.mark.parametrize(
+    "name", ["AttributeError", "KeyError", "NotImplementedError", "OSError", "ZeroDivisionError"]
+)
+def test_errors_are_the_builtin_that_they_were(name: str) -> None:
+    """``except KeyError`` catches a remote KeyError, and its text is the worker's."""
+    error = raised(a_raised(builtin=name))
+    assert isinstance(error, getattr(builtins, name))
+    assert isinstance(error, errors.RemoteEnvError)
+    assert str(error) == "mypkg.Oops: no"
+    assert (error.type_name, error.message, error.traceback) == (
+        "mypkg.Oops",
+        "no",
+        "Traceback ...",
+    )
+
+
+@pytest.mark.parametrize("name", ["KeyboardInterrupt", "SystemExit", "Oops", "", "print", "open"])
+def test_other_names_mean_nothing(name: str) -> None:
+    """A worker cannot choose what is raised beyond a fixed table."""
+    error = raised(a_raised(builtin=name))
+    assert type(error) is errors.RemoteEnvError
+
+
+@pytest.mark.parametrize("field", ["type_name", "message", "traceback"])
+@pytest.mark.parametrize("stage", ["step", "import", "make_env", "return"])
+def test_escape_sequences_are_not_obeyed(field: str, stage: str) -> None:
+    """Text of a hostile host is escaped here: the host's own care is not relied on."""
+    error: BaseException | None = raised(a_raised(stage=stage, **{field: f"a{ESCAPE}b"}))
+    while error is not None:
+        for text in (str(error), *map(str, vars(error).values())):
+            assert "\x1b" not in text
+            assert "\r" not in text
+        error = error.__cause__
+
+
+def test_long_texts_are_cut() -> None:
+    """An exception of megabytes is not a log of megabytes."""
+    error = raised(a_raised(message="x" * 3_000_000, type_name="T" * 3_000_000))
+    assert len(str(error)) < 20_000
+
+
+@pytest.mark.parametrize(
+    ("reply", "expected"),
+    [
+        (a_raised(stage="import", builtin="ModuleNotFoundError"), errors.DependencyError),
+        (a_raised(stage="import", builtin="SyntaxError"), errors.LoadError),
+        (a_raised(stage="make_env"), errors.LoadError),
+        (a_raised(stage="return"), errors.LoadError),
+    ],
+)
+def test_failures_to_load_say_so(reply: m.Raised, expected: type[Exception]) -> None:
+    """What fails before there is an environment is an error of loading."""
+    assert type(raised(reply)) is expected
+
+
+def test_errors_can_be_copied_and_pickled() -> None:
+    """As those of a pool's worker are."""
+    error: Any = raised(a_raised(builtin="KeyError"))
+    for made in (copy.copy(error), pickle.loads(pickle.dumps(error))):
+        assert type(made) is type(error)
+        assert (str(made), made.traceback) == (str(error), error.traceback)
+
+
+class FakeClient:
+    """A connection whose server relays what a host says."""
+
+    def __init__(self, frames: list[Any]) -> None:
+        self.frames = frames
+
+    def receive(self, request_id: int, deadline: object) -> tuple[m.Message, list[Any]]:
+        """The reply of the server, with the host's frames."""
+        return m.Relayed((len(self.frames),)), self.frames
+
+
+SERVERS = [
+    m.Died(1, "exit", 0, None, ESCAPE, ESCAPE, "step"),
+    m.Refused("SandboxUnavailableError", ESCAPE, "", ESCAPE),
+    m.Relayed((1,)),
+    m.Done(),
+]
+
+
+@pytest.mark.parametrize("message", SERVERS, ids=lambda message: type(message).__name__)
+def test_a_host_cannot_speak_in_the_servers_name(message: m.Message) -> None:
+    """A death or a refusal inside a host's reply is a broken rule, not news."""
+    client: Any = FakeClient(m.pack(message, 0))
+    jail = RemoteJail(client, 1, [1], [], DEFAULT_LIMITS)
+    with pytest.raises(errors.RemoteProtocolError, match="a host sent") as caught:
+        jail.receive(1, None)  # type: ignore[arg-type]
+    assert "\x1b" not in str(caught.value)
+
+
+def test_the_kinds_of_both_conversations_are_apart() -> None:
+    """What hosts may send begins at one number."""
+    hosts = {cls.__name__ for kind, cls in m.KINDS.items() if kind >= m.FIRST_HOST_KIND}
+    assert {"Loaded", "Built", "ResetDone", "StepDone", "Value", "Method", "Raised"} <= hosts
+    assert not hosts & {type(message).__name__ for message in SERVERS}
+
+
+@pytest.mark.parametrize(
+    ("reply", "text"),
+    [
+        (m.Died(1, "exit", 3, None, "", "", "step"), "died during step: it exited (exit code 3)"),
+        (m.Died(1, "signal", None, "SIGKILL", "", "", ""), "died: a signal ended it (SIGKILL)"),
+        (m.Died(1, "exit", 0, None, "", "bye", "reset"), "Its last output:\nbye"),
+        (m.Died(1, "exit", 0, None, "why", "", "reset"), "\nwhy"),
+    ],
+)
+def test_deaths_say_how(reply: m.Died, text: str) -> None:
+    """Exit code or signal, the request that was being served, and the last output."""
+    error = death(reply)
+    assert text in str(error)
+    assert (error.exit_code, error.signal, error.reason) == (
+        reply.exit_code,
+        reply.signal,
+        reply.reason,
+    )
+    assert (error.log_tail, error.request) == (reply.tail, reply.operation or None)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("SandboxUnavailableError", errors.SandboxUnavailableError),
+        ("VersionMismatchError", errors.VersionMismatchError),
+        ("WorkerError", errors.WorkerError),
+        ("SystemExit", errors.WorkerError),
+    ],
+)
+def test_refusals_come_from_a_table(name: str, expected: type[Exception]) -> None:
+    """The server names an error; what it does not know is a WorkerError."""
+    assert type(refusal(m.Refused(name, "text", "", ""))) is expected
+
+
+def test_a_missing_layer_comes_with_its_fix() -> None:
+    """The reader learns the layer, the reason and what to do."""
+    error = refusal(m.Refused("SandboxUnavailableError", "it is off", "landlock", "turn it on"))
+    assert str(error) == "this host cannot enforce landlock: it is off\nturn it on"
+
+
+def test_other_replies_than_expected_break_the_rules() -> None:
+    """A reply of another kind is the worker's fault; deaths and refusals are told as such."""
+    assert expect(m.Done(), m.Done) == m.Done()
+    with pytest.raises(errors.RemoteProtocolError, match="with Output where Done belongs"):
+        expect(m.Output(""), m.Done)
+    with pytest.raises(errors.WorkerDiedError):
+        expect(SERVERS[0], m.Done)
+    with pytest.raises(errors.WorkerError):
+        expect(m.Refused("WorkerError", "no", "", ""), m.Done)
+
+
+def test_check_raises_what_a_reply_says() -> None:
+    """Everything else passes."""
+    check(m.Value(3))
+    with pytest.raises(errors.RemoteEnvError):
+        check(a_raised())
