@@ -1,0 +1,297 @@
+"""What the documents say is what the code does."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import re
+import string
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.lifecycle import TABLE, Event, State
+from envhub_worker.protocol.limits import DEFAULT_LIMITS
+from envhub_worker.protocol.manifest import MAX_ENVS, MAX_NAME, MAX_NUM_ENVS
+from tests.unit.test_imports import folder
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+DOCUMENTS = sorted([*CHECKOUT.glob("*.md"), *(CHECKOUT / "docs").rglob("*.md")])
+README = (CHECKOUT / "README.md").read_text()
+PROTOCOL = (CHECKOUT / "docs" / "protocol.md").read_text()
+
+
+def named(path: Path) -> str:
+    """A document's name in a test's."""
+    return str(path.relative_to(CHECKOUT))
+
+
+def section(text: str, title: str) -> str:
+    """The part of a document below a title, up to the next of the same rank."""
+    [rank] = re.findall(rf"^(#+) {re.escape(title)}$", text, re.MULTILINE)
+    part = text.partition(f"\n{rank} {title}\n")[2]
+    return re.split(rf"^#{{2,{len(rank)}}} ", part, maxsplit=1, flags=re.MULTILINE)[0]
+
+
+def rows(text: str) -> list[list[str]]:
+    """The cells of every row of the tables in a text, without their heads."""
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    heads = {index - 1 for index, row in enumerate(cells) if set("".join(row)) <= set("-: ")}
+    return [row for index, row in enumerate(cells) if index not in heads and index - 1 not in heads]
+
+
+def code_words(text: str) -> list[str]:
+    """What stands in backquotes."""
+    return re.findall(r"`([^`]+)`", text)
+
+
+def sources() -> str:
+    """The source of both packages, as one text."""
+    packages = [folder("envhub_sandbox"), folder("envhub_worker")]
+    return "\n".join(path.read_text() for root in packages for path in root.rglob("*.py"))
+
+
+@pytest.mark.parametrize("title", ["Client and server", "Client and host"])
+def test_protocol_lists_every_message_with_its_fields(title: str) -> None:
+    """Kind, name and fields, in the order of the wire."""
+    listed = {
+        int(kind): (*code_words(name), code_words(fields))
+        for kind, name, fields, _ in rows(section(PROTOCOL, title))
+    }
+    hosts = title == "Client and host"
+    assert listed == {
+        kind: (cls.__name__, [field.name for field in dataclasses.fields(cls)])  # type: ignore[arg-type]
+        for kind, cls in m.KINDS.items()
+        if (kind >= m.FIRST_HOST_KIND) == hosts
+    }
+
+
+def test_protocol_draws_the_lifecycle_from_its_table() -> None:
+    """Every state in its words, every legal move, and no other."""
+    states, moves = [], []
+    for row in rows(section(PROTOCOL, "The life of an environment")):
+        (states if len(row) == 2 else moves).append(row)
+    assert states == [[f"`{state.name}`", state.value] for state in State]
+    drawn = {
+        (state, Event[event.strip("`")]): State[target.strip("`")]
+        for event, *targets in moves
+        for state, target in zip(State, targets, strict=True)
+        if target
+    }
+    assert drawn == TABLE
+    assert [row[0].strip("`") for row in moves] == [event.name for event in Event]
+    assert all(f"`{event.name}`: {event.value}." in flat(PROTOCOL) for event in Event)
+
+
+def flat(text: str) -> str:
+    """A text without its line ends."""
+    return " ".join(text.split())
+
+
+def test_protocol_states_its_version_and_limits() -> None:
+    """The numbers in the text are those of the code."""
+    assert f"Version {m.VERSION}." in PROTOCOL
+    for number in (MAX_ENVS, MAX_NUM_ENVS, MAX_NAME):
+        assert re.search(rf"\b{number}\b", section(PROTOCOL, "Manifest"))
+
+
+def test_values_lists_the_limits_with_their_defaults() -> None:
+    """Each limit of the wire, and its number."""
+    text = (CHECKOUT / "docs" / "values.md").read_text()
+    units = {"KiB": 1024, "MiB": 1024**2}
+    listed = {}
+    for name, default, _ in rows(section(text, "Limits")):
+        number, _, unit = default.replace(",", "").partition(" ")
+        listed[name.strip("`")] = int(number) * units.get(unit, 1)
+    assert listed == dataclasses.asdict(DEFAULT_LIMITS)
+
+
+def fenced(text: str, language: str) -> list[str]:
+    """The blocks of code in a document."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+
+
+def test_readme_opens_with_one_command_to_try_and_one_to_test() -> None:
+    """Five lines, then the two commands, each on one line."""
+    first, second = fenced(README, "sh")[:2]
+    assert first.count("\n") == second.count("\n") == 1
+    assert "envhub run ./examples/" in first
+    assert second == "./test\n"
+    introduction = README.split("\n\n")[1]
+    assert introduction.count("\n") <= 5
+
+
+def test_ci_runs_the_commands_of_the_readme() -> None:
+    """The first word for word, the second as it stands."""
+    steps = CHECKOUT / ".ci" / "steps"
+    assert "README.md" in (steps / "readme.sh").read_text()
+    assert re.search(r"^with_summary tests \./test$", (steps / "tests.sh").read_text(), re.M)
+
+
+def test_readme_quick_start_runs() -> None:
+    """The Python of the README does what it says."""
+    [source] = fenced(README, "python")
+    done = subprocess.run(
+        [sys.executable, "-c", source],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("local-")
+
+
+def error_texts() -> list[str]:
+    """Every error text of the troubleshooting table."""
+    table = rows(section(README, "Troubleshooting"))
+    return [text for symptom, _ in table for text in code_words(symptom)]
+
+
+# said by others than us
+_FOREIGN_TEXTS = {"no module named venv", "ensurepip is not available"}
+
+
+@pytest.mark.parametrize("text", [text for text in error_texts() if text not in _FOREIGN_TEXTS])
+def test_troubleshooting_quotes_errors_that_exist(text: str) -> None:
+    """Whoever searches the README for what is on the screen finds it."""
+    assert text in joined_literals()
+
+
+def joined_literals() -> str:
+    """The source, with texts that go on over a line's end put together."""
+    return re.sub(r'(?<!\\)"\s*\n?\s*f?"', "", sources())
+
+
+def test_readme_names_arguments_that_exist() -> None:
+    """Each argument of the table is one of ``make_env``, each mapping key one of its class."""
+    import inspect
+
+    from envhub_sandbox import Limits, Policy, Timeouts, make_env
+
+    parameters = inspect.signature(make_env).parameters
+    classes = {"policy": Policy, "limits": Limits, "timeouts": Timeouts}
+    for argument, meaning in rows(section(README, "Quick start")):
+        names = [word.partition("=")[0] for word in code_words(argument)]
+        assert set(names) <= set(parameters), names
+        if names[0] in classes:
+            known = {field.name for field in dataclasses.fields(classes[names[0]])}
+            assert set(re.findall(r'"(\w+)":', meaning)) <= known
+
+
+def command_line_options() -> set[str]:
+    """The options that ``envhub run`` takes, by its own help."""
+    done = subprocess.run(
+        [sys.executable, "-m", "envhub_sandbox", "run", "--help"],
+        capture_output=True,
+        text=True,
+        env={"COLUMNS": "200", "TERM": "dumb", "NO_COLOR": "1"},
+        check=True,
+        timeout=120,
+    )
+    return set(re.findall(r"--[a-z][a-z-]+", done.stdout))
+
+
+def test_readme_names_options_that_exist() -> None:
+    """Each option in a command of the README is one of ``envhub run``."""
+    lines = [line for block in fenced(README, "sh") for line in block.splitlines()]
+    used = {
+        option
+        for line in lines
+        if "envhub run" in line
+        for option in re.findall(r"--[a-z][a-z-]+", line.partition("envhub run")[2])
+    }
+    assert used
+    assert used <= command_line_options()
+
+
+def links(text: str) -> Iterator[str]:
+    """The targets of all links that stay in the project."""
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if not target.startswith(("http://", "https://", "mailto:")):
+            yield target
+
+
+def anchors(text: str) -> set[str]:
+    """The anchors that a forge makes of the titles."""
+    titles = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    kept = string.ascii_lowercase + string.digits + "-_ "
+    return {
+        "".join(char for char in title.lower() if char in kept).replace(" ", "-")
+        for title in titles
+    }
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=named)
+def test_links_resolve(document: Path) -> None:
+    """Files are there, and so are the titles that an anchor means."""
+    for target in links(document.read_text()):
+        path, _, anchor = target.partition("#")
+        found = (document.parent / path).resolve() if path else document
+        assert found.exists(), target
+        if anchor:
+            assert anchor in anchors(found.read_text()), target
+
+
+# files that a user has, or that a repository on the Hub would have
+_ELSEWHERE = re.compile(r"^(\./my-env|envs?/|\./examples/\w+$|org/|~|/|\.\./|\.venv)")
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=named)
+def test_named_files_exist(document: Path) -> None:
+    """A path of this project in backquotes is a path of this project."""
+    tops = ("tests/", "docs/", "worker/", "envhub_sandbox/", "examples/", ".ci/", "benchmarks/")
+    for word in code_words(document.read_text()):
+        path = word.partition(" ")[0].rstrip("/")
+        if not path.startswith(tops) or re.search(r"[*{<(]", path):
+            continue
+        package = {"worker": "envhub_worker", "envhub_sandbox": "envhub_sandbox"}
+        top, _, rest = path.partition("/")
+        root = folder(package[top]) if top in package else CHECKOUT / top
+        assert (root / rest).exists(), word
+
+
+# said nowhere in the project: they name people's machines and tools, not the project
+_FORBIDDEN = re.compile(r"(?<![\w./-])/(work|root)/\w|TODO|FIXME|XXX(?!X)")
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=named)
+def test_documents_are_finished(document: Path) -> None:
+    """No machine's paths, no notes to oneself."""
+    assert _FORBIDDEN.findall(document.read_text()) == []
+
+
+def test_sources_are_finished() -> None:
+    """Likewise the code."""
+    assert _FORBIDDEN.findall(sources()) == []
+
+
+def error_tree() -> list[tuple[int, str]]:
+    """The tree in the docstring of ``errors``: depth and name."""
+    errors: Any = importlib.import_module("envhub_sandbox.errors")
+    block = errors.__doc__.partition("::\n\n")[2].partition("\n\nA remote")[0]
+    found = []
+    for line in block.splitlines():
+        depth = (len(line) - len(line.lstrip())) // 2
+        found += [(depth, name) for name in re.findall(r"(\w+Error)(?: \(\w+\))?", line)[:1]]
+    return found
+
+
+def test_error_tree_is_the_tree() -> None:
+    """The docstring of ``errors`` shows each class below its base."""
+    errors: Any = importlib.import_module("envhub_sandbox.errors")
+    parents: dict[int, type] = {}
+    tree = error_tree()
+    for depth, name in tree:
+        cls = parents[depth] = getattr(errors, name)
+        if depth - 1 in parents:
+            assert issubclass(cls, parents[depth - 1]), name
+    shown = {name for _, name in tree}
+    assert {name for name in errors.__all__ if name.endswith("Error")} <= shown
