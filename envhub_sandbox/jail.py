@@ -7,7 +7,7 @@ from typing import Any
 
 import cloudpickle  # type: ignore[import-untyped]
 
-from envhub_sandbox.client import WorkerClient, death, expect, refusal
+from envhub_sandbox.client import WorkerClient, expect
 from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import (
     DependencyError,
@@ -88,10 +88,7 @@ class RemoteJail:
         return replies
 
     def _unpack(self, frames: Sequence[Buffer]) -> m.Message:
-        message = m.unpack(frames, limits=self._limits, tensors=to_tensor)[1]
-        if message.kind < m.FIRST_HOST_KIND:  # a host that speaks in the server's name
-            raise RemoteProtocolError(f"a host sent {type(message).__name__}")
-        return message
+        return m.unpack(frames, limits=self._limits, tensors=to_tensor)[1]
 
     def exchange(
         self, operation: str, requests: Sequence[tuple[int, m.Message]], deadline: Deadline
@@ -137,13 +134,16 @@ def open_jail(
 
 
 def check(reply: m.Message) -> None:
-    """Raise what a reply says went wrong."""
+    """Raise what a host's reply says went wrong.
+
+    Raises:
+        EnvHubError: What the repository raised.
+        RemoteProtocolError: A host spoke in the server's name.
+    """
     if isinstance(reply, m.Raised):
         raise raised(reply)
-    if isinstance(reply, m.Died):
-        raise death(reply)
-    if isinstance(reply, m.Refused):
-        raise refusal(reply)
+    if reply.kind < m.FIRST_HOST_KIND:
+        raise RemoteProtocolError(f"a host sent {type(reply).__name__}")
 
 
 def typed(reply: m.Message, kind: type[m.M]) -> m.M:
