@@ -1,0 +1,132 @@
+"""What ``envhub run`` does with the environments that it is given; nothing here is sandboxed."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import pytest
+from gymnasium.vector import SyncVectorEnv
+from typer.testing import CliRunner
+
+from envhub_sandbox import api
+from envhub_sandbox.cli.app import app
+from envhub_sandbox.errors import WorkerDiedError
+from envhub_sandbox.suites import EnvSuites
+
+PROVENANCE = {"repository": "r", "repo_type": "model", "commit": "c", "path": "env.py"}
+
+
+class Noted(SyncVectorEnv):
+    """CartPoles that note when they are reset and closed."""
+
+    def __init__(self, task: int, events: list[tuple[str, int]]) -> None:
+        super().__init__([lambda: gym.make("CartPole-v1")])
+        self.task, self.events = task, events
+
+    def reset(self, **kwargs: Any) -> Any:
+        """Note it."""
+        self.events.append(("reset", self.task))
+        return super().reset(**kwargs)
+
+    def close(self, **kwargs: Any) -> None:
+        """Note it, the first time."""
+        if not self.closed:
+            self.events.append(("close", self.task))
+        super().close(**kwargs)
+
+
+class Dying(Noted):
+    """Dies in its first step."""
+
+    def step(self, actions: Any) -> Any:
+        """As a worker does."""
+        raise WorkerDiedError("it died", log_tail="")
+
+
+def run(
+    monkeypatch: pytest.MonkeyPatch, make_env: Callable[..., EnvSuites], *arguments: str
+) -> tuple[int, dict[str, Any]]:
+    """The exit code and the document of a run in which ``make_env`` is replaced."""
+    monkeypatch.setattr(api, "make_env", make_env)
+    done = CliRunner().invoke(app, ["run", "org/repo", "--episodes", "2", "--json", *arguments])
+    text = done.stdout  # older versions of the runner mix stderr into it
+    return done.exit_code, json.loads(text[text.index("{") : text.rindex("}") + 1])
+
+
+def suites(*envs: SyncVectorEnv) -> EnvSuites:
+    """One suite of these tasks."""
+    return EnvSuites({"s": dict(enumerate(envs))}, lambda: dict(PROVENANCE))
+
+
+def test_each_task_is_closed_before_the_next_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that only the task in use costs processes."""
+    events: list[tuple[str, int]] = []
+    envs = suites(Noted(0, events), Noted(1, events))
+    code, document = run(monkeypatch, lambda **kwargs: envs)
+    assert code == 0
+    assert events == [("reset", 0), ("close", 0), ("reset", 1), ("close", 1)]
+    assert [len(task["episodes"]) for task in document["tasks"]] == [2, 2]
+
+
+def test_a_failing_task_ends_the_run_and_closes_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was finished is reported, with the error and its code."""
+    events: list[tuple[str, int]] = []
+    envs = suites(Noted(0, events), Dying(1, events), Noted(2, events))
+    code, document = run(monkeypatch, lambda **kwargs: envs)
+    assert code == 5
+    assert events[-2:] == [("close", 1), ("close", 2)]
+    assert [task["task"] for task in document["tasks"]] == [0]
+    assert document["error"] == {
+        "type": "WorkerDiedError",
+        "message": "it died",
+        "exit_code": 5,
+    }
+
+
+def test_options_become_arguments_of_make_env(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each under the name that the library has for it."""
+    seen: dict[str, Any] = {}
+
+    def make_env(**kwargs: Any) -> EnvSuites:
+        seen.update(kwargs)
+        return suites(Noted(0, []))
+
+    run(
+        monkeypatch,
+        make_env,
+        *("--n-envs", "3", "--async", "--env-kwargs", "size=8", "--num-workers", "2"),
+        *("--python", "/usr/bin/python3", "--token", "hf_x", "--endpoint", "http://h"),
+        *("--hub-cache-dir", "/cache", "--memory", "1G", "--timeout", "9", "--profile", "strict"),
+    )
+    assert seen == {
+        "cfg": "org/repo",
+        "n_envs": 3,
+        "use_async_envs": True,
+        "hub_cache_dir": "/cache",
+        "trust_remote_code": False,
+        "sandbox": "process",
+        "env_kwargs": {"size": 8},
+        "policy": {"profile": "strict", "limits": {"memory_bytes": 2**30}},
+        "timeouts": {"startup_s": 9.0, "reset_s": 9.0, "step_s": 9.0, "call_s": 9.0},
+        "token": "hf_x",
+        "endpoint": "http://h",
+        "python": "/usr/bin/python3",
+        "num_workers": 2,
+    }
+
+
+def test_make_env_takes_all_that_it_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The names are those of the real one."""
+    seen: dict[str, Any] = {}
+
+    def make_env(**kwargs: Any) -> EnvSuites:
+        seen.update(kwargs)
+        return suites(Noted(0, []))
+
+    known = set(inspect.signature(api.make_env).parameters)
+    run(monkeypatch, make_env)
+    assert set(seen) <= known
