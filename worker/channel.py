@@ -5,6 +5,7 @@ Only our own code holds an end of such a channel: it is closed before a stranger
 
 from __future__ import annotations
 
+import array
 import collections
 import contextlib
 import json
@@ -16,6 +17,7 @@ from typing import Any
 # SEQPACKET refuses a message above the socket buffer (212992 by default); say so early.
 MAX_MESSAGE_BYTES = 128 * 1024
 MAX_FDS = 64
+_ANCILLARY_BYTES = socket.CMSG_SPACE(MAX_FDS * array.array("i").itemsize)
 
 Message = dict[str, Any]
 
@@ -70,15 +72,25 @@ class Channel:
             BlockingIOError: Nothing is there (non-blocking sockets).
         """
         try:
-            data, fds, flags, _ = socket.recv_fds(
-                self._socket, MAX_MESSAGE_BYTES, MAX_FDS, socket.MSG_CMSG_CLOEXEC
-            )
-        except ConnectionError:
-            return None
+            data, fds, flags = self._receive()
+        except ConnectionResetError:
+            # Told once, when the peer closed with our messages unread; its own still come.
+            data, fds, flags = self._receive()
         if not data:
             return None
         assert not flags & (socket.MSG_TRUNC | socket.MSG_CTRUNC)
         return json.loads(data), fds
+
+    def _receive(self) -> tuple[bytes, list[int], int]:
+        # Not socket.recv_fds: before Python 3.13 it drops the flags, and so CLOEXEC.
+        data, ancillary, flags, _ = self._socket.recvmsg(
+            MAX_MESSAGE_BYTES, _ANCILLARY_BYTES, socket.MSG_CMSG_CLOEXEC
+        )
+        fds = array.array("i")
+        for level, kind, content in ancillary:
+            if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
+                fds.frombytes(content[: len(content) - len(content) % fds.itemsize])
+        return data, list(fds), flags
 
     def drain(self) -> tuple[list[tuple[Message, list[int]]], bool]:
         """Everything that is there now, and whether the stream has ended."""

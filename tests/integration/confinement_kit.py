@@ -163,12 +163,16 @@ def open_folder() -> Iterator[Path]:
         yield Path(name)
 
 
-def make_snapshot(folder: Path) -> str:
-    """A tiny snapshot below ``folder``."""
+def make_snapshot(folder: Path, link: str | None = None) -> str:
+    """A tiny snapshot below ``folder``, read-only as in a store; ``link`` is where one leads."""
     snapshot = folder / "snapshot"
     (snapshot / "assets").mkdir(parents=True)
     (snapshot / "env.py").write_text("VALUE = 7\n")
     (snapshot / "assets" / "a.txt").write_text("asset")
+    if link is not None:
+        (snapshot / "link").symlink_to(link)
+    for name, mode in (("env.py", 0o444), ("assets/a.txt", 0o444), ("assets", 0o555), (".", 0o555)):
+        (snapshot / name).chmod(mode)
     return str(snapshot)
 
 

@@ -15,8 +15,7 @@ CAP_SETPCAP = 8
 
 def drop_all() -> None:
     """Empty the bounding, ambient, inheritable, permitted and effective sets."""
-    if capget()[0] >> CAP_SETPCAP & 1:
-        _empty_the_bounding_set()
+    empty_the_bounding_set()
     prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL)
     capset(0, 0, 0)
 
@@ -27,7 +26,10 @@ def held() -> int:
     return effective | permitted | inheritable
 
 
-def _empty_the_bounding_set() -> None:
+def empty_the_bounding_set() -> None:
+    """Let no later ``execve`` bring a capability in. Nothing happens without the right to."""
+    if not capget()[0] >> CAP_SETPCAP & 1:
+        return
     for capability in range(64):
         try:
             prctl(_PR_CAPBSET_DROP, capability)

@@ -7,7 +7,7 @@ import os
 import pwd
 import random
 
-from envhub_worker.lockdown import process
+from envhub_worker.lockdown import capabilities, process
 from envhub_worker.lockdown.report import LayerUnavailableError
 
 # Far above the ranges that distributions, systemd and rootless containers hand out.
@@ -66,6 +66,7 @@ def _has_name(uid: int) -> bool:
 
 def become(uid: int) -> None:
     """Become ``uid`` with that group only, for good. ``die_with_parent`` must be armed again."""
+    capabilities.empty_the_bounding_set()
     os.setgroups([])
     os.setresgid(uid, uid, uid)
     os.setresuid(uid, uid, uid)

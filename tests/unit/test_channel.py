@@ -1,0 +1,84 @@
+"""Messages with descriptors between our own processes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import pytest
+
+from envhub_worker.channel import MAX_MESSAGE_BYTES, Channel
+
+
+@pytest.fixture
+def ends() -> Iterator[tuple[Channel, Channel]]:
+    """Both ends; the second one blocks."""
+    ours, theirs = Channel.pair()
+    other = Channel(theirs)
+    yield ours, other
+    ours.close()
+    other.close()
+
+
+def test_message_arrives_with_its_descriptors(ends: tuple[Channel, Channel]) -> None:
+    """The sender keeps its own; the receiver's are closed on exec."""
+    ours, theirs = ends
+    read, write = os.pipe()
+    ours.send({"op": "x", "n": 1}, [write])
+    message, (copy,) = theirs.receive() or ({}, [])
+    assert message == {"op": "x", "n": 1}
+    assert not os.get_inheritable(copy)
+    os.write(copy, b"through")
+    os.write(write, b" both")
+    assert os.read(read, 20) == b"through both"
+    for fd in (read, write, copy):
+        os.close(fd)
+
+
+def test_nothing_there_is_not_the_end(ends: tuple[Channel, Channel]) -> None:
+    """drain says which."""
+    ours, theirs = ends
+    assert ours.drain() == ([], False)
+    theirs.send({"a": 1})
+    theirs.close()
+    assert ours.drain() == ([({"a": 1}, [])], True)
+
+
+def test_last_words_arrive_although_our_own_were_never_read(
+    ends: tuple[Channel, Channel],
+) -> None:
+    """A peer that closes with unread messages resets the stream; what it sent still counts."""
+    ours, theirs = ends
+    ours.send({"unread": True})
+    theirs.send({"last": "words"})
+    theirs.close()
+    assert ours.drain() == ([({"last": "words"}, [])], True)
+
+
+def test_full_socket_keeps_the_order(ends: tuple[Channel, Channel]) -> None:
+    """What does not fit waits for flush."""
+    ours, theirs = ends
+    for n in range(2000):
+        ours.send({"n": n, "padding": "x" * 1000})
+    seen = []
+    while len(seen) < 2000:
+        message, _ = theirs.receive() or ({"n": None}, [])
+        seen.append(message["n"])
+        ours.flush()
+    assert seen == list(range(2000))
+
+
+def test_sending_to_nobody_is_no_error(ends: tuple[Channel, Channel]) -> None:
+    """Whoever reads learns of the end."""
+    ours, theirs = ends
+    theirs.close()
+    ours.send({"a": 1})
+    assert ours.drain() == ([], True)
+
+
+def test_oversized_message_is_refused(ends: tuple[Channel, Channel]) -> None:
+    """Before anything is sent."""
+    with pytest.raises(ValueError, match="over"):
+        ends[0].send({"a": "x" * MAX_MESSAGE_BYTES})
+    ends[0].close()
+    assert ends[1].receive() is None
