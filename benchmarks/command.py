@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from benchmarks.driver import players
+from benchmarks.driver import Player, players
 from benchmarks.interpreters import PEER_VENVS, Interpreters
 from benchmarks.load import load_average
 from benchmarks.machine import machine
@@ -32,6 +33,7 @@ class Plan:
         peers: Names.
         rounds: Turns of each peer.
         seconds: Length of a turn.
+        patience_s: How long to wait for a quiet machine, before each round.
     """
 
     cells: list[tuple[Workload, int]]
@@ -39,16 +41,20 @@ class Plan:
     peers: list[str]
     rounds: int
     seconds: float
+    patience_s: float
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run what the arguments say; returns the exit code."""
     options = _parser().parse_args(arguments)
     plan = _plan(options)
+    if options.nice:
+        os.nice(options.nice)  # everything that we start inherits it, the loaded condition's too
     results: dict[str, Any] = {
         "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "machine": machine(),
         "load_average": load_average(),
+        "nice": options.nice,
         "rounds": plan.rounds,
         "seconds": plan.seconds,
         "cells": run(plan, Interpreters(options.venvs)),
@@ -71,11 +77,17 @@ def run(plan: Plan, interpreters: Interpreters) -> list[dict[str, Any]]:
                     "condition": name,
                     "ready": {player.peer.name: player.ready for player in present},
                     "absent": absent,
-                    **measure(present, CONDITIONS[name], plan.rounds, plan.seconds),
+                    **_measured(plan, present, name),
                 }
                 print("\n".join(cell_lines(cell)), flush=True)
                 cells.append(cell)
     return cells
+
+
+def _measured(plan: Plan, present: list[Player], condition: str) -> dict[str, Any]:
+    return measure(
+        present, CONDITIONS[condition], plan.rounds, plan.seconds, patience_s=plan.patience_s
+    )
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -87,6 +99,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--peers", nargs="+", choices=PEERS, default=list(PEERS))
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--seconds", type=float, default=0.25, help="length of one turn")
+    parser.add_argument("--patience", type=float, default=10.0, help="seconds, per round")
+    parser.add_argument("--nice", type=int, default=0, help="-20: on a machine that others use")
     parser.add_argument("--venvs", type=Path, default=PEER_VENVS, help="of peers, by name")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder for the reports")
     return parser
@@ -96,10 +110,17 @@ def _plan(options: argparse.Namespace) -> Plan:
     if options.quick:
         cells = [(WORKLOADS["cartpole"], 4), (WORKLOADS["cameras"], 2)]
         peers = [name for name in options.peers if name in ("sync", "async", "envhub")]
-        return Plan(cells, ["quiet"], peers, rounds=2, seconds=0.05)
+        return Plan(cells, ["quiet"], peers, rounds=2, seconds=0.05, patience_s=0.0)
     cells = [
         (WORKLOADS[name], size)
         for name in options.workloads
         for size in options.sizes or WORKLOADS[name].sizes
     ]
-    return Plan(cells, options.conditions, options.peers, options.rounds, options.seconds)
+    return Plan(
+        cells,
+        options.conditions,
+        options.peers,
+        options.rounds,
+        options.seconds,
+        options.patience,
+    )

@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+_QUIET_CORES = 0.15
 _BUSY = "import os\nparent = os.getppid()\nwhile os.getppid() == parent:\n    sum(range(100000))"
 
 
@@ -26,3 +28,27 @@ def busy_processes(count: int) -> Iterator[None]:
 def load_average() -> float:
     """Processes that ran or wanted to, over the last minute."""
     return os.getloadavg()[0]
+
+
+def busy_cores(seconds: float = 0.1) -> float:
+    """Cores that are in use. Called while all peers are parked, so by somebody else."""
+    before = _jiffies()
+    time.sleep(seconds)
+    return (_jiffies() - before) / os.sysconf("SC_CLK_TCK") / seconds
+
+
+def wait_for_quiet(patience_s: float) -> float:
+    """Wait until nobody else computes, or patience ends; returns the cores then in use."""
+    until = time.monotonic() + patience_s
+    busy = busy_cores()
+    while busy > _QUIET_CORES and time.monotonic() < until:
+        time.sleep(0.2)
+        busy = busy_cores()
+    return round(busy, 2)
+
+
+def _jiffies() -> int:
+    # user, nice, system, idle, iowait, irq, softirq, steal: see proc_stat(5)
+    with open("/proc/stat") as stat:
+        fields = [int(field) for field in stat.readline().split()[1:9]]
+    return sum(fields) - fields[3] - fields[4]

@@ -36,10 +36,11 @@ def markdown(results: dict[str, Any]) -> Iterator[str]:
 def cell_lines(cell: dict[str, Any]) -> Iterator[str]:
     """One workload at one size under one condition."""
     title = WORKLOADS[cell["workload"]].title
-    loads = cell["load_average"]
+    others = cell["busy_cores_before_rounds"]
     yield f"### {title}, n = {cell['n']}, {cell['condition']}"
     yield ""
-    yield f"Load average {loads[0]:.1f} to {loads[-1]:.1f}. Microseconds for one vector step."
+    busy = f"{min(others):.2f} to {max(others):.2f}"
+    yield f"Cores in use by others before the rounds: {busy}. Microseconds for one vector step."
     yield ""
     yield "| peer | mean | p50 | p95 | over Sync | x Sync | x Async | p50: x Sync | x Async |"
     yield "|---|---|---|---|---|---|---|---|---|"

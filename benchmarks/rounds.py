@@ -11,7 +11,7 @@ from typing import Any
 
 from benchmarks.clock import Slice
 from benchmarks.driver import Absent, Player
-from benchmarks.load import busy_processes, load_average
+from benchmarks.load import busy_processes, load_average, wait_for_quiet
 from benchmarks.peers import ASYNC, SYNC
 
 _BUSY_PROCESSES = 2
@@ -48,21 +48,34 @@ CONDITIONS = {
 
 
 def measure(
-    present: list[Player], condition: Condition, rounds: int, seconds: float
+    present: list[Player], condition: Condition, rounds: int, seconds: float, patience_s: float
 ) -> dict[str, Any]:
-    """Run rounds; returns each peer's turns and ratios, and the load of the machine."""
+    """Run rounds; returns each peer's turns and ratios, and what else the machine did.
+
+    Args:
+        present: The peers.
+        condition: Under which they step.
+        rounds: Turns of each.
+        seconds: Length of a turn.
+        patience_s: How long to wait, before each round, for others to leave the machine alone.
+    """
     turns: dict[str, list[dict[str, Any]]] = {player.peer.name: [] for player in present}
     failed: dict[str, str] = {}
     order = Slice(seconds * condition.longer, think_s=condition.think_s, busy=condition.busy)
-    loads = [load_average()]
+    others: list[float] = []
     shuffled = random.Random(0)
-    with busy_processes(_BUSY_PROCESSES) if condition.others else nullcontext():
-        for _ in range(rounds):
+    for _ in range(rounds):
+        others.append(wait_for_quiet(patience_s))
+        with busy_processes(_BUSY_PROCESSES) if condition.others else nullcontext():
             for player in shuffled.sample(present, len(present)):
                 _take_turn(player, order, turns, failed)
-            loads.append(load_average())
     results = {name: _result(name, turns) for name in turns if name not in failed}
-    return {"peers": results, "failed": failed, "load_average": loads}
+    return {
+        "peers": results,
+        "failed": failed,
+        "load_average": load_average(),
+        "busy_cores_before_rounds": others,
+    }
 
 
 def _take_turn(
