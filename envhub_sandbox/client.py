@@ -157,6 +157,7 @@ _REASONS = {
     "signal": "a signal ended it",
     "out-of-memory": "it ran out of memory",
     "cpu-limit": "it used up its cpu limit",
+    "disk-limit": "it used up its disk limit",
     "protocol": "it broke the rules of the wire and was killed",
     "killed": "it was closed",
     "zygote": "the process that forks workers ended",
@@ -180,4 +181,5 @@ def death(reply: m.Died) -> WorkerDiedError:
         reason=reply.reason,
         log_tail=reply.tail,
         request=reply.operation or None,
+        detail=reply.detail,
     )

@@ -121,9 +121,12 @@ class WorkerDiedError(WorkerError):
     Attributes:
         exit_code: The exit code, or None when a signal ended it.
         signal: The name of the signal (``"SIGKILL"``), or None.
-        reason: ``"exit"``, ``"signal"``, ``"out-of-memory"``, ``"cpu-limit"`` or ``"killed"``.
+        reason: ``"exit"``, ``"signal"``, ``"out-of-memory"``, ``"cpu-limit"``, ``"disk-limit"``,
+            ``"protocol"``, ``"zygote"``, ``"server"`` or ``"killed"``.
         log_tail: The last lines of its output, control characters escaped.
         request: The operation that it was serving (``"step"``), or None.
+        detail: The numbers, where a limit was the reason.
+        repository: The repository, commit and entry file, as in ``org/repo@0123456789ab:env.py``.
     """
 
     def __init__(
@@ -135,8 +138,11 @@ class WorkerDiedError(WorkerError):
         reason: str = "exit",
         log_tail: str = "",
         request: str | None = None,
+        detail: str = "",
     ) -> None:
         super().__init__(message)
+        self.repository: str | None = None
+        self.detail = detail
         self.exit_code = exit_code
         self.signal = signal
         self.reason = reason
@@ -145,7 +151,21 @@ class WorkerDiedError(WorkerError):
 
 
 class WorkerTimeoutError(WorkerError, TimeoutError):
-    """The worker did not answer in time. ``reset()`` brings the environment back."""
+    """The worker did not answer in time. ``reset()`` brings the environment back.
+
+    Attributes:
+        request: The operation that was asked for (``"step"``), or None.
+        timeout_s: How long it was waited for.
+        repository: The repository, commit and entry file, as in ``org/repo@0123456789ab:env.py``.
+    """
+
+    def __init__(
+        self, message: str, *, request: str | None = None, timeout_s: float | None = None
+    ) -> None:
+        super().__init__(message)
+        self.request = request
+        self.timeout_s = timeout_s
+        self.repository: str | None = None
 
 
 class RemoteEnvError(EnvHubError):
@@ -223,3 +243,5 @@ def name_source(error: EnvHubError, label: str) -> None:
     text = str(error.args[0]) if error.args else ""
     if not text.startswith(label):
         error.args = (f"{label}: {text}", *error.args[1:])
+    if isinstance(error, (WorkerDiedError, WorkerTimeoutError)):
+        error.repository = label

@@ -6,6 +6,7 @@ its processes. Where ``make_env`` has already built all of them, they live in on
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable
 from typing import Protocol
@@ -64,7 +65,8 @@ class SharedJail:
     def __init__(self, repository: Repository, forget_manifest: Callable[[], None]) -> None:
         self.repository = repository
         self.forget_manifest = forget_manifest
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # the garbage collector may close one of them meanwhile
+        self._owner = os.getpid()
         self._first: LoadedJail | None = None
         self._users = 0
 
@@ -96,7 +98,9 @@ class SharedJail:
                 self._close_first()
 
     def close(self) -> None:
-        """End a jail that was provided and never taken."""
+        """End a jail that was provided and never taken. A fork of its owner does nothing."""
+        if os.getpid() != self._owner:
+            return
         with self._lock:
             if self._users == 0:
                 self._close_first()

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import os
 import threading
 import time
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
@@ -66,13 +68,15 @@ class RemoteEnv:
         self.bounds = even_bounds(manifest.num_envs, shards)
         self.lifecycle = Lifecycle()
         self._jails = jails
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # a signal handler may close what its own thread waits for
         self._loaded: LoadedJail | None = None
         self._hosts: list[int] = []
         self._number = 0
         self._pending: tuple[int, str] | None = None
         self._lane: FastLane | None = None
+        self._release_server: Callable[[], None] = _nothing
         self.results = Results(manifest, self.bounds)
+        _living.add(self)
 
     @property
     def repository(self) -> Repository:
@@ -166,7 +170,7 @@ class RemoteEnv:
         outcomes = self._finish(lambda: self._wait_on_lane(lane, deadline), timeout_s)
         infos: dict[Any, Any] = {}
         if any(outcome != _EMPTY for outcome in outcomes):
-            infos = self.results.lane_infos(self._lane_infos(lane, outcomes))
+            infos = self.results.lane_infos(self._lane_infos(lane, outcomes, deadline, timeout_s))
         return (lane.observation(), *lane.flags(), infos)
 
     def _wait_on_lane(self, lane: FastLane, deadline: Deadline) -> list[Outcome]:
@@ -175,13 +179,19 @@ class RemoteEnv:
         except JailGoneError:
             raise self._cause_of_death() from None
 
-    def _lane_infos(self, lane: FastLane, outcomes: list[Outcome]) -> list[Any]:
+    def _lane_infos(
+        self,
+        lane: FastLane,
+        outcomes: list[Outcome],
+        deadline: Deadline,
+        timeout_s: float | None,
+    ) -> list[Any]:
         infos: list[Any] = []
         for (kind, message), shard, host in zip(outcomes, lane.shards, self._hosts, strict=True):
             if kind == slabs.COLUMNS:
                 infos.append(shard.columns())
             elif kind == slabs.FETCH:
-                infos.append(self._fetch_infos(host))
+                infos.append(self._fetch_infos(host, deadline, timeout_s))
             elif message is None:
                 infos.append({})
             else:
@@ -189,11 +199,10 @@ class RemoteEnv:
                 infos.append(typed(message, m.Value).value)
         return infos
 
-    def _fetch_infos(self, host: int) -> Any:
-        assert self._loaded is not None
-        deadline = Deadline(self.repository.timeouts.call_s)
-        request = (host, m.FetchInfos(self._number))
-        [reply] = self._loaded.jail.exchange("step", [request], deadline)
+    def _fetch_infos(self, host: int, deadline: Deadline, timeout_s: float | None) -> Any:
+        self._send("step", [(host, m.FetchInfos(self._number))])
+        [reply] = self._collect(deadline, timeout_s)
+        check(reply)
         return typed(reply, m.Value).value
 
     def _cause_of_death(self) -> Exception:
@@ -211,9 +220,12 @@ class RemoteEnv:
     def recover(self) -> None:
         """Before a reset: catch up with a late reply, or give up the jail that owes it.
 
-        After a death a fresh jail is started only if the policy says ``restart="on_reset"``.
+        A reply that nobody waits for any more, because of Ctrl-C, counts as late. After a death
+        a fresh jail is started only if the policy says ``restart="on_reset"``.
         """
         with self._lock, self.repository.named():
+            if self.lifecycle.state is State.PENDING:
+                self.lifecycle.on(Event.INTERRUPT)
             if self.lifecycle.state is State.LATE:
                 self._catch_up()
             may_restart = self.repository.policy.restart != "never"
@@ -223,9 +235,10 @@ class RemoteEnv:
     def _catch_up(self) -> None:
         loaded, pending = self._loaded, self._pending
         assert loaded is not None
-        assert pending is not None
         deadline = Deadline(_GRACE_S)
         try:
+            if pending is None:  # interrupted on the way out: nobody knows what was sent
+                raise WorkerTimeoutError("the request was interrupted")
             if pending is _BY_LANE and self._lane is not None:
                 self._wait_on_lane(self._lane, deadline)
             else:
@@ -238,14 +251,21 @@ class RemoteEnv:
 
     def _refuse_unless_usable(self, operation: str) -> None:
         state = self.lifecycle.state
-        if state is State.LATE:
+        if state in (State.LATE, State.PENDING):
             raise WorkerTimeoutError(
-                f"cannot {operation}: the reply to the last request is late; call reset() first"
+                f"cannot {operation}: the reply to the last request is late; call reset() first",
+                request=operation,
             )
         if state is State.DEAD:
             raise WorkerDiedError(
                 f"cannot {operation}: the worker process has died; make the environment again, or "
-                "use policy={'restart': 'on_reset'} and call reset()"
+                "use policy={'restart': 'on_reset'} and call reset()",
+                request=operation,
+            )
+        if state is State.FOREIGN:
+            raise WorkerError(
+                f"cannot {operation}: this environment belongs to another process, and this is a "
+                f"fork of it ({os.getpid()}); call make_env here to get one of its own"
             )
         if state not in (State.IDLE, State.READY):
             raise WorkerError(f"cannot {operation}: the environment is {state.value}")
@@ -272,14 +292,34 @@ class RemoteEnv:
             self._moved(Event.TIMEOUT)
             raise WorkerTimeoutError(
                 f"{self._pending[1]} has not finished after {timeout_s} s; reset() brings the "
-                "environment back, in a fresh process if it still does not answer"
+                "environment back, in a fresh process if it still does not answer",
+                request=self._pending[1],
+                timeout_s=timeout_s,
             ) from error
-        except EnvHubError:
-            self._moved(Event.DEATH)
+        except EnvHubError as error:
+            raise self._dead(error) from error.__cause__
+        except BaseException as error:  # Ctrl-C, or whatever else a signal handler raises or does
+            if self.lifecycle.state is State.CLOSED and isinstance(error, Exception):
+                raise self._dead(WorkerDiedError("")) from error
+            self._moved(Event.INTERRUPT)
             raise
         self._pending = None
         self._moved(Event.REPLY)
         return received
+
+    def _dead(self, error: EnvHubError) -> EnvHubError:
+        """Write a death down; what closed an environment under its user is told as such."""
+        assert self._pending is not None
+        if self.lifecycle.state is State.CLOSED:
+            return WorkerDiedError(
+                f"the environment was closed during {self._pending[1]}",
+                reason="killed",
+                request=self._pending[1],
+            )
+        self._moved(Event.DEATH)
+        if not isinstance(error, WorkerDiedError) and self._loaded is not None:
+            self._jails.end(self._loaded)  # it lives, and cannot be trusted to do what it says
+        return error
 
     def _moved(self, event: Event) -> None:
         # close() may have come meanwhile, from another thread
@@ -295,9 +335,20 @@ class RemoteEnv:
 
     def _start(self) -> None:
         deadline = Deadline(self.repository.timeouts.startup_s)
-        self._build(self._jails.take(deadline), deadline)
+        try:
+            self._build(self._jails.take(deadline), deadline)
+        finally:
+            self._let_server_go()
+
+    def _let_server_go(self) -> None:
+        release, self._release_server = self._release_server, _nothing
+        release()
 
     def _build(self, loaded: LoadedJail, deadline: Deadline) -> None:
+        with self.repository.starting():
+            self._build_in(loaded, deadline)
+
+    def _build_in(self, loaded: LoadedJail, deadline: Deadline) -> None:
         try:
             self._check_manifest(loaded)
             hosts = self.repository.spread(loaded, len(self.bounds), deadline)
@@ -354,7 +405,9 @@ class RemoteEnv:
             )
 
     def _forget(self) -> None:
-        """Give up the jail; the next request opens another."""
+        """Give up the jail; the next request opens another, in the same server."""
+        self._let_server_go()
+        self._release_server = self.repository.hold()
         if self._loaded is not None:
             self._jails.end(self._loaded)
             self._jails.give_back(self._loaded)
@@ -365,6 +418,9 @@ class RemoteEnv:
     def close(self) -> None:
         """Close the environment and end its processes, in bounded time, from any thread."""
         if self.lifecycle.state is State.CLOSED:
+            return
+        if self.lifecycle.state is State.FOREIGN:
+            self.lifecycle.on(Event.CLOSE)
             return
         if not self._lock.acquire(blocking=False):
             self._interrupt()
@@ -377,8 +433,17 @@ class RemoteEnv:
                     self._close_politely(loaded)
                 self._jails.give_back(loaded)
             self._close_lane()
+            self._let_server_go()
         finally:
             self._lock.release()
+
+    def abandon(self) -> None:
+        """In a fork of the process that made it: touch nothing, and refuse from now on."""
+        self._lock = threading.RLock()  # whichever thread held it is not here
+        if self.lifecycle.state is not State.CLOSED:
+            self.lifecycle.on(Event.FORK)
+        self._pending, self._release_server = None, _nothing
+        self._close_lane()
 
     def _interrupt(self) -> None:
         """Another thread waits for a reply: end the jail under it, then clean up after it."""
@@ -391,6 +456,7 @@ class RemoteEnv:
             try:
                 self._jails.give_back(loaded)
                 self._close_lane()
+                self._let_server_go()
             finally:
                 self._lock.release()
 
@@ -405,6 +471,21 @@ class RemoteEnv:
         requests = [(host, m.Close(self._number)) for host in self._hosts]
         with contextlib.suppress(EnvHubError):
             loaded.jail.receive(loaded.jail.send("close", requests), deadline)
+
+
+_living: weakref.WeakSet[RemoteEnv] = weakref.WeakSet()
+
+
+def _abandon_all() -> None:
+    for env in list(_living):
+        env.abandon()
+
+
+os.register_at_fork(after_in_child=_abandon_all)
+
+
+def _nothing() -> None:
+    """There is nothing to give back."""
 
 
 def _shape(manifest: EnvManifest) -> tuple[Any, ...]:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.client import WorkerClient
 from envhub_sandbox.deadline import Deadline
-from envhub_sandbox.errors import EnvHubError, LoadError, name_source
+from envhub_sandbox.errors import EnvHubError, LoadError, WorkerTimeoutError, name_source
 from envhub_sandbox.jail import RemoteJail, check, open_jail
 from envhub_sandbox.policy import Policy, Timeouts
 from envhub_sandbox.sandboxes.base import Sandbox, WorkerServer
@@ -51,6 +52,7 @@ class LoadedJail:
     value: dict[str, object]
     loaded: set[int]
     server: WorkerServer
+    closed: bool = False
 
 
 class Repository:
@@ -115,6 +117,26 @@ class Repository:
             name_source(error, self.label)
             raise
 
+    @contextmanager
+    def starting(self) -> Iterator[None]:
+        """Say what it was that took too long."""
+        try:
+            yield
+        except WorkerTimeoutError as error:
+            if error.request is not None:
+                raise
+            startup_s = self.timeouts.startup_s
+            raise WorkerTimeoutError(
+                f"make_env has not finished after {startup_s} s and was ended; give it longer "
+                "with timeouts={'startup_s': ...}, or make it again",
+                request="make_env",
+                timeout_s=startup_s,
+            ) from error
+
+    def hold(self) -> Callable[[], None]:
+        """Keep the server between two jails; returns what gives it back."""
+        return partial(self._sandbox.release, self._sandbox.acquire(self._store))
+
     def open(self, deadline: Deadline) -> LoadedJail:
         """Fork a jail and have its first host call ``make_env``.
 
@@ -124,7 +146,8 @@ class Repository:
         """
         server = self._sandbox.acquire(self._store)
         try:
-            return self._open(server, deadline)
+            with self.starting():
+                return self._open(server, deadline)
         except BaseException:
             self._sandbox.release(server)
             raise
@@ -195,7 +218,10 @@ class Repository:
         self._sandbox.release(loaded.server)
 
     def close(self, loaded: LoadedJail) -> None:
-        """End a jail and give its server back."""
+        """End a jail and give its server back. Idempotent."""
+        if loaded.closed:
+            return
+        loaded.closed = True
         try:
             loaded.jail.close(Deadline(_CLOSE_S))
         finally:

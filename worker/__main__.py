@@ -4,8 +4,9 @@
 [--client-pidfd N]``
 
 - argv: ``E`` is the ZeroMQ endpoint to bind, ``ipc://`` in a folder of mode 0700. ``D`` is an
-  existing private folder for what lives as long as the server. ``P`` are the folders that
-  snapshots may lie in; nothing else of the machine's data is shown to a jail.
+  existing private folder for what lives as long as the server; it is removed at the end. ``P``
+  are the folders that snapshots may lie in; nothing else of the machine's data is shown to a
+  jail.
 - file descriptors: ``--ready-fd`` gets one line (``ready``) once the endpoint is bound, and is
   closed. ``--client-pidfd`` is a pidfd of the client: when that process ends, so does all of this.
   stdin is not read; stdout and stderr are for people.

@@ -23,6 +23,7 @@ from envhub_worker.channel import close_fds
 from envhub_worker.deposits import Deposits
 from envhub_worker.jailspec import JailSpec, confinement_from_wire
 from envhub_worker.link import MAX_PENDING, HostLink
+from envhub_worker.lockdown.scratch import remove_tree
 from envhub_worker.output import OutputTail
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec import Buffer
@@ -91,6 +92,7 @@ class JailEntry:
     opening: list[Opening] = field(default_factory=list)
     closing: list[Asker] = field(default_factory=list)
     death: m.Died | None = None
+    released: bool = False
 
     def __post_init__(self) -> None:
         # kept, because closing a descriptor makes it forget its number
@@ -177,6 +179,7 @@ class Server:
         self._deposits.close()
         self._router.close()
         self._context.term()
+        remove_tree(str(self._runtime_dir))  # its owner may not be there any more
 
     # --- clients -------------------------------------------------------------------------------
 
@@ -356,10 +359,10 @@ class Server:
         entry = self._jails.get(request.jail)
         if entry is None or entry.session != self._sessions[asker.identity]:
             self._reply(asker, m.Done())
-        elif entry.death is not None:
+        elif entry.released:
             del self._jails[entry.number]
             self._reply(asker, m.Done())
-        else:
+        else:  # also after its death: Done means that nothing of it is left
             entry.closing.append(asker)
             self._kill(entry)
 
@@ -489,6 +492,7 @@ class Server:
             self._reply(asker, m.Done())
 
     def _release(self, entry: JailEntry) -> None:
+        entry.released = True
         for link in entry.links.values():
             self._unwatch(link.fileno())
             link.close()

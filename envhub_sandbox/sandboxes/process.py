@@ -66,7 +66,8 @@ class ProcessSandbox:
     name = "process"
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        # reentrant: the garbage collector may close an environment in the middle of acquire()
+        self._lock = threading.RLock()
         self._servers: dict[tuple[int, Path], ProcessServer] = {}
 
     def acquire(self, store: Path) -> ProcessServer:
@@ -78,8 +79,11 @@ class ProcessSandbox:
             )
         with self._lock:
             server = self._servers.get((os.getpid(), store))
-            if server is None or server.process.poll() is not None:
-                server = self._servers[os.getpid(), store] = _start(store)
+            if server is not None:
+                server.users += 1  # at once: nobody may end it from here on
+                if server.process.poll() is None:
+                    return server
+            server = self._servers[os.getpid(), store] = _start(store)
             server.users += 1
             return server
 
@@ -94,6 +98,10 @@ class ProcessSandbox:
                 if known is server:
                     del self._servers[key]
         server.stop()
+
+    def forked(self) -> None:
+        """In a fork: whichever thread held the lock is not here."""
+        self._lock = threading.RLock()
 
     def stop_all(self) -> None:
         """End all servers of this process, as at its exit."""
@@ -163,3 +171,4 @@ def _wait_until_ready(ready: int, server: ProcessServer) -> None:
 
 PROCESS = ProcessSandbox()
 atexit.register(PROCESS.stop_all)
+os.register_at_fork(after_in_child=PROCESS.forked)

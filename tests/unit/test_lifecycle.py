@@ -69,8 +69,22 @@ def test_requests_are_answered_one_at_a_time() -> None:
 
 
 def test_death_is_survived_by_forgetting() -> None:
-    """A dead environment can only be given up or closed."""
-    assert {event for state, event in TABLE if state is State.DEAD} == {Event.FORGET, Event.CLOSE}
+    """A dead environment can only be given up or closed (and be forked along)."""
+    dead = {event for state, event in TABLE if state is State.DEAD}
+    assert dead == {Event.FORGET, Event.CLOSE, Event.FORK}
+
+
+def test_interruption_leaves_a_late_reply() -> None:
+    """Whoever was interrupted while waiting has a reply outstanding, as after a timeout."""
+    assert after(Event.START, Event.SUBMIT, Event.INTERRUPT) is State.LATE
+
+
+def test_fork_can_only_close() -> None:
+    """In a fork every environment that was open is another process's, and stays so."""
+    for state in set(State) - {State.CLOSED}:
+        assert TABLE[state, Event.FORK] is State.FOREIGN
+    leads = {event: TABLE[state, event] for state, event in TABLE if state is State.FOREIGN}
+    assert leads == {Event.CLOSE: State.CLOSED, Event.FORK: State.FOREIGN}
 
 
 def test_every_state_can_be_reached() -> None:

@@ -13,6 +13,7 @@ class State(Enum):
     PENDING = "waiting for a reply"
     LATE = "waiting for a reply that is late"
     DEAD = "dead"
+    FOREIGN = "another process's: this is a fork of it"
     CLOSED = "closed"
 
     __hash__ = object.__hash__  # members are singletons; Enum's own hash is slow in Python
@@ -25,8 +26,10 @@ class Event(Enum):
     SUBMIT = "a request was sent"
     REPLY = "the reply came"
     TIMEOUT = "the deadline came first"
+    INTERRUPT = "whoever waited was interrupted"
     DEATH = "its jail ended"
     FORGET = "its jail was given up"
+    FORK = "this process is a fork of the one that made it"
     CLOSE = "it was closed"
 
     __hash__ = object.__hash__
@@ -41,6 +44,7 @@ TABLE: dict[tuple[State, Event], State] = {
     (State.READY, Event.CLOSE): State.CLOSED,
     (State.PENDING, Event.REPLY): State.READY,
     (State.PENDING, Event.TIMEOUT): State.LATE,
+    (State.PENDING, Event.INTERRUPT): State.LATE,
     (State.PENDING, Event.DEATH): State.DEAD,
     (State.PENDING, Event.CLOSE): State.CLOSED,
     (State.LATE, Event.REPLY): State.READY,
@@ -49,6 +53,8 @@ TABLE: dict[tuple[State, Event], State] = {
     (State.LATE, Event.CLOSE): State.CLOSED,
     (State.DEAD, Event.FORGET): State.IDLE,
     (State.DEAD, Event.CLOSE): State.CLOSED,
+    (State.FOREIGN, Event.CLOSE): State.CLOSED,
+    **{(state, Event.FORK): State.FOREIGN for state in State if state is not State.CLOSED},
 }
 
 
