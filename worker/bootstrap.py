@@ -6,6 +6,7 @@ from the folder of this very file::
 
     python -I .../bootstrap.py worker ARGS...    envhub_worker.__main__.main(ARGS)
     python -I .../bootstrap.py zygote ARGS...    envhub_worker.zygote.main(ARGS)
+    python -I .../bootstrap.py probe             envhub_worker.lockdown.probe.main([])
 """
 
 from __future__ import annotations
@@ -16,11 +17,15 @@ import os
 import sys
 from collections.abc import Sequence
 
-_PROGRAMS = {"worker": "envhub_worker.__main__", "zygote": "envhub_worker.zygote"}
+_PROGRAMS = {
+    "worker": "envhub_worker.__main__",
+    "zygote": "envhub_worker.zygote",
+    "probe": "envhub_worker.lockdown.probe",
+}
 
 
 def command(python: str, program: str, *args: str) -> list[str]:
-    """The argv that runs ``program`` (``"worker"`` or ``"zygote"``) with ``args`` in ``python``."""
+    """The argv that runs ``program`` (a key of ``_PROGRAMS``) with ``args`` in ``python``."""
     return [python, "-I", os.path.abspath(__file__), program, *args]
 
 

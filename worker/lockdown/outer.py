@@ -40,6 +40,7 @@ def enter(config: ZygoteConfig) -> Common:
     else:
         if config.user is not None:
             _become(config)
+            _check_interpreter()
         covered = ([], [])
     return Common(
         config=config,
@@ -107,6 +108,18 @@ def _become(config: ZygoteConfig) -> None:
     assert config.user is not None
     user.become(config.user)
     process.die_with_parent(config.parent)
+
+
+def _check_interpreter() -> None:
+    """Without a private root, the new user needs the host's permission to read its Python."""
+    for path in (os.__file__, sys.prefix, __file__):
+        if not os.access(path, os.R_OK):
+            raise LayerUnavailableError(
+                "unprivileged-user",
+                f"root must run jails as another user, and that one may not read {path}",
+                'Use an interpreter that all users may read, the profile "strict", or start as '
+                "a plain user.",
+            )
 
 
 def _be_the_first_process() -> None:
