@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     plan = _plan(options)
     if options.nice:
-        os.nice(options.nice)  # everything that we start inherits it, the loaded condition's too
+        os.nice(options.nice)  # all that we start inherits it, the loaded condition's too
     results: dict[str, Any] = {
         "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "machine": machine(),

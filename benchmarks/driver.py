@@ -16,6 +16,7 @@ from typing import Any
 
 from benchmarks.clock import Slice
 from benchmarks.interpreters import Interpreters
+from benchmarks.load import take_precedence
 from benchmarks.peers import Peer
 from benchmarks.workloads import Workload
 
@@ -53,6 +54,7 @@ class Player:
             self.ready = self._report(_OPEN_S)
             if not self.ready.get("ready"):
                 raise Absent(self.ready.get("missing") or f"{self.ready.get('failed')}")
+            take_precedence(self._process.pid)
         except BaseException:
             self.close()
             raise
