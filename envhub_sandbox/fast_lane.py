@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from envhub_sandbox.cores import CPUS, Cores
 from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import RemoteProtocolError, WorkerTimeoutError
 from envhub_sandbox.observations import RING, ObservationSlab
@@ -35,6 +36,7 @@ _RECHECK_MS = 2
 _CONNECT_S = 5.0
 # elsewhere a core may see the sequence word before the data it announces: sleep, do not poll
 _ORDERED_STORES = platform.machine() in ("x86_64", "AMD64")
+
 
 Outcome = tuple[int, m.Message | None]
 """``slabs.DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``, and what came encoded."""
@@ -80,7 +82,7 @@ class LaneShard:
         while self._slab_fds:
             os.close(self._slab_fds.pop())
 
-    def ask(self, leaves: Sequence[Any], slot: int, spin_ns: int) -> None:
+    def ask(self, leaves: Sequence[Any], slot: int, spin_ns: int, cpu: int = 0) -> None:
         """Write a shard's actions and announce them; its observations are to go to ``slot``."""
         asks = self._asks
         for index, leaf in enumerate(leaves):
@@ -93,6 +95,7 @@ class LaneShard:
         self.sequence += 1
         asks[slabs.SPIN] = spin_ns
         asks[slabs.SLOT] = slot
+        asks[slabs.CPU] = cpu
         asks[slabs.SEQUENCE] = self.sequence
         if self._tells[slabs.PARKED]:
             os.write(self._host_bell, _RING)
@@ -190,8 +193,13 @@ class FastLane:
         self._poller.register(process_fd, select.POLLIN)
         for shard in self.shards:
             self._poller.register(shard.bell, select.POLLIN)
-        self._spin = SpinChooser(_ORDERED_STORES)
+        self._spin = SpinChooser(_ORDERED_STORES and len(CPUS) > 1)
         self._asked_ns = 0
+        # One core is the client's. Shards that find no other sleep until they are asked, then run
+        # on the client's while it sleeps: so it waits for those first, and for the others awake.
+        self._awake = min(len(self.shards), len(CPUS) - 1)
+        self._cores = Cores(len(self.shards), self._awake)
+        self._order = [*self.shards[self._awake :], *self.shards[: self._awake]]
 
     @classmethod
     def for_spaces(
@@ -227,13 +235,15 @@ class FastLane:
         """Send a validated batch of actions to every shard."""
         leaves = [actions] if self._flat_actions else slabs.flatten(self._action_space, actions)
         self._asked_ns = perf_counter_ns()
-        spin_ns = self._spin.host_budget_ns
+        spin_ns = self._spin.budget_ns
         slot = self.observations.choose()
         if len(self.shards) == 1:
             self.shards[0].ask(leaves, slot, spin_ns)
             return
-        for shard, (start, stop) in zip(self.shards, self._bounds, strict=True):
-            shard.ask([leaf[start:stop] for leaf in leaves], slot, spin_ns)
+        cpus = self._cores.of_shards()
+        for index, (shard, (start, stop)) in enumerate(zip(self.shards, self._bounds, strict=True)):
+            rows = [leaf[start:stop] for leaf in leaves]
+            shard.ask(rows, slot, spin_ns if index < self._awake else 0, cpus[index])
 
     def wait(self, deadline: Deadline) -> list[Outcome]:
         """Every shard's outcome.
@@ -243,8 +253,9 @@ class FastLane:
             JailGoneError: The jail has ended.
             RemoteProtocolError: A shard wrote what the rules forbid.
         """
-        for shard in self.shards:
-            if not shard.answered() and not self._spin_for(shard):
+        asleep = len(self._order) - self._awake
+        for index, shard in enumerate(self._order):
+            if not shard.answered() and (index < asleep or not self._spin_for(shard)):
                 self._sleep_for(shard, deadline)
         self._spin.measured(perf_counter_ns() - self._asked_ns)
         return [shard.outcome() for shard in self.shards]

@@ -10,8 +10,11 @@ import mmap
 import os
 
 SEAL_FUTURE_WRITE = 0x10
-"""``F_SEAL_FUTURE_WRITE``, which ``fcntl`` does not name: nobody else maps it writable."""
-_SIZE_SEALS = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW
+"""``F_SEAL_FUTURE_WRITE``: nobody else maps it writable."""
+_ADD_SEALS = 1033
+_SIZE_SEALS = 0x1 | 0x2 | 0x4
+"""``F_SEAL_SEAL``, ``F_SEAL_SHRINK`` and ``F_SEAL_GROW``, by number: systems without them import
+this file too."""
 
 
 def slab(name: str, size: int, further_seals: int = 0) -> tuple[mmap.mmap, int]:
@@ -22,5 +25,5 @@ def slab(name: str, size: int, further_seals: int = 0) -> tuple[mmap.mmap, int]:
     fd = os.memfd_create(f"envhub-{name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     os.ftruncate(fd, size)
     mapped = mmap.mmap(fd, size)
-    fcntl.fcntl(fd, fcntl.F_ADD_SEALS, _SIZE_SEALS | further_seals)
+    fcntl.fcntl(fd, _ADD_SEALS, _SIZE_SEALS | further_seals)
     return mapped, fd

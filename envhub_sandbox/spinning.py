@@ -13,7 +13,7 @@ _TRIAL = 16
 """Steps of one trial."""
 _FIRST_INTERVAL = 64
 _LONGEST_INTERVAL = 8192
-_MAX_BUDGET_NS = 200_000
+_MAX_BUDGET_NS = 400_000
 """A reply that is further away than this is not worth waiting awake for."""
 _ADVANTAGE = 0.97
 """Spinning must be this much faster to be chosen: it burns a core."""
@@ -23,36 +23,31 @@ class SpinChooser:
     """The chooser. ``measured`` is called once a step.
 
     Attributes:
-        budget_ns: How long the client may wait awake; 0 for not at all.
-        host_budget_ns: Likewise the host, for the next request.
+        budget_ns: How long each side may wait awake; 0 for not at all.
     """
 
     def __init__(self, allowed: bool) -> None:
         self._allowed = allowed
         self.budget_ns = 0
         self._chosen = self._spinning = False
-        self._best = {False: 0.0, True: 0.0}
-        self._sum = 0
-        self._steps = 0
+        self._best = {False: 0, True: 0}
+        self._samples: list[int] = []
         self._trials = 2 if allowed else 0
         self._interval = _FIRST_INTERVAL
         self._left = _TRIAL
-
-    @property
-    def host_budget_ns(self) -> int:
-        """Like the client's: the decision is one."""
-        return self.budget_ns
 
     def measured(self, elapsed_ns: int) -> None:
         """Take note of how long a step took, and decide when it is time to."""
         if not self._allowed:
             return
-        self._sum += elapsed_ns
-        self._steps += 1
-        if self._steps < self._left:
+        self._left -= 1
+        if self._trials:
+            self._samples.append(elapsed_ns)
+        if self._left > 0:
             return
-        self._best[self._spinning] = self._sum / self._steps
-        self._sum = self._steps = 0
+        if self._samples:  # the median: one hiccup of the machine must not decide
+            self._best[self._spinning] = sorted(self._samples)[len(self._samples) // 2]
+            self._samples.clear()
         self._decide()
 
     def _decide(self) -> None:

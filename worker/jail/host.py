@@ -39,16 +39,19 @@ def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
     poller.register(stream, select.POLLIN)
     timeout: int | None = None
     while True:
-        if host.lane is not None:
-            poller.register(host.lane.bell, select.POLLIN)
-            host.lane.rest()
         ready = [fd for fd, _ in poller.poll(timeout)]
+        lane = host.lane
+        if stream.fileno() in ready:
+            if not _serve(stream, reader, host):
+                return 0
+            if host.lane is not lane and host.lane is not None:
+                poller.register(host.lane.bell, select.POLLIN)
+        elif lane is not None and ready:
+            lane.wake()
+        elif lane is not None:
+            lane.serve()
         # a request may cross with our going to sleep: look again soon, once
         timeout = _RECHECK_MS if ready and host.lane is not None else None
-        if host.lane is not None and host.lane.bell in ready:
-            host.lane.wake()
-        if stream.fileno() in ready and not _serve(stream, reader, host):
-            return 0
 
 
 def _serve(stream: socket.socket, reader: PacketReader, host: Host) -> bool:

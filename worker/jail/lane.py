@@ -50,14 +50,17 @@ class Lane:
         os.set_blocking(self.bell, False)
         self._asked = slabs.words(self._request)
         self._told = slabs.words(self._reply)
+        self._told[slabs.PARKED] = 1
         self._layout = layout
         self._env = env
         self._assemble = slabs.assembler(env.single_action_space)
         self._served = 0
-        self._views: dict[tuple[int, int], Any] = {}
+        self._leaves = len(layout.actions)
+        self._codes: list[int] = []
+        self._views: list[Any] = []
         self._pairs: Pairs = []
         self._writer = InfoWriter(self._reply, layout.infos, layout.count)
-        self._slot = 0
+        self._slot = self._cpu = 0
         self._move(attach.start, observed)
 
     def _move(self, start: int, observed: slabs.ObservationLayout) -> None:
@@ -74,28 +77,25 @@ class Lane:
     def _rows(self, leaf: slabs.Leaf, base: int, start: int) -> Any:
         return slabs.view(self._observations, leaf, base=base)[start : start + self._layout.count]
 
-    def rest(self) -> None:
-        """Before sleeping: ask for the doorbell, and serve what came in the meantime."""
-        self._told[slabs.PARKED] = 1
-        self.serve()
-
     def wake(self) -> None:
         """After the doorbell: silence it, and serve while requests keep coming quickly."""
         with contextlib.suppress(BlockingIOError):
             os.read(self.bell, 8)
-        self._told[slabs.PARKED] = 0
         while self.serve() and self._wait_awake():
             pass
 
     def _wait_awake(self) -> bool:
-        budget = self._asked[slabs.SPIN]
-        if not budget:
-            return False
-        asked, served, until = self._asked, self._served, perf_counter_ns() + budget
-        while asked[slabs.SEQUENCE] == served:
-            if perf_counter_ns() > until:
-                return False
-        return True
+        """Wait for the next request without sleeping, for as long as the client says."""
+        asked, served = self._asked, self._served
+        budget = asked[slabs.SPIN]
+        if budget:
+            self._told[slabs.PARKED] = 0
+            until = perf_counter_ns() + budget
+            while perf_counter_ns() < until:
+                if asked[slabs.SEQUENCE] != served:
+                    return True
+        self._told[slabs.PARKED] = 1
+        return asked[slabs.SEQUENCE] != served
 
     def serve(self) -> bool:
         """Serve a request if there is one."""
@@ -116,10 +116,17 @@ class Lane:
             if slot != self._slot:
                 self._env.batch.choose(slot)
                 self._slot = slot
+            if self._asked[slabs.CPU] != self._cpu:
+                self._keep_to(self._asked[slabs.CPU])
             pairs = self._pairs = self._env.run_step(self._actions())
             return self._writer.write(pairs) if pairs else (slabs.DONE, 0)
         except BaseException as error:
             return slabs.RAISED, self._writer.put(_raised_frame(error))
+
+    def _keep_to(self, cpu: int) -> None:
+        self._cpu = cpu
+        with contextlib.suppress(OSError):  # it may have gone, or not be ours
+            os.sched_setaffinity(0, {cpu - 1} if cpu else range(os.cpu_count() or 1))
 
     def infos(self) -> dict[Any, Any]:
         """The last step's infos."""
@@ -127,17 +134,14 @@ class Lane:
 
     def _actions(self) -> Any:
         # copied, because an environment may keep its action and the client writes the next one
-        leaves = [self._view(index).copy() for index in range(len(self._layout.actions))]
-        return self._assemble(leaves)
-
-    def _view(self, index: int) -> Any:
-        code = self._asked[slabs.DTYPES + index]
-        found = self._views.get((index, code))
-        if found is None:
-            leaf = self._layout.actions[index]
-            found = slabs.view(self._request, leaf, slabs.ACTION_DTYPES[code])
-            self._views[index, code] = found
-        return found
+        codes = self._asked[slabs.DTYPES : slabs.DTYPES + self._leaves].tolist()
+        if codes != self._codes:
+            self._codes = codes
+            pairs = zip(self._layout.actions, codes, strict=True)
+            self._views = [
+                slabs.view(self._request, leaf, slabs.ACTION_DTYPES[code]) for leaf, code in pairs
+            ]
+        return self._assemble([view.copy() for view in self._views])
 
 
 def _raised_frame(error: BaseException) -> Any:

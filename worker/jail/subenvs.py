@@ -118,8 +118,9 @@ class SubEnvs(SyncVectorEnv):
         terminations, truncations = batch.terminations, batch.truncations
         done = [False] * count
         infos: Pairs = []
-        for index, (action, env) in enumerate(zip(self._each(actions), self.envs, strict=True)):
-            if self._done[index]:
+        each = zip(self._each(actions), self.envs, self._done, strict=True)
+        for index, (action, env, over) in enumerate(each):
+            if over:
                 observation, info = env.reset()
                 rewards[index] = 0.0
                 terminations[index] = truncations[index] = False
@@ -128,7 +129,7 @@ class SubEnvs(SyncVectorEnv):
                 rewards[index] = reward
                 terminations[index] = terminated
                 truncations[index] = truncated
-                if terminations[index] or truncations[index]:
+                if terminated or truncated:
                     if same_step:
                         infos.append((index, {"final_obs": observation, "final_info": info}))
                         observation, info = env.reset()
@@ -177,7 +178,7 @@ def _leaf_writer(rows: Any) -> Store:
     dtype, shape = rows.dtype, rows.shape[1:]
 
     def write(index: int, member: Any) -> None:
-        if type(member) is np.ndarray and member.dtype == dtype and member.shape == shape:
+        if type(member) is np.ndarray and member.dtype is dtype and member.shape == shape:
             rows[index] = member
         else:  # the casts that SyncVectorEnv permits, and its errors for the others
             np.stack([member], out=rows[index : index + 1])

@@ -48,6 +48,8 @@ SPIN = 16
 """Request: nanoseconds that the shard may wait for the next request without sleeping."""
 SLOT = 17
 """Request: the slot of the observation slab that the shard writes."""
+CPU = 18
+"""Request: one more than the number of the core that the shard should keep to; 0 for any."""
 DTYPES = 24
 """Request: the dtype code of each action leaf, one word each, up to ``MAX_LEAVES``."""
 MAX_LEAVES = 64
