@@ -83,6 +83,7 @@ class ProcessSandbox:
                 server.users += 1  # at once: nobody may end it from here on
                 if server.process.poll() is None:
                     return server
+                self.release(server)
             server = self._servers[os.getpid(), store] = _start(store)
             server.users += 1
             return server
