@@ -268,6 +268,7 @@ class FastLane:
         answered = shard.answered
         while not answered():
             if perf_counter_ns() > until:
+                self._spin.missed()
                 return False
         return True
 

@@ -15,6 +15,9 @@ _FIRST_INTERVAL = 64
 _LONGEST_INTERVAL = 8192
 _MAX_BUDGET_NS = 400_000
 """A reply that is further away than this is not worth waiting awake for."""
+_MIN_BUDGET_NS = 100_000
+_MISSES = 3
+"""Waits in vain, one after the other, that end spinning at once."""
 _ADVANTAGE = 0.97
 """Spinning must be this much faster to be chosen: it burns a core."""
 
@@ -32,6 +35,7 @@ class SpinChooser:
         self._chosen = self._spinning = False
         self._best = {False: 0, True: 0}
         self._samples: list[int] = []
+        self._misses = 0
         self._trials = 2 if allowed else 0
         self._interval = _FIRST_INTERVAL
         self._left = _TRIAL
@@ -41,6 +45,8 @@ class SpinChooser:
         if not self._allowed:
             return
         self._left -= 1
+        if elapsed_ns < self.budget_ns:
+            self._misses = 0
         if self._trials:
             self._samples.append(elapsed_ns)
         if self._left > 0:
@@ -49,6 +55,16 @@ class SpinChooser:
             self._best[self._spinning] = sorted(self._samples)[len(self._samples) // 2]
             self._samples.clear()
         self._decide()
+
+    def missed(self) -> None:
+        """A wait used its whole budget up: somebody else has the core. A few in a row are enough."""
+        self._misses += 1
+        if self._misses >= _MISSES and self._spinning:
+            self._samples.clear()
+            self._trials = 0
+            self._chosen = False
+            self._interval = _FIRST_INTERVAL
+            self._use(False, _FIRST_INTERVAL)
 
     def _decide(self) -> None:
         if self._trials:
@@ -67,4 +83,7 @@ class SpinChooser:
     def _use(self, spinning: bool, steps: int) -> None:
         self._spinning = spinning
         self._left = steps
-        self.budget_ns = _MAX_BUDGET_NS if spinning else 0
+        self._misses = 0
+        # a reply that takes much longer than awake ones usually do will not come soon
+        usual = 3 * self._best[True] or _MAX_BUDGET_NS
+        self.budget_ns = min(max(usual, _MIN_BUDGET_NS), _MAX_BUDGET_NS) if spinning else 0

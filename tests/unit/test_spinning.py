@@ -35,6 +35,33 @@ def test_a_change_of_load_is_noticed() -> None:
     assert chooser.budget_ns > 0
 
 
+def test_waits_in_vain_end_spinning_at_once() -> None:
+    """A core that somebody else takes does not cost the rest of a long interval."""
+    chooser = SpinChooser(True)
+    run(chooser, 10_000, awake_ns=10_000, asleep_ns=20_000)
+    assert chooser.budget_ns > 0
+    for _ in range(3):
+        chooser.missed()
+    assert chooser.budget_ns == 0
+
+
+def test_the_budget_follows_what_awake_steps_take() -> None:
+    """A reply that is long overdue is not waited for awake."""
+    chooser = SpinChooser(True)
+    run(chooser, 10_000, awake_ns=50_000, asleep_ns=90_000)
+    assert chooser.budget_ns == 150_000
+
+
+def test_a_slow_step_now_and_then_does_not_end_spinning() -> None:
+    """An episode that ends makes one step long; the next is answered in time again."""
+    chooser = SpinChooser(True)
+    run(chooser, 1_000, awake_ns=10_000, asleep_ns=20_000)
+    for _ in range(10):
+        chooser.missed()
+        run(chooser, 1, awake_ns=10_000, asleep_ns=20_000)
+    assert chooser.budget_ns > 0
+
+
 def test_spinning_that_is_not_allowed_never_happens() -> None:
     """Where a core may see stores out of order, the lane sleeps."""
     assert run(SpinChooser(False), 1_000, awake_ns=1, asleep_ns=1_000) == 0
