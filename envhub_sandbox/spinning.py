@@ -57,7 +57,7 @@ class SpinChooser:
         self._decide()
 
     def missed(self) -> None:
-        """A wait used its whole budget up: somebody else has the core. A few in a row are enough."""
+        """A wait used its whole budget up: somebody else has the core. A few in a row end it."""
         self._misses += 1
         if self._misses >= _MISSES and self._spinning:
             self._samples.clear()
