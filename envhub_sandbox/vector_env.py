@@ -10,9 +10,7 @@ import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 
-import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import (
     AlreadyPendingCallError,
     ClosedEnvironmentError,
@@ -20,14 +18,12 @@ from gymnasium.error import (
 )
 from gymnasium.vector import VectorEnv
 
-from envhub_sandbox.actions import ActionReader
+from envhub_sandbox import declared
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.jail import typed
 from envhub_sandbox.remote_env import RemoteEnv
 from envhub_sandbox.results import StepResult
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.manifest import EnvManifest
-from envhub_worker.protocol.spaces import OpaqueSpace
 
 Bounds = tuple[int, int]
 
@@ -52,16 +48,16 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         self._manifest = manifest
         self._timeouts = remote.repository.timeouts
         self._waiting: str | None = None
-        self._read_actions = _action_reader(manifest)
+        self._read_actions = declared.action_reader(manifest)
         self.closed = False
         self.num_envs = manifest.num_envs
         self.single_observation_space = manifest.single_observation_space
         self.single_action_space = manifest.single_action_space
         self.observation_space = manifest.observation_space
         self.action_space = manifest.action_space
-        self.metadata = _metadata(manifest)
+        self.metadata = declared.metadata(manifest)
         self.render_mode = manifest.render_mode
-        self.spec = _spec(manifest)
+        self.spec = declared.spec(manifest)
         # a proxy that nobody holds any more must not keep processes alive
         weakref.finalize(self, remote.close).atexit = False
 
@@ -100,7 +96,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         options = None if options is None else dict(options)
         mask = None if options is None else options.pop("reset_mask", None)
         if mask is not None:
-            _check_mask(mask, self.num_envs)
+            declared.check_mask(mask, self.num_envs)
         seeds = self._seeds(seed)
         self._remote.recover()
 
@@ -203,9 +199,9 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         """Copies of the generators: ``SyncVectorEnv`` has one for each sub-environment."""
         replies = self._ask("np_random", lambda number, _: m.GetRandom(number))
         if type(replies[0].value) is dict:
-            return _generator(replies[0].value)
+            return declared.generator(replies[0].value)
         states = self._remote.results.one_each("np_random", replies)
-        return tuple(_generator(state) for state in states)
+        return tuple(declared.generator(state) for state in states)
 
     @property
     def np_random_seed(self) -> Any:
@@ -341,70 +337,3 @@ class SubEnvironment:
         if name.startswith("__"):
             raise AttributeError(name)
         return self._vector.get_attr(name)[self._index]
-
-
-def _action_reader(manifest: EnvManifest) -> Callable[[Any], Any]:
-    space = manifest.single_action_space
-    if isinstance(space, OpaqueSpace):
-        return lambda actions: actions
-    return ActionReader(space, manifest.num_envs).read
-
-
-def _metadata(manifest: EnvManifest) -> dict[str, Any]:
-    mode: Any = manifest.autoreset_mode
-    if mode is None:
-        return dict(manifest.metadata)
-    if hasattr(gym.vector, "AutoresetMode"):
-        mode = gym.vector.AutoresetMode(mode)
-    return {**manifest.metadata, "autoreset_mode": mode}
-
-
-def _spec(manifest: EnvManifest) -> EnvSpec | None:
-    if manifest.spec is None or type(manifest.spec.get("id")) is not str:
-        return None
-    try:
-        return EnvSpec(**manifest.spec)
-    except Exception:  # an id that this Gymnasium cannot read: not worth failing for
-        return None
-
-
-def _check_mask(mask: Any, num_envs: int) -> None:
-    """``SyncVectorEnv.reset``'s checks, in its words."""
-    if not isinstance(mask, np.ndarray):
-        raise TypeError(f"`options['reset_mask']` must be a numpy array, got {type(mask)}")
-    if mask.shape != (num_envs,):
-        raise ValueError(
-            f"`options['reset_mask']` must have shape `({num_envs},)`, got {mask.shape}"
-        )
-    if mask.dtype != np.bool_:
-        raise TypeError(f"`options['reset_mask']` must have `dtype=np.bool_`, got {mask.dtype}")
-    if not np.any(mask):
-        raise ValueError(
-            "`options['reset_mask']` must contain a boolean array with at least one True value, "
-            f"got reset_mask={mask}"
-        )
-
-
-_BIT_GENERATORS = {
-    kind.__name__: kind
-    for kind in (
-        np.random.PCG64,
-        np.random.PCG64DXSM,
-        np.random.MT19937,
-        np.random.Philox,
-        np.random.SFC64,
-    )
-}
-
-
-def _generator(state: Any) -> np.random.Generator:
-    """A generator in a given state. Trust: the state is input from the worker."""
-    kind = _BIT_GENERATORS.get(str(state.get("bit_generator"))) if type(state) is dict else None
-    if kind is None:
-        raise RemoteProtocolError("the worker sent the state of an unknown random generator")
-    bits = kind()
-    try:
-        bits.state = state
-    except (TypeError, ValueError, KeyError, OverflowError) as error:
-        raise RemoteProtocolError(f"the worker sent a broken generator state: {error}") from error
-    return np.random.Generator(bits)
