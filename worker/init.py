@@ -20,8 +20,6 @@ The end of the channel ends the jail.
 
 from __future__ import annotations
 
-import contextlib
-import json
 import os
 import select
 import signal
@@ -34,7 +32,7 @@ from typing import Any, NoReturn
 from envhub_worker import launch
 from envhub_worker.channel import Channel, close_fds
 from envhub_worker.jailspec import JailSpec
-from envhub_worker.lockdown import inner, process, sweep
+from envhub_worker.lockdown import broker, inner, process, sweep
 from envhub_worker.lockdown.context import Common, JailContext
 from envhub_worker.lockdown.guard import Guard
 from envhub_worker.lockdown.plan import HostFacts, plan
@@ -64,11 +62,16 @@ def run(control: int, output: int, common: Common) -> NoReturn:
 
 @dataclass
 class _Host:
-    """A host as its init knows it. ``ended``: (reason, detail) of the end that we gave it."""
+    """A host as its init knows it.
+
+    Attributes:
+        number: The server's number for it.
+        status: Where it reports, until it is confined.
+        ended: (reason, detail) of the end that we gave it.
+    """
 
     number: int
-    status: int
-    report: bytes = b""
+    status: Channel | None
     ended: tuple[str, str] | None = None
 
 
@@ -79,6 +82,7 @@ class Init:
         self._channel = channel
         self._common = common
         self._hosts: dict[int, _Host] = {}
+        self._listeners: set[int] = set()
         self._running = True
         self._poller = select.poll()
         self._joins: list[int] = []
@@ -133,8 +137,10 @@ class Init:
                     sweep.drain(wakeup)
                 elif fd == self._channel.fileno():
                     self._serve()
+                elif fd in self._listeners:
+                    self._answer(fd)
                 else:
-                    self._read_report(fd)
+                    self._read_reports(fd)
             if wakeup in ready:
                 self._reap()
             if self._hosts:
@@ -147,7 +153,7 @@ class Init:
     def _look(self) -> None:
         if self._guard.seconds_left() == 0:
             # A host that is still locking itself down runs our code, and cannot be measured yet.
-            starting = [pid for pid, host in self._hosts.items() if host.status >= 0]
+            starting = [pid for pid, host in self._hosts.items() if host.status is not None]
             over = self._guard.look(sweep.descendants(os.getpid(), starting))
             if over is not None:
                 for host in self._hosts.values():
@@ -166,22 +172,23 @@ class Init:
             self._kill(message["host"])
 
     def _start(self, number: int, fds: list[int]) -> None:
-        read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        status, theirs = Channel.pair()
         order = launch.Order(
             parent=os.getpid(),
             jail=self._jail,
             fds=fds,
             hosts=len(self._hosts) + 1,
             joins=self._joins,
-            status=write,
+            status=theirs.fileno(),
         )
         pid = os.fork()
         if pid == 0:
             launch.run(order)
         self._guard.ignore(fds)
-        close_fds([*fds, write])
-        self._hosts[pid] = _Host(number, read)
-        self._poller.register(read, select.POLLIN)
+        close_fds(fds)
+        theirs.close()
+        self._hosts[pid] = _Host(number, status)
+        self._poller.register(status, select.POLLIN)
 
     def _kill(self, number: int) -> None:
         for pid, host in self._hosts.items():
@@ -192,28 +199,35 @@ class Init:
                 sweep.kill_below(pid)
                 os.kill(pid, signal.SIGKILL)
 
-    def _read_report(self, fd: int) -> None:
-        pid, host = next((pid, host) for pid, host in self._hosts.items() if host.status == fd)
-        with contextlib.suppress(BlockingIOError):
-            while data := os.read(fd, 65536):
-                host.report += data
-            self._close_report(host)
-            self._tell_report(pid, host)
+    def _answer(self, listener: int) -> None:
+        if not broker.serve(listener):
+            self._poller.unregister(listener)
+            self._listeners.discard(listener)
+            os.close(listener)
 
-    def _close_report(self, host: _Host) -> None:
-        if host.status >= 0:
-            self._poller.unregister(host.status)
-            os.close(host.status)
-            host.status = -1
+    def _read_reports(self, fd: int) -> None:
+        for pid, host in self._hosts.items():
+            if host.status is not None and host.status.fileno() == fd:
+                self._read_report(pid, host, host.status)
 
-    def _tell_report(self, pid: int, host: _Host) -> None:
-        if not host.report:
-            return  # it died before it was confined: its exit says so
-        report = json.loads(host.report)
-        if "layer" in report:
-            raise LayerUnavailableError(**report)
+    def _read_report(self, pid: int, host: _Host, status: Channel) -> None:
+        messages, ended = status.drain()
+        for message, fds in messages:
+            if "layer" in message:
+                raise LayerUnavailableError(**message)
+            if "broker" in message:
+                self._listeners.update(fds)
+                self._poller.register(fds[0], select.POLLIN)
+            else:
+                self._tell_started(pid, host, message["report"])
+        if ended:  # or it died before it was confined: its exit says so
+            self._poller.unregister(status)
+            status.close()
+            host.status = None
+
+    def _tell_started(self, pid: int, host: _Host, report: list[dict[str, Any]]) -> None:
         pidfd = os.pidfd_open(pid)  # not reaped yet: even if it has ended, it is this one
-        fields = {"host": host.number, "report": report["report"]}
+        fields = {"host": host.number, "report": report}
         self._channel.send({"event": "host_started", **fields}, [pidfd])
         os.close(pidfd)
 
@@ -228,9 +242,8 @@ class Init:
 
     def _before_reaping(self, pid: int) -> None:
         host = self._hosts.get(pid)
-        if host is not None and host.status >= 0:
-            self._read_report(host.status)
-            self._close_report(host)
+        if host is not None and host.status is not None:
+            self._read_report(pid, host, host.status)
 
     def _tell_exit(self, host: _Host, status: int) -> None:
         fields = process.exit_fields(status)

@@ -7,7 +7,6 @@ a privilege comes before its drop, and the syscall filter comes last.
 from __future__ import annotations
 
 import importlib
-import json
 import os
 import random
 import runpy
@@ -15,13 +14,14 @@ import socket
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NoReturn
 
 import numpy as np
 
 from envhub_worker import blas
+from envhub_worker.channel import Channel
 from envhub_worker.jailspec import JailSpec
 from envhub_worker.lockdown import cgroups, innermost, process, sweep
 from envhub_worker.lockdown.context import JailContext
@@ -41,7 +41,7 @@ class Order:
         fds: The stream to the server, then whatever the server passes through.
         hosts: How many the jail has, this one included.
         joins: Where to join the jail's control group, if it has one.
-        status: Write end of the pipe for the report; closed before the target runs.
+        status: Socket for the report to init; closed before the target runs.
     """
 
     parent: int
@@ -68,13 +68,15 @@ def run(order: Order) -> NoReturn:
 
 
 def _run(order: Order) -> int:
+    init = Channel(socket.socket(fileno=order.status))
     try:
-        confine(order)
+        confine(order, init)
     except LayerUnavailableError as error:
-        _report(order.status, error.to_wire())
+        init.send(error.to_wire())
         return 1
     blas.restore_threads(order.jail.common.set_blas_threads, order.hosts)
-    _report(order.status, {"report": [_SELF_TEST.to_wire()]})
+    init.send({"report": [_SELF_TEST.to_wire()]})
+    init.close()
     stream = socket.socket(fileno=order.fds[0])
     main = _resolve(order.jail.common.config.target)
     return int(main(stream, order.jail.spec, order.fds[1:]) or 0)
@@ -87,7 +89,7 @@ def _resolve(target: str) -> Callable[[socket.socket, JailSpec, list[int]], int 
     return getattr(importlib.import_module(place), function)  # type: ignore[no-any-return]
 
 
-def confine(order: Order) -> None:
+def confine(order: Order, init: Channel) -> None:
     """Give up everything that the jail does not need."""
     process.die_with_parent(order.parent)
     os.setsid()
@@ -96,7 +98,7 @@ def confine(order: Order) -> None:
     descriptors = {0, 1, 2, order.status, *order.fds}
     process.close_all_but(descriptors)
     _forget_the_zygote(order.jail)
-    innermost.enter(order.jail, descriptors)
+    innermost.enter(order.jail, descriptors, init)
 
 
 def _forget_the_zygote(jail: JailContext) -> None:
@@ -110,12 +112,6 @@ def _forget_the_zygote(jail: JailContext) -> None:
     tempfile.tempdir = None
     random.seed()
     np.random.seed(np.frombuffer(os.urandom(32), np.uint32))
-
-
-def _report(status: int, message: Mapping[str, object]) -> None:
-    data = json.dumps(message).encode()
-    os.write(status, data)  # far below the pipe's capacity: never partial
-    os.close(status)
 
 
 def _exit_code(error: SystemExit) -> int:

@@ -23,11 +23,11 @@ from typing import Any
 from envhub_worker import bootstrap
 from envhub_worker.channel import Channel, close_fds
 from envhub_worker.jailspec import JailSpec
-from envhub_worker.lockdown import cgroups, process
+from envhub_worker.lockdown import cgroups, process, user
 from envhub_worker.lockdown.context import ZygoteConfig
 from envhub_worker.lockdown.environment import zygote_environment
+from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.scratch import Scratch, remove_tree
-from envhub_worker.lockdown.user import unused_uid
 from envhub_worker.protocol.confinement import Confinement
 
 _END_S = 8.0
@@ -156,7 +156,7 @@ class Spawner:
         self._pidfd = -1
         self._exited = False
         self._folder = Path(tempfile.mkdtemp(prefix="zygote-", dir=runtime_dir))
-        self._user = unused_uid() if os.geteuid() == 0 else None
+        self._user, self._refusal = _choose_user()
         self._scratches = self._make_scratches(confinement)
         self._cgroups = self._make_cgroups()
         self._log = self._folder / "log"
@@ -183,6 +183,7 @@ class Spawner:
             place=str(place),
             canary=str(self._log),
             user=self._user,
+            refusal=self._refusal,
         )
 
     def _make_scratches(self, confinement: Confinement) -> Path | None:
@@ -307,6 +308,14 @@ class Spawner:
             self._cgroups = None
         for folder in {self._folder, self._scratches or self._folder}:
             remove_tree(str(folder))
+
+
+def _choose_user() -> tuple[int | None, dict[str, str] | None]:
+    """(the user that jails become, or None to stay; why that is impossible, or None)."""
+    try:
+        return user.choose(), None
+    except LayerUnavailableError as error:
+        return None, error.to_wire()
 
 
 class Jail:

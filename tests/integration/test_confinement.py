@@ -663,3 +663,67 @@ def test_container_profile_runs_without_landlock() -> None:
     """Its outer layers hold; the report says that this one is missing."""
     said = on_restricted_host(NO_LANDLOCK, "container")
     assert said == "started ['pid-namespace', 'mount-namespace', 'landlock']\n"
+
+
+SIGNALS = """
+import os, signal, subprocess, threading, time
+got = []
+signal.signal(signal.SIGUSR1, lambda *_: got.append("usr1"))
+os.kill(os.getpid(), signal.SIGUSR1)
+signal.raise_signal(signal.SIGUSR1)
+signal.pthread_kill(threading.main_thread().ident, signal.SIGUSR1)
+child = subprocess.Popen(["sleep", "1000"])
+child.terminate()
+group = subprocess.Popen(["sleep", "1000"], start_new_session=True)
+os.killpg(group.pid, signal.SIGKILL)
+denied = []
+for target in (victim, -1, os.getppid()):
+    try:
+        os.kill(target, signal.SIGTERM)
+    except OSError as error:
+        denied.append(error.errno)
+signal.signal(signal.SIGTERM, lambda *_: got.append("group"))
+os.kill(0, signal.SIGTERM)
+try:
+    os.kill(2**22 + 7, 0)
+except OSError as error:
+    denied.append(error.errno)
+result = [len(got), got[-1], child.wait(), group.wait(), denied]
+"""
+BROKERED = (
+    NO_LANDLOCK
+    + """
+import subprocess
+victim = subprocess.Popen(["sleep", "1000"])
+with open_folder() as folder, cell_in(folder, Confinement(profile="container")) as cell:
+    print(cell.run(f"victim = {victim.pid}" + SOURCE))
+    print(cell.run("import os; os.abort()"))
+    print(cell.wait_for(HostExited).signal)
+    host = cell.start()
+    print(cell.run("result = 'again'", host))
+    report = cell.wait_for(HostStarted).report
+    print([layer["enforced"] for layer in report if layer["layer"] == "signals"])
+print(victim.poll())
+victim.kill()
+victim.wait()
+"""
+)
+
+
+def test_init_sends_signals_where_landlock_does_not_keep_them_inside() -> None:
+    """To the jail's own processes in every way, and to none outside."""
+    kit = os.path.dirname(os.path.abspath(__file__))
+    head = RESTRICTED.partition("with open_folder")[0]
+    source = head.format(kit=kit, restrict=BROKERED.replace("SOURCE", repr(SIGNALS)))
+    done = subprocess.run(
+        [sys.executable, "-c", source], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.stderr == ""
+    assert done.stdout.splitlines() == [
+        "{'result': [4, 'group', -15, -9, [1, 1, 1, 3]]}",
+        "{'error': 'the host has gone'}",
+        "6",
+        "{'result': 'again'}",
+        "[True]",
+        "None",
+    ]

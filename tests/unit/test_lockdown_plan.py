@@ -102,6 +102,15 @@ def test_missing_layer_is_an_error_with_a_fix(
     assert raised.value.fix
 
 
+def test_signals_are_a_layer_where_init_must_send_them() -> None:
+    """Before Landlock ABI 6 and without a pid namespace."""
+    bare = replace(STRICT, profile="no-userns")
+    signals = ("signals", True, "sent by the jail's init, to processes of the jail only")
+    assert signals in layers(bare, replace(USER, landlock_abi=4))
+    assert signals not in layers(bare, replace(USER, landlock_abi=6))
+    assert signals not in layers(STRICT, replace(USER, landlock_abi=4))
+
+
 def test_container_without_landlock_says_so() -> None:
     """Its own outer layers hold; this one is reported as missing."""
     container = replace(STRICT, profile="container")

@@ -13,6 +13,7 @@ from envhub_worker.lockdown.bpf import Instruction
 from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp_policy import (
     ALLOW,
+    ASK,
     ENOSYS,
     EPERM,
     KILL_PROCESS,
@@ -222,6 +223,25 @@ def test_signals_by_descriptor_owner_are_denied_without_a_pid_namespace(machine:
         assert check("ioctl", 0, request) == EPERM
     assert check("sched_setaffinity", 0) == ALLOW
     assert check("sched_setaffinity", 1) == PRETEND
+
+
+@machines
+def test_signals_are_handed_to_init_where_it_sends_them(machine: str) -> None:
+    """All that name a process; what has no broker is denied, or falls back."""
+    verdicts = table(namespaced=False, network="none", brokered=True)
+    program = seccomp.program(machine, verdicts)
+    numbers = NUMBERS[machine]
+    answers = {
+        name: run(program, ARCH[machine], numbers[name], (1, 15))
+        for name in ("kill", "tkill", "tgkill", "rt_sigqueueinfo", "pidfd_send_signal")
+    }
+    assert answers == {
+        "kill": ASK,
+        "tkill": ASK,
+        "tgkill": ASK,
+        "rt_sigqueueinfo": EPERM,
+        "pidfd_send_signal": ENOSYS,
+    }
 
 
 @machines

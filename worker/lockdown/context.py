@@ -27,6 +27,7 @@ class ZygoteConfig:
         place: An empty folder of the zygote's own.
         canary: A file that exists and that no jail may read.
         user: The user to become where the server is root, else None.
+        refusal: Why no jail can be had (``LayerUnavailableError.to_wire``), if that is known.
     """
 
     control: int
@@ -40,6 +41,7 @@ class ZygoteConfig:
     place: str
     canary: str
     user: int | None
+    refusal: dict[str, str] | None
 
     @classmethod
     def from_wire(cls, data: dict[str, Any]) -> ZygoteConfig:
@@ -61,6 +63,7 @@ class Common:
         devices: Device nodes that may be used.
         covered: (files, folders) of /proc to hide.
         landlock_abi: 0 where there is none.
+        brokered: Whether init sends the jails' signals.
         program: The compiled system call filter.
         set_blas_threads: Sets OpenBLAS's threads, if that is what numpy uses.
     """
@@ -73,6 +76,7 @@ class Common:
     devices: tuple[str, ...]
     covered: tuple[list[str], list[str]]
     landlock_abi: int
+    brokered: bool
     program: bytes
     set_blas_threads: Callable[[int], None] | None = None
 

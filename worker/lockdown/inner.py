@@ -10,7 +10,7 @@ from envhub_worker.jailspec import JailSpec
 from envhub_worker.lockdown import capabilities, mounts, namespaces, process
 from envhub_worker.lockdown.context import Common
 from envhub_worker.lockdown.report import LayerUnavailableError
-from envhub_worker.lockdown.root_plan import within
+from envhub_worker.lockdown.root_plan import SHARED_MEMORY, within
 from envhub_worker.lockdown.scratch import Scratch
 from envhub_worker.protocol.confinement import Limits
 
@@ -33,7 +33,9 @@ def enter(spec: JailSpec, common: Common, folder: str) -> tuple[Scratch, str]:
         process.set_no_new_privileges()
         _check_readable(spec)
         process.set_dumpable(False)
-        return Scratch.on_host(folder), "links"
+        # A container has a /dev/shm of its own; the user's own one is full of other programs'.
+        own = spec.confinement.profile == "container"
+        return Scratch.on_host(folder, SHARED_MEMORY if own else None), "links"
     try:
         view = _mount(spec, common)
     except OSError as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 
+from envhub_worker.channel import Channel
 from envhub_worker.lockdown import capabilities, landlock, process, rlimits, seccomp, selftest
 from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.landlock import DEVICE, READ, WRITE, Rule
@@ -32,12 +33,13 @@ _HOST_FILES = (
 )
 
 
-def enter(jail: JailContext, descriptors: Iterable[int]) -> None:
+def enter(jail: JailContext, descriptors: Iterable[int], init: Channel) -> None:
     """Confine this single-threaded process for good, and test that it holds.
 
     Args:
         jail: The jail that it belongs to.
         descriptors: Every descriptor that may be open.
+        init: Takes the broker's listener, if there is one.
 
     Raises:
         LayerUnavailableError: A layer cannot be had, or a denial does not hold.
@@ -51,7 +53,10 @@ def enter(jail: JailContext, descriptors: Iterable[int]) -> None:
     if jail.plan.landlock:
         wanted = landlock.ruleset(jail.common.landlock_abi, jail.common.config.network)
         landlock.restrict(wanted, rules(jail, os.getpid()))
-    seccomp.install(jail.common.program)
+    listener = seccomp.install(jail.common.program, brokered=jail.common.brokered)
+    if listener >= 0:
+        init.send({"broker": True}, [listener])
+        os.close(listener)  # whoever holds it may permit anything
     selftest.run(jail, descriptors)
 
 

@@ -9,7 +9,6 @@ As root it first becomes a user that owns nothing; the root is built before, whi
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import pwd
 import signal
@@ -19,6 +18,7 @@ from collections.abc import Iterable
 from envhub_worker.lockdown import landlock, mounts, namespaces, process, root_plan, user
 from envhub_worker.lockdown.context import Common, ZygoteConfig
 from envhub_worker.lockdown.kernel import CLONE_NEWNS, unshare
+from envhub_worker.lockdown.plan import needs_broker
 from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp import compile_filter
 
@@ -31,17 +31,20 @@ def enter(config: ZygoteConfig) -> Common:
     Raises:
         LayerUnavailableError: The host lacks a layer that the profile names.
     """
+    if config.refusal is not None:
+        raise LayerUnavailableError(**config.refusal)
     namespaced = config.profile == "strict"
     plan = _plan_root(config)
     if namespaced:
         _enter_namespaces(config, plan)
-        mounts.mount_proc()
         covered = mounts.proc_to_cover()
     else:
         if config.user is not None:
             _become(config)
             _check_interpreter()
         covered = ([], [])
+    abi = landlock.version()
+    brokered = needs_broker(namespaced=namespaced, landlock_abi=abi)
     return Common(
         config=config,
         pid=0 if namespaced else os.getpid(),
@@ -50,8 +53,11 @@ def enter(config: ZygoteConfig) -> Common:
         roots=plan.roots,
         devices=plan.devices,
         covered=covered,
-        landlock_abi=landlock.version(),
-        program=compile_filter(os.uname().machine, namespaced=namespaced, network=config.network),
+        landlock_abi=abi,
+        brokered=brokered,
+        program=compile_filter(
+            os.uname().machine, namespaced=namespaced, network=config.network, brokered=brokered
+        ),
     )
 
 
@@ -100,6 +106,7 @@ def _enter_namespaces(config: ZygoteConfig, plan: root_plan.RootPlan) -> None:
         if config.user is None:
             mounts.enter_root(plan, config.place)
         _be_the_first_process()
+        mounts.mount_proc()
     except OSError as error:
         raise _mounts_unavailable(error) from error
 
@@ -135,11 +142,6 @@ def _be_the_first_process() -> None:
 
 
 def _mounts_unavailable(error: OSError) -> LayerUnavailableError:
-    answer = errno.errorcode.get(error.errno or 0, "?")
-    where = f" at {error.filename}" if error.filename else ""
-    return LayerUnavailableError(
-        "mount-namespace",
-        f"the kernel answers {answer}{where}",
-        "A user namespace that may not mount is a restricted one: see the fix for "
-        '"user-namespace" in `envhub doctor`, or choose Policy(profile="no-userns").',
-    )
+    where = f"mounting at {error.filename}: " if error.filename else ""
+    cause = namespaces.user_namespace_unavailable(error)
+    return LayerUnavailableError("mount-namespace", where + cause.reason, cause.fix)

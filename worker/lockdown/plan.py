@@ -16,9 +16,14 @@ PROFILES = ("strict", "no-userns", "container")
 NETWORKS = ("none", "loopback", "host")
 
 # Without a mount namespace Landlock must itself guard truncation, and without a pid namespace
-# signals: from these ABIs on it does.
+# signals: from these ABIs on it does. Before the second one, init sends the jail's signals.
 _LANDLOCK_FOR_TRUNCATION = 3
 _LANDLOCK_FOR_SIGNALS = 6
+
+
+def needs_broker(*, namespaced: bool, landlock_abi: int) -> bool:
+    """Whether nothing but init keeps a jail's signals inside."""
+    return not namespaced and landlock_abi < _LANDLOCK_FOR_SIGNALS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +80,7 @@ def plan(confinement: Confinement, facts: HostFacts) -> Plan:
         Layer("capabilities", True, "none in any set"),
         Layer("no-new-privileges", True, "set-user-id programs gain nothing"),
         _landlock_layer(landlock, facts),
+        *_signal_layers(facts, namespaced),
         Layer("seccomp", True, _seccomp_detail(facts, namespaced)),
         Layer("rlimits", True, _rlimits_detail(confinement)),
         *_limit_layers(confinement, facts, namespaced),
@@ -103,14 +109,14 @@ def _check_seccomp(facts: HostFacts) -> None:
 
 
 def _wants_landlock(confinement: Confinement, facts: HostFacts) -> bool:
-    needed = {"strict": 1, "no-userns": _LANDLOCK_FOR_SIGNALS, "container": 0}
+    needed = {"strict": 1, "no-userns": _LANDLOCK_FOR_TRUNCATION, "container": 0}
     least = needed[confinement.profile]
     if facts.landlock_abi < least:
         have = f"ABI {facts.landlock_abi}" if facts.landlock_abi else "none"
         raise LayerUnavailableError(
             "landlock",
             f"the profile {confinement.profile} needs Landlock ABI {least}, this kernel has {have}",
-            "ABI 1 came with Linux 5.13, 6 with 6.12; it must be in the kernel's lsm= list, and a "
+            "ABI 1 came with Linux 5.13, 3 with 6.2; it must be in the kernel's lsm= list, and a "
             "container's seccomp profile must allow it.",
         )
     return facts.landlock_abi > 0
@@ -170,6 +176,12 @@ def _landlock_layer(landlock: bool, facts: HostFacts) -> Layer:
     abi = facts.landlock_abi
     scope = ", TCP" * (abi >= 4) + ", signals and abstract sockets" * (abi >= 6)
     return Layer("landlock", True, f"ABI {abi}: files{scope}")
+
+
+def _signal_layers(facts: HostFacts, namespaced: bool) -> list[Layer]:
+    if not needs_broker(namespaced=namespaced, landlock_abi=facts.landlock_abi):
+        return []
+    return [Layer("signals", True, "sent by the jail's init, to processes of the jail only")]
 
 
 def _seccomp_detail(facts: HostFacts, namespaced: bool) -> str:

@@ -19,7 +19,7 @@ class Scratch:
         home: The private home.
         temporary: For temporary files.
         work: The working directory: shows the snapshot's files, takes new ones.
-        shared_memory: Where ``shm_open`` puts its files, or None for the host's own.
+        shared_memory: Where ``shm_open`` puts its files, or None for nowhere.
     """
 
     home: str
@@ -33,9 +33,9 @@ class Scratch:
         return cls(HOME, TEMPORARY, WORK, SHARED_MEMORY)
 
     @classmethod
-    def on_host(cls, folder: str) -> Scratch:
+    def on_host(cls, folder: str, shared_memory: str | None = None) -> Scratch:
         """The folders that ``create`` makes in ``folder``."""
-        return cls(f"{folder}/home", f"{folder}/tmp", f"{folder}/work")
+        return cls(f"{folder}/home", f"{folder}/tmp", f"{folder}/work", shared_memory)
 
     def create(self, snapshot: str, owner: int | None) -> None:
         """Make the folders, readable by nobody else, and link the snapshot into ``work``.

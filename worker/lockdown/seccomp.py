@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 from envhub_worker.lockdown import bpf
 from envhub_worker.lockdown.bpf import Branch, Do, Item, Label
-from envhub_worker.lockdown.kernel import prctl
+from envhub_worker.lockdown.kernel import prctl, syscall
 from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp_policy import (
     ENOSYS,
@@ -19,7 +19,7 @@ from envhub_worker.lockdown.seccomp_policy import (
     Verdict,
     table,
 )
-from envhub_worker.lockdown.syscalls import NUMBERS
+from envhub_worker.lockdown.syscalls import NUMBERS, number
 
 _AUDIT_ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 # The x32 ABI reaches the same calls under numbers that a table does not list.
@@ -28,17 +28,22 @@ _X32 = 0x40000000
 _PR_GET_SECCOMP = 21
 _PR_SET_SECCOMP = 22
 _MODE_FILTER = 2
+_SET_MODE_FILTER = 1
+_NEW_LISTENER = 1 << 3
 
 _NUMBER, _ARCHITECTURE, _ARGUMENTS = 0, 4, 16
 
 
-def compile_filter(machine: str, *, namespaced: bool, network: str) -> bytes:
+def compile_filter(
+    machine: str, *, namespaced: bool, network: str, brokered: bool = False
+) -> bytes:
     """The program for ``machine`` as bytes; see ``seccomp_policy.table``.
 
     Raises:
         LayerUnavailableError: No table for this machine.
     """
-    return bpf.to_bytes(program(machine, table(namespaced=namespaced, network=network)))
+    verdicts = table(namespaced=namespaced, network=network, brokered=brokered)
+    return bpf.to_bytes(program(machine, verdicts))
 
 
 def program(machine: str, verdicts: Mapping[str, Verdict]) -> list[bpf.Instruction]:
@@ -69,8 +74,8 @@ def program(machine: str, verdicts: Mapping[str, Verdict]) -> list[bpf.Instructi
     return bpf.assemble(items + _returns(items))
 
 
-def _label(number: int, verdict: Verdict) -> str:
-    return f"call-{number}" if isinstance(verdict, ByArguments) else _returning(verdict)
+def _label(call: int, verdict: Verdict) -> str:
+    return f"call-{call}" if isinstance(verdict, ByArguments) else _returning(verdict)
 
 
 def _returning(verdict: int) -> str:
@@ -105,9 +110,9 @@ def _entry(segments: list[tuple[int, str]]) -> str:
 
 def _argument_blocks(by_number: Mapping[int, Verdict]) -> list[Item]:
     items: list[Item] = []
-    for number, verdict in sorted(by_number.items()):
+    for call, verdict in sorted(by_number.items()):
         if isinstance(verdict, ByArguments):
-            items += _argument_block(f"call-{number}", verdict)
+            items += _argument_block(_label(call, verdict), verdict)
     return items
 
 
@@ -154,8 +159,11 @@ class _Program(ctypes.Structure):
     _fields_ = (("length", ctypes.c_ushort), ("filter", ctypes.c_void_p))
 
 
-def install(compiled: bytes) -> None:
+def install(compiled: bytes, *, brokered: bool = False) -> int:
     """Filter this thread and its descendants for good. ``no_new_privs`` must be set.
+
+    Returns:
+        Where the calls that ask arrive if ``brokered``, else -1. Whoever holds it decides.
 
     Raises:
         LayerUnavailableError: The kernel refuses.
@@ -163,13 +171,18 @@ def install(compiled: bytes) -> None:
     code = ctypes.create_string_buffer(compiled, len(compiled))
     header = _Program(len(compiled) // 8, ctypes.addressof(code))
     try:
+        if brokered:
+            place = ctypes.addressof(header)
+            return syscall(number("seccomp"), _SET_MODE_FILTER, _NEW_LISTENER, place)
         prctl(_PR_SET_SECCOMP, _MODE_FILTER, ctypes.addressof(header))
     except OSError as error:
         raise LayerUnavailableError(
             "seccomp",
             f"the kernel answers {os.strerror(error.errno or 0)}",
-            "It needs CONFIG_SECCOMP_FILTER, which every distribution's kernel has.",
+            "It needs CONFIG_SECCOMP_FILTER, which every distribution's kernel has"
+            f"{', and Linux 5.5' if brokered else ''}.",
         ) from error
+    return -1
 
 
 def installed() -> bool:

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 _ERRNO = 0x00050000
 ALLOW = 0x7FFF0000
 KILL_PROCESS = 0x80000000
+#: Somebody outside of the filter answers (``SECCOMP_RET_USER_NOTIF``).
+ASK = 0x7FC00000
 EPERM = _ERRNO | errno.EPERM
 ENOSYS = _ERRNO | errno.ENOSYS
 #: Says that it worked and does nothing: libraries abort, or give up a copy, over an error.
@@ -100,13 +102,14 @@ _PR_SET_DUMPABLE = 4
 _PERSONALITY_QUERY = 0xFFFFFFFF
 
 
-def table(*, namespaced: bool, network: str) -> dict[str, Verdict]:
+def table(*, namespaced: bool, network: str, brokered: bool = False) -> dict[str, Verdict]:
     """System call to verdict; what is missing is denied.
 
     Args:
         namespaced: A mount, pid and IPC namespace hold the jail, so that paths, processes and
             IPC objects of the host are out of reach anyway.
         network: ``"none"``, ``"loopback"`` or ``"host"``.
+        brokered: Init sends the jail's signals: see ``broker``.
     """
     verdicts: dict[str, Verdict] = {}
     for group in (_MEMORY, _FILES, _PROCESSES, _SIGNALS, _CONNECTED_SOCKETS):
@@ -114,6 +117,10 @@ def table(*, namespaced: bool, network: str) -> dict[str, Verdict]:
     verdicts |= _filtered() | _pretended()
     verdicts |= _sockets(namespaced, network)
     verdicts |= dict.fromkeys(_NAMESPACED.split(), ALLOW) if namespaced else _without_namespaces()
+    if brokered:
+        verdicts |= dict.fromkeys(("kill", "tkill", "tgkill"), ASK)
+        verdicts |= dict.fromkeys(("rt_sigqueueinfo", "rt_tgsigqueueinfo"), EPERM)
+        verdicts["pidfd_send_signal"] = ENOSYS
     return verdicts
 
 

@@ -45,7 +45,7 @@ def _denials(jail: JailContext) -> dict[str, Callable[[], object]]:
     if jail.plan.landlock or jail.common.namespaced:
         canary = jail.common.config.canary
         denials["files outside cannot be read"] = lambda: os.open(canary, os.O_RDONLY)
-    if jail.common.landlock_abi >= 6:
+    if jail.common.landlock_abi >= 6 or jail.common.brokered:
         denials["init cannot be signalled"] = lambda: os.kill(init, 0)
     if jail.common.config.network == "none":
         denials["no internet socket can be made"] = lambda: socket.socket(socket.AF_INET)

@@ -63,6 +63,15 @@ def descendants(root: int, keep: Collection[int] = ()) -> list[int]:
     return found
 
 
+def process_of(thread: int) -> int:
+    """The pid of the process that ``thread`` belongs to; 0 when it has gone."""
+    with contextlib.suppress(OSError), open(f"/proc/{thread}/status", "rb") as status:
+        for line in status:
+            if line.startswith(b"Tgid:"):
+                return int(line.split()[1])
+    return 0
+
+
 def _parent(pid: int) -> int:
     with open(f"/proc/{pid}/stat", "rb") as stat:
         # The command may hold anything, parentheses and blanks included.

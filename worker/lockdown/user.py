@@ -7,13 +7,34 @@ import os
 import pwd
 import random
 
-from envhub_worker.lockdown import capabilities, process
+from envhub_worker.lockdown import capabilities, kernel, process
 from envhub_worker.lockdown.report import LayerUnavailableError
+
+CAP_CHOWN, CAP_SETGID, CAP_SETUID = 0, 6, 7
 
 # Far above the ranges that distributions, systemd and rootless containers hand out.
 _HIGH = range(0x6E000000, 0x6EFFFFFF)
 # For a container whose own user namespace maps only 65536 users.
 _LOW = range(62000, 65000)
+
+
+def choose() -> int | None:
+    """The user that root's jails become; None for a plain user, who stays.
+
+    Raises:
+        LayerUnavailableError: This root has no right to become another user.
+    """
+    if os.geteuid() != 0:
+        return None
+    needed = 1 << CAP_CHOWN | 1 << CAP_SETGID | 1 << CAP_SETUID
+    if kernel.capget()[0] & needed != needed:
+        raise LayerUnavailableError(
+            "unprivileged-user",
+            "this root was started without the right to become another user",
+            "Start as a plain user (in a container: --user 1000:1000), or give it back: "
+            "--cap-add CHOWN --cap-add SETGID --cap-add SETUID.",
+        )
+    return unused_uid()
 
 
 def unused_uid() -> int:
