@@ -1,25 +1,36 @@
-"""The attacks that a profile does not stop, each with the reason. Asserted: a change is noticed.
+"""The attacks that are not stopped, where, and why. Asserted: a change is noticed.
 
 ``docs/threat-model.md`` lists every one of them; a test compares the two.
 """
 
 from __future__ import annotations
 
-# attack: {profile: why}
+from collections.abc import Collection
+
+MEASURED = "memory measured by init"
+"""The condition of a host that lets us make no control group: a plain user without delegation."""
+
+# attack: {a profile, or a condition of the host: why}
 NOT_STOPPED: dict[str, dict[str, str]] = {
     "learn that a file exists, and its size": {
         "no-userns": "Landlock does not restrict stat; hiding names takes a mount namespace",
     },
+    "thread bomb": {
+        f"no-userns, {MEASURED}": "without a user namespace the kernel counts by user, and init "
+        "counts processes, not threads",
+    },
+    "memory bomb: memfd in flight": {
+        MEASURED: "a file that waits in a socket belongs to no process that could be measured",
+    },
 }
 
 
-def not_stopped(attack: str, profile: str, user: str) -> str | None:
-    """Why an attack gets through under a profile, or None if it must not.
+def not_stopped(attack: str, conditions: Collection[str]) -> str | None:
+    """Why an attack gets through, or None if it must not.
 
     Args:
         attack: Its title.
-        profile: The policy's profile.
-        user: ``"root"`` or ``"user"``.
+        conditions: The policy's profile, and what is true of this host.
     """
     reasons = NOT_STOPPED.get(attack, {})
-    return reasons.get(f"{profile}, {user}", reasons.get(profile))
+    return next((reasons[name] for name in conditions if name in reasons), None)

@@ -23,7 +23,7 @@ from typing import Any
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError
-from tests.attacks.expectations import not_stopped
+from tests.attacks.expectations import MEASURED, not_stopped
 from tests.support.processes import eventually
 
 HOSTILE = Path(__file__).with_name("hostile")
@@ -81,11 +81,13 @@ class Arena:
         profile: The policy's profile.
         family: Heading in the table.
         rows: What was found out, for the table.
+        report: What the last jail said of its layers.
     """
 
     profile: str
     family: str
     rows: list[Row] = field(default_factory=list)
+    report: list[dict[str, Any]] = field(default_factory=list)
 
     def attack(
         self,
@@ -133,11 +135,17 @@ class Arena:
         verdict = "NOT STOPPED" if through else "no proof" if impossible else "stopped"
         note = impossible or (_brief(detail) if not through else "")
         self.rows.append(Row(title, self.family, self.profile, USER, control, verdict, note))
-        reason = not_stopped(title, self.profile, USER)
+        reason = not_stopped(title, self.conditions())
         if reason is None:
             assert not through, f"{title!r} succeeded inside ({self.profile}): {detail[-3000:]}"
         else:
             assert through, f"{title!r} is stopped now; expectations say otherwise: {reason}"
+
+    def conditions(self) -> list[str]:
+        """The profile, and what is true of this host."""
+        details = [layer["detail"] for layer in self.report if layer["layer"] == "memory"]
+        measured = any("measured by" in detail for detail in details)
+        return [self.profile, *([MEASURED, f"{self.profile}, {MEASURED}"] if measured else [])]
 
     @contextlib.contextmanager
     def inside(
@@ -151,6 +159,7 @@ class Arena:
         run = Run(new_alias(), True)
         with self.environment(policy, limits) as env:
             call(env, run, payload, arguments)
+            self.report = env.sandbox_report
             yield run
 
     @contextlib.contextmanager

@@ -171,6 +171,8 @@ def _typed(fields: Mapping[str, Any], name: str, kind: type) -> Any:
 def _name(value: object, what: str) -> str:
     if type(value) is not str or len(value) > MAX_NAME:
         raise RemoteProtocolError(f"{what} is not a string of at most {MAX_NAME} characters")
+    if not value.isprintable():  # names are printed all the time, and a terminal obeys what it gets
+        raise RemoteProtocolError(f"{what} holds control characters")
     return value
 
 
