@@ -7,6 +7,8 @@ from time import monotonic
 _LONGEST_WAIT_MS = 24 * 3600 * 1000
 """One wait; who waits asks again afterwards. Infinity has no milliseconds."""
 
+_LOOK_AGAIN_MS = 100
+
 
 class Deadline:
     """A point in time. ``Deadline(None)`` never comes."""
@@ -29,3 +31,18 @@ class Deadline:
     def passed(self) -> bool:
         """Whether it has come."""
         return self._at is not None and monotonic() >= self._at
+
+
+class StartupDeadline(Deadline):
+    """A deadline that another thread can bring forward: its waits are short."""
+
+    __slots__ = ()
+
+    def give_up(self) -> None:
+        """It has come."""
+        self._at = 0.0
+
+    def left_ms(self) -> int:
+        """Milliseconds until somebody should look again."""
+        left = super().left_ms()
+        return _LOOK_AGAIN_MS if left is None else min(left, _LOOK_AGAIN_MS)

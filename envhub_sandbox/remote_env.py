@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 from envhub_sandbox.client import SESSION
-from envhub_sandbox.deadline import Deadline
+from envhub_sandbox.deadline import Deadline, StartupDeadline
 from envhub_sandbox.errors import (
     EnvHubError,
     LoadError,
@@ -75,6 +75,7 @@ class RemoteEnv:
         self._pending: tuple[int, str] | None = None
         self._lane: FastLane | None = None
         self._release_server: Callable[[], None] = _nothing
+        self._startup: StartupDeadline | None = None
         self.results = Results(manifest, self.bounds)
         _living.add(self)
 
@@ -136,9 +137,10 @@ class RemoteEnv:
                 with self.repository.named():
                     self._send("step", self._step_requests(actions))
                 return
-            self._lane.ask(actions)
+            # first: an interrupt from here on leaves a reply that may come
             self._pending = _BY_LANE
             self.lifecycle.on(Event.SUBMIT)
+            self._lane.ask(actions)
 
     def _step_requests(self, actions: Any) -> list[tuple[int, m.Message]]:
         if len(self.bounds) == 1:
@@ -162,6 +164,10 @@ class RemoteEnv:
                 return self.results.step([typed(reply, m.StepDone) for reply in replies])
             except EnvHubError as error:
                 name_source(error, self.repository.label)
+                raise
+            except Exception as error:
+                if self.lifecycle.state is State.CLOSED:  # by a signal handler, in our midst
+                    raise self._closed("step") from error
                 raise
 
     def _collect_by_lane(self, deadline: Deadline, timeout_s: float | None) -> StepResult:
@@ -267,6 +273,8 @@ class RemoteEnv:
                 f"cannot {operation}: this environment belongs to another process, and this is a "
                 f"fork of it ({os.getpid()}); call make_env here to get one of its own"
             )
+        if state is State.CLOSED:
+            raise self._closed(operation)
         if state not in (State.IDLE, State.READY):
             raise WorkerError(f"cannot {operation}: the environment is {state.value}")
 
@@ -311,15 +319,15 @@ class RemoteEnv:
         """Write a death down; what closed an environment under its user is told as such."""
         assert self._pending is not None
         if self.lifecycle.state is State.CLOSED:
-            return WorkerDiedError(
-                f"the environment was closed during {self._pending[1]}",
-                reason="killed",
-                request=self._pending[1],
-            )
+            return self._closed(self._pending[1])
         self._moved(Event.DEATH)
         if not isinstance(error, WorkerDiedError) and self._loaded is not None:
             self._jails.end(self._loaded)  # it lives, and cannot be trusted to do what it says
         return error
+
+    def _closed(self, operation: str) -> WorkerDiedError:
+        text = f"the environment was closed during {operation}"
+        return WorkerDiedError(text, reason="killed", request=operation)
 
     def _moved(self, event: Event) -> None:
         # close() may have come meanwhile, from another thread
@@ -334,10 +342,15 @@ class RemoteEnv:
             self._build(loaded, Deadline(self.repository.timeouts.startup_s))
 
     def _start(self) -> None:
-        deadline = Deadline(self.repository.timeouts.startup_s)
+        deadline = self._startup = StartupDeadline(self.repository.timeouts.startup_s)
         try:
             self._build(self._jails.take(deadline), deadline)
+        except EnvHubError:
+            if self.lifecycle.state is State.CLOSED:
+                raise self._closed("make_env") from None
+            raise
         finally:
+            self._startup = None
             self._let_server_go()
 
     def _let_server_go(self) -> None:
@@ -359,11 +372,15 @@ class RemoteEnv:
                 for host, (start, stop) in zip(hosts, self.bounds, strict=True)
             ]
             loaded.jail.exchange("make_env", builds, deadline)
+            self._hosts, self._number = hosts, number
+            self._lane = self._open_lane(loaded, deadline)
+            if self.lifecycle.state is State.CLOSED:
+                raise self._closed("make_env")
         except BaseException:
+            self._close_lane()
             self._jails.give_back(loaded)
             raise
-        self._loaded, self._hosts, self._number = loaded, hosts, number
-        self._lane = self._open_lane(loaded, deadline)
+        self._loaded = loaded
         self.lifecycle.on(Event.START)
 
     def _open_lane(self, loaded: LoadedJail, deadline: Deadline) -> FastLane | None:
@@ -427,7 +444,7 @@ class RemoteEnv:
             return
         try:
             state, loaded = self.lifecycle.state, self._loaded
-            self.lifecycle.on(Event.CLOSE)
+            self._moved(Event.CLOSE)
             if loaded is not None:
                 if state is State.READY:
                     self._close_politely(loaded)
@@ -447,13 +464,16 @@ class RemoteEnv:
 
     def _interrupt(self) -> None:
         """Another thread waits for a reply: end the jail under it, then clean up after it."""
-        loaded = self._loaded
-        self.lifecycle.on(Event.CLOSE)
+        loaded, startup = self._loaded, self._startup
+        self._moved(Event.CLOSE)
+        if startup is not None:
+            startup.give_up()
         if loaded is None:
             return
         self._jails.end(loaded)
         if self._lock.acquire(timeout=_INTERRUPT_S):
             try:
+                self._moved(Event.CLOSE)  # the other may have moved at the same moment
                 self._jails.give_back(loaded)
                 self._close_lane()
                 self._let_server_go()

@@ -289,3 +289,27 @@ def test_many_clients_at_once_do_not_meet(folder: Path) -> None:
     for path in pytest_of:
         shutil.rmtree(path)
     assert is_clean(folder), left(folder)
+
+
+def test_close_under_a_starting_worker_returns(folder: Path) -> None:
+    """``close`` does not wait for a constructor that hangs, and nor does the first ``reset``."""
+    client = start(
+        folder,
+        """
+        from gymnasium.error import ClosedEnvironmentError
+        fails = {"moment": "init", "fault": "hang", "tasks": 2}
+        suites = make_env(REPOSITORY, n_envs=2, env_kwargs=fails)
+        env = suites["suite"][0]
+        threading.Timer(1.0, env.close).start()
+        try:
+            env.reset()
+        except ClosedEnvironmentError:
+            say("closed")
+        time.sleep(600)
+        """,
+    )
+    assert line(client) == "closed"
+    assert eventually(lambda: not Traces.of(folder).processes), left(folder)
+    client.kill()
+    finish(client)
+    assert is_clean(folder), left(folder)

@@ -1,0 +1,218 @@
+"""No result is ever attributed to another request, and the lifecycle's table is what happens.
+
+A state machine drives a real worker through timeouts, late replies, deaths, interrupts and
+closes. Every request carries a token of its own and every answer repeats it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.error import ClosedEnvironmentError
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+
+from envhub_sandbox import errors, make_env, remote_env
+from envhub_worker.protocol.lifecycle import State
+from tests.support.samples import sample
+
+_SLOW_S = 0.12
+_SOON_S = 0.03
+_AGES_S = 60.0
+_tokens = itertools.count(1)
+
+delays = st.sampled_from([0.0, 0.0, _SLOW_S])
+waits = st.sampled_from([_AGES_S, _AGES_S, _SOON_S])
+
+
+class Attribution(RuleBasedStateMachine):
+    """One environment, and what must be true of it."""
+
+    lane = "auto"
+    shards = 1
+
+    @initialize()
+    def begin(self) -> None:
+        """Nothing runs yet, or a remembered manifest would not be one."""
+        self.suites = make_env(
+            sample("echo"),
+            n_envs=2,
+            use_async_envs=True,
+            num_workers=self.shards,
+            lane=self.lane,
+            policy={"restart": "on_reset"},
+        )
+        self.env = self.suites.env
+        self.expected = self.state
+
+    @property
+    def state(self) -> State:
+        """Where the environment says it is."""
+        return self.env._remote.lifecycle.state  # type: ignore[no-any-return]
+
+    def after(self, ask: Callable[[], Any], check: Callable[[Any], bool]) -> None:
+        """Ask; what comes back is checked, and what is raised says where we are now."""
+        before = self.expected
+        try:
+            answer = ask()
+        except errors.WorkerTimeoutError as error:
+            refused = "cannot" in str(error)
+            assert not refused or before is State.LATE
+            self.expected = State.LATE
+        except errors.WorkerDiedError:
+            self.expected = State.DEAD
+        except KeyboardInterrupt:
+            self.expected = State.LATE
+        else:
+            assert before not in (State.LATE, State.DEAD, State.CLOSED)
+            assert check(answer), answer
+            self.expected = State.READY
+
+    @precondition(lambda self: self.expected is not State.CLOSED)
+    @rule(delay=delays, wait=waits)
+    def reset(self, delay: float, wait: float) -> None:
+        """A reset brings it back from everywhere, and answers with its own token."""
+        token = float(next(_tokens))
+        if self.expected in (State.LATE, State.DEAD):
+            self.expected = State.IDLE
+
+        def ask() -> Any:
+            self.env.reset_async(options={"token": token, "delay": delay})
+            return self.env.reset_wait(timeout=wait)
+
+        self.after(ask, lambda got: got[0].tolist() == [[token, 0.0]] * 2)
+
+    @precondition(lambda self: self.expected is not State.CLOSED)
+    @rule(delay=delays, wait=waits)
+    def step(self, delay: float, wait: float) -> None:
+        """A step answers with its own token, or not at all."""
+        token = float(next(_tokens))
+
+        def ask() -> Any:
+            self.env.step_async([[token, delay]] * 2)
+            return self.env.step_wait(timeout=wait)
+
+        self.after(ask, lambda got: _is_step(got, token))
+
+    @precondition(lambda self: self.expected is not State.CLOSED)
+    @rule(delay=delays, wait=waits)
+    def call(self, delay: float, wait: float) -> None:
+        """A call answers with its own token, or not at all."""
+        token = float(next(_tokens))
+
+        def ask() -> Any:
+            self.env.call_async("echo", token, delay)
+            return self.env.call_wait(timeout=wait)
+
+        self.after(ask, lambda got: got == (token, token))
+
+    @precondition(lambda self: self.expected is not State.CLOSED)
+    @rule(by_step=st.booleans())
+    def die(self, by_step: bool) -> None:
+        """The worker ends while it serves."""
+        if by_step:
+            self.after(lambda: self.env.step([[0.0, 0.0], [0.0, -1.0]]), lambda got: False)
+        else:
+            self.after(lambda: self.env.call("echo", 0.0, -1.0), lambda got: False)
+
+    @precondition(lambda self: self.expected is not State.CLOSED)
+    @rule(grace=st.sampled_from([0.01, 2.0]))
+    def patience(self, grace: float) -> None:
+        """How long a reset waits for a late reply before it starts afresh."""
+        remote_env._GRACE_S = grace
+
+    @precondition(lambda self: self.expected is not State.CLOSED)
+    @rule()
+    def interrupt(self) -> None:
+        """Ctrl-C while a step is waited for, or while the worker starts."""
+        token = float(next(_tokens))
+        was_running = self.state is State.READY
+
+        def ask() -> Any:
+            signal.setitimer(signal.ITIMER_REAL, _SOON_S)
+            try:
+                return self.env.step([[token, _SLOW_S]] * 2)
+            finally:
+                signal.setitimer(signal.ITIMER_REAL, 0)
+
+        self.after(ask, lambda got: _is_step(got, token))
+        if not was_running and self.state is State.IDLE:
+            self.expected = State.IDLE
+
+    @precondition(lambda self: self.expected is not State.CLOSED)
+    @rule(running=st.booleans())
+    def close(self, running: bool) -> None:
+        """Close from another thread, under a running step or not."""
+        closing = threading.Timer(_SOON_S if running else 0.0, self.env.close)
+        closing.start()
+        try:
+            token = float(next(_tokens))
+            while running:
+                assert _is_step(self.env.step([[token, _SLOW_S]] * 2), token)
+        except (ClosedEnvironmentError, errors.WorkerError):
+            pass
+        closing.join()
+        self.expected = State.CLOSED
+
+    @precondition(lambda self: self.expected is State.CLOSED)
+    @rule()
+    def use_when_closed(self) -> None:
+        """A closed environment does nothing any more."""
+        for ask in (self.env.reset, self.env.render, lambda: self.env.step([[0.0, 0.0]] * 2)):
+            with pytest.raises(ClosedEnvironmentError):
+                ask()
+
+    @invariant()
+    def state_is_the_expected_one(self) -> None:
+        """The table's state is the one that the answers told."""
+        if hasattr(self, "env"):
+            assert self.state is self.expected or (
+                # nothing was built, or a death was noticed before anything could be asked
+                {self.state, self.expected} <= {State.IDLE, State.READY}
+            )
+
+    def teardown(self) -> None:
+        """Whatever has happened, it can be closed."""
+        remote_env._GRACE_S = 2.0
+        started = time.monotonic()
+        self.suites.close()
+        assert time.monotonic() - started < _AGES_S
+        assert self.state is State.CLOSED
+
+
+def _is_step(got: Any, token: float) -> bool:
+    observations, rewards, _, _, infos = got
+    same = observations.tolist() == [[token, 1.0]] * 2 and rewards.tolist() == [token] * 2
+    return bool(same and np.array_equal(infos["token"], [token, token]))
+
+
+@pytest.fixture
+def _interrupts() -> Iterator[None]:
+    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.usefixtures("neighbour", "_interrupts")
+@pytest.mark.parametrize("shards", [1, 2])
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+def test_no_result_is_attributed_to_another_request(lane: str, shards: int) -> None:
+    """Whatever is interleaved, an answer is the answer to its own request."""
+    machine = type("Machine", (Attribution,), {"lane": lane, "shards": shards})
+    few = settings(max_examples=12, stateful_step_count=15, deadline=None, print_blob=True)
+    run_state_machine_as_test(machine, settings=few)
