@@ -32,6 +32,18 @@ with_summary() {
   grep -E '^=*.*[0-9]+ passed' "$log" | tail -1 | tr -d '=' >"$CI_WORK/$name.summary"
 }
 
+# A skipped test fails, but for these, each with a reason that is said here.
+permit_what_this_machine_lacks() {
+  if ! ls ${PIP_FIND_LINKS:-/nowhere}/torch-*.whl >/dev/null 2>&1; then
+    echo "no torch build without CUDA in PIP_FIND_LINKS: the tests that need torch are skipped"
+    export ENVHUB_CI_WITHOUT_TORCH=1
+  fi
+  if ! [ -w /sys/fs/cgroup ] && ! [ -w /sys/fs/cgroup/memory ]; then
+    echo "no control groups for this user: the tests that need them are skipped"
+    export ENVHUB_CI_WITHOUT_CGROUPS=1
+  fi
+}
+
 # make_venv PYTHON FOLDER: a virtual environment with uv in it.
 make_venv() {
   "$1" -m venv "$2"
@@ -74,5 +86,5 @@ smoke() {
 # copy_tests FOLDER: what the tests need of the checkout, without the packages.
 copy_tests() {
   mkdir -p "$1"
-  cp -R .ci docs examples tests ./*.md LICENSE pyproject.toml test "$1/"
+  cp -R .ci benchmarks docs examples tests ./*.md LICENSE pyproject.toml test "$1/"
 }

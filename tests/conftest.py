@@ -12,7 +12,11 @@ from hypothesis import HealthCheck, settings
 pytest_plugins = ["tests.hub.fixtures"]
 
 # Reasons for which a test may be skipped in CI, each with the variable that permits it there.
-_PERMITTED = {"'torch'": "ENVHUB_CI_WITHOUT_TORCH", "needs torch": "ENVHUB_CI_WITHOUT_TORCH"}
+_PERMITTED = {
+    "'torch'": "ENVHUB_CI_WITHOUT_TORCH",
+    "needs torch": "ENVHUB_CI_WITHOUT_TORCH",
+    "may not make control groups": "ENVHUB_CI_WITHOUT_CGROUPS",
+}
 
 # A loaded machine is slow at random; what may be slow is bounded by pytest-timeout instead.
 settings.register_profile("local", deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -14,13 +14,18 @@ from tests.hub.olah_server import OlahServer
 from tests.hub.stub_hub import StubHub
 
 
-@pytest.fixture(scope="session")
-def olah(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OlahServer]:
-    """A Hub with real git repositories; give each test's repository a name of its own."""
+def olah_python() -> str:
+    """The interpreter that has olah; the test is skipped if there is none."""
     python = os.environ.get("ENVHUB_TEST_OLAH_PYTHON", sys.executable)
     if subprocess.run([python, "-c", "import olah"], capture_output=True, check=False).returncode:
         pytest.skip(f"olah is missing from {python}: pip install olah")
-    server = OlahServer(tmp_path_factory.mktemp("olah"), python)
+    return python
+
+
+@pytest.fixture(scope="session")
+def olah(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OlahServer]:
+    """A Hub with real git repositories; give each test's repository a name of its own."""
+    server = OlahServer(tmp_path_factory.mktemp("olah"), olah_python())
     yield server
     server.stop()
 

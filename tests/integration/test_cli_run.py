@@ -222,6 +222,8 @@ def test_failures_have_a_code_and_a_message(
     tmp_path: Path, step: str, arguments: Sequence[str], code: int, says: str
 ) -> None:
     """Nothing on stdout, no traceback, and the exit code that the documentation names."""
+    if "--video" in arguments:
+        pytest.importorskip("imageio_ffmpeg")
     done = envhub("run", one_env(tmp_path / "one", step), *arguments)
     assert (done.returncode, done.stdout) == (code, ""), done.stderr
     assert says in done.stderr

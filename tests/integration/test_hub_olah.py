@@ -14,6 +14,7 @@ import pytest
 from envhub_sandbox.errors import RepositoryUnavailableError
 from envhub_sandbox.reference import HubRef
 from envhub_sandbox.snapshot import Snapshot, fetch
+from tests.hub.fixtures import olah_python
 from tests.hub.olah_server import GitRepository, OlahServer
 from tests.hub.stub_hub import git_blob_id
 
@@ -224,8 +225,7 @@ def test_stopped_hub_serves_pins_from_the_store_and_nothing_stale(
 ) -> None:
     """Without its Hub a pin still loads, and a branch fails with the pins that would load."""
     (tmp_path / "olah").mkdir()
-    python = os.environ.get("ENVHUB_TEST_OLAH_PYTHON", sys.executable)
-    server = OlahServer(tmp_path / "olah", python)
+    server = OlahServer(tmp_path / "olah", olah_python())
     try:
         commit = server.repository("org/gone").commit(FILES, tag="v1")
         arguments = {"hub_cache_dir": hub_cache, "token": False, "endpoint": server.endpoint}

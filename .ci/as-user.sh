@@ -1,0 +1,11 @@
+# as-user.sh COMMAND...: runs it in the current folder as a user that owns just this folder and a
+# home, with an environment of its own. To be run as root.
+set -euo pipefail
+uid=$(($(awk -F: '$3 < 60000 && $3 > max {max = $3} END {print max}' /etc/passwd) + 1000))
+home=$CI_WORK/home
+mkdir -p "$home"
+chown -R "$uid:$uid" "$PWD" "$home"
+permitted=(ENVHUB_CI=1 ENVHUB_CI_WITHOUT_CGROUPS=1)
+[ -z "${ENVHUB_CI_WITHOUT_TORCH:-}" ] || permitted+=(ENVHUB_CI_WITHOUT_TORCH=1)
+exec setpriv --reuid "$uid" --regid "$uid" --clear-groups --inh-caps=-all \
+  env -i HOME="$home" TMPDIR="$home" PATH=/usr/bin:/bin LANG=C.UTF-8 CI=true "${permitted[@]}" "$@"
