@@ -16,6 +16,7 @@ import pytest
 
 from envhub_sandbox import Limits, Timeouts, errors, make_env
 from tests.faults.conftest import Neighbour
+from tests.faults.document import DOCUMENT, document
 from tests.faults.table import CLOSED, LOADING, RESET, ROWS, USABLE, Cell, Row, cells
 from tests.faults.traces import Traces
 from tests.support.processes import eventually
@@ -186,3 +187,8 @@ def test_every_moment_and_fault_is_in_the_table() -> None:
 
     assert {row.fault for row in ROWS} == set(FAULTS)
     assert {row.moment for row in ROWS} == set(MOMENTS)
+
+
+def test_document_is_written_from_the_table() -> None:
+    """``docs/faults.md`` says what the rows say."""
+    assert DOCUMENT.read_text() == document()
