@@ -30,15 +30,15 @@ In every cell:
 - After `close()` no process, zombie, descriptor, mapped slab, socket, file, mount or control group
   is there that was not there before. This is read from `/proc` and the file system.
 
-"In seconds" is the median of a row's six cells, on two busy cores, from the request to the error or
-the answer. Timeouts were 1 second for requests, 5 for starting and 1 for closing. `reset()` after a death needs
-`policy={"restart": "on_reset"}`; after a timeout it needs nothing.
+"In seconds" is the median of a row's six cells, on two busy cores, from the request to the error
+or the answer. Timeouts were 1 second for requests, 5 for starting and 1 for closing. `reset()`
+after a death needs `policy={"restart": "on_reset"}`; after a timeout it needs nothing.
 
 ## However the client ends
 
 `tests/faults/test_nothing_left.py` ends clients: by return without `close()`, exceptions,
-`sys.exit`, `os._exit`, a crash, and by SIGINT, SIGTERM, SIGHUP and SIGKILL while idle, in a step and
-in `make_env`. Nothing of theirs remains, their temporary folders included. (If the *server* is
+`sys.exit`, `os._exit`, a crash, and by SIGINT, SIGTERM, SIGHUP and SIGKILL while idle, in a step
+and in `make_env`. Nothing of theirs remains, their temporary folders included. (If the *server* is
 killed its client removes the folder; if both are killed at once, a folder and empty control groups
 stay.)
 
