@@ -63,6 +63,9 @@ class Policy:
         limits: Hard caps.
         restart: What happens after the worker has died: ``"never"``, or a fresh one at the next
             ``reset()`` with ``"on_reset"``.
+        restart_budget: How many such restarts one environment gets in its life.
+        restart_backoff_s: Seconds to wait before a restart that follows another within a minute;
+            they double with each, up to half a minute.
     """
 
     profile: str = "strict"
@@ -72,11 +75,20 @@ class Policy:
     environment: tuple[str, ...] = ()
     limits: Limits = field(default_factory=Limits)
     restart: str = "never"
+    restart_budget: int = 100
+    restart_backoff_s: float = 0.1
 
     def __post_init__(self) -> None:
         _one_of("profile", self.profile, PROFILES)
         _one_of("network", self.network, NETWORKS)
+        if self.restart == "transparent":
+            raise PolicyError(
+                "policy: restart is 'transparent', which cannot be had: the death of one process ends its "
+                "whole jail, so the other sub-environments could not go on; use 'on_reset'"
+            )
         _one_of("restart", self.restart, RESTARTS)
+        _count("restart_budget", self.restart_budget)
+        _seconds("restart_backoff_s", self.restart_backoff_s)
         if not isinstance(self.gpu, bool):
             raise PolicyError(f"policy: gpu is {self.gpu!r}; it is True or False")
         # frozen: this is how a field gets the form that the rest relies on
@@ -144,6 +156,16 @@ def _from(cls: type[T], value: T | Mapping[str, Any] | None, what: str) -> T:
 def _one_of(name: str, value: str, known: tuple[str, ...]) -> None:
     if value not in known:
         raise PolicyError(f"policy: {name} is {value!r}; it is one of {', '.join(known)}")
+
+
+def _count(name: str, value: object) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise PolicyError(f"policy: {name} is {value!r}; it takes a whole number, 0 or more")
+
+
+def _seconds(name: str, value: Any) -> None:
+    if not (_is_number(value) and 0 <= value < float("inf")):
+        raise PolicyError(f"policy: {name} is {value!r}; it takes seconds, 0 or more")
 
 
 _OPTIONAL_LIMITS = frozenset({"cpu_s", "file_bytes"})

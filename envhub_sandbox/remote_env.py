@@ -29,6 +29,7 @@ from envhub_sandbox.fast_lane import FastLane, JailGoneError, Outcome, deposit
 from envhub_sandbox.jail import check, typed
 from envhub_sandbox.jail_sources import JailSource
 from envhub_sandbox.repository import LoadedJail, Repository
+from envhub_sandbox.restarts import Restarts
 from envhub_sandbox.results import Results, StepResult
 from envhub_worker.protocol import batches, slabs
 from envhub_worker.protocol import messages as m
@@ -76,6 +77,7 @@ class RemoteEnv:
         self._lane: FastLane | None = None
         self._release_server: Callable[[], None] = _nothing
         self._startup: StartupDeadline | None = None
+        self._restarts = Restarts(jails.repository.policy)
         self.results = Results(manifest, self.bounds)
         _living.add(self)
 
@@ -236,6 +238,7 @@ class RemoteEnv:
                 self._catch_up()
             may_restart = self.repository.policy.restart != "never"
             if self.lifecycle.state is State.DEAD and may_restart:
+                self._restarts.spend()
                 self._forget()
 
     def _catch_up(self) -> None:

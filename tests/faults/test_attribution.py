@@ -55,7 +55,7 @@ class Attribution(RuleBasedStateMachine):
             use_async_envs=True,
             num_workers=self.shards,
             lane=self.lane,
-            policy={"restart": "on_reset"},
+            policy={"restart": "on_reset", "restart_backoff_s": 0, "restart_budget": 10_000},
         )
         self.env = self.suites.env
         self.expected = self.state

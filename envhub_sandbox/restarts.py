@@ -1,0 +1,51 @@
+"""How often, and how soon, an environment whose worker died gets a fresh one."""
+
+from __future__ import annotations
+
+import time
+
+from envhub_sandbox.errors import WorkerDiedError
+from envhub_sandbox.policy import Policy
+
+_CALM_S = 60.0
+_LONGEST_S = 30.0
+
+
+class Restarts:
+    """The restarts of one environment.
+
+    Attributes:
+        count: How many there were.
+    """
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy = policy
+        self._last = -_CALM_S
+        self._in_a_row = 0
+        self.count = 0
+
+    def spend(self) -> None:
+        """Count one more, and wait if the last one was a moment ago.
+
+        Raises:
+            WorkerDiedError: There are none left.
+        """
+        budget = self._policy.restart_budget
+        if self.count >= budget:
+            raise WorkerDiedError(
+                f"the worker process has died again, and all {budget} restarts are used up "
+                "(restart_budget of the policy); make the environment again",
+                request="reset",
+            )
+        calm = time.monotonic() - self._last >= _CALM_S
+        self._in_a_row = 0 if calm else self._in_a_row + 1
+        time.sleep(backoff_s(self._policy.restart_backoff_s, self._in_a_row))
+        self._last = time.monotonic()
+        self.count += 1
+
+
+def backoff_s(first_s: float, in_a_row: int) -> float:
+    """Seconds to wait before a restart that has so many right before it."""
+    if in_a_row == 0:
+        return 0.0
+    return min(first_s * 2.0 ** min(in_a_row - 1, 64), _LONGEST_S)

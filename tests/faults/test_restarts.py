@@ -1,0 +1,76 @@
+"""How often, and how soon, a worker that died is replaced."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from envhub_sandbox import errors, make_env
+from envhub_sandbox.policy import Policy
+from envhub_sandbox.restarts import backoff_s
+from tests.support.samples import sample
+
+
+def made(**policy: Any) -> Any:
+    """Two sub-environments, of which the last ends its process when it is told to."""
+    fails = {"moment": "step", "fault": "kill"}
+    return make_env(sample("faulty"), n_envs=2, env_kwargs=fails, policy=policy)
+
+
+@pytest.mark.usefixtures("neighbour")
+def test_never_means_never() -> None:
+    """Without a policy for it, everything after a death says that it has died, and what to do."""
+    with made() as suites:
+        env = suites.env
+        env.reset()
+        with pytest.raises(errors.WorkerDiedError):
+            env.step([0, 1])
+        for operation in (env.reset, lambda: env.step([0, 0]), env.render):
+            with pytest.raises(errors.WorkerDiedError, match="on_reset"):
+                operation()
+
+
+@pytest.mark.usefixtures("neighbour")
+def test_budget_ends() -> None:
+    """After the last restart a death is final, and the text names the budget."""
+    with made(restart="on_reset", restart_budget=2, restart_backoff_s=0) as suites:
+        env = suites.env
+        for _ in range(3):
+            env.reset()
+            with pytest.raises(errors.WorkerDiedError, match="died during step"):
+                env.step([0, 1])
+        for _ in range(2):
+            with pytest.raises(errors.WorkerDiedError, match=r"all 2 restarts.*restart_budget"):
+                env.reset()
+
+
+def test_backoff_doubles_and_is_bounded() -> None:
+    """The first restart is at once, those right after it wait longer and longer."""
+    assert [backoff_s(0.1, n) for n in range(5)] == [0.0, 0.1, 0.2, 0.4, 0.8]
+    assert backoff_s(0.1, 10_000) == 30.0
+    assert backoff_s(0.0, 10_000) == 0.0
+
+
+def test_transparent_is_refused_with_the_reason() -> None:
+    """What cannot be had honestly is refused, and the text names what can be had."""
+    with pytest.raises(errors.PolicyError, match=r"transparent.*whole jail.*'on_reset'"):
+        Policy(restart="transparent")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("restart_budget", -1),
+        ("restart_budget", 1.5),
+        ("restart_budget", True),
+        ("restart_backoff_s", -0.1),
+        ("restart_backoff_s", float("nan")),
+        ("restart_backoff_s", float("inf")),
+        ("restart_backoff_s", "soon"),
+    ],
+)
+def test_impossible_values_are_refused(name: str, value: Any) -> None:
+    """A budget is a count, a backoff is seconds."""
+    with pytest.raises(errors.PolicyError, match=name):
+        Policy(**{name: value})
