@@ -7,7 +7,6 @@ events from ``Spawner.poll`` and ``Jail.poll``, whenever their descriptors are r
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import select
 import signal
@@ -16,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -162,17 +161,15 @@ class Spawner:
         self._log = self._folder / "log"
         self._channel, theirs = Channel.pair()
         python = python or sys.executable
+        config = self._config(confinement, readable_roots, target)
+        self._channel.send(asdict(config))
         with theirs:
-            config = self._config(confinement, readable_roots, target, theirs.fileno())
-            self._process = self._execute(config, python)
+            self._process = self._execute(python, theirs.fileno())
 
-    def _config(
-        self, confinement: Confinement, roots: Sequence[str], target: str, control: int
-    ) -> ZygoteConfig:
+    def _config(self, confinement: Confinement, roots: Sequence[str], target: str) -> ZygoteConfig:
         place = self._folder / "root"
         place.mkdir()
         return ZygoteConfig(
-            control=control,
             parent=os.getpid(),
             target=target,
             profile=confinement.profile,
@@ -204,16 +201,16 @@ class Spawner:
                 return cgroups.Tree(hierarchy, self._folder.name)
         return None
 
-    def _execute(self, config: ZygoteConfig, python: str) -> subprocess.Popen[bytes]:
+    def _execute(self, python: str, control: int) -> subprocess.Popen[bytes]:
         with open(self._log, "ab") as log:
             return subprocess.Popen(
-                bootstrap.command(python, "zygote", json.dumps(asdict(config))),
+                bootstrap.command(python, "zygote", str(control)),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
                 cwd="/",
                 env=zygote_environment(os.environ, python),
-                pass_fds=[config.control],
+                pass_fds=[control],
                 start_new_session=True,
             )
 
@@ -278,6 +275,8 @@ class Spawner:
         if self._exited:
             raise RuntimeError("the zygote has gone")
         self._count += 1
+        # Mounts and Landlock know real paths only.
+        spec = replace(spec, snapshot=os.path.realpath(spec.snapshot))
         folder = None if self._scratches is None else self._scratches / f"jail-{self._count}"
         jail = Jail(spec, self, folder, self._user)
         jail._describe(self._make_group(spec))

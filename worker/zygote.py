@@ -4,7 +4,8 @@ It is executed with ``-I``, a built environment and named descriptors, never run
 code and never sees what a jail is for: a jail's specification, with the secrets that its caller
 may grant, goes straight from the server to the jail's init, so that no later fork inherits it.
 
-argv: one JSON object with the fields of ``ZygoteConfig``. Requests on its control channel::
+argv: the descriptor of its control channel. The first message there is its configuration (a
+command line can be read by every jail), with the fields of ``ZygoteConfig``. Then requests::
 
     {"op": "spawn", "id": N} + [init's control socket, the jail's output pipe]
 
@@ -22,7 +23,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import importlib
-import json
 import os
 import select
 import signal
@@ -57,10 +57,14 @@ _END_S = 5.0
 
 def main(argv: Sequence[str]) -> int:
     """Preload, then fork an init for each request until the server goes away."""
-    config = ZygoteConfig.from_wire(json.loads(argv[0]))
+    control = int(argv[0])
+    process.close_all_but({0, 1, 2, control})
+    channel = Channel(socket.socket(fileno=control))
+    received = channel.receive()
+    if received is None:
+        return 0
+    config = ZygoteConfig.from_wire(received[0])
     process.die_with_parent(config.parent, signal.SIGTERM)
-    process.close_all_but({0, 1, 2, config.control})
-    channel = Channel(socket.socket(fileno=config.control))
     try:
         common = outer.enter(config)
     except LayerUnavailableError as error:

@@ -546,6 +546,26 @@ def test_pid_of_a_host_is_the_one_outside(cell: Cell) -> None:
     assert "zygote" in Path(f"/proc/{started.pid}/cmdline").read_text()
 
 
+def test_command_line_of_a_host_tells_nothing(cell: Cell) -> None:
+    """The zygote's configuration, with the paths of the server, is not in it."""
+    source = "result = open('/proc/self/cmdline').read().split(chr(0))"
+    arguments = cell.run(source)["result"]
+    assert arguments[1] == "-I"
+    assert arguments[3] == "zygote"
+    assert arguments[4].isdigit()
+    assert arguments[5:] == [""]
+
+
+def test_snapshot_may_be_named_through_a_link() -> None:
+    """A home may be a symbolic link to another disk."""
+    with open_folder() as folder, spawner_in(folder, Confinement()) as spawner:
+        make_snapshot(folder)
+        (folder / "alias").symlink_to(folder, target_is_directory=True)
+        cell = new_cell(spawner, str(folder / "alias" / "snapshot"), Confinement())
+        cell.start()
+        assert cell.run("result = open('env.py').read()") == {"result": "VALUE = 7\n"}
+
+
 def test_grants_are_readable_and_no_more(outside: Path) -> None:
     """A path that the policy names is there, read-only; its neighbour is not."""
     (outside / "granted").mkdir()

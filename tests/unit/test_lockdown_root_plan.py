@@ -17,6 +17,7 @@ FOLDERS = {
     "/data/store",
     "/home/ann",
     "/home/ann/proj",
+    "/sys/devices",
     "/sys/devices/system/cpu",
 }
 FILES = {"/etc/ld.so.cache", "/etc/resolv.conf", "/etc/hosts"}
@@ -103,7 +104,9 @@ def test_gpu_adds_compute_nodes_and_what_drivers_read() -> None:
         "/dev/nvidia0",
         "/dev/nvidiactl",
     )
-    assert set(gpu_devices(HOST)) <= set(root(gpu=True).devices)
+    plan = root(gpu=True)
+    assert set(gpu_devices(HOST)) <= set(plan.devices)
+    assert [path for path in plan.trees if path.startswith("/sys")] == ["/sys/devices"]
 
 
 def test_host_network_adds_name_resolution() -> None:

@@ -16,7 +16,6 @@ class ZygoteConfig:
     """How a zygote is started.
 
     Attributes:
-        control: Descriptor of its control socket.
         parent: The server's pid.
         target: What a host runs once it is confined, as ``"module:function"``.
         profile: The profile of its jails.
@@ -30,7 +29,6 @@ class ZygoteConfig:
         refusal: Why no jail can be had (``LayerUnavailableError.to_wire``), if that is known.
     """
 
-    control: int
     parent: int
     target: str
     profile: str

@@ -26,6 +26,8 @@ _ETC_FILES = ("/etc/ld.so.cache", "/etc/localtime", "/etc/mime.types", "/etc/os-
 _NETWORK_FILES = ("/etc/resolv.conf", "/etc/hosts", "/etc/services", "/etc/gai.conf")
 _NETWORK_FOLDERS = ("/etc/ssl", "/etc/pki", "/etc/ca-certificates")
 _SYS_FOLDERS = ("/sys/devices/system/cpu", "/sys/devices/system/node")
+# Drivers look devices up here; the rest of /sys is left out.
+_GPU_SYS_FOLDERS = ("/sys/bus/pci", "/sys/class/drm", "/sys/dev/char", "/sys/devices")
 _DEVICES = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom")
 
 _TEXTS = {
@@ -109,7 +111,7 @@ def plan_root(
     copies = list(_ETC_FILES)
     texts = dict(_TEXTS)
     if gpu:
-        trees.append("/sys")
+        trees += _GPU_SYS_FOLDERS
     if network == "host":
         copies += _NETWORK_FILES
         trees += _NETWORK_FOLDERS
