@@ -83,8 +83,8 @@ class Policy:
         _one_of("network", self.network, NETWORKS)
         if self.restart == "transparent":
             raise PolicyError(
-                "policy: restart is 'transparent', which cannot be had: the death of one process ends its "
-                "whole jail, so the other sub-environments could not go on; use 'on_reset'"
+                "policy: restart is 'transparent', which cannot be had: the death of one process "
+                "ends its whole jail, so the other sub-environments could not go on; use 'on_reset'"
             )
         _one_of("restart", self.restart, RESTARTS)
         _count("restart_budget", self.restart_budget)
