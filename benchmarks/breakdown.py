@@ -34,9 +34,14 @@ def breakdown(workload: Workload, count: int, shards: int) -> dict[str, dict[str
     """Microseconds for one vector step of ``count`` sub-environments, by way of waiting."""
     raw = _median(_costs(_raw_loop(workload, count)))
     loop = _median(_costs(_jail_loop(workload, -(-count // shards))))
-    arguments = {"n_envs": count, "use_async_envs": True, "num_workers": shards}
     rows = {}
-    with make_env(str(workload.folder), **arguments) as suites:
+    with make_env(
+        str(workload.folder),
+        count,
+        use_async_envs=True,
+        num_workers=shards,
+        env_kwargs=workload.arguments,
+    ) as suites:
         env = suites.env
         env.reset(seed=0)
         take_precedence(os.getpid())

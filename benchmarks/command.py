@@ -1,126 +1,121 @@
-"""The command line."""
+"""The command line: ``python -m benchmarks``."""
 
 from __future__ import annotations
 
 import argparse
 import os
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from benchmarks.driver import Player, players
+from benchmarks.attributes import measure_attributes
+from benchmarks.driver import players
 from benchmarks.interpreters import PEER_VENVS, Interpreters
-from benchmarks.load import load_average
+from benchmarks.load import Patience, load_average
 from benchmarks.machine import machine
 from benchmarks.peers import PEERS
+from benchmarks.plan import PARTS, Cell, Plan, planned
+from benchmarks.plot import plot
 from benchmarks.report import cell_lines, write_report
 from benchmarks.rounds import CONDITIONS, measure
-from benchmarks.workloads import WORKLOADS, Workload
+from benchmarks.spawning import measure_spawning
+from benchmarks.targets import against_others, reached
+from benchmarks.workloads import WORKLOADS
 
 RESULTS = Path(__file__).parent / "results"
-
-
-@dataclass
-class Plan:
-    """What to run.
-
-    Attributes:
-        cells: Workloads and sizes.
-        conditions: Names.
-        peers: Names.
-        rounds: Turns of each peer.
-        seconds: Length of a turn.
-        patience_s: How long to wait for a quiet machine, before each round.
-    """
-
-    cells: list[tuple[Workload, int]]
-    conditions: list[str]
-    peers: list[str]
-    rounds: int
-    seconds: float
-    patience_s: float
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run what the arguments say; returns the exit code."""
     options = _parser().parse_args(arguments)
-    plan = _plan(options)
     if options.nice:
         os.nice(options.nice)  # all that we start inherits it, the loaded condition's too
-    results: dict[str, Any] = {
+    plan = planned(options)
+    results = {
         "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "quick": options.quick,
         "machine": machine(),
         "load_average": load_average(),
         "nice": options.nice,
         "rounds": plan.rounds,
         "seconds": plan.seconds,
-        "cells": run(plan, Interpreters(options.venvs)),
+        **run(plan, Interpreters(options.venvs)),
     }
-    for path in write_report(results, options.out):
-        print(path, file=sys.stderr)
+    paths = write_report(results, options.out)
+    if options.plot:
+        paths.append(plot(results, paths[0].with_suffix(".png")))
+    print("\n".join(map(str, paths)), file=sys.stderr)
     return 0
 
 
-def run(plan: Plan, interpreters: Interpreters) -> list[dict[str, Any]]:
-    """Every workload at every size under every condition."""
-    cells = []
-    for workload, count in plan.cells:
-        peers = [PEERS[name] for name in plan.peers if PEERS[name].runs(workload, count)]
+def run(plan: Plan, interpreters: Interpreters) -> dict[str, Any]:
+    """Each part of the plan."""
+    patience = Patience(plan.patience_s)
+    results: dict[str, Any] = {}
+    if "steps" in plan.parts:
+        cells = _cells(plan, plan.cells, plan.peers, plan.conditions, patience, interpreters)
+        results["steps"] = cells
+        results["targets"] = reached(cells)
+        results["against_others"] = against_others(cells)
+    if "growth" in plan.parts:
+        peers = plan.growing_peers()
+        results["growth"] = _cells(plan, plan.growing, peers, ["quiet"], patience, interpreters)
+    if "attributes" in plan.parts:
+        peers = list(plan.peers)
+        results["attributes"] = measure_attributes(peers, plan.rounds, patience, interpreters)
+    if "spawning" in plan.parts:
+        results["spawning"] = measure_spawning(plan.spawns, patience)
+    return results
+
+
+def _cells(
+    plan: Plan,
+    cells: Iterable[Cell],
+    names: Iterable[str],
+    conditions: Iterable[str],
+    patience: Patience,
+    interpreters: Interpreters,
+) -> list[dict[str, Any]]:
+    """Each workload at each size, opened once, under each condition."""
+    found = []
+    for workload, count in cells:
+        peers = [PEERS[name] for name in names if PEERS[name].runs(workload, count)]
         with players(peers, workload, count, interpreters) as (present, absent):
-            for name in plan.conditions:
+            for name in conditions:
                 cell = {
                     "workload": workload.name,
                     "n": count,
                     "condition": name,
                     "ready": {player.peer.name: player.ready for player in present},
                     "absent": absent,
-                    **_measured(plan, present, name),
+                    **measure(present, CONDITIONS[name], plan.rounds, plan.seconds, patience),
                 }
                 print("\n".join(cell_lines(cell)), flush=True)
-                cells.append(cell)
-    return cells
-
-
-def _measured(plan: Plan, present: list[Player], condition: str) -> dict[str, Any]:
-    return measure(
-        present, CONDITIONS[condition], plan.rounds, plan.seconds, patience_s=plan.patience_s
-    )
+                found.append(cell)
+    return found
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="under a minute: does it run?")
-    parser.add_argument("--workloads", nargs="+", choices=WORKLOADS, default=list(WORKLOADS))
-    parser.add_argument("--sizes", nargs="+", type=int, help="numbers of sub-environments")
-    parser.add_argument("--conditions", nargs="+", choices=CONDITIONS, default=list(CONDITIONS))
-    parser.add_argument("--peers", nargs="+", choices=PEERS, default=list(PEERS))
-    parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--seconds", type=float, default=0.25, help="length of one turn")
-    parser.add_argument("--patience", type=float, default=10.0, help="seconds, per round")
-    parser.add_argument("--nice", type=int, default=0, help="-20: on a machine that others use")
-    parser.add_argument("--venvs", type=Path, default=PEER_VENVS, help="of peers, by name")
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder for the reports")
-    return parser
-
-
-def _plan(options: argparse.Namespace) -> Plan:
-    if options.quick:
-        cells = [(WORKLOADS["cartpole"], 4), (WORKLOADS["cameras"], 2)]
-        peers = [name for name in options.peers if name in ("sync", "async", "envhub")]
-        return Plan(cells, ["quiet"], peers, rounds=2, seconds=0.05, patience_s=0.0)
-    cells = [
-        (WORKLOADS[name], size)
-        for name in options.workloads
-        for size in options.sizes or WORKLOADS[name].sizes
-    ]
-    return Plan(
-        cells,
-        options.conditions,
-        options.peers,
-        options.rounds,
-        options.seconds,
-        options.patience,
+    compared = [name for name, workload in WORKLOADS.items() if not workload.grows]
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks",
+        description="envhub-sandbox against Gymnasium's vector environments, and others.",
     )
+    add = parser.add_argument
+    add("parts", nargs="*", metavar="part", help=f"of {', '.join(PARTS)}; all by default")
+    add("--quick", action="store_true", help="under a minute: does it run?")
+    add("--workloads", nargs="+", choices=WORKLOADS, default=compared)
+    add("--sizes", nargs="+", type=int, help="numbers of sub-environments")
+    add("--conditions", nargs="+", choices=CONDITIONS, default=list(CONDITIONS))
+    add("--peers", nargs="+", choices=PEERS, default=list(PEERS))
+    add("--rounds", type=int, default=7)
+    add("--seconds", type=float, default=0.25, help="length of a turn")
+    add("--spawns", type=int, default=50, help="workers to spawn")
+    add("--patience", type=float, default=60.0, help="seconds to wait for a quiet machine")
+    add("--nice", type=int, default=0, help="-20, as root: for a machine that others use")
+    add("--venvs", type=Path, default=PEER_VENVS, help="virtual environments of peers, by name")
+    add("--out", type=Path, default=RESULTS, help="folder for the reports")
+    add("--plot", action="store_true", help="a picture too; needs matplotlib")
+    return parser

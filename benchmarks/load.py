@@ -13,6 +13,7 @@ from pathlib import Path
 import psutil
 
 _QUIET_CORES = 0.15
+_POLL_S = 0.2
 _BUSY = "import os\nparent = os.getppid()\nwhile os.getppid() == parent:\n    sum(range(100000))"
 
 
@@ -57,14 +58,25 @@ def busy_cores(seconds: float = 0.1) -> float:
     return (_jiffies() - before) / os.sysconf("SC_CLK_TCK") / seconds
 
 
-def wait_for_quiet(patience_s: float) -> float:
-    """Wait until nobody else computes, or patience ends; returns the cores then in use."""
-    until = time.monotonic() + patience_s
-    busy = busy_cores()
-    while busy > _QUIET_CORES and time.monotonic() < until:
-        time.sleep(0.2)
+class Patience:
+    """Waits for others to leave the machine alone, but not forever.
+
+    Args:
+        total_s: Seconds to spend on it altogether.
+    """
+
+    def __init__(self, total_s: float) -> None:
+        self._left_s = total_s
+
+    def wait(self) -> float:
+        """Wait until nobody else computes, or patience ends; returns the cores then in use."""
         busy = busy_cores()
-    return round(busy, 2)
+        while busy > _QUIET_CORES and self._left_s > 0:
+            start = time.monotonic()
+            time.sleep(_POLL_S)
+            busy = busy_cores()
+            self._left_s -= time.monotonic() - start
+        return round(busy, 2)
 
 
 def _jiffies() -> int:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.peers import PEERS
+from benchmarks.targets import OTHERS
 from benchmarks.workloads import WORKLOADS
 
 
@@ -29,17 +30,58 @@ def markdown(results: dict[str, Any]) -> Iterator[str]:
     yield f"{facts}. Load before the start: {results['load_average']:.2f}."
     yield f"{results['rounds']} rounds of {results['seconds']} s for each peer."
     yield ""
-    for cell in results["cells"]:
-        yield from cell_lines(cell)
+    yield from _targets(results)
+    for part in ("steps", "growth"):
+        if part in results:
+            yield f"## {part.capitalize()}"
+            yield ""
+        for cell in results.get(part, []):
+            yield from cell_lines(cell)
+    if "attributes" in results:
+        yield from _attributes(results["attributes"])
+    if "spawning" in results:
+        yield from _spawning(results["spawning"])
+
+
+def _targets(results: dict[str, Any]) -> Iterator[str]:
+    if not results.get("targets"):
+        return
+    yield "## Targets on two cores"
+    yield ""
+    yield "| workload, condition | n | envhub | x Sync, target | x Async, target | reached |"
+    yield "|---|---|---|---|---|---|"
+    for row in results["targets"]:
+        yield _target_row(row)
+    yield ""
+    for name, ratio in results["against_others"].items():
+        title = PEERS[name].title
+        yield f"CartPole, n = 16, quiet: {ratio:.2f} x {title} (target {OTHERS[name]:g})."
+    yield ""
+
+
+def _target_row(row: dict[str, Any]) -> str:
+    found, target = row["found"], row["target"]
+    sync = f"{found['sync']:.2f}, {_or_none(target['sync'])}"
+    if target["over_us"] is not None:
+        sync = f"{found['over_us']:.0f} us over, at most {target['over_us']:.0f}"
+    return (
+        f"| {WORKLOADS[row['workload']].title}, {row['condition']} | {row['n']} "
+        f"| {PEERS[row['peer']].title} | {sync} "
+        f"| {found['async']:.2f}, {_or_none(target['async'])} "
+        f"| {'yes' if row['reached'] else '**no**'} |"
+    )
+
+
+def _or_none(value: float | None) -> str:
+    return "none" if value is None else f"{value:g}"
 
 
 def cell_lines(cell: dict[str, Any]) -> Iterator[str]:
     """One workload at one size under one condition."""
-    title = WORKLOADS[cell["workload"]].title
     others = cell["busy_cores_before_rounds"]
-    yield f"### {title}, n = {cell['n']}, {cell['condition']}"
-    yield ""
     busy = f"{min(others):.2f} to {max(others):.2f}"
+    yield f"### {WORKLOADS[cell['workload']].title}, n = {cell['n']}, {cell['condition']}"
+    yield ""
     yield f"Cores in use by others before the rounds: {busy}. Microseconds for one vector step."
     yield ""
     yield "| peer | mean | p50 | p95 | over Sync | x Sync | x Async | p50: x Sync | x Async |"
@@ -47,9 +89,7 @@ def cell_lines(cell: dict[str, Any]) -> Iterator[str]:
     for name, result in cell["peers"].items():
         yield _row(PEERS[name].title + _setting(cell["ready"][name]), result)
     yield ""
-    for name, reason in {**cell["absent"], **cell["failed"]}.items():
-        yield f"Not measured: {PEERS[name].title} ({reason})."
-        yield ""
+    yield from _not_measured({**cell["absent"], **cell["failed"]})
     yield from _digests(cell)
 
 
@@ -77,9 +117,44 @@ def _median(ratio: dict[str, Any] | None) -> str:
     return "" if ratio is None else f"{ratio['median']:.2f}"
 
 
+def _not_measured(reasons: dict[str, str]) -> Iterator[str]:
+    for name, reason in reasons.items():
+        yield f"Not measured: {PEERS[name].title} ({reason})."
+        yield ""
+
+
 def _digests(cell: dict[str, Any]) -> Iterator[str]:
-    digests = {ready["digest"] for ready in cell["ready"].values() if ready["digest"]}
-    if len(digests) > 1:
-        found = {name: ready["digest"] for name, ready in cell["ready"].items()}
+    found = {name: ready["digest"] for name, ready in cell["ready"].items() if ready["digest"]}
+    if len(set(found.values())) > 1:
         yield f"**Results differ**: {found}"
         yield ""
+
+
+def _attributes(found: dict[str, Any]) -> Iterator[str]:
+    yield f"## `get_attr` of {found['n']} CartPoles"
+    yield ""
+    yield "| peer | microseconds | x Async |"
+    yield "|---|---|---|"
+    for name, result in found["peers"].items():
+        ratio = _ratio(result.get("x_async"))
+        yield f"| {PEERS[name].title} | {result['call_us']:.0f} | {ratio} |"
+    yield ""
+    yield from _not_measured(found["absent"])
+
+
+def _spawning(found: dict[str, Any]) -> Iterator[str]:
+    yield "## Starting, in milliseconds, and memory, in MB"
+    yield ""
+    yield "| what | found |"
+    yield "|---|---|"
+    for name, values in found.items():
+        yield f"| {name.replace('_', ' ')} | {_flat(values)} |"
+    yield ""
+
+
+def _flat(values: Any) -> str:
+    if isinstance(values, dict):
+        return "; ".join(f"{name} {_flat(value)}" for name, value in values.items())
+    if isinstance(values, list):
+        return " ".join(map(str, values))
+    return str(values)

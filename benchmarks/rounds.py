@@ -11,7 +11,7 @@ from typing import Any
 
 from benchmarks.clock import Slice
 from benchmarks.driver import Absent, Player
-from benchmarks.load import busy_processes, load_average, wait_for_quiet
+from benchmarks.load import Patience, busy_processes, load_average
 from benchmarks.peers import ASYNC, SYNC
 
 _BUSY_PROCESSES = 2
@@ -48,7 +48,7 @@ CONDITIONS = {
 
 
 def measure(
-    present: list[Player], condition: Condition, rounds: int, seconds: float, patience_s: float
+    present: list[Player], condition: Condition, rounds: int, seconds: float, patience: Patience
 ) -> dict[str, Any]:
     """Run rounds; returns each peer's turns and ratios, and what else the machine did.
 
@@ -57,7 +57,7 @@ def measure(
         condition: Under which they step.
         rounds: Turns of each.
         seconds: Length of a turn.
-        patience_s: How long to wait, before each round, for others to leave the machine alone.
+        patience: Waits for others to leave the machine alone, before each round.
     """
     turns: dict[str, list[dict[str, Any]]] = {player.peer.name: [] for player in present}
     failed: dict[str, str] = {}
@@ -65,7 +65,7 @@ def measure(
     others: list[float] = []
     shuffled = random.Random(0)
     for _ in range(rounds):
-        others.append(wait_for_quiet(patience_s))
+        others.append(patience.wait())
         with busy_processes(_BUSY_PROCESSES) if condition.others else nullcontext():
             for player in shuffled.sample(present, len(present)):
                 _take_turn(player, order, turns, failed)

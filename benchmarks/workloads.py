@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
 from types import ModuleType
@@ -21,21 +21,38 @@ class Workload:
     """One environment repository, and the sizes at which it is measured.
 
     Attributes:
-        name: Its folder in ``repositories/``.
+        name: On the command line and in reports.
         title: For tables.
         sizes: Numbers of sub-environments.
         envpool: Its name in EnvPool, if EnvPool has it.
+        repository: Its folder in ``repositories/``, if not its name.
+        arguments: For the repository's functions.
+        grows: Whether it belongs to the series that shows growth, not to the comparison.
     """
 
     name: str
     title: str
     sizes: tuple[int, ...] = (1, 4, 16, 64)
     envpool: str | None = None
+    repository: str = ""
+    arguments: dict[str, Any] = field(default_factory=dict)
+    grows: bool = False
 
     @property
     def folder(self) -> Path:
         """The repository."""
-        return REPOSITORIES / self.name
+        return REPOSITORIES / (self.repository or self.name)
+
+
+def _bytes(size: int, title: str) -> Workload:
+    return Workload(
+        f"bytes-{size}",
+        f"{title} observations",
+        sizes=(4,),
+        repository="bytes",
+        arguments={"size": size},
+        grows=True,
+    )
 
 
 WORKLOADS = {
@@ -47,16 +64,18 @@ WORKLOADS = {
         Workload("cameras", "2 cameras 480x640x3", sizes=(8,)),
         Workload("busy", "2 ms busy step"),
         Workload("sleeping", "2 ms sleeping step"),
+        _bytes(64, "64 B"),
+        _bytes(4 << 10, "4 KiB"),
+        _bytes(64 << 10, "64 KiB"),
+        _bytes(1 << 20, "1 MiB"),
+        _bytes(4 << 20, "4 MiB"),
     )
 }
 
 
 @lru_cache
-def module(name: str) -> ModuleType:
-    """A repository's ``env.py``, run in this process."""
-    spec = importlib.util.spec_from_file_location(
-        f"benchmark_{name}", REPOSITORIES / name / "env.py"
-    )
+def _module(folder: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"benchmark_{folder.name}", folder / "env.py")
     assert spec is not None
     assert spec.loader is not None
     loaded = importlib.util.module_from_spec(spec)
@@ -65,8 +84,9 @@ def module(name: str) -> ModuleType:
 
 
 def single(name: str) -> Any:
-    """One sub-environment."""
-    return module(name).single()
+    """One sub-environment of a workload, in this process."""
+    workload = WORKLOADS[name]
+    return _module(workload.folder).single(**workload.arguments)
 
 
 def makers(name: str, count: int) -> list[Callable[[], Any]]:

@@ -18,6 +18,7 @@ def open_peer(workload: Workload, count: int, **arguments: Any) -> Any:
         raise Missing(f"make_env has no {', '.join(unknown)}")
     if arguments.get("num_workers") == -1:
         arguments["num_workers"] = count
+    arguments["env_kwargs"] = workload.arguments
     env = make_env(str(workload.folder), n_envs=count, **arguments).env
     env.reset(seed=0)
     return env

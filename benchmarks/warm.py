@@ -1,0 +1,64 @@
+"""A warm worker server, to spawn confined workers from. Looks into private parts."""
+
+from __future__ import annotations
+
+from time import perf_counter
+from typing import Any
+
+from benchmarks.load import Patience
+from envhub_sandbox import make_env
+from envhub_sandbox.client import WorkerClient
+from envhub_sandbox.deadline import Deadline
+from envhub_sandbox.jail import open_jail
+
+_LONG_S = 60.0
+
+
+class Warm:
+    """Keeps one environment running, so that server and zygote are up.
+
+    Args:
+        reference: A repository.
+        patience: Waits for others to leave the machine alone, before each.
+
+    Attributes:
+        layers: What confines the workers.
+    """
+
+    def __init__(self, reference: str, patience: Patience) -> None:
+        self._reference = reference
+        self._patience = patience
+        self._suites = make_env(reference)
+        self._suites.env.reset(seed=0)
+        self._repository: Any = self._suites.env._remote.repository
+        self._server = self._suites.env._remote._loaded.server
+        report = self._suites.env.sandbox_report
+        self.layers = [layer["layer"] for layer in report if layer["enforced"]]
+
+    def __enter__(self) -> Warm:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._suites.close()
+
+    def spawn(self) -> float:
+        """Milliseconds until a worker is confined, has tried its denials and reports."""
+        repository, server = self._repository, self._server
+        client = WorkerClient(server.endpoint, server.process_fd, repository.wire_limits)
+        client.hello(Deadline(_LONG_S))
+        self._patience.wait()
+        start = perf_counter()
+        jail = open_jail(client, repository._order(), repository.wire_limits, Deadline(_LONG_S))
+        taken = (perf_counter() - start) * 1000
+        jail.close(Deadline(_LONG_S))
+        return round(taken, 3)
+
+    def ready(self) -> float:
+        """Milliseconds for ``make_env`` and the first ``reset``."""
+        self._patience.wait()
+        start = perf_counter()
+        suites = make_env(self._reference)
+        suites.env.reset(seed=0)
+        taken = (perf_counter() - start) * 1000
+        suites.close()
+        return round(taken, 3)
