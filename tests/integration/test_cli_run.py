@@ -269,19 +269,32 @@ def make_env(n_envs=1, use_async_envs=False):
     assert found["provenance"]["layers"]
 
 
-def test_hostile_names_and_messages_are_escaped(tmp_path: Path) -> None:
-    """Escape sequences and markup of a stranger reach the terminal as text."""
+def hostile_names(folder: Path, suite: str, task: str) -> Path:
+    """A repository that calls its suite and its task so."""
     code = _ONE_ENV % (OVER, "return None")
-    code += """
+    code += f"""
 def make_env(n_envs=1, use_async_envs=False):
-    return {"\\x1b]0;owned\\x07": {"[red]x[/red]\\x1b[2J": gym.vector.SyncVectorEnv([One])}}
+    return {{{suite!r}: {{{task!r}: gym.vector.SyncVectorEnv([One])}}}}
 """
-    folder = write_repository(tmp_path / "evil", code)
+    return write_repository(folder, code)
+
+
+@pytest.mark.parametrize("command", ["run", "inspect"])
+def test_names_with_control_characters_are_refused(tmp_path: Path, command: str) -> None:
+    """A repository that names its tasks in escape sequences does not get to run."""
+    done = envhub(command, hostile_names(tmp_path / "evil", "\x1b]0;owned\x07", "\x1b[2J"))
+    assert (done.returncode, done.stdout) == (5, "")
+    assert "control characters" in done.stderr
+    assert "\x1b" not in done.stderr
+
+
+def test_markup_and_messages_are_shown_as_text(tmp_path: Path) -> None:
+    """Markup in names and escape sequences in messages of a stranger do nothing to the terminal."""
+    folder = hostile_names(tmp_path / "evil", "[bold]s[/bold]", "[red]x[/red]")
     for command in ("run", "inspect"):
         done = envhub(command, folder)
         assert done.returncode == 0, done.stderr
-        assert r"\x1b]0;owned\x07 / [red]x[/red]\x1b[2J" in done.stdout.replace("\n", "")
-        assert "\x1b" not in done.stdout + envhub(command, folder, "--json").stdout
+        assert "[bold]s[/bold] / [red]x[/red]" in done.stdout.replace("\n", "")
     noisy = envhub("run", sample("noisy"))
     assert r"\x1b[2J" in noisy.stderr
     assert "\x1b" not in noisy.stderr
