@@ -15,6 +15,7 @@ from envhub_sandbox.jail_sources import JailSource, OwnJails, SharedJail
 from envhub_sandbox.manifest_cache import ManifestCache, manifest_key
 from envhub_sandbox.policy import Limits, Policy, Timeouts, limits_from, policy_from, timeouts_from
 from envhub_sandbox.provenance import provenance_of
+from envhub_sandbox.recipe import Recipe, pinned
 from envhub_sandbox.reference import HubRef, is_local
 from envhub_sandbox.remote_env import RemoteEnv
 from envhub_sandbox.repository import LoadArguments, LoadedJail, Repository
@@ -111,6 +112,25 @@ def make_env(
         lane,
         copy,
     )
+    repository.recipe = Recipe(
+        make_env=make_env,
+        reference=pinned(snapshot),
+        config=repository.arguments.cfg,
+        options={
+            "n_envs": n_envs,
+            "use_async_envs": use_async_envs,
+            "hub_cache_dir": hub_cache_dir,
+            "sandbox": sandbox,
+            "env_kwargs": repository.arguments.env_kwargs,
+            "policy": chosen_policy,
+            "timeouts": chosen_timeouts,
+            "endpoint": endpoint,
+            "python": python,
+            "num_workers": num_workers,
+            "lane": lane,
+            "copy": copy,
+        },
+    )
     return _Maker(repository, num_workers).make()
 
 
@@ -155,6 +175,7 @@ class _Maker:
             envs,
             lambda: provenance_of(repository.snapshot, manifest, repository.report),
             shared.close if shared else lambda: None,
+            repository.recipe,
         )
 
     def _shared(self, loaded: LoadedJail | None) -> SharedJail:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import threading
+import weakref
 from collections.abc import Callable
 from typing import Protocol
 
@@ -73,6 +74,8 @@ class SharedJail:
     def provide(self, loaded: LoadedJail) -> None:
         """Start with a jail that is loaded already."""
         self._first = loaded
+        # nobody may ever take it, nor close
+        weakref.finalize(self, self.repository.close, loaded).atexit = False
 
     def take(self, deadline: Deadline) -> LoadedJail:
         """A connection to the jail, which is opened if there is none."""

@@ -14,6 +14,7 @@ from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import EnvHubError, LoadError, WorkerTimeoutError, name_source
 from envhub_sandbox.jail import RemoteJail, check, open_jail
 from envhub_sandbox.policy import Policy, Timeouts
+from envhub_sandbox.recipe import Recipe
 from envhub_sandbox.sandboxes.base import Sandbox, WorkerServer
 from envhub_sandbox.snapshot import Snapshot
 from envhub_worker.protocol import messages as m
@@ -90,6 +91,7 @@ class Repository:
         self.lane = lane
         self.copy = copy
         self.report: list[dict[str, Any]] = []
+        self.recipe: Recipe | None = None
         self._sandbox = sandbox
         self._store = store
 

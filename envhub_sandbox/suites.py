@@ -8,6 +8,8 @@ from typing import Any
 
 from gymnasium.vector import VectorEnv
 
+from envhub_sandbox.recipe import Recipe
+
 Envs = Mapping[str, Mapping[int | str, VectorEnv[Any, Any, Any]]]
 
 
@@ -20,6 +22,7 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
         envs: The environments.
         provenance: Makes ``provenance``.
         on_close: Runs after the environments have been closed.
+        recipe: Makes them again: a pickle starts workers of its own.
     """
 
     def __init__(
@@ -27,10 +30,17 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
         envs: Envs,
         provenance: Callable[[], dict[str, Any]],
         on_close: Callable[[], None] = lambda: None,
+        recipe: Recipe | None = None,
     ) -> None:
         super().__init__({suite: dict(tasks) for suite, tasks in envs.items()})
         self._provenance = provenance
         self._on_close = on_close
+        self._recipe = recipe
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if self._recipe is None:
+            raise TypeError("environments that run in this process cannot be pickled")
+        return self._recipe.make, ()
 
     @property
     def env(self) -> Any:

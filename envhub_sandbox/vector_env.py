@@ -250,6 +250,12 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
         return method
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        recipe = self._remote.repository.recipe
+        if recipe is None:
+            raise TypeError(f"{self!r} does not know how it was made, so it cannot be pickled")
+        return recipe.make_one, (self._manifest.suite, self._manifest.task)
+
     def __repr__(self) -> str:
         return f"SandboxVectorEnv({self._remote.repository.label}, num_envs={self.num_envs})"
 

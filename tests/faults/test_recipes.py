@@ -1,0 +1,95 @@
+"""A proxy in a pickle is a recipe: the other process gets an environment and worker of its own."""
+
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from envhub_sandbox import make_env
+from tests.support.samples import sample
+
+
+def tenth_step(env: Any) -> list[list[float]]:
+    """In a child: use the environment that came in a pickle, and close it."""
+    env.reset(seed=0)
+    for _ in range(9):
+        env.step([0, 0])
+    observations = env.step([0, 0])[0].tolist()
+    env.close()
+    return observations  # type: ignore[no-any-return]
+
+
+@pytest.mark.usefixtures("neighbour")
+@pytest.mark.parametrize("use_async_envs", [False, True])
+def test_spawned_child_has_its_own(use_async_envs: bool) -> None:
+    """RLlib and SB3 send environments to spawned children; ours goes on meanwhile."""
+    made = make_env(sample("faulty"), n_envs=2, use_async_envs=use_async_envs)
+    with made as suites, multiprocessing.get_context("spawn").Pool(1) as pool:
+        suites.env.reset()
+        suites.env.step([0, 0])
+        assert pool.apply(tenth_step, (suites.env,)) == [[10.0], [10.0]]
+        assert suites.env.step([0, 0])[0].tolist() == [[2.0], [2.0]]
+
+
+@pytest.mark.usefixtures("neighbour")
+def test_options_and_tasks_travel() -> None:
+    """Arguments, timeouts, policy and the chosen task are the same on the other side."""
+    with make_env(
+        sample("faulty"),
+        n_envs=3,
+        env_kwargs={"tasks": 2},
+        timeouts={"step_s": 12.5},
+        policy={"restart": "on_reset"},
+        lane="frames",
+    ) as suites:
+        with pickle.loads(pickle.dumps(suites)) as again:
+            assert list(again["suite"]) == [0, 1]
+            assert again is not suites
+        one = pickle.loads(pickle.dumps(suites["suite"][1]))
+        assert one.num_envs == 3
+        assert one._timeouts.step_s == 12.5
+        assert one._remote.repository.policy.restart == "on_reset"
+        assert one._remote.repository.lane == "frames"
+        assert one._manifest.task == 1
+        one.close()
+
+
+@pytest.mark.usefixtures("neighbour")
+def test_config_object_travels_as_its_attributes() -> None:
+    """What the repository saw of the caller's object, it sees again."""
+    config = SimpleNamespace(
+        hub_path=str(sample("cfg_reader")),
+        task="CartPole-v1",
+        episode_length=5,
+        camera={"width": 64},
+        robot=SimpleNamespace(name="arm"),
+        secret=lambda: 0,
+    )
+    with make_env(config) as suites:
+        recipe = suites._recipe
+        assert recipe is not None
+        assert recipe.config is not None
+        assert "secret" not in recipe.config
+        with pickle.loads(pickle.dumps(suites)) as again:
+            for name in ("camera_width", "robot"):
+                assert again.env.get_attr(name) == suites.env.get_attr(name)
+
+
+def test_token_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pickle holds no token, and of a repository its commit."""
+    with make_env(sample("faulty"), token="hf_do_not_tell") as suites:
+        assert b"hf_do_not_tell" not in pickle.dumps(suites)
+        assert b"hf_do_not_tell" not in pickle.dumps(suites.env)
+
+
+def test_environments_of_this_process_are_not_pickled() -> None:
+    """Without a sandbox there is no recipe, and the text says so."""
+    with (
+        make_env(sample("faulty"), sandbox=None, trust_remote_code=True) as suites,
+        pytest.raises(TypeError, match="in this process"),
+    ):
+        pickle.dumps(suites)
