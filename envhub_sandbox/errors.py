@@ -156,6 +156,8 @@ class WorkerTimeoutError(WorkerError, TimeoutError):
     Attributes:
         request: The operation that was asked for (``"step"``), or None.
         timeout_s: How long it was waited for.
+        worker: What the kernel says of its processes, one word each: ``"running"``,
+            ``"waiting"``, ``"stopped"`` or ``"gone"``. Empty if the server did not tell.
         repository: The repository, commit and entry file, as in ``org/repo@0123456789ab:env.py``.
     """
 
@@ -165,6 +167,7 @@ class WorkerTimeoutError(WorkerError, TimeoutError):
         super().__init__(message)
         self.request = request
         self.timeout_s = timeout_s
+        self.worker: tuple[str, ...] = ()
         self.repository: str | None = None
 
 

@@ -301,12 +301,7 @@ class RemoteEnv:
             received = receive()
         except WorkerTimeoutError as error:
             self._moved(Event.TIMEOUT)
-            raise WorkerTimeoutError(
-                f"{self._pending[1]} has not finished after {timeout_s} s; reset() brings the "
-                "environment back, in a fresh process if it still does not answer",
-                request=self._pending[1],
-                timeout_s=timeout_s,
-            ) from error
+            raise self._late(self._pending[1], timeout_s) from error
         except EnvHubError as error:
             raise self._dead(error) from error.__cause__
         except BaseException as error:  # Ctrl-C, or whatever else a signal handler raises or does
@@ -317,6 +312,19 @@ class RemoteEnv:
         self._pending = None
         self._moved(Event.REPLY)
         return received
+
+    def _late(self, operation: str, timeout_s: float | None) -> WorkerTimeoutError:
+        assert self._loaded is not None
+        states = self.repository.states(self._loaded)
+        busy = f" (its processes: {', '.join(states)})" if states else ""
+        error = WorkerTimeoutError(
+            f"{operation} has not finished after {timeout_s} s{busy}; reset() brings the "
+            "environment back, in a fresh process if it still does not answer",
+            request=operation,
+            timeout_s=timeout_s,
+        )
+        error.worker = states
+        return error
 
     def _dead(self, error: EnvHubError) -> EnvHubError:
         """Write a death down; what closed an environment under its user is told as such."""

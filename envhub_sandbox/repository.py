@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.client import WorkerClient
+from envhub_sandbox.client import WorkerClient, expect
 from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import EnvHubError, LoadError, WorkerTimeoutError, name_source
 from envhub_sandbox.jail import RemoteJail, check, open_jail
@@ -22,6 +22,7 @@ from envhub_worker.protocol.limits import WireLimits
 from envhub_worker.protocol.manifest import Manifest, decode_manifest
 
 _CLOSE_S = 5.0
+_STATUS_S = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,6 +229,24 @@ class Repository:
             loaded.jail.close(Deadline(_CLOSE_S))
         finally:
             self._sandbox.release(loaded.server)
+
+    def states(self, loaded: LoadedJail) -> tuple[str, ...]:
+        """What a jail's hosts are doing, one word each; asked over a connection of its own.
+
+        The late reply may come at any moment on the jail's own connection, and would be dropped.
+        """
+        client = WorkerClient(loaded.server.endpoint, loaded.server.process_fd, self.wire_limits)
+        deadline = Deadline(_STATUS_S)
+        try:
+            client.hello(deadline)
+            status, _ = client.request(m.GetStatus(), deadline=deadline)
+        except EnvHubError:
+            return ()
+        finally:
+            client.close()
+        jails = [one for one in expect(status, m.Status).jails if isinstance(one, dict)]
+        mine = next((one for one in jails if one.get("jail") == loaded.jail.number), {})
+        return tuple(state for state in mine.get("states", ()) if isinstance(state, str))
 
     def interrupt(self, loaded: LoadedJail) -> None:
         """End a jail over a connection of its own, while another thread waits on the first."""

@@ -549,6 +549,19 @@ def _signal_name(number: int | None) -> str | None:
     return None if number is None else signal.Signals(number).name
 
 
+_STATES = {"R": "running", "S": "waiting", "D": "waiting", "T": "stopped", "t": "stopped"}
+
+
+def _state_of(pid: int) -> str:
+    """What the kernel says that a host is doing: of a busy environment nobody else can tell."""
+    try:
+        with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as file:
+            # the command may hold anything, parentheses and blanks included
+            return _STATES.get(file.read().rpartition(")")[2].split()[0], "gone")
+    except (OSError, IndexError):
+        return "gone"
+
+
 def _status_of(entry: JailEntry) -> dict[str, object]:
     owed = [pending for link in entry.links.values() for pending, _ in link.pending.values()]
     oldest = min(owed, key=lambda pending: pending.since, default=None)
@@ -556,6 +569,7 @@ def _status_of(entry: JailEntry) -> dict[str, object]:
         "jail": entry.number,
         "name": entry.name,
         "pids": tuple(entry.pids.values()),
+        "states": tuple(_state_of(pid) for pid in entry.pids.values()),
         "busy_s": 0.0 if oldest is None else monotonic() - oldest.since,
         "operation": "" if oldest is None else oldest.operation,
     }

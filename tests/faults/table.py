@@ -123,6 +123,11 @@ def _late(moment: str) -> dict[str, Any]:
     }
 
 
+def _frozen(moment: str) -> dict[str, Any]:
+    seen = _late(moment)
+    return {**seen, "says": (*seen["says"], "stopped")}
+
+
 def _exits(moment: str) -> dict[str, Any]:
     seen = _raised("SystemExit", "8")(moment)
     return seen if moment in ("import", "make") else {**seen, "error": "RemoteEnvError"}
@@ -139,7 +144,7 @@ _SEEN: dict[str, Any] = {
     "disk": _raised("OSError", "No space left on device"),
     "sys.exit": _exits,
     "hang": _late,
-    "stop": _late,
+    "stop": _frozen,
     "exit": _died("exit code 7", exit_code=7, reason="exit"),
     "kill": _died("SIGKILL", signal="SIGKILL", reason="signal"),
     "segfault": _died("SIGSEGV", signal="SIGSEGV", reason="signal"),

@@ -219,7 +219,7 @@ class GetStatus(Message):
 @_message(15)
 @dataclass(frozen=True, slots=True)
 class Status(Message):
-    """One mapping per jail: ``jail``, ``name``, ``pids``, ``busy_s``, ``operation``."""
+    """One mapping per jail: ``jail``, ``name``, ``pids``, ``states``, ``busy_s``, ``operation``."""
 
     jails: tuple[object, ...]
 
