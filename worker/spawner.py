@@ -15,12 +15,25 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from envhub_worker import bootstrap
 from envhub_worker.channel import Channel, close_fds
+from envhub_worker.events import (
+    Disconnected,
+    Failed,
+    HostExited,
+    HostStarted,
+    JailEvent,
+    JailExited,
+    JailSpawned,
+    Ready,
+    SpawnerEvent,
+    ZygoteDied,
+    ZygoteReady,
+)
 from envhub_worker.jailspec import JailSpec
 from envhub_worker.lockdown import cgroups, process, user
 from envhub_worker.lockdown.context import ZygoteConfig
@@ -29,103 +42,26 @@ from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.scratch import Scratch, remove_tree
 from envhub_worker.protocol.confinement import Confinement
 
+__all__ = [
+    "HOST_TARGET",
+    "Disconnected",
+    "Failed",
+    "HostExited",
+    "HostStarted",
+    "Jail",
+    "JailEvent",
+    "JailExited",
+    "JailSpawned",
+    "Ready",
+    "Spawner",
+    "SpawnerEvent",
+    "ZygoteDied",
+    "ZygoteReady",
+]
+
 _END_S = 8.0
 _LOG_TAIL_BYTES = 8192
 HOST_TARGET = "envhub_worker.jail.host:main"
-
-
-@dataclass(frozen=True)
-class ZygoteReady:
-    """The zygote has preloaded and forks from now on."""
-
-
-@dataclass(frozen=True)
-class ZygoteDied:
-    """The zygote has gone, and every jail with it.
-
-    Attributes:
-        code: Its exit code, or minus the signal that ended it.
-        log: The end of what it printed.
-    """
-
-    code: int
-    log: str
-
-
-@dataclass(frozen=True)
-class JailSpawned:
-    """The init of ``jail`` exists."""
-
-    jail: Jail
-
-
-@dataclass(frozen=True)
-class JailExited:
-    """The init of ``jail`` has gone, and every process of the jail with it."""
-
-    jail: Jail
-    code: int | None
-    signal: int | None
-
-
-@dataclass(frozen=True)
-class Ready:
-    """A host of the jail is confined. ``report``: every layer that holds for it."""
-
-    report: list[dict[str, Any]]
-
-
-@dataclass(frozen=True)
-class Failed:
-    """A layer that the profile names cannot be had here; the jail ends, nothing has run."""
-
-    layer: str
-    reason: str
-    fix: str
-
-
-@dataclass(frozen=True)
-class HostStarted:
-    """A host is confined, has tested its denials, and now enters ``host.main``.
-
-    Attributes:
-        host_id: From ``Jail.start_host``.
-        pid: Its pid as this process sees it; 0 or less when it has already ended.
-        report: Every layer that holds for it, the jail's own first.
-    """
-
-    host_id: int
-    pid: int
-    report: list[dict[str, Any]]
-
-
-@dataclass(frozen=True)
-class HostExited:
-    """A host has ended.
-
-    Attributes:
-        host_id: From ``Jail.start_host``.
-        code: Its exit code, or None.
-        signal: The number of the signal that ended it, or None.
-        reason: ``"exit"``, ``"signal"``, ``"out-of-memory"``, ``"cpu-limit"``, ``"disk-limit"``
-            or ``"killed"``.
-        detail: The numbers, where a limit was the reason.
-    """
-
-    host_id: int
-    code: int | None
-    signal: int | None
-    reason: str
-    detail: str = ""
-
-
-@dataclass(frozen=True)
-class Disconnected:
-    """The jail's control channel has ended: its init is going or gone."""
-
-
-SpawnerEvent = ZygoteReady | ZygoteDied | JailSpawned | JailExited
-JailEvent = Ready | Failed | HostStarted | HostExited | Disconnected
 
 
 class Spawner:

@@ -1,0 +1,103 @@
+"""What a spawner and its jails tell the server: frozen values, read in its poll loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from envhub_worker.spawner import Jail
+
+
+@dataclass(frozen=True)
+class ZygoteReady:
+    """The zygote has preloaded and forks from now on."""
+
+
+@dataclass(frozen=True)
+class ZygoteDied:
+    """The zygote has gone, and every jail with it.
+
+    Attributes:
+        code: Its exit code, or minus the signal that ended it.
+        log: The end of what it printed.
+    """
+
+    code: int
+    log: str
+
+
+@dataclass(frozen=True)
+class JailSpawned:
+    """The init of ``jail`` exists."""
+
+    jail: Jail
+
+
+@dataclass(frozen=True)
+class JailExited:
+    """The init of ``jail`` has gone, and every process of the jail with it."""
+
+    jail: Jail
+    code: int | None
+    signal: int | None
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A host of the jail is confined. ``report``: every layer that holds for it."""
+
+    report: list[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A layer that the profile names cannot be had here; the jail ends, nothing has run."""
+
+    layer: str
+    reason: str
+    fix: str
+
+
+@dataclass(frozen=True)
+class HostStarted:
+    """A host is confined, has tested its denials, and now enters ``host.main``.
+
+    Attributes:
+        host_id: From ``Jail.start_host``.
+        pid: Its pid as this process sees it; 0 or less when it has already ended.
+        report: Every layer that holds for it, the jail's own first.
+    """
+
+    host_id: int
+    pid: int
+    report: list[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class HostExited:
+    """A host has ended.
+
+    Attributes:
+        host_id: From ``Jail.start_host``.
+        code: Its exit code, or None.
+        signal: The number of the signal that ended it, or None.
+        reason: ``"exit"``, ``"signal"``, ``"out-of-memory"``, ``"cpu-limit"``, ``"disk-limit"``
+            or ``"killed"``.
+        detail: The numbers, where a limit was the reason.
+    """
+
+    host_id: int
+    code: int | None
+    signal: int | None
+    reason: str
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class Disconnected:
+    """The jail's control channel has ended: its init is going or gone."""
+
+
+SpawnerEvent = ZygoteReady | ZygoteDied | JailSpawned | JailExited
+JailEvent = Ready | Failed | HostStarted | HostExited | Disconnected
