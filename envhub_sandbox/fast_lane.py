@@ -195,6 +195,7 @@ class FastLane:
             self._poller.register(shard.bell, select.POLLIN)
         self._spin = SpinChooser(_ORDERED_STORES and len(CPUS) > 1)
         self._asked_ns = 0
+        self.elapsed_ns = 0
         # One core is the client's. Shards that find no other sleep until they are asked, then run
         # on the client's while it sleeps: so it waits for those first, and for the others awake.
         self._awake = min(len(self.shards), len(CPUS) - 1)
@@ -257,7 +258,8 @@ class FastLane:
         for index, shard in enumerate(self._order):
             if not shard.answered() and (index < asleep or not self._spin_for(shard)):
                 self._sleep_for(shard, deadline)
-        self._spin.measured(perf_counter_ns() - self._asked_ns)
+        self.elapsed_ns = perf_counter_ns() - self._asked_ns
+        self._spin.measured(self.elapsed_ns)
         return [shard.outcome() for shard in self.shards]
 
     def _spin_for(self, shard: LaneShard) -> bool:

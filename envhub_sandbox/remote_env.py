@@ -13,6 +13,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Sequence
+from time import perf_counter_ns
 from typing import Any, TypeVar
 
 from envhub_sandbox.client import SESSION
@@ -31,6 +32,7 @@ from envhub_sandbox.jail_sources import JailSource
 from envhub_sandbox.repository import LoadedJail, Repository
 from envhub_sandbox.restarts import Restarts
 from envhub_sandbox.results import Results, StepResult
+from envhub_sandbox.stats import Counters
 from envhub_worker.protocol import batches, slabs
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.batches import even_bounds
@@ -78,6 +80,8 @@ class RemoteEnv:
         self._release_server: Callable[[], None] = _nothing
         self._startup: StartupDeadline | None = None
         self._restarts = Restarts(jails.repository.policy)
+        self.counters = Counters()
+        self._asked_ns = 0
         self.results = Results(manifest, self.bounds)
         _living.add(self)
 
@@ -85,6 +89,13 @@ class RemoteEnv:
     def repository(self) -> Repository:
         """The repository that it comes from."""
         return self._jails.repository
+
+    def stats(self) -> dict[str, Any]:
+        """Counters, and where it is in its life."""
+        found = self.counters.snapshot()
+        if self._loaded is not None:
+            found["stale_replies"] += self._loaded.jail.client.stale_replies
+        return {**found, "restarts": self._restarts.count, "state": self.lifecycle.state.name}
 
     # --- requests ------------------------------------------------------------------------------
 
@@ -143,6 +154,7 @@ class RemoteEnv:
             self._pending = _BY_LANE
             self.lifecycle.on(Event.SUBMIT)
             self._lane.ask(actions)
+            self.counters.lane_steps += 1
 
     def _step_requests(self, actions: Any) -> list[tuple[int, m.Message]]:
         if len(self.bounds) == 1:
@@ -161,6 +173,7 @@ class RemoteEnv:
                 if self._pending is _BY_LANE:
                     return self._collect_by_lane(deadline, timeout_s)
                 replies = self._collect(deadline, timeout_s)
+                self.counters.stepped(perf_counter_ns() - self._asked_ns)
                 for reply in replies:
                     check(reply)
                 return self.results.step([typed(reply, m.StepDone) for reply in replies])
@@ -176,6 +189,7 @@ class RemoteEnv:
         lane = self._lane
         assert lane is not None
         outcomes = self._finish(lambda: self._wait_on_lane(lane, deadline), timeout_s)
+        self.counters.stepped(lane.elapsed_ns)
         infos: dict[Any, Any] = {}
         if any(outcome != _EMPTY for outcome in outcomes):
             infos = self.results.lane_infos(self._lane_infos(lane, outcomes, deadline, timeout_s))
@@ -283,7 +297,9 @@ class RemoteEnv:
 
     def _send(self, operation: str, requests: Sequence[tuple[int, m.Message]]) -> None:
         assert self._loaded is not None
+        self._asked_ns = perf_counter_ns()
         request_id = self._loaded.jail.send(operation, requests)
+        self.counters.requests += 1
         self._pending = (request_id, operation)
         self.lifecycle.on(Event.SUBMIT)
 
@@ -300,6 +316,7 @@ class RemoteEnv:
         try:
             received = receive()
         except WorkerTimeoutError as error:
+            self.counters.timeouts += 1
             self._moved(Event.TIMEOUT)
             raise self._late(self._pending[1], timeout_s) from error
         except EnvHubError as error:
@@ -331,6 +348,7 @@ class RemoteEnv:
         assert self._pending is not None
         if self.lifecycle.state is State.CLOSED:
             return self._closed(self._pending[1])
+        self.counters.deaths += 1
         self._moved(Event.DEATH)
         if not isinstance(error, WorkerDiedError) and self._loaded is not None:
             self._jails.end(self._loaded)  # it lives, and cannot be trusted to do what it says
@@ -437,6 +455,7 @@ class RemoteEnv:
         self._let_server_go()
         self._release_server = self.repository.hold()
         if self._loaded is not None:
+            self.counters.stale_replies += self._loaded.jail.client.stale_replies
             self._jails.end(self._loaded)
             self._jails.give_back(self._loaded)
         self._close_lane()

@@ -221,6 +221,16 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         """One mapping per layer: ``layer``, ``enforced``, ``detail``. Empty before it runs."""
         return [dict(layer) for layer in self._remote.repository.report]
 
+    def stats(self) -> dict[str, Any]:
+        """Counters, at any moment, from any thread; asks nothing of the worker.
+
+        Returns:
+            ``requests``, ``steps``, ``timeouts``, ``deaths``, ``restarts`` (after deaths),
+            ``stale_replies``, ``state``, and ``step_latency_s``: ``p50``, ``p90``, ``p99`` and
+            ``max`` in seconds of the last 1024 steps, from the request to the reply.
+        """
+        return self._remote.stats()
+
     def close(self, **kwargs: Any) -> None:
         """Close the sub-environments and end their processes, in bounded time. Idempotent."""
         if self.closed:

@@ -1,0 +1,56 @@
+"""The counters say what has happened."""
+
+from __future__ import annotations
+
+import pytest
+
+from envhub_sandbox import errors, make_env
+from envhub_sandbox.stats import KEPT, Counters
+from tests.support.samples import sample
+
+
+@pytest.mark.usefixtures("neighbour")
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+def test_counters_follow_what_happens(lane: str) -> None:
+    """Steps, timeouts, deaths and restarts are counted once each, over both lanes."""
+    policy = {"restart": "on_reset"}
+    with make_env(sample("echo"), lane=lane, policy=policy) as suites:
+        env = suites.env
+        env.reset()
+        for _ in range(5):
+            env.step([[1.0, 0.0]])
+        env.step_async([[1.0, 0.2]])
+        with pytest.raises(errors.WorkerTimeoutError):
+            env.step_wait(timeout=0.02)
+        assert env.stats()["state"] == "LATE"
+        env.reset()
+        with pytest.raises(errors.WorkerDiedError):
+            env.step([[1.0, -1.0]])
+        assert env.stats()["state"] == "DEAD"
+        env.reset()
+        found = env.stats()
+        latency = found.pop("step_latency_s")
+        assert found == {
+            "requests": 3 + 5 + 1 + 1,
+            "steps": 5,
+            "timeouts": 1,
+            "deaths": 1,
+            "restarts": 1,
+            "stale_replies": 0,
+            "state": "READY",
+        }
+        assert 0 < latency["p50"] <= latency["p90"] <= latency["p99"] <= latency["max"]
+    assert env.stats()["state"] == "CLOSED"
+
+
+def test_latencies_are_those_of_the_last_steps() -> None:
+    """Old latencies are forgotten, new ones are not."""
+    counters = Counters()
+    assert counters.snapshot()["step_latency_s"] == {}
+    for _ in range(KEPT):
+        counters.stepped(10**9)
+    for _ in range(KEPT):
+        counters.stepped(2 * 10**9)
+    expected = {"p50": 2.0, "p90": 2.0, "p99": 2.0, "max": 2.0}
+    assert counters.snapshot()["step_latency_s"] == expected
+    assert counters.snapshot()["steps"] == 2 * KEPT
