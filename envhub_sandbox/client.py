@@ -21,6 +21,7 @@ from envhub_sandbox.errors import (
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+from envhub_worker.protocol.text import printable
 
 SESSION = secrets.token_bytes(16)
 _contexts: dict[int, zmq.Context[zmq.Socket[bytes]]] = {}
@@ -62,7 +63,12 @@ class WorkerClient:
     def hello(self, deadline: Deadline) -> m.Welcome:
         """Agree on a protocol version."""
         reply, _ = self.request(m.Hello(m.VERSION, m.VERSION, SESSION), deadline=deadline)
-        return expect(reply, m.Welcome)
+        welcome = expect(reply, m.Welcome)
+        if welcome.version != m.VERSION:
+            raise VersionMismatchError(
+                f"this client speaks protocol {m.VERSION}, the worker chose {welcome.version}"
+            )
+        return welcome
 
     def request(
         self, message: m.Message, payload: Sequence[Buffer] = (), *, deadline: Deadline
@@ -142,14 +148,15 @@ def expect(reply: m.Message, kind: type[m.M]) -> m.M:
 
 
 def refusal(reply: m.Refused) -> Exception:
-    """The error for a refused request."""
+    """The error for a refused request. Trust: text from the worker."""
+    message = printable(reply.message)
     if reply.error == "SandboxUnavailableError":
-        layer = f"{reply.layer}: " if reply.layer else ""
-        fix = f"\n{reply.fix}" if reply.fix else ""
-        return SandboxUnavailableError(f"this host cannot enforce {layer}{reply.message}{fix}")
+        layer = f"{printable(reply.layer)}: " if reply.layer else ""
+        fix = f"\n{printable(reply.fix)}" if reply.fix else ""
+        return SandboxUnavailableError(f"this host cannot enforce {layer}{message}{fix}")
     if reply.error == "VersionMismatchError":
-        return VersionMismatchError(reply.message)
-    return WorkerError(reply.message)
+        return VersionMismatchError(message)
+    return WorkerError(message)
 
 
 _REASONS = {

@@ -129,6 +129,8 @@ def open_jail(
     """
     reply, _ = client.request(request, deadline=deadline)
     opened = expect(reply, m.JailOpened)
+    if len(opened.hosts) != request.hosts:
+        raise RemoteProtocolError(f"the worker opened a jail of {len(opened.hosts)} hosts")
     report = [dict(layer) for layer in opened.report if isinstance(layer, dict)]
     return RemoteJail(client, opened.jail, opened.hosts, report, limits)
 

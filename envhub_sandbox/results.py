@@ -72,6 +72,8 @@ class Results:
             shape = getattr(part, "shape", None)
             if not shape or shape[0] != size:
                 raise RemoteProtocolError(f"the worker sent {name} that do not fit num_envs")
+            if not (_numeric(part) and (not self._declared or name == "rewards" or _flags(part))):
+                raise RemoteProtocolError(f"the worker sent {name} of a wrong dtype or shape")
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def _infos(self, parts: list[dict[Any, Any]]) -> dict[Any, Any]:
@@ -93,3 +95,13 @@ class Results:
         if type(part) is not dict:
             raise RemoteProtocolError("the worker's infos are not a mapping")
         return part
+
+
+def _numeric(part: Any) -> bool:
+    """Whether these are numbers or booleans; a tensor's always are."""
+    return not isinstance(part, np.ndarray) or part.dtype.kind in "biuf"
+
+
+def _flags(part: Any) -> bool:
+    """Whether this is one boolean each."""
+    return isinstance(part, np.ndarray) and part.dtype.kind == "b" and part.ndim == 1

@@ -1,0 +1,194 @@
+"""A worker server that speaks the wire and lies; a sandbox that leads the client to it.
+
+It answers honestly, for a repository with one environment, except for the requests that a test
+has a lie for. Runs in a thread of the test: what it allocates is small, so that memory that the
+client is made to take shows.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zmq
+from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
+
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.manifest import EnvManifest, Manifest, encode_env, encode_manifest
+
+Frames = list[Buffer]
+NUM_ENVS = 2
+OBSERVATION = spaces.Box(-1, 1, (3,), np.float32)
+ACTION = spaces.Discrete(2)
+
+Lie = Callable[["Asked"], list[Frames]]
+"""All the messages that go out instead of the honest one."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A request, and what an honest server would answer.
+
+    Attributes:
+        request_id: Id of the client's message.
+        request: The message for the host, or for the server where there is no host in it.
+        relayed: Whether it was for the host.
+        honest: The honest answer.
+    """
+
+    request_id: int
+    request: m.Message
+    relayed: bool
+    honest: m.Message
+
+    def answer(self, message: m.Message | Frames, request_id: int | None = None) -> Frames:
+        """An answer to this request: the server's own, or the host's wrapped as it is relayed."""
+        number = self.request_id if request_id is None else request_id
+        if not self.relayed:
+            assert isinstance(message, m.Message)
+            return m.pack(message, number)
+        frames = m.pack(message, number) if isinstance(message, m.Message) else message
+        return [*m.pack(m.Relayed((len(frames),)), number), *frames]
+
+
+@dataclass
+class LyingServer:
+    """What ``Sandbox.acquire`` gives; lies are looked up by the type of the request."""
+
+    lies: dict[type[m.Message], Lie] = field(default_factory=dict)
+    fd_path: None = None
+    asked: list[m.Message] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.folder = tempfile.mkdtemp(prefix="envhub-liar-")
+        self.endpoint = f"ipc://{self.folder}/server"
+        self.process_fd, self._alive = os.pipe()
+        self._context = zmq.Context()
+        self._router = self._context.socket(zmq.ROUTER)
+        self._router.setsockopt(zmq.LINGER, 0)
+        self._router.bind(self.endpoint)
+        self._stopped = False
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stopped:
+            if self._router.poll(50):
+                with contextlib.suppress(zmq.ZMQError):
+                    identity, *frames = self._router.recv_multipart()
+                    for answer in self._answers(frames):
+                        self._router.send_multipart([identity, *answer])
+
+    def _answers(self, frames: list[bytes]) -> list[Frames]:
+        request_id, request = m.unpack(frames[:1])
+        relayed = isinstance(request, m.Relay)
+        if relayed:
+            _, request = m.unpack(frames[1:], unpickler=lambda data: data)
+        self.asked.append(request)
+        asked = Asked(request_id, request, relayed, honest(request))
+        lie = self.lies.get(type(request))
+        return lie(asked) if lie else [asked.answer(asked.honest)]
+
+    def stop(self) -> None:
+        """End it."""
+        self._stopped = True
+        self._thread.join()
+        self._router.close()
+        self._context.term()
+        os.close(self._alive)
+        os.close(self.process_fd)
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+class LyingSandbox:
+    """A place for workers that has only the liar."""
+
+    name = "liar"
+
+    def __init__(self, server: LyingServer) -> None:
+        self._server = server
+
+    def acquire(self, store: Path) -> LyingServer:
+        """The liar."""
+        return self._server
+
+    def release(self, server: object) -> None:
+        """The test ends it."""
+
+
+@contextmanager
+def lying() -> Iterator[LyingServer]:
+    """A server without lies yet."""
+    server = LyingServer()
+    try:
+        yield server
+    finally:
+        server.stop()
+
+
+def env_manifest(**changes: Any) -> EnvManifest:
+    """The honest description of the environment, changed."""
+    fields: dict[str, Any] = {
+        "suite": "env",
+        "task": 0,
+        "num_envs": NUM_ENVS,
+        "shardable": True,
+        "sync": True,
+        "single_observation_space": OBSERVATION,
+        "single_action_space": ACTION,
+        "observation_space": batch_space(OBSERVATION, NUM_ENVS),
+        "action_space": batch_space(ACTION, NUM_ENVS),
+        "autoreset_mode": "NextStep",
+        "metadata": {},
+        "render_mode": None,
+        "spec": None,
+        "attributes": (),
+        "type_name": "gymnasium.vector.SyncVectorEnv",
+    }
+    return EnvManifest(**(fields | changes))
+
+
+def manifest() -> dict[str, Any]:
+    """The honest manifest as it travels."""
+    return encode_manifest(Manifest(envs=(env_manifest(),), lazy=True))
+
+
+def step_done(**changes: Any) -> m.StepDone:
+    """An honest step's result, changed."""
+    fields: dict[str, Any] = {
+        "observation": np.zeros((NUM_ENVS, 3), np.float32),
+        "rewards": np.zeros(NUM_ENVS),
+        "terminations": np.zeros(NUM_ENVS, bool),
+        "truncations": np.zeros(NUM_ENVS, bool),
+        "info": {},
+    }
+    return m.StepDone(**(fields | changes))
+
+
+def honest(request: m.Message) -> m.Message:
+    """What an honest server or host answers."""
+    if isinstance(request, (m.Reset, m.Step)):
+        done = step_done()
+        return done if isinstance(request, m.Step) else m.ResetDone(done.observation, {})
+    answers: dict[type[m.Message], m.Message] = {
+        m.Hello: m.Welcome(m.VERSION, "0", os.getpid()),
+        m.OpenJail: m.JailOpened(1, (1,), ()),
+        m.StartHosts: m.JailOpened(1, (2,), ()),
+        m.CloseJail: m.Done(),
+        m.ReadOutput: m.Output(""),
+        m.Load: m.Loaded(manifest()),
+        m.Build: m.Built(encode_env(env_manifest())),
+        m.Call: m.Value((None,) * NUM_ENVS),
+    }
+    return answers.get(type(request), m.Value(None))
