@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from envhub_worker.spawner import Jail
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -25,22 +22,6 @@ class ZygoteDied:
 
     code: int
     log: str
-
-
-@dataclass(frozen=True)
-class JailSpawned:
-    """The init of ``jail`` exists."""
-
-    jail: Jail
-
-
-@dataclass(frozen=True)
-class JailExited:
-    """The init of ``jail`` has gone, and every process of the jail with it."""
-
-    jail: Jail
-    code: int | None
-    signal: int | None
 
 
 @dataclass(frozen=True)
@@ -99,5 +80,4 @@ class Disconnected:
     """The jail's control channel has ended: its init is going or gone."""
 
 
-SpawnerEvent = ZygoteReady | ZygoteDied | JailSpawned | JailExited
 JailEvent = Ready | Failed | HostStarted | HostExited | Disconnected

@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +27,7 @@ from envhub_worker.events import (
     HostExited,
     HostStarted,
     JailEvent,
-    JailExited,
-    JailSpawned,
     Ready,
-    SpawnerEvent,
     ZygoteDied,
     ZygoteReady,
 )
@@ -62,6 +59,25 @@ __all__ = [
 _END_S = 8.0
 _LOG_TAIL_BYTES = 8192
 HOST_TARGET = "envhub_worker.jail.host:main"
+
+
+@dataclass(frozen=True)
+class JailSpawned:
+    """The init of ``jail`` exists."""
+
+    jail: Jail
+
+
+@dataclass(frozen=True)
+class JailExited:
+    """The init of ``jail`` has gone, and every process of the jail with it."""
+
+    jail: Jail
+    code: int | None
+    signal: int | None
+
+
+SpawnerEvent = ZygoteReady | ZygoteDied | JailSpawned | JailExited
 
 
 class Spawner:
