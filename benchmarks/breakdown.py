@@ -60,7 +60,7 @@ def _client(env: Any, batches: list[Any], spin_ns: int | None) -> dict[str, floa
         _marking(type(lane).wait, lane, marks),
     )
     lane._spin = _Forced(spin_ns) if spin_ns is not None else SpinChooser(True)
-    parts = []
+    parts: list[tuple[int, int, int, int]] = []
     actions = itertools.cycle(batches)
     until = perf_counter_ns() + _LONGEST_NS
     while len(parts) < _STEPS and perf_counter_ns() < until:
@@ -117,11 +117,15 @@ def _jail_loop(workload: Workload, count: int) -> Callable[[], None]:
     envs = SubEnvs(makers(workload.name, count), "NextStep", sync=False)
     envs.run_reset(list(range(count)), None, None)
     actions = itertools.cycle(action_batches(workload.name, count))
-    return lambda: envs.run_step(next(actions)) and None
+
+    def step() -> None:
+        envs.run_step(next(actions))
+
+    return step
 
 
 def _costs(step: Callable[[], None]) -> list[int]:
-    costs = []
+    costs: list[int] = []
     until = perf_counter_ns() + _LONGEST_NS
     while len(costs) < _STEPS and perf_counter_ns() < until:
         start = perf_counter_ns()

@@ -22,6 +22,7 @@ from benchmarks.report import cell_lines, write_report
 from benchmarks.rounds import CONDITIONS, measure
 from benchmarks.spawning import measure_spawning
 from benchmarks.targets import against_others, reached
+from benchmarks.wellformed import problems
 from benchmarks.workloads import WORKLOADS
 
 RESULTS = Path(__file__).parent / "results"
@@ -47,7 +48,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.plot:
         paths.append(plot(results, paths[0].with_suffix(".png")))
     print("\n".join(map(str, paths)), file=sys.stderr)
-    return 0
+    wrong = problems(results, plan) if options.quick else []
+    print("\n".join(wrong), file=sys.stderr, end="\n" if wrong else "")
+    return 1 if wrong else 0
 
 
 def run(plan: Plan, interpreters: Interpreters) -> dict[str, Any]:
@@ -105,7 +108,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("parts", nargs="*", metavar="part", help=f"of {', '.join(PARTS)}; all by default")
-    add("--quick", action="store_true", help="under a minute: does it run?")
+    add(
+        "--quick",
+        action="store_true",
+        help="under a minute: does it run, and is the report complete?",
+    )
     add("--workloads", nargs="+", choices=WORKLOADS, default=compared)
     add("--sizes", nargs="+", type=int, help="numbers of sub-environments")
     add("--conditions", nargs="+", choices=CONDITIONS, default=list(CONDITIONS))

@@ -114,7 +114,7 @@ def _result(name: str, turns: dict[str, list[dict[str, Any]]]) -> dict[str, Any]
 
 
 def _us(turns: list[dict[str, Any]], key: str) -> float:
-    return round(statistics.median(turn[key] for turn in turns) / 1000, 1)
+    return round(float(statistics.median(turn[key] for turn in turns)) / 1000, 1)
 
 
 def ratios(
