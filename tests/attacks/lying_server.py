@@ -187,6 +187,7 @@ def honest(request: m.Message) -> m.Message:
         m.StartHosts: m.JailOpened(1, (2,), ()),
         m.CloseJail: m.Done(),
         m.ReadOutput: m.Output(""),
+        m.GetStatus: m.Status(()),
         m.Load: m.Loaded(manifest()),
         m.Build: m.Built(encode_env(env_manifest())),
         m.Call: m.Value((None,) * NUM_ENVS),

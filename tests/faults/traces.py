@@ -1,7 +1,8 @@
 """What of ours is on this machine, by looking at the system and not at our own bookkeeping.
 
-Everything of a test lies below a temporary folder with a name of its own, which stands in the
-command line of every process: the server's runtime folder is there.
+Everything of a test lies below a temporary folder with a name of its own. It stands in the command
+line of the server, and in the environment of everybody below it: as the time zone, the one variable
+that everybody inherits and nobody minds.
 """
 
 from __future__ import annotations
@@ -67,14 +68,17 @@ class Traces:
 @contextlib.contextmanager
 def temporary_root() -> Iterator[Path]:
     """A short-named folder that all temporary files of ours go to. Sockets' paths are short."""
-    before = tempfile.tempdir
+    before, zone = tempfile.tempdir, os.environ.get("TZ")
     folder = Path(tempfile.mkdtemp(prefix="ehf", dir="/tmp"))
     folder.chmod(0o711)  # jails of an unused uid pass through
-    tempfile.tempdir = str(folder)
+    tempfile.tempdir = os.environ["TZ"] = str(folder)
     try:
         yield folder
     finally:
         tempfile.tempdir = before
+        os.environ.pop("TZ")
+        if zone is not None:
+            os.environ["TZ"] = zone
         with contextlib.suppress(OSError):
             folder.rmdir()  # what is left in it has been reported
 
@@ -82,7 +86,8 @@ def temporary_root() -> Iterator[Path]:
 def _processes(marker: str) -> Iterator[tuple[int, str]]:
     for pid in _pids():
         command = _read(f"/proc/{pid}/cmdline").replace("\0", " ")
-        if marker in command and pid != os.getpid() and _state(pid) not in ("Z", "X", ""):
+        marked = marker in command or f"TZ={marker}" in _read(f"/proc/{pid}/environ")
+        if marked and pid != os.getpid() and _state(pid) not in ("Z", "X", ""):
             yield pid, command[:120]
 
 
