@@ -32,12 +32,13 @@ def say(text):
 
 def start(folder: Path, body: str) -> subprocess.Popen[str]:
     """Start a client whose temporary files all lie in ``folder``."""
+    inherited = {name: value for name, value in os.environ.items() if name != "TZ"}
     return subprocess.Popen(
         [sys.executable, "-c", _HEAD + textwrap.dedent(body)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, "TMPDIR": str(folder)},
+        env={**inherited, "TMPDIR": str(folder)},
     )
 
 
