@@ -20,6 +20,16 @@ NOT_STOPPED: dict[str, dict[str, str]] = {
     },
 }
 
+MEASURED_ATTACKS = frozenset({"fork bomb", "thread bomb", "memory bomb: memfd in flight"})
+"""What init measures now and then under ``no-userns`` without a control group: a burst between two
+looks gets through on a busy machine and is stopped on a quiet one, so neither is asserted there."""
+
+
+def depends_on_load(attack: str, conditions: Collection[str]) -> bool:
+    """Whether an attack is stopped here only if init looks in time."""
+    needed = {"no-userns", MEASURED}
+    return attack in MEASURED_ATTACKS and needed <= set(conditions)
+
 
 def not_stopped(attack: str, conditions: Collection[str]) -> str | None:
     """Why an attack gets through, or None if it must not.

@@ -23,7 +23,7 @@ from typing import Any
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError
-from tests.attacks.expectations import MEASURED, not_stopped
+from tests.attacks.expectations import MEASURED, depends_on_load, not_stopped
 from tests.support.processes import eventually
 
 HOSTILE = Path(__file__).with_name("hostile")
@@ -135,6 +135,8 @@ class Arena:
         verdict = "NOT STOPPED" if through else "no proof" if impossible else "stopped"
         note = impossible or (_brief(detail) if not through else "")
         self.rows.append(Row(title, self.family, self.profile, USER, control, verdict, note))
+        if depends_on_load(title, self.conditions()):
+            return
         reason = not_stopped(title, self.conditions())
         if reason is None:
             assert not through, f"{title!r} succeeded inside ({self.profile}): {detail[-3000:]}"
