@@ -96,7 +96,15 @@ class HostLink:
             return None
         if not data:
             return None
-        return [(packet, self._owner(packet)) for packet in self._reader.feed(data)]
+        answers = []
+        try:
+            for packet in self._reader.feed(data):
+                answers.append((packet, self._owner(packet)))
+        except RemoteProtocolError:
+            # what came before the offence is dropped with it: its owners hear of the death
+            self.pending.update((packet.request_id, owner) for packet, owner in answers)
+            raise
+        return answers
 
     def _owner(self, packet: Packet) -> Any:
         expected = next(iter(self.pending), None)

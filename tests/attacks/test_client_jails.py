@@ -7,6 +7,7 @@ counts is what the server and the client make of it.
 from __future__ import annotations
 
 import os
+import pickle
 import time
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,12 @@ import psutil
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import EnvHubError, RemoteEnvError, WorkerTimeoutError
+from envhub_sandbox.errors import (
+    EnvHubError,
+    RemoteProtocolError,
+    WorkerDiedError,
+    WorkerTimeoutError,
+)
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec import Buffer
 from tests.attacks.harness import TIMEOUTS, Arena
@@ -130,8 +136,10 @@ def test_pickles_from_a_jail_are_never_loaded(
     done = step_done(**{place: {"a": evil} if place == "info" else evil})
     frames = m.pack(done, 1, pickler=cloudpickle.dumps)
     assert any(str(canary).encode() in bytes(frame) for frame in frames)
-    error, _ = lies_to(arena, liar(home, "frames", frames))
-    arena.judge(f"a pickle for the {place}", "succeeds", canary.exists(), str(error))
+    lies_to(arena, liar(home, "frames", frames))
+    assert not canary.exists()
+    pickle.loads(cloudpickle.dumps(evil))
+    assert canary.exists(), "the control failed: loaded, the pickle does nothing"
 
 
 BOMBS: dict[str, list[Buffer]] = {
@@ -154,18 +162,19 @@ def test_bombs_from_a_jail_are_refused(arena: Arena, neighbour: Any, home: Path,
     found: list[tuple[Exception, int]] = []
     folder = liar(home, "frames", BOMBS[what])
     client_grew = peak_growth(lambda: found.append(lies_to(arena, folder)))
-    error, server_grew = found[0]
-    through = max(client_grew, server_grew) > GROWTH
-    detail = f"{error} (client +{client_grew >> 20} MiB, server +{server_grew >> 20} MiB)"
-    arena.judge(f"send {what}", "not possible", through, detail, "nothing decodes it otherwise")
+    _, server_grew = found[0]
+    assert client_grew < GROWTH
+    assert server_grew < GROWTH
 
 
 @pytest.mark.parametrize("mode", ["twice", "other id", "exit"])
 def test_rule_breakers_lose_their_jail(arena: Arena, neighbour: Any, home: Path, mode: str) -> None:
     """Two answers, another id, no answer at all: the environment is dead, in plain words."""
     error, _ = lies_to(arena, liar(home, mode))
-    clear = not isinstance(error, RemoteEnvError)
-    arena.judge(f"answer a step: {mode}", "not possible", not clear, str(error), "it is a rule")
+    if mode == "twice" and isinstance(error, RemoteProtocolError):
+        return  # the first answer came alone, and was of a wrong kind
+    assert isinstance(error, WorkerDiedError)
+    assert error.reason == ("exit" if mode == "exit" else "protocol")
 
 
 @pytest.mark.parametrize("mode", ["silence", "dribble"])
@@ -175,6 +184,5 @@ def test_silence_from_a_jail_ends_at_the_deadline(
     """A host that does not answer, or a byte at a time, costs the time that was given."""
     started = time.monotonic()
     error, _ = lies_to(arena, liar(home, mode), step_s=0.5, close_s=0.5)
-    waited = time.monotonic() - started
-    through = not isinstance(error, WorkerTimeoutError) or waited > 60
-    arena.judge(f"answer a step: {mode}", "not possible", through, str(error), "it is a rule")
+    assert isinstance(error, WorkerTimeoutError)
+    assert time.monotonic() - started < TIMEOUTS["step_s"]
