@@ -28,7 +28,8 @@ what the repository returned. `docs/threat-model.md` explains what is not stoppe
 
 - **succeeds**: the control did what the attack wants.
 - **stopped**: the same payload did not do it inside.
-- **NOT STOPPED**: it did, and the suite asserts that it does.
+- **NOT STOPPED**: it did. The suite asserts that it does, except for the bombs that are only
+  measured now and then under `no-userns` without a control group: those depend on the load.
 - **no proof**: the control is not possible for this user or on this host (the reason stands
   below the table), so that nothing follows from its failing inside.
 """

@@ -1,0 +1,55 @@
+"""What is said about the attacks is what is tested."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from tests.attacks import table
+from tests.attacks.expectations import MEASURED_ATTACKS, NOT_STOPPED
+from tests.attacks.harness import Row
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def listed(page: str, profile: str) -> set[str]:
+    """The attacks in the table below a profile's heading."""
+    _, _, below = page.partition(f"### Under `{profile}`")
+    section = re.split(r"\n#+ ", below)[0]
+    rows = [line for line in section.splitlines() if line.startswith("| ")]
+    return {row.split("|")[1].strip() for row in rows} - {"Attack", "---"}
+
+
+def test_threat_model_lists_what_is_not_stopped() -> None:
+    """Every exception is in the threat model under its profile, and nothing else is."""
+    page = (DOCS / "threat-model.md").read_text()
+    everywhere = listed(page, "strict")
+    weaker = listed(page, "no-userns")
+    assert everywhere | weaker == set(NOT_STOPPED)
+    for attack, reasons in NOT_STOPPED.items():
+        only_weaker = all(where.startswith("no-userns") for where in reasons)
+        assert attack in (weaker if only_weaker else everywhere), attack
+
+
+def test_table_agrees_with_the_expectations() -> None:
+    """What the table of attacks calls not stopped is expected, or only measured."""
+    page = (DOCS / "attacks.md").read_text()
+    attacks = table.attacks_on(page)
+    assert attacks >= set(NOT_STOPPED)
+    for line in page.splitlines():
+        if line.startswith("| ") and "NOT STOPPED" in line:
+            assert line.split("|")[1].strip() in {*NOT_STOPPED, *MEASURED_ATTACKS}, line
+
+
+def test_updates_keep_the_other_users_columns(tmp_path: Path) -> None:
+    """A run as one user leaves what a run as another has written."""
+    page = tmp_path / "attacks.md"
+    for user in ("root", "user"):
+        table.update(page, [Row("tcp", "Network", "strict", user, "succeeds", "stopped", "")])
+    noted = Row("raw", "Network", "strict", "user", "not possible", "no proof", "only root may")
+    table.update(page, [noted])
+    text = page.read_text()
+    assert "| tcp | succeeds | succeeds | stopped | stopped |  |  |" in text
+    assert "- raw, user: only root may" in text
+    table.update(page, [noted])
+    assert page.read_text() == text
