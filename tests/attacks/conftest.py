@@ -25,7 +25,7 @@ _PROPERTY = "attack"
 _rows: list[Row] = []
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def _open_ground() -> Iterator[Path]:
     """A folder that every user may enter. File modes shall not be what stops an attack."""
     folder = Path(tempfile.mkdtemp(prefix="envhub-attacks-"))
@@ -34,9 +34,9 @@ def _open_ground() -> Iterator[Path]:
     shutil.rmtree(folder, ignore_errors=True)
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="package", autouse=True)
 def _warm_server(_own_cache: None, _open_ground: Path) -> Iterator[None]:
-    """One worker server for all tests of this process: its zygotes stay warm between them."""
+    """One worker server for all tests in a row: its zygotes stay warm between them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ENVHUB_CACHE", str(_open_ground / "cache"))
         server = PROCESS.acquire(snapshot_store.cache_root() / "snapshots")

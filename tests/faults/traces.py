@@ -13,6 +13,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker
 from pathlib import Path
 
 _MARKER_FILES = ("/dev/shm", "/tmp", "/var/tmp", str(Path.home()))
@@ -84,10 +85,12 @@ def temporary_root() -> Iterator[Path]:
 
 
 def _processes(marker: str) -> Iterator[tuple[int, str]]:
+    # Python's own, which a test of multiprocessing starts and which stays with this process.
+    ours = {os.getpid(), getattr(resource_tracker._resource_tracker, "_pid", None)}
     for pid in _pids():
         command = _read(f"/proc/{pid}/cmdline").replace("\0", " ")
         marked = marker in command or f"TZ={marker}" in _read(f"/proc/{pid}/environ")
-        if marked and pid != os.getpid() and _state(pid) not in ("Z", "X", ""):
+        if marked and pid not in ours and _state(pid) not in ("Z", "X", ""):
             yield pid, command[:120]
 
 
