@@ -40,7 +40,7 @@ LOCKDOWN_KNOWS = {
     "envhub_worker.protocol.confinement",
 }
 WITHOUT_IO = {"asyncio", "multiprocessing", "os", "select", "socket", "subprocess", "zmq"}
-ZEROMQ = {"envhub_sandbox.client", "envhub_worker.server"}
+ZEROMQ = {"envhub_sandbox.client", "envhub_worker.loop", "envhub_worker.server"}
 # who runs code by a name that is not written in its source, and whose code that is
 IMPORTERS = {
     "envhub_sandbox": "our own public names",

@@ -1,0 +1,480 @@
+"""The jails of a worker server: opened, asked, watched, and ended.
+
+Trusted code. It never decodes what a host says: it checks sizes and order, and hands the frames
+on. A host that breaks the rules loses its jail.
+"""
+
+from __future__ import annotations
+
+import itertools
+import secrets
+import signal
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import monotonic
+from typing import Protocol
+
+from envhub_worker.channel import close_fds
+from envhub_worker.deposits import Deposits
+from envhub_worker.jailspec import JailSpec, confinement_from_wire
+from envhub_worker.link import MAX_PENDING, HostLink
+from envhub_worker.loop import Loop
+from envhub_worker.output import OutputTail
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.confinement import Confinement
+from envhub_worker.protocol.errors import ProtocolError
+from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.spawner import (
+    Failed,
+    HostExited,
+    HostStarted,
+    Jail,
+    JailExited,
+    Spawner,
+    ZygoteDied,
+)
+
+MAX_HOSTS = 64
+"""Hosts of one jail: one per useful core, not one per sub-environment."""
+ATTACH = "attach"
+"""The operation that brings a host its descriptors."""
+MAX_JAILS = 256
+"""Open jails of one server."""
+
+
+@dataclass(frozen=True)
+class Asker:
+    """Who asked: the reply goes to this identity under this id. Jails belong to its session."""
+
+    identity: bytes
+    request_id: int
+    session: bytes = b""
+
+
+@dataclass
+class Opening:
+    """An ``OpenJail`` or ``StartHosts`` whose hosts have not all come up."""
+
+    asker: Asker
+    waiting: set[int]
+    hosts: tuple[int, ...]
+
+
+@dataclass
+class Pending:
+    """A ``Relay`` that hosts still owe answers to."""
+
+    asker: Asker
+    operation: str
+    replies: list[list[Buffer] | None]
+    since: float = field(default_factory=monotonic)
+
+
+@dataclass
+class JailEntry:
+    """A jail and everything that waits for it."""
+
+    number: int
+    name: str
+    session: bytes
+    jail: Jail
+    spawner: tuple[object, ...]
+    output: OutputTail
+    links: dict[int, HostLink] = field(default_factory=dict)
+    pids: dict[int, int] = field(default_factory=dict)
+    report: tuple[object, ...] = ()
+    opening: list[Opening] = field(default_factory=list)
+    closing: list[Asker] = field(default_factory=list)
+    death: m.Died | None = None
+    released: bool = False
+
+    def __post_init__(self) -> None:
+        # kept, because closing a descriptor makes it forget its number
+        self.control = self.jail.fileno()
+
+
+class Answers(Protocol):
+    """Where replies go."""
+
+    def reply(self, asker: Asker, message: m.Message, payload: Sequence[Buffer] = ()) -> None:
+        """Answer a request."""
+
+    def refuse(
+        self, asker: Asker, error: str, message: str, layer: str = "", fix: str = ""
+    ) -> None:
+        """Answer that it is not done."""
+
+
+class Jails:
+    """All jails of a server, and the zygotes that fork them.
+
+    Args:
+        loop: Calls back when one of their descriptors is ready.
+        answers: Takes the replies.
+        runtime_dir: An existing folder of the server's own.
+        readable_roots: Where snapshots lie.
+        limits: Bounds on what a host may say.
+    """
+
+    def __init__(
+        self,
+        loop: Loop,
+        answers: Answers,
+        runtime_dir: Path,
+        readable_roots: Sequence[str],
+        limits: WireLimits,
+    ) -> None:
+        self._loop = loop
+        self._answers = answers
+        self._runtime_dir = runtime_dir
+        self._readable_roots = tuple(readable_roots)
+        self._limits = limits
+        self._jails: dict[int, JailEntry] = {}
+        self._spawners: dict[tuple[object, ...], Spawner] = {}
+        self._packet_ids = itertools.count(1)
+        self._deposits = Deposits(str(runtime_dir / "fds"), self._pidfd_for)
+        loop.watch(self._deposits.fileno(), self._deposits.accept)
+
+    def close(self) -> None:
+        """End every jail and zygote."""
+        for entry in self._jails.values():
+            self._kill(entry)
+        for spawner in self._spawners.values():
+            spawner.close()
+        self._deposits.close()
+
+    # --- requests ------------------------------------------------------------------------------
+
+    def open(self, asker: Asker, request: m.OpenJail) -> None:
+        """Fork a jail for a snapshot, and its first hosts."""
+        if len(self._jails) >= MAX_JAILS or not 1 <= request.hosts <= MAX_HOSTS:
+            self._answers.refuse(
+                asker, "WorkerError", f"at most {MAX_JAILS} jails of 1 to {MAX_HOSTS} hosts"
+            )
+            return
+        confinement = confinement_from_wire(request.confinement)
+        spec = JailSpec(
+            snapshot=request.snapshot,
+            entry=request.entry,
+            confinement=confinement,
+            name=request.name,
+        )
+        key = (request.python, *(getattr(confinement, name) for name in _ZYGOTE_FIELDS))
+        jail = self._spawner(key, confinement).spawn(spec)
+        entry = JailEntry(
+            number=secrets.randbits(62),
+            name=request.name,
+            session=asker.session,
+            jail=jail,
+            spawner=key,
+            output=OutputTail(jail.output, confinement.limits.output_bytes),
+        )
+        self._jails[entry.number] = entry
+        self._loop.watch(entry.control, lambda: self._jail_events(entry))
+        self._loop.watch(jail.output, lambda: self._read_output(entry))
+        self._start_hosts(asker, entry, request.hosts)
+
+    def start_more(self, asker: Asker, request: m.StartHosts) -> None:
+        """Fork further hosts in an open jail."""
+        entry = self._owned(asker, request.jail)
+        if entry is None:
+            return
+        if not 1 <= request.hosts <= MAX_HOSTS - len(entry.links):
+            self._answers.refuse(asker, "WorkerError", f"a jail has at most {MAX_HOSTS} hosts")
+            return
+        self._start_hosts(asker, entry, request.hosts)
+
+    def _start_hosts(self, asker: Asker, entry: JailEntry, count: int) -> None:
+        hosts = tuple(self._start_host(entry) for _ in range(count))
+        entry.opening.append(Opening(asker, set(hosts), hosts))
+
+    def _start_host(self, entry: JailEntry) -> int:
+        host, sock = entry.jail.start_host()
+        link = entry.links[host] = HostLink(sock, self._limits)
+        self._loop.watch(link.fileno(), lambda: self._host_ready(entry, host))
+        return host
+
+    def _spawner(self, key: tuple[object, ...], confinement: Confinement) -> Spawner:
+        spawner = self._spawners.get(key)
+        if spawner is None:
+            spawner = self._spawners[key] = Spawner(
+                confinement,
+                runtime_dir=self._runtime_dir,
+                readable_roots=self._readable_roots,
+                python=str(key[0]) or None,
+            )
+            self._loop.watch(spawner.fileno(), lambda: self._spawner_events(key))
+        return spawner
+
+    def relay(self, asker: Asker, request: m.Relay, payload: list[bytes]) -> None:
+        """Hand the payload to hosts; the reply goes out once all of them have answered."""
+        entry = self._owned(asker, request.jail)
+        if entry is None:
+            return
+        targets = self._relay_targets(entry, request, payload)
+        if targets is None:
+            self._answers.refuse(
+                asker, "LocalProtocolError", "the parts of Relay do not fit its frames"
+            )
+            return
+        if any(len(entry.links[host].pending) >= MAX_PENDING for host, _ in targets):
+            self._answers.refuse(asker, "WorkerError", f"a host owes {MAX_PENDING} answers already")
+            return
+        pending = Pending(asker, request.operation, [None] * len(targets))
+        for index, (host, frames) in enumerate(targets):
+            link = entry.links[host]
+            fds = self._deposits.take(entry.number, host) if request.operation == ATTACH else []
+            link.send(next(self._packet_ids), frames, (pending, index), fds)
+            close_fds(fds)
+            self._follow_writes(link)
+
+    def _relay_targets(
+        self, entry: JailEntry, request: m.Relay, payload: list[bytes]
+    ) -> list[tuple[int, list[bytes]]] | None:
+        targets = []
+        start = 0
+        for part in request.parts:
+            if type(part) is not tuple or len(part) != 2 or part[0] not in entry.links:
+                return None
+            host, count = part
+            if type(count) is not int or not 1 <= count <= len(payload) - start:
+                return None
+            targets.append((host, payload[start : start + count]))
+            start += count
+        return targets if targets and start == len(payload) else None
+
+    def _pidfd_for(self, request: m.Deposit) -> int | None:
+        entry = self._jails.get(request.jail)
+        if entry is None or entry.session != request.session or entry.death is not None:
+            return None
+        return entry.jail.pidfd if request.host in entry.links and entry.jail.pidfd >= 0 else None
+
+    def _follow_writes(self, link: HostLink) -> None:
+        self._loop.watch_writes(link.fileno(), link.wants_write)
+
+    def _owned(self, asker: Asker, number: int, operation: str = "") -> JailEntry | None:
+        entry = self._jails.get(number)
+        if entry is None or entry.session != asker.session:
+            self._answers.refuse(
+                asker, "WorkerError", f"there is no jail {number}; it has been closed"
+            )
+            return None
+        if entry.death is not None:
+            self._answers.reply(asker, _for_operation(entry.death, operation))
+            return None
+        return entry
+
+    def close_jail(self, asker: Asker, request: m.CloseJail) -> None:
+        """End a jail; also after its death, for ``Done`` means that nothing of it is left."""
+        entry = self._jails.get(request.jail)
+        if entry is None or entry.session != asker.session:
+            self._answers.reply(asker, m.Done())
+        elif entry.released:
+            del self._jails[entry.number]
+            self._answers.reply(asker, m.Done())
+        else:  # also after its death: Done means that nothing of it is left
+            entry.closing.append(asker)
+            self._kill(entry)
+
+    def read_output(self, asker: Asker, request: m.ReadOutput) -> None:
+        """Tell the last lines that a jail printed."""
+        entry = self._owned(asker, request.jail, request.operation)
+        if entry is not None:
+            entry.output.read()
+            self._answers.reply(asker, m.Output(entry.output.text()))
+
+    def status(self, asker: Asker, request: m.GetStatus) -> None:
+        """Tell what the asker's jails are doing."""
+        mine = [entry for entry in self._jails.values() if entry.session == asker.session]
+        self._answers.reply(asker, m.Status(tuple(_status_of(entry) for entry in mine)))
+
+    # --- what happens --------------------------------------------------------------------------
+
+    def _host_ready(self, entry: JailEntry, host: int) -> None:
+        link = entry.links[host]
+        link.flush()
+        try:
+            answers = link.receive()
+        except ProtocolError as error:
+            self._end(entry, host, "protocol", detail=str(error))
+            return
+        if answers is None:
+            self._loop.unwatch(link.fileno())
+            return  # its exit says more
+        self._follow_writes(link)
+        for packet, (pending, index) in answers:
+            pending.replies[index] = packet.frames
+            self._gather(pending)
+
+    def _gather(self, pending: Pending) -> None:
+        replies = [frames for frames in pending.replies if frames is not None]
+        if len(replies) == len(pending.replies):
+            payload = [frame for frames in replies for frame in frames]
+            self._answers.reply(pending.asker, m.Relayed(tuple(map(len, replies))), payload)
+
+    def _read_output(self, entry: JailEntry) -> None:
+        fd = entry.output.fileno()
+        entry.output.read()
+        if entry.output.fileno() < 0:
+            self._loop.unwatch(fd)
+
+    def _jail_events(self, entry: JailEntry) -> None:
+        for event in entry.jail.poll():
+            if isinstance(event, HostStarted):
+                self._host_started(entry, event)
+            elif isinstance(event, Failed):
+                self._failed(entry, event)
+            elif isinstance(event, HostExited):
+                self._host_exited(entry, event)
+
+    def _host_started(self, entry: JailEntry, event: HostStarted) -> None:
+        entry.pids[event.host_id] = event.pid
+        entry.report = tuple(event.report)
+        for opening in list(entry.opening):
+            opening.waiting.discard(event.host_id)
+            if not opening.waiting:
+                entry.opening.remove(opening)
+                opened = m.JailOpened(entry.number, opening.hosts, entry.report)
+                self._answers.reply(opening.asker, opened)
+
+    def _failed(self, entry: JailEntry, event: Failed) -> None:
+        for opening in entry.opening:
+            self._answers.refuse(
+                opening.asker, "SandboxUnavailableError", event.reason, event.layer, event.fix
+            )
+        entry.opening.clear()
+        self._end(entry, -1, "unavailable", detail=event.reason)
+
+    def _host_exited(self, entry: JailEntry, event: HostExited) -> None:
+        self._end(
+            entry,
+            event.host_id,
+            event.reason,
+            exit_code=event.code,
+            signal=_signal_name(event.signal),
+        )
+
+    def _end(
+        self,
+        entry: JailEntry,
+        host: int,
+        reason: str,
+        *,
+        exit_code: int | None = None,
+        signal: str | None = None,
+        detail: str = "",
+    ) -> None:
+        """Write the jail's death down, tell everybody who waits, and make it true."""
+        if entry.death is not None:
+            return
+        entry.output.read()
+        death = m.Died(host, reason, exit_code, signal, detail, entry.output.text(), "")
+        entry.death = death
+        for pending in _waiting(entry):
+            self._answers.reply(pending.asker, _for_operation(death, pending.operation))
+        for opening in entry.opening:
+            self._answers.reply(opening.asker, _for_operation(death, "start"))
+        entry.opening.clear()
+        self._kill(entry)
+
+    def _kill(self, entry: JailEntry) -> None:
+        self._deposits.drop(entry.number)
+        self._loop.unwatch(entry.control)
+        entry.jail.kill()
+
+    def _spawner_events(self, key: tuple[object, ...]) -> None:
+        for event in self._spawners[key].poll():
+            if isinstance(event, JailExited):
+                self._jail_gone(event)
+            elif isinstance(event, ZygoteDied):
+                self._zygote_died(key, event)
+
+    def _jail_gone(self, event: JailExited) -> None:
+        entry = next((one for one in self._jails.values() if one.jail is event.jail), None)
+        if entry is None:
+            return
+        if entry.closing:
+            del self._jails[entry.number]
+        else:
+            self._jail_events(entry)  # its hosts' exits say more than its own
+            self._end(entry, -1, "exit", exit_code=event.code, signal=_signal_name(event.signal))
+        self._release(entry)
+        for asker in entry.closing:
+            self._answers.reply(asker, m.Done())
+
+    def _release(self, entry: JailEntry) -> None:
+        entry.released = True
+        for link in entry.links.values():
+            self._loop.unwatch(link.fileno())
+            link.close()
+        self._loop.unwatch(entry.output.fileno())
+        self._loop.unwatch(entry.control)
+        entry.output.close()
+        for pending in _waiting(entry):
+            death = m.Died(-1, "killed", None, None, "the jail was closed", "", pending.operation)
+            self._answers.reply(pending.asker, death)
+
+    def _zygote_died(self, key: tuple[object, ...], event: ZygoteDied) -> None:
+        spawner = self._spawners.pop(key)
+        self._loop.unwatch(spawner.fileno())
+        for entry in list(self._jails.values()):
+            if entry.spawner == key:
+                self._end(entry, -1, "zygote", exit_code=event.code, detail=event.log)
+                self._release(entry)
+        spawner.close()
+
+
+_ZYGOTE_FIELDS = ("profile", "network", "readable", "gpu")
+
+
+def _waiting(entry: JailEntry) -> list[Pending]:
+    found = {}
+    for link in entry.links.values():
+        for pending, _ in link.pending.values():
+            found[id(pending)] = pending
+        link.pending.clear()
+    return list(found.values())
+
+
+def _for_operation(death: m.Died, operation: str) -> m.Died:
+    return m.Died(
+        death.host,
+        death.reason,
+        death.exit_code,
+        death.signal,
+        death.detail,
+        death.tail,
+        operation,
+    )
+
+
+def _signal_name(number: int | None) -> str | None:
+    return None if number is None else signal.Signals(number).name
+
+
+_STATES = {"R": "running", "S": "waiting", "D": "waiting", "T": "stopped", "t": "stopped"}
+
+
+def _state_of(pid: int) -> str:
+    """What the kernel says that a host is doing: of a busy environment nobody else can tell."""
+    try:
+        with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as file:
+            # the command may hold anything, parentheses and blanks included
+            return _STATES.get(file.read().rpartition(")")[2].split()[0], "gone")
+    except (OSError, IndexError):
+        return "gone"
+
+
+def _status_of(entry: JailEntry) -> dict[str, object]:
+    owed = [pending for link in entry.links.values() for pending, _ in link.pending.values()]
+    oldest = min(owed, key=lambda pending: pending.since, default=None)
+    return {
+        "jail": entry.number,
+        "name": entry.name,
+        "pids": tuple(entry.pids.values()),
+        "states": tuple(_state_of(pid) for pid in entry.pids.values()),
+        "busy_s": 0.0 if oldest is None else monotonic() - oldest.since,
+        "operation": "" if oldest is None else oldest.operation,
+    }

@@ -1,0 +1,55 @@
+"""One thread, one poll: who waits for which descriptor."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from typing import Any
+
+import zmq
+
+_POLL_MS = 1000
+
+
+class Loop:
+    """Calls back when a descriptor or a ZeroMQ socket is ready, until ``stop``."""
+
+    def __init__(self) -> None:
+        self._poller = zmq.Poller()
+        self._callbacks: dict[Any, Callable[[], None]] = {}
+        self._stopped = False
+
+    def watch(self, source: Any, callback: Callable[[], None]) -> None:
+        """Call back when there is something to read."""
+        self._poller.register(source, zmq.POLLIN)
+        self._callbacks[source] = callback
+
+    def watch_writes(self, source: Any, wanted: bool) -> None:
+        """Whether to call a watched source back also when it can be written to."""
+        self._poller.register(source, zmq.POLLIN | (zmq.POLLOUT if wanted else 0))
+
+    def unwatch(self, source: Any) -> None:
+        """Forget a source. Idempotent."""
+        if self._callbacks.pop(source, None) is not None:
+            self._poller.unregister(source)
+
+    def stop_on(self, *signals: int) -> None:
+        """End the loop at these signals; to be called on the main thread."""
+        woken, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        signal.set_wakeup_fd(wakes)
+        for number in signals:
+            signal.signal(number, lambda *_: self.stop())
+        self.watch(woken, self.stop)
+
+    def stop(self) -> None:
+        """End the loop after the current round."""
+        self._stopped = True
+
+    def run(self) -> None:
+        """Call back until ``stop``."""
+        while not self._stopped:
+            for ready, _ in self._poller.poll(_POLL_MS):
+                callback = self._callbacks.get(ready)
+                if callback is not None:
+                    callback()
