@@ -116,6 +116,7 @@ class Jails:
         runtime_dir: An existing folder of the server's own.
         readable_roots: Where snapshots lie.
         limits: Bounds on what a host may say.
+        fd_path: The socket that takes descriptors.
     """
 
     def __init__(
@@ -125,6 +126,7 @@ class Jails:
         runtime_dir: Path,
         readable_roots: Sequence[str],
         limits: WireLimits,
+        fd_path: Path,
     ) -> None:
         self._loop = loop
         self._answers = answers
@@ -134,7 +136,7 @@ class Jails:
         self._jails: dict[int, JailEntry] = {}
         self._spawners: dict[tuple[object, ...], Spawner] = {}
         self._packet_ids = itertools.count(1)
-        self._deposits = Deposits(str(runtime_dir / "fds"), self._pidfd_for)
+        self._deposits = Deposits(str(fd_path), self._pidfd_for)
         loop.watch(self._deposits.fileno(), self._deposits.accept)
 
     def close(self) -> None:

@@ -32,6 +32,7 @@ class Server:
         readable_roots: Sequence[str],
         client_pidfd: int | None = None,
         limits: WireLimits = DEFAULT_LIMITS,
+        fd_path: Path | None = None,
     ) -> None:
         self._runtime_dir = runtime_dir
         self._limits = limits
@@ -40,7 +41,8 @@ class Server:
         self._context = zmq.Context()
         self._router = self._listen(endpoint)
         self._loop.watch(self._router, self._serve_clients)
-        self._jails = Jails(self._loop, self, runtime_dir, readable_roots, limits)
+        fd_path = fd_path or runtime_dir / "fds"
+        self._jails = Jails(self._loop, self, runtime_dir, readable_roots, limits, fd_path)
         if client_pidfd is not None:
             self._loop.watch(client_pidfd, self.stop)
 
