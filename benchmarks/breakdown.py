@@ -84,6 +84,9 @@ class _Forced:
     def measured(self, elapsed_ns: int) -> None:
         """Learn nothing."""
 
+    def missed(self) -> None:
+        """Stay with it."""
+
 
 def _marking(function: Callable[..., Any], lane: Any, marks: list[int]) -> Callable[..., Any]:
     def marked(*args: Any) -> Any:
