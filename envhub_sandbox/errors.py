@@ -31,6 +31,8 @@ table, so ``except AttributeError`` keeps working although nothing of the worker
 
 from __future__ import annotations
 
+import shlex
+
 from envhub_worker.protocol.errors import (
     EnvHubError,
     LocalProtocolError,
@@ -62,6 +64,7 @@ __all__ = [
     "WorkerError",
     "WorkerStartupError",
     "WorkerTimeoutError",
+    "name_bundle",
     "name_source",
     "remote_error",
 ]
@@ -127,6 +130,7 @@ class WorkerDiedError(WorkerError):
         request: The operation that it was serving (``"step"``), or None.
         detail: The numbers, where a limit was the reason.
         repository: The repository, commit and entry file, as in ``org/repo@0123456789ab:env.py``.
+        bundle: The folder with everything that led there, for ``envhub replay``, or None.
     """
 
     def __init__(
@@ -142,6 +146,7 @@ class WorkerDiedError(WorkerError):
     ) -> None:
         super().__init__(message)
         self.repository: str | None = None
+        self.bundle: str | None = None
         self.detail = detail
         self.exit_code = exit_code
         self.signal = signal
@@ -159,6 +164,7 @@ class WorkerTimeoutError(WorkerError, TimeoutError):
         worker: What the kernel says of its processes, one word each: ``"running"``,
             ``"waiting"``, ``"stopped"`` or ``"gone"``. Empty if the server did not tell.
         repository: The repository, commit and entry file, as in ``org/repo@0123456789ab:env.py``.
+        bundle: As with ``WorkerDiedError``, where the process was ended at once.
     """
 
     def __init__(
@@ -169,6 +175,7 @@ class WorkerTimeoutError(WorkerError, TimeoutError):
         self.timeout_s = timeout_s
         self.worker: tuple[str, ...] = ()
         self.repository: str | None = None
+        self.bundle: str | None = None
 
 
 class RemoteEnvError(EnvHubError):
@@ -248,3 +255,11 @@ def name_source(error: EnvHubError, label: str) -> None:
         error.args = (f"{label}: {text}", *error.args[1:])
     if isinstance(error, (WorkerDiedError, WorkerTimeoutError)):
         error.repository = label
+
+
+def name_bundle(error: WorkerDiedError | WorkerTimeoutError, bundle: str) -> None:
+    """Tell of a crash bundle, and of the command that tries it again."""
+    error.bundle = bundle
+    text = str(error.args[0]) if error.args else ""
+    command = f"envhub replay {shlex.quote(bundle)}"
+    error.args = (f"{text}\nTo try the same again: {command}", *error.args[1:])

@@ -66,6 +66,11 @@ class Policy:
         restart_budget: How many such restarts one environment gets in its life.
         restart_backoff_s: Seconds to wait before a restart that follows another within a minute;
             they double with each, up to half a minute.
+        output: What becomes of what the worker prints: ``"tail"`` keeps the last lines for error
+            messages; a path writes it to that file as well, a further file for each further jail.
+        crash_history: How many requests since the last seeded reset are kept for a crash bundle
+            (``docs/crashes.md``), within 8 MiB; 0 keeps none and writes no bundles.
+        crash_folder: Where crash bundles are written; ``crashes`` in the cache by default.
     """
 
     profile: str = "strict"
@@ -77,6 +82,9 @@ class Policy:
     restart: str = "never"
     restart_budget: int = 100
     restart_backoff_s: float = 0.1
+    output: str = "tail"
+    crash_history: int = 100_000
+    crash_folder: str | None = None
 
     def __post_init__(self) -> None:
         _one_of("profile", self.profile, PROFILES)
@@ -89,6 +97,10 @@ class Policy:
         _one_of("restart", self.restart, RESTARTS)
         _count("restart_budget", self.restart_budget)
         _seconds("restart_backoff_s", self.restart_backoff_s)
+        _count("crash_history", self.crash_history)
+        object.__setattr__(self, "output", _path("output", self.output))
+        if self.crash_folder is not None:
+            object.__setattr__(self, "crash_folder", _path("crash_folder", self.crash_folder))
         if not isinstance(self.gpu, bool):
             raise PolicyError(f"policy: gpu is {self.gpu!r}; it is True or False")
         # frozen: this is how a field gets the form that the rest relies on
@@ -161,6 +173,12 @@ def _one_of(name: str, value: str, known: tuple[str, ...]) -> None:
 def _count(name: str, value: object) -> None:
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
         raise PolicyError(f"policy: {name} is {value!r}; it takes a whole number, 0 or more")
+
+
+def _path(name: str, value: object) -> str:
+    if not isinstance(value, (str, os.PathLike)) or not os.fspath(value):
+        raise PolicyError(f"policy: {name} is {value!r}; it takes a path")
+    return str(os.fspath(value))
 
 
 def _seconds(name: str, value: Any) -> None:
