@@ -27,8 +27,9 @@ from envhub_sandbox.errors import (
     name_source,
 )
 from envhub_sandbox.fast_lane import FastLane, JailGoneError, Outcome, deposit
+from envhub_sandbox.history import History
 from envhub_sandbox.jail import check, typed
-from envhub_sandbox.jail_sources import JailSource
+from envhub_sandbox.jail_sources import JailSource, SharedJail
 from envhub_sandbox.repository import LoadedJail, Repository
 from envhub_sandbox.restarts import Restarts
 from envhub_sandbox.results import Results, StepResult
@@ -83,6 +84,7 @@ class RemoteEnv:
         self.counters = Counters()
         self._asked_ns = 0
         self.results = Results(manifest, self.bounds)
+        self.history = History(manifest, jails.repository.policy.crash_history)
         _living.add(self)
 
     @property
@@ -115,6 +117,7 @@ class RemoteEnv:
                 for host, bounds in zip(self._hosts, self.bounds, strict=True)
             ]
             self._send(operation, requests)
+            self.history.requested(message_for)
 
     def collect(self, timeout_s: float | None) -> list[m.Message]:
         """The shards' replies to the last ``submit``; the environment is usable afterwards.
@@ -149,12 +152,14 @@ class RemoteEnv:
             if self._lane is None:
                 with self.repository.named():
                     self._send("step", self._step_requests(actions))
+                self.history.step(actions)
                 return
             # first: an interrupt from here on leaves a reply that may come
             self._pending = _BY_LANE
             self.lifecycle.on(Event.SUBMIT)
             self._lane.ask(actions)
             self.counters.lane_steps += 1
+            self.history.step(actions)  # while the jail is at it
 
     def _step_requests(self, actions: Any) -> list[tuple[int, m.Message]]:
         if len(self.bounds) == 1:
@@ -266,6 +271,12 @@ class RemoteEnv:
                 self._wait_on_lane(self._lane, deadline)
             else:
                 loaded.jail.receive(pending[0], deadline)
+        except (WorkerDiedError, WorkerTimeoutError) as error:
+            if pending is not None:
+                error.request = pending[1]
+                self._keep_crash(error)
+            self._forget()
+            return
         except EnvHubError:
             self._forget()
             return
@@ -352,7 +363,20 @@ class RemoteEnv:
         self._moved(Event.DEATH)
         if not isinstance(error, WorkerDiedError) and self._loaded is not None:
             self._jails.end(self._loaded)  # it lives, and cannot be trusted to do what it says
+        if isinstance(error, WorkerDiedError):
+            self._keep_crash(error)
         return error
+
+    def _keep_crash(self, error: WorkerDiedError | WorkerTimeoutError) -> None:
+        task = {
+            "suite": self.manifest.suite,
+            "task": self.manifest.task,
+            "num_envs": self.manifest.num_envs,
+            "shards": len(self.bounds),
+            "lane": "frames" if self._lane is None else "shared memory",
+        }
+        recording, shared = self.history.recording(), isinstance(self._jails, SharedJail)
+        self.repository.keep_crash(error, recording, task, self._loaded, shared=shared)
 
     def _closed(self, operation: str) -> WorkerDiedError:
         text = f"the environment was closed during {operation}"
@@ -410,6 +434,7 @@ class RemoteEnv:
             self._jails.give_back(loaded)
             raise
         self._loaded = loaded
+        self.history.started()
         self.lifecycle.on(Event.START)
 
     def _open_lane(self, loaded: LoadedJail, deadline: Deadline) -> FastLane | None:

@@ -10,13 +10,25 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.client import WorkerClient, expect
+from envhub_sandbox.crashes import Crash, keep
 from envhub_sandbox.deadline import Deadline
-from envhub_sandbox.errors import EnvHubError, LoadError, WorkerTimeoutError, name_source
+from envhub_sandbox.errors import (
+    EnvHubError,
+    LoadError,
+    WorkerDiedError,
+    WorkerTimeoutError,
+    name_bundle,
+    name_source,
+)
+from envhub_sandbox.history import Recording
 from envhub_sandbox.jail import RemoteJail, check, open_jail
+from envhub_sandbox.log import CRASHES
 from envhub_sandbox.policy import Policy, Timeouts
+from envhub_sandbox.provenance import provenance_of
 from envhub_sandbox.recipe import Recipe
 from envhub_sandbox.sandboxes.base import Sandbox, WorkerServer
 from envhub_sandbox.snapshot import Snapshot
+from envhub_sandbox.snapshot_store import cache_root
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import WireLimits
 from envhub_worker.protocol.manifest import Manifest, decode_manifest
@@ -122,19 +134,66 @@ class Repository:
 
     @contextmanager
     def starting(self) -> Iterator[None]:
-        """Say what it was that took too long."""
+        """Say what it was that took too long, and keep what led to a death."""
         try:
             yield
+        except WorkerDiedError as error:
+            self.keep_crash(error)
+            raise
         except WorkerTimeoutError as error:
             if error.request is not None:
                 raise
             startup_s = self.timeouts.startup_s
-            raise WorkerTimeoutError(
+            late = WorkerTimeoutError(
                 f"make_env has not finished after {startup_s} s and was ended; give it longer "
                 "with timeouts={'startup_s': ...}, or make it again",
                 request="make_env",
                 timeout_s=startup_s,
-            ) from error
+            )
+            self.keep_crash(late)
+            raise late from error
+
+    def keep_crash(
+        self,
+        error: WorkerDiedError | WorkerTimeoutError,
+        recording: Recording | None = None,
+        task: dict[str, Any] | None = None,
+        loaded: LoadedJail | None = None,
+        *,
+        shared: bool = False,
+    ) -> None:
+        """Write a crash bundle and name it in the error. What hinders that is only logged.
+
+        Args:
+            error: What the user is going to be told.
+            recording: What was asked of the environment; None before there is one.
+            task: Which environment, as in ``Crash``.
+            loaded: Its jail.
+            shared: Whether other environments lived in it.
+        """
+        ours = self.policy.crash_history and error.bundle is None and self.recipe is not None
+        if not ours or getattr(error, "reason", "") == "killed":
+            return
+        assert self.recipe is not None
+        manifest = None if loaded is None else loaded.manifest
+        crash = Crash(
+            error=error,
+            label=self.label,
+            provenance=provenance_of(self.snapshot, manifest, self.report),
+            load=self.arguments.message(),
+            options=self.recipe.options,
+            task=task,
+            shared=shared,
+            recording=recording or Recording(),
+        )
+        try:
+            folder = self.policy.crash_folder or cache_root() / "crashes"
+            bundle = keep(Path(folder).absolute(), crash)
+        except Exception as problem:
+            CRASHES.warning("%s: no crash bundle could be written: %s", self.label, problem)
+        else:
+            name_bundle(error, str(bundle))
+            CRASHES.info("%s: crash bundle %s", self.label, bundle)
 
     def hold(self) -> Callable[[], None]:
         """Keep the server between two jails; returns what gives it back."""

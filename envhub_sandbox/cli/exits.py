@@ -82,9 +82,10 @@ def describe(error: BaseException) -> str:
         return safe_text(f"a bug in envhub: {type(error).__name__}: {error}")
     text = str(error)
     tail = getattr(error, "log_tail", "")
-    if tail and text.endswith(tail):
+    before, found, after = text.rpartition(tail) if tail else (text, "", "")
+    if found:
         kept = tail.rstrip().splitlines()[-_TAIL_LINES:]
-        text = text[: -len(tail)] + "\n".join(f"  {line}" for line in kept)
+        text = before + "\n".join(f"  {line}" for line in kept) + after
     return safe_text(text.partition(_TRACE_MARK)[0])
 
 

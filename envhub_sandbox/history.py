@@ -1,0 +1,280 @@
+"""What was asked of an environment since it was last seeded: enough to ask it all again.
+
+Kept in memory, bounded by count and by bytes, and read only when the environment's jail has died.
+A step costs a copy of its actions as bytes. Whatever else is asked is encoded at once: the caller
+may change it afterwards.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from envhub_sandbox.errors import EnvHubError
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.manifest import EnvManifest
+
+HISTORY_BYTES = 8 << 20
+"""Memory that the history of one environment takes at most."""
+_ENTRY_BYTES = 48
+_REQUEST_BYTES = 500
+"""What Python's objects take beside the bytes of a step, and of another request."""
+_EVICTED = 64
+_PRELUDE = 256
+_ARRAYS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+_LASTING = (m.Call, m.SetAttr, m.CallOwn)
+
+
+@dataclass(frozen=True, slots=True)
+class Requested:
+    """Any request but a step whose actions are one array.
+
+    Attributes:
+        operation: The message's name in lower case.
+        frames: The message, encoded.
+        exact: Whether these are its very values; what only pickle can carry is left out.
+    """
+
+    operation: str
+    frames: list[bytes]
+    exact: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """Steps in a row. ``actions`` is ``(steps, num_envs, *single_action_space.shape)``."""
+
+    actions: Any
+
+
+@dataclass(frozen=True, slots=True)
+class _Held:
+    """A step whose actions are not one array; a copy of them."""
+
+    actions: Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """A history, as it stood.
+
+    Attributes:
+        seeded: Whether every sub-environment was seeded, once, since the jail started.
+        before: What lasts beyond a reset: calls, and attributes that were set.
+        requests: Everything since the last reset that seeded all, or since the start.
+        dropped: Requests that were forgotten in between, for their number or size.
+    """
+
+    seeded: bool = False
+    before: tuple[Requested, ...] = ()
+    requests: tuple[Steps | Requested, ...] = ()
+    dropped: int = 0
+
+    @property
+    def exact(self) -> bool:
+        """Whether the same requests again are all there was."""
+        kept = [*self.before, *self.requests]
+        return not self.dropped and all(not isinstance(r, Requested) or r.exact for r in kept)
+
+
+class History:
+    """Records the requests of one environment. Not thread-safe: its owner holds a lock.
+
+    Args:
+        manifest: The environment's spaces.
+        limit: How many requests are kept; 0 records nothing.
+
+    Attributes:
+        step: Records a step, given its validated batch of actions.
+    """
+
+    def __init__(self, manifest: EnvManifest, limit: int) -> None:
+        space = manifest.single_action_space
+        self._num_envs = manifest.num_envs
+        self._shape = (manifest.num_envs, *(space.shape or ()))
+        self._flat = isinstance(space, _ARRAYS)
+        size = 8 * int(np.prod(self._shape, dtype=np.int64)) if self._flat else 0
+        self._unit = _ENTRY_BYTES + size
+        self._capacity = min(limit, max(1, HISTORY_BYTES // self._unit))
+        self._log: deque[bytes | np.dtype[Any] | Requested | _Held] = deque()
+        self._append = self._log.append
+        self._lasting: dict[object, Requested] = {}
+        self.step: Callable[[Any], None] = _nothing
+        if limit:
+            self.step = self._flat_step if self._flat else self._any_step
+        self.started()
+
+    def started(self) -> None:
+        """A fresh jail: whatever was asked of another is of no concern."""
+        self._lasting.clear()
+        self._before: tuple[Requested, ...] = ()
+        self._forgotten = 0
+        self._seeded = False
+        self._restart()
+
+    def _restart(self) -> None:
+        self._log.clear()
+        self._room = self._capacity
+        self._dropped = 0
+        self._dtype: np.dtype[Any] | None = None
+        self._first_dtype: np.dtype[Any] | None = None
+
+    def _flat_step(self, actions: Any) -> None:
+        if actions.dtype is not self._dtype:
+            self._change(actions.dtype)
+        self._append(actions.tobytes())
+        self._room -= 1
+        if self._room < 0:
+            self._evict()
+
+    def _change(self, dtype: np.dtype[Any]) -> None:
+        if dtype != self._dtype:
+            self._append(dtype)
+            self._room -= 1
+        self._dtype = dtype
+
+    def _any_step(self, actions: Any) -> None:
+        held = _Held(_copied(actions))
+        self._append(held)
+        self._take_room(held)
+
+    def requested(self, message_for: Callable[[int, tuple[int, int]], m.Message]) -> None:
+        """Record another request, given what makes its message for a slice."""
+        if not self._capacity:
+            return
+        message = message_for(0, (0, self._num_envs))
+        if isinstance(message, m.Reset) and message.mask is None:
+            self._reset(message.seeds)
+        made = encoded(message)
+        if isinstance(message, _LASTING):
+            self._keep_lasting(message, made)
+        self._append(made)
+        self._take_room(made)
+
+    def _reset(self, seeds: Any) -> None:
+        """A reset of all: what it seeds does not depend on anything before, but for attributes."""
+        each = seeds if isinstance(seeds, list) else [seeds]
+        seeding = all(seed is not None for seed in each)
+        if seeding or not self._seeded:
+            self._seeded = seeding
+            self._before = tuple(self._lasting.values())
+            self._restart()
+
+    def _keep_lasting(self, message: m.Message, made: Requested) -> None:
+        name = getattr(message, "name", "")
+        plain = isinstance(message, m.SetAttr) or not (
+            getattr(message, "args", ()) or getattr(message, "kwargs", {})
+        )
+        key: object = (type(message), name) if plain else made.frames[0]
+        self._lasting.pop(key, None)  # the last one counts, in its place
+        self._lasting[key] = made
+        if len(self._lasting) > _PRELUDE:
+            del self._lasting[next(iter(self._lasting))]
+            self._forgotten += 1
+
+    def _take_room(self, entry: Requested | _Held) -> None:
+        self._room -= self._units(entry)
+        if self._room < 0:
+            self._evict()
+
+    def _units(self, entry: object) -> int:
+        if isinstance(entry, Requested):
+            return 1 + (_REQUEST_BYTES + sum(map(len, entry.frames))) // self._unit
+        return 1 + _size(entry.actions) // self._unit if isinstance(entry, _Held) else 1
+
+    def _evict(self) -> None:
+        """Forget the oldest requests, some at a time."""
+        enough = max(1, self._capacity // _EVICTED)
+        while self._room < enough and self._log:
+            oldest = self._log.popleft()
+            self._room += self._units(oldest)
+            if isinstance(oldest, np.dtype):
+                self._first_dtype = oldest
+            else:
+                self._dropped += 1
+        if not self._log:
+            self._dtype = None
+
+    def recording(self) -> Recording:
+        """What is kept, in order."""
+        return Recording(
+            seeded=self._seeded,
+            before=self._before,
+            requests=tuple(self._runs()),
+            dropped=self._dropped + self._forgotten,
+        )
+
+    def _runs(self) -> list[Steps | Requested]:
+        found: list[Steps | Requested] = []
+        run: list[bytes] = []
+        dtype = self._first_dtype
+        for entry in [*self._log, None]:
+            if isinstance(entry, bytes):
+                run.append(entry)
+                continue
+            if run:
+                actions = np.frombuffer(b"".join(run), dtype).reshape(len(run), *self._shape)
+                found.append(Steps(actions))
+                run = []
+            if isinstance(entry, np.dtype):
+                dtype = entry
+            elif isinstance(entry, Requested):
+                found.append(entry)
+            elif entry is not None:
+                found.append(encoded(m.Step(0, entry.actions)))
+        return found
+
+
+def _nothing(actions: Any) -> None:
+    """Nothing is recorded."""
+
+
+def encoded(message: m.Message) -> Requested:
+    """A message as it can be kept: without anything pickled."""
+    name = type(message).__name__.lower()
+    try:
+        frames, exact = m.pack(message, 0, pickler=_refuse), True
+    except EnvHubError:
+        frames, exact = _inert(message), False
+    return Requested(name, [bytes(frame) for frame in frames], exact)
+
+
+def _inert(message: m.Message) -> list[Buffer]:
+    """The same with descriptions in place of what only pickle could carry."""
+    try:
+        return m.pack(message, 0)
+    except EnvHubError:
+        return m.pack(m.Done(), 0)
+
+
+def _refuse(value: object) -> bytes:
+    raise TypeError(f"{type(value).__name__} has no plain form")
+
+
+def _copied(value: Any) -> Any:
+    """Actions that their owner cannot change any more: arrays copied, containers rebuilt."""
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if isinstance(value, Mapping):
+        return {key: _copied(item) for key, item in value.items()}
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return type(value)(*map(_copied, value))
+    if isinstance(value, (tuple, list)):
+        return tuple(map(_copied, value))
+    return value
+
+
+def _size(value: Any) -> int:
+    if isinstance(value, np.ndarray):
+        return int(value.nbytes) + _ENTRY_BYTES
+    if isinstance(value, Mapping):
+        return sum(map(_size, value.values())) + _ENTRY_BYTES
+    if isinstance(value, (tuple, list)):
+        return sum(map(_size, value)) + _ENTRY_BYTES
+    return len(value) if isinstance(value, (str, bytes)) else _ENTRY_BYTES

@@ -1,0 +1,17 @@
+"""Our part of the ``logging`` tree. Silent until the application that uses us sets it up.
+
+``envhub_sandbox.worker`` tells of jails: opened, closed, died, timed out, restarted (INFO, DEBUG).
+``envhub_sandbox.worker.output`` has every line that they print (DEBUG). ``envhub_sandbox.snapshot``
+tells of downloads, ``envhub_sandbox.crashes`` of crash bundles.
+"""
+
+from __future__ import annotations
+
+import logging
+
+ROOT = logging.getLogger("envhub_sandbox")
+ROOT.addHandler(logging.NullHandler())
+WORKER = ROOT.getChild("worker")
+OUTPUT = WORKER.getChild("output")
+SNAPSHOT = ROOT.getChild("snapshot")
+CRASHES = ROOT.getChild("crashes")
