@@ -1,7 +1,7 @@
 """The worker's program. Its contract:
 
 ``envhub-worker serve --endpoint E --runtime-dir D [--readable-root P ...] [--ready-fd N]
-[--client-pidfd N]``
+[--client-pidfd N] [--fd-path F] [--until-eof] [--announce]``
 
 - argv: ``E`` is the ZeroMQ endpoint to bind, ``ipc://`` in a folder of mode 0700. ``D`` is an
   existing private folder for what lives as long as the server; it is removed at the end. ``P``
@@ -9,9 +9,15 @@
   jail.
 - file descriptors: ``--ready-fd`` gets one line (``ready``) once the endpoint is bound, and is
   closed. ``--client-pidfd`` is a pidfd of the client: when that process ends, so does all of this.
-  stdin is not read; stdout and stderr are for people.
+  ``--until-eof`` is the same for a client that can hand over nothing but a pipe: the server ends
+  when stdin does. Else stdin is not read; stdout and stderr are for people.
+- in a container: ``F`` is where the socket that takes descriptors shall lie, in a folder that is
+  shared with the client; ``D`` need not be. ``D`` is made if it is missing. ``--announce`` prints
+  one line of JSON once the endpoint is bound: what holds around this process (``container.py``).
 - environment: nothing is read from it but what Python itself needs.
 - exit code: 0 after a stop, 2 for wrong arguments.
+
+``envhub-worker health [--port 5555]`` exits with 0 if a server of this container answers, else 1.
 """
 
 from __future__ import annotations
@@ -20,27 +26,46 @@ import argparse
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a worker server until it is told to stop or its client ends."""
+    """Run a command: see the head of this file."""
     arguments = _parser().parse_args(argv)
+    run: Callable[[argparse.Namespace], int] = arguments.run
+    return run(arguments)
+
+
+def _serve(arguments: argparse.Namespace) -> int:
+    """Run a worker server until it is told to stop or its client ends."""
+    from envhub_worker import container
     from envhub_worker.server import Server
 
+    announced = container.announcement() if arguments.announce else None
+    arguments.runtime_dir.mkdir(mode=0o700, exist_ok=True)
     server = Server(
         arguments.endpoint,
         arguments.runtime_dir,
         arguments.readable_root,
-        arguments.client_pidfd,
+        0 if arguments.until_eof else arguments.client_pidfd,  # stdin is readable at its end
+        fd_path=arguments.fd_path,
     )
     server.stop_on(signal.SIGTERM, signal.SIGINT)
     if arguments.ready_fd is not None:
         os.write(arguments.ready_fd, b"ready\n")
         os.close(arguments.ready_fd)
+    if announced is not None:
+        print(announced, flush=True)
     server.run()
     return 0
+
+
+def _health(arguments: argparse.Namespace) -> int:
+    """Say whether a server answers."""
+    from envhub_worker.health import answers
+
+    return 0 if answers("127.0.0.1", arguments.port) else 1
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -54,6 +79,13 @@ def _parser() -> argparse.ArgumentParser:
     serve.add_argument("--readable-root", action="append", default=[])
     serve.add_argument("--ready-fd", type=int)
     serve.add_argument("--client-pidfd", type=int)
+    serve.add_argument("--fd-path", type=Path)
+    serve.add_argument("--until-eof", action="store_true")
+    serve.add_argument("--announce", action="store_true")
+    serve.set_defaults(run=_serve)
+    health = commands.add_parser("health", help="whether a server of this container answers")
+    health.add_argument("--port", type=int, default=5555)
+    health.set_defaults(run=_health)
     return parser
 
 

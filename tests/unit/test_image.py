@@ -1,0 +1,62 @@
+"""The container image installs what the worker imports, and cannot drift from pyproject.toml."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.unit.test_imports import WORKERS_OWN
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+_IMPORTED_AS = {"pyzmq": "zmq"}
+
+
+@pytest.fixture(scope="module")
+def project() -> dict[str, Any]:
+    """pyproject.toml, read."""
+    if sys.version_info < (3, 11):
+        from pip._vendor import tomli as tomllib
+    else:
+        import tomllib
+    return tomllib.loads((CHECKOUT / "pyproject.toml").read_text())
+
+
+def name_of(requirement: str) -> str:
+    """The distribution that a requirement names."""
+    return re.split(r"[^\w-]", requirement, maxsplit=1)[0]
+
+
+def test_the_workers_group_is_a_part_of_the_dependencies(project: dict[str, Any]) -> None:
+    """Word for word, so that a version is raised in both or in neither."""
+    assert set(project["dependency-groups"]["worker"]) <= set(project["project"]["dependencies"])
+
+
+def test_the_workers_group_is_what_the_worker_imports(project: dict[str, Any]) -> None:
+    """No more and no less."""
+    names = {name_of(one) for one in project["dependency-groups"]["worker"]}
+    assert {_IMPORTED_AS.get(name, name) for name in names} == WORKERS_OWN - {"envhub_worker"}
+
+
+def test_the_image_carries_the_projects_version(project: dict[str, Any]) -> None:
+    """The label says which worker it is."""
+    text = (CHECKOUT / "Dockerfile").read_text()
+    assert f"ARG VERSION={project['project']['version']}\n" in text
+
+
+def test_nothing_but_the_worker_goes_into_the_image() -> None:
+    """What is not listed never reaches the engine: no tests, no client, no history."""
+    lines = (CHECKOUT / ".dockerignore").read_text().splitlines()
+    rules = [line for line in lines if line and not line.startswith("#")]
+    assert rules == ["*", "!pyproject.toml", "!worker", "**/__pycache__"]
+
+
+def test_the_image_runs_as_nobody() -> None:
+    """Neither root nor a user that owns a file."""
+    text = (CHECKOUT / "Dockerfile").read_text()
+    final = text.rpartition("\nFROM ")[2]
+    assert re.search(r"^USER (\d+):\1$", final, re.MULTILINE)
+    assert not re.search(r"^USER (root|0)", final, re.MULTILINE)
