@@ -20,8 +20,13 @@ from envhub_worker.protocol.codec import Buffer, decode, encode
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 
-VERSION = 1
-"""The protocol's version: what ``Hello`` offers and ``Welcome`` agrees to."""
+VERSION = 2
+"""The newest version of the protocol: ``Hello`` offers a range, ``Welcome`` agrees to one.
+
+Version 2 added kinds 17 to 27; nothing of version 1 changed.
+"""
+OLDEST_VERSION = 1
+"""The oldest version that this code still speaks."""
 FIRST_HOST_KIND = 32
 """Kinds from here on are between client and jail host; a host may send no other."""
 
@@ -237,6 +242,115 @@ class Deposit(Message):
     host: int
 
 
+@_message(17)
+@dataclass(frozen=True, slots=True)
+class KeepJail(Message):
+    """From now on a host's death does not end the jail. Reply: ``Done``, or ``Died``.
+
+    A ``Relay`` to a host that has died, or dies before it answers, is then answered with
+    ``RelayedPartly``; further hosts can be started in its place.
+    """
+
+    jail: int
+
+
+@_message(18)
+@dataclass(frozen=True, slots=True)
+class RelayedPartly(Message):
+    """As ``Relayed``, of a jail that is kept, where some hosts have died.
+
+    ``dead`` holds their places in the request; what stands there is the server's own ``Died``,
+    in one frame. What hosts send never counts as such, whatever it says.
+    """
+
+    parts: tuple[int, ...]
+    dead: tuple[int, ...]
+
+
+@_message(19)
+@dataclass(frozen=True, slots=True)
+class OfferSnapshot(Message):
+    """A snapshot's files, each ``(path, size, sha256)``. Reply: ``Wanted``, or ``Refused``."""
+
+    files: tuple[object, ...]
+
+
+@_message(20)
+@dataclass(frozen=True, slots=True)
+class Wanted(Message):
+    """The hashes that the server does not have. None: ``OpenJail`` may name ``snapshot``."""
+
+    snapshot: str
+    hashes: tuple[object, ...]
+
+
+@_message(21)
+@dataclass(frozen=True, slots=True)
+class PutBlob(Message):
+    """One piece of a wanted file, in order; the frame that follows holds it. Reply: ``Done``.
+
+    With the last piece the whole is compared with its hash.
+    """
+
+    sha256: bytes
+    offset: int
+
+
+@_message(22)
+@dataclass(frozen=True, slots=True)
+class KeepAlive(Message):
+    """The client lives, and still holds these jails. Reply: ``Done``."""
+
+    jails: tuple[int, ...]
+
+
+@_message(23)
+@dataclass(frozen=True, slots=True)
+class Agree(Message):
+    """The compressions that the client can read, best first. Reply: ``Agreed``."""
+
+    compressions: tuple[object, ...]
+
+
+@_message(24)
+@dataclass(frozen=True, slots=True)
+class Agreed(Message):
+    """The compression of both directions from here on, or ``""``; and the server's patience.
+
+    Jails of a client that is not heard from for ``idle_s`` seconds are ended; 0 means never.
+    """
+
+    compression: str
+    idle_s: int
+
+
+@_message(25)
+@dataclass(frozen=True, slots=True)
+class Packed(Message):
+    """In front of a message's frames: some of them are compressed.
+
+    ``sizes`` has one number for each frame that follows: its size when unpacked, or -1 for a
+    frame that is as it was.
+    """
+
+    compression: str
+    sizes: tuple[int, ...]
+
+
+@_message(26)
+@dataclass(frozen=True, slots=True)
+class GetSessions(Message):
+    """Ask who uses the server: the asker's own sessions, or all for the operator."""
+
+
+@_message(27)
+@dataclass(frozen=True, slots=True)
+class Sessions(Message):
+    """One mapping a session: ``client``, ``session``, ``heard_s``, ``connections``, ``jails``."""
+
+    sessions: tuple[object, ...]
+
+
 # --- client and jail host ----------------------------------------------------------------------
 
 
@@ -419,6 +533,19 @@ class FetchInfos(Message):
     """Ask for the last step's infos, which did not fit the slab. Reply: ``Value``."""
 
     env: int
+
+
+@_message(52)
+@dataclass(frozen=True, slots=True)
+class Revive(Message):
+    """Reset all sub-environments in the place of others, which died in the middle of an episode.
+
+    Reply: ``StepDone``: the fresh observations, rewards of zero, every episode truncated. What
+    the next step does with those is as the autoreset mode says.
+    """
+
+    env: int
+    seeds: object
 
 
 @_message(48)
