@@ -9,6 +9,7 @@
         SnapshotIntegrityError
         RepositoryUnavailableError
       PolicyError (ValueError)
+      BundleError (ValueError)
       ActionError (ValueError)
       SandboxUnavailableError
       DependencyError
@@ -44,6 +45,7 @@ from envhub_worker.protocol.errors import (
 
 __all__ = [
     "ActionError",
+    "BundleError",
     "DependencyError",
     "EnvHubError",
     "HubReferenceError",
@@ -92,6 +94,10 @@ class RepositoryUnavailableError(SnapshotError):
 
 class PolicyError(EnvHubError, ValueError):
     """A policy, limit or timeout has an unknown name or an impossible value."""
+
+
+class BundleError(EnvHubError, ValueError):
+    """This is no crash bundle, or one that breaks a rule."""
 
 
 class ActionError(EnvHubError, ValueError):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from envhub_sandbox.cli import cache, doctor, inspect, run, version
+from envhub_sandbox.cli import cache, doctor, inspect, replay, run, version
 from envhub_sandbox.cli.exits import EXIT_CODES
 
 app = typer.Typer(
@@ -20,6 +20,7 @@ app = typer.Typer(
 )
 app.command("run", epilog=EXIT_CODES)(run.run)
 app.command("inspect", epilog=EXIT_CODES)(inspect.inspect)
+app.command("replay", epilog=EXIT_CODES)(replay.replay)
 app.command("doctor")(doctor.doctor)
 app.add_typer(cache.app, name="cache")
 app.command("version")(version.version)

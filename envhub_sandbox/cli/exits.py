@@ -29,6 +29,8 @@ class Exit(IntEnum):
     LOAD = 4
     WORKER = 5
     SANDBOX = 6
+    DIFFERENT = 7
+    SURVIVED = 8
     BUG = 70
     INTERRUPTED = 130
     PIPE = 141
@@ -39,13 +41,15 @@ EXIT_CODES = (
     "Exit codes: 0 done; 1 the environment raised, or broke the rules; 2 usage, a bad reference, "
     "policy or limit; 3 the files could not be had, or are not what the commit says; 4 the "
     "repository did not load, or a package is missing; 5 the worker died or took too long; "
-    "6 this host cannot enforce the policy; 70 a bug of ours; 130 interrupted; 141 broken pipe; "
+    "6 this host cannot enforce the policy; 7 a replay that ended in another way, or elsewhere; "
+    "8 a replay in which nothing died; 70 a bug of ours; 130 interrupted; 141 broken pipe; "
     "143 terminated."
 )
 
 _CODES: tuple[tuple[type[EnvHubError], Exit], ...] = (
     (errors.HubReferenceError, Exit.USAGE),
     (errors.PolicyError, Exit.USAGE),
+    (errors.BundleError, Exit.USAGE),
     (errors.SnapshotError, Exit.SNAPSHOT),
     (errors.LoadError, Exit.LOAD),
     (errors.DependencyError, Exit.LOAD),

@@ -1,0 +1,211 @@
+"""``envhub replay``: does it die again?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from envhub_sandbox.cli import options as opt
+from envhub_sandbox.cli.console import console, print_json, safe_line, safe_text, say
+from envhub_sandbox.cli.exits import Exit, UsageError, reported
+from envhub_sandbox.cli.progress import Bar
+
+if TYPE_CHECKING:
+    from envhub_sandbox.bundles import Bundle
+    from envhub_sandbox.replay import Replayed
+
+BundleFolder = Annotated[
+    Path,
+    typer.Argument(
+        metavar="BUNDLE",
+        help="The folder of a crash bundle, as the message of the death names it.",
+        show_default=False,
+    ),
+]
+Grant = Annotated[
+    bool,
+    typer.Option(
+        "--grant",
+        help="Permit what the bundle asks for beyond an ordinary run: its network, readable paths, "
+        "variables, limits, interpreter, Hub. Only for bundles that you trust.",
+    ),
+]
+
+
+def replay(
+    bundle: BundleFolder,
+    grant: Grant = False,
+    sandbox: opt.SandboxName = "process",
+    profile: opt.Profile = None,
+    python: opt.Python = None,
+    token: opt.Token = None,
+    endpoint: opt.Endpoint = None,
+    hub_cache_dir: opt.HubCacheDir = None,
+    json: opt.Json = False,
+    debug: opt.Debug = False,
+) -> None:
+    """Make the environment of a crash bundle again, ask the same of it, and say how that ends.
+
+    The same commit, the same seeds, the same actions: an environment whose only chance is its
+    seed dies again at the same step. The exit code is 0 if it does, 7 if it ends in another way
+    or at another request, 8 if it does not end.
+
+    [bold]envhub replay ~/.cache/envhub-sandbox/crashes/20261121T081500-5f3a9c01[/bold]
+    """
+    given = {
+        "profile": profile,
+        "python": python,
+        "token": token,
+        "endpoint": endpoint,
+        "hub_cache_dir": hub_cache_dir,
+    }
+    with reported(debug=debug):
+        _Replay(bundle, grant, sandbox, given, as_json=json).execute()
+
+
+class _Replay:
+    """One ``envhub replay``."""
+
+    def __init__(
+        self, folder: Path, grant: bool, sandbox: str, given: dict[str, Any], *, as_json: bool
+    ) -> None:
+        self._folder, self._grant, self._sandbox = folder, grant, sandbox
+        self._given = {name: value for name, value in given.items() if value is not None}
+        self._as_json = as_json
+        self._changed: list[str] = []
+
+    def execute(self) -> None:
+        """Read, check, repeat, print; the exit code is the verdict."""
+        from envhub_sandbox.bundles import load_bundle
+        from envhub_sandbox.replay import Verdict
+
+        if self._sandbox == "none":
+            raise UsageError("a replay without a sandbox would take this process along")
+        bundle = load_bundle(self._folder)
+        self._refuse_wishes(bundle)
+        for doubt in bundle.doubts:
+            say(f"This cannot be exact: {safe_text(doubt)}.")
+        with Bar(quiet=self._as_json) as bar:
+            replayed = self._run(bundle, bar)
+        self._print(bundle, replayed)
+        codes = {Verdict.SAME: Exit.OK, Verdict.DIFFERENT: Exit.DIFFERENT}
+        raise typer.Exit(codes.get(replayed.verdict, Exit.SURVIVED))
+
+    def _refuse_wishes(self, bundle: Bundle) -> None:
+        from envhub_sandbox.bundles import wishes
+
+        wanted = [wish for wish in wishes(bundle) if wish.partition("=")[0] not in self._given]
+        if wanted and not self._grant:
+            raise UsageError(
+                f"the bundle asks for more than an ordinary run: {', '.join(wanted)}. If that is "
+                "yours, or you trust whoever gave you the bundle, add --grant"
+            )
+
+    def _run(self, bundle: Bundle, bar: Bar) -> Replayed:
+        from envhub_sandbox.replay import replay
+
+        bar.begin(f"loading {safe_line(bundle.label)}")
+        made: list[Any] = []
+        try:
+            return replay(lambda: self._make(bundle, bar, made), bundle)
+        finally:
+            for envs in made:
+                envs.close()
+
+    def _make(self, bundle: Bundle, bar: Bar, made: list[Any]) -> Any:
+        """The environment that the bundle is about; None if it is about ``make_env`` alone."""
+        from envhub_sandbox.api import make_env
+        from envhub_sandbox.recipe import Recipe
+        from envhub_sandbox.replay import changed_files
+
+        envs = Recipe(
+            make_env=make_env,
+            reference=bundle.reference,
+            config=bundle.load.cfg,
+            options=self._options(bundle),
+        ).make()
+        made.append(envs)
+        self._changed = list(changed_files(bundle.files, envs.provenance["files"]))
+        if self._changed:
+            say(f"The files have changed since: {safe_line(', '.join(self._changed))}.")
+        if bundle.task is None:
+            next(iter(envs.envs())).np_random  # noqa: B018  # starts it, and changes nothing
+            return None
+        bar.begin(f"repeating {len(bundle.requests)} requests")
+        return self._chosen(envs, bundle.task)
+
+    def _chosen(self, envs: Any, task: dict[str, Any]) -> Any:
+        env = envs.get(task["suite"], {}).get(task["task"])
+        if env is None or env.num_envs != task["num_envs"]:
+            name = safe_line(f"{task['suite']} / {task['task']}")
+            raise UsageError(
+                f"make_env gives no {name} of {task['num_envs']} sub-environments any more, so "
+                "nothing can be repeated"
+            )
+        return env
+
+    def _options(self, bundle: Bundle) -> dict[str, Any]:
+        from envhub_sandbox.bundles import replayed_arguments
+
+        options = replayed_arguments(bundle, granted=self._grant)
+        given = dict(self._given)
+        if "profile" in given:
+            options["policy"] = {**options["policy"], "profile": given.pop("profile")}
+        return {**options, **given, "sandbox": self._sandbox}
+
+    # --- what is printed -----------------------------------------------------------------------
+
+    def _print(self, bundle: Bundle, replayed: Replayed) -> None:
+        if self._as_json:
+            print_json(self._document(bundle, replayed))
+            return
+        out = console()
+        out.print(safe_line(bundle.label, 400), style="bold", soft_wrap=True)
+        out.print(
+            f"then:  {_how(bundle.death)}, {_where(len(bundle.requests), bundle.steps)}",
+            soft_wrap=True,
+        )
+        now = "nothing died" if replayed.death is None else _how(replayed.death)
+        out.print(f"now:   {now}, {_where(replayed.requests, replayed.steps)}", soft_wrap=True)
+        if replayed.note:
+            out.print(safe_text(replayed.note), soft_wrap=True)
+        out.print(_SAID[replayed.verdict.value], soft_wrap=True)
+
+    def _document(self, bundle: Bundle, replayed: Replayed) -> dict[str, Any]:
+        return {
+            "bundle": str(self._folder),
+            "label": bundle.label,
+            "verdict": replayed.verdict.value,
+            "changed_files": [safe_line(path) for path in self._changed],
+            "doubts": list(bundle.doubts),
+            "recorded": {"requests": len(bundle.requests), **bundle.death},
+            "replayed": {
+                "requests": replayed.requests,
+                "steps": replayed.steps,
+                "death": replayed.death,
+                "note": replayed.note,
+            },
+        }
+
+
+_SAID = {
+    "same": "It died again, in the same way and at the same request.",
+    "different": "It did not go the same way.",
+    "survived": "It did not die.",
+}
+
+
+def _how(death: dict[str, Any]) -> str:
+    """An ending in few words. Trust: from the bundle, or from the worker."""
+    words = safe_line(death["reason"], 100)
+    if death["signal"]:
+        words += f" ({safe_line(death['signal'], 100)})"
+    elif death["exit_code"] is not None:
+        words += f" (exit code {death['exit_code']})"
+    return words
+
+
+def _where(requests: int, steps: int) -> str:
+    return f"at request {requests} (step {steps})" if requests else "in make_env"
