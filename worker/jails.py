@@ -10,7 +10,7 @@ import itertools
 import secrets
 import signal
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import monotonic
 from typing import Protocol
@@ -69,7 +69,13 @@ class Pending:
     asker: Asker
     operation: str
     replies: list[list[Buffer] | None]
+    dead: set[int] = field(default_factory=set)
     since: float = field(default_factory=monotonic)
+
+    def lost(self, index: int, death: m.Died) -> None:
+        """In the place of a host's answer: how it died."""
+        self.dead.add(index)
+        self.replies[index] = m.pack(_for_operation(death, self.operation), 0)
 
 
 @dataclass
@@ -87,6 +93,8 @@ class JailEntry:
     report: tuple[object, ...] = ()
     opening: list[Opening] = field(default_factory=list)
     closing: list[Asker] = field(default_factory=list)
+    kept: bool = False
+    lost: dict[int, m.Died] = field(default_factory=dict)
     death: m.Died | None = None
     released: bool = False
 
@@ -221,16 +229,21 @@ class Jails:
                 asker, "LocalProtocolError", "the parts of Relay do not fit its frames"
             )
             return
-        if any(len(entry.links[host].pending) >= MAX_PENDING for host, _ in targets):
+        if any(_owes(entry, host) >= MAX_PENDING for host, _ in targets):
             self._answers.refuse(asker, "WorkerError", f"a host owes {MAX_PENDING} answers already")
             return
         pending = Pending(asker, request.operation, [None] * len(targets))
         for index, (host, frames) in enumerate(targets):
+            if host in entry.lost:
+                pending.lost(index, entry.lost[host])
+                continue
             link = entry.links[host]
             fds = self._deposits.take(entry.number, host) if request.operation == ATTACH else []
             link.send(next(self._packet_ids), frames, (pending, index), fds)
             close_fds(fds)
             self._follow_writes(link)
+        if pending.dead:
+            self._gather(pending)
 
     def _relay_targets(
         self, entry: JailEntry, request: m.Relay, payload: list[bytes]
@@ -238,20 +251,32 @@ class Jails:
         targets = []
         start = 0
         for part in request.parts:
-            if type(part) is not tuple or len(part) != 2 or part[0] not in entry.links:
+            if type(part) is not tuple or len(part) != 2:
                 return None
             host, count = part
+            if host not in entry.links and host not in entry.lost:
+                return None
             if type(count) is not int or not 1 <= count <= len(payload) - start:
                 return None
             targets.append((host, payload[start : start + count]))
             start += count
         return targets if targets and start == len(payload) else None
 
+    def keep(self, asker: Asker, request: m.KeepJail) -> None:
+        """From now on the death of a host is its own affair."""
+        entry = self._owned(asker, request.jail)
+        if entry is not None:
+            entry.kept = True
+            self._answers.reply(asker, m.Done())
+
     def _pidfd_for(self, request: m.Deposit) -> int | None:
         entry = self._jails.get(request.jail)
         if entry is None or entry.session != request.session or entry.death is not None:
             return None
-        return entry.jail.pidfd if request.host in entry.links and entry.jail.pidfd >= 0 else None
+        if request.host not in entry.links:
+            return None
+        pidfd = entry.jail.host_pidfd(request.host) if entry.kept else entry.jail.pidfd
+        return pidfd if pidfd >= 0 else None
 
     def _follow_writes(self, link: HostLink) -> None:
         self._loop.watch_writes(link.fileno(), link.wants_write)
@@ -300,7 +325,7 @@ class Jails:
         try:
             answers = link.receive()
         except ProtocolError as error:
-            self._end(entry, host, "protocol", detail=str(error))
+            self._host_died(entry, m.Died(host, "protocol", None, None, str(error), "", ""))
             return
         if answers is None:
             self._loop.unwatch(link.fileno())
@@ -314,7 +339,10 @@ class Jails:
         replies = [frames for frames in pending.replies if frames is not None]
         if len(replies) == len(pending.replies):
             payload = [frame for frames in replies for frame in frames]
-            self._answers.reply(pending.asker, m.Relayed(tuple(map(len, replies))), payload)
+            counts = tuple(map(len, replies))
+            dead = tuple(sorted(pending.dead))
+            answer = m.RelayedPartly(counts, dead) if dead else m.Relayed(counts)
+            self._answers.reply(pending.asker, answer, payload)
 
     def _read_output(self, entry: JailEntry) -> None:
         fd = entry.output.fileno()
@@ -347,33 +375,47 @@ class Jails:
                 opening.asker, "SandboxUnavailableError", event.reason, event.layer, event.fix
             )
         entry.opening.clear()
-        self._end(entry, -1, "unavailable", detail=event.reason)
+        self._end(entry, m.Died(-1, "unavailable", None, None, event.reason, "", ""))
 
     def _host_exited(self, entry: JailEntry, event: HostExited) -> None:
-        self._end(
-            entry,
-            event.host_id,
-            event.reason,
-            exit_code=event.code,
-            signal=_signal_name(event.signal),
+        how = _signal_name(event.signal)
+        self._host_died(
+            entry, m.Died(event.host_id, event.reason, event.code, how, event.detail, "", "")
         )
 
-    def _end(
-        self,
-        entry: JailEntry,
-        host: int,
-        reason: str,
-        *,
-        exit_code: int | None = None,
-        signal: str | None = None,
-        detail: str = "",
-    ) -> None:
+    def _host_died(self, entry: JailEntry, death: m.Died) -> None:
+        """The end of its jail too, unless that is kept."""
+        if not entry.kept:
+            self._end(entry, death)
+        elif entry.death is None and death.host in entry.links:
+            self._lose(entry, death)
+
+    def _lose(self, entry: JailEntry, death: m.Died) -> None:
+        """Go on without a host: whoever waits for it hears how it died, and nobody else."""
+        entry.output.read()
+        death = replace(death, tail=entry.output.text())
+        # the last lines of earlier deaths have been told: many of them would be much
+        entry.lost = {host: replace(one, tail="") for host, one in entry.lost.items()}
+        entry.lost[death.host] = death
+        entry.jail.kill_host(death.host)  # it may live, and have broken the rules
+        entry.pids.pop(death.host, None)
+        close_fds(self._deposits.take(entry.number, death.host))
+        link = entry.links.pop(death.host)
+        self._loop.unwatch(link.fileno())
+        for pending, index in link.pending.values():
+            pending.lost(index, death)
+            self._gather(pending)
+        link.close()
+        for opening in [one for one in entry.opening if death.host in one.waiting]:
+            entry.opening.remove(opening)
+            self._answers.reply(opening.asker, _for_operation(death, "start"))
+
+    def _end(self, entry: JailEntry, death: m.Died) -> None:
         """Write the jail's death down, tell everybody who waits, and make it true."""
         if entry.death is not None:
             return
         entry.output.read()
-        death = m.Died(host, reason, exit_code, signal, detail, entry.output.text(), "")
-        entry.death = death
+        entry.death = death = replace(death, tail=entry.output.text())
         for pending in _waiting(entry):
             self._answers.reply(pending.asker, _for_operation(death, pending.operation))
         for opening in entry.opening:
@@ -401,7 +443,8 @@ class Jails:
             del self._jails[entry.number]
         else:
             self._jail_events(entry)  # its hosts' exits say more than its own
-            self._end(entry, -1, "exit", exit_code=event.code, signal=_signal_name(event.signal))
+            how = _signal_name(event.signal)
+            self._end(entry, m.Died(-1, "exit", event.code, how, "", "", ""))
         self._release(entry)
         for asker in entry.closing:
             self._answers.reply(asker, m.Done())
@@ -423,7 +466,7 @@ class Jails:
         self._loop.unwatch(spawner.fileno())
         for entry in list(self._jails.values()):
             if entry.spawner == key:
-                self._end(entry, -1, "zygote", exit_code=event.code, detail=event.log)
+                self._end(entry, m.Died(-1, "zygote", event.code, None, event.log, "", ""))
                 self._release(entry)
         spawner.close()
 
@@ -440,16 +483,14 @@ def _waiting(entry: JailEntry) -> list[Pending]:
     return list(found.values())
 
 
+def _owes(entry: JailEntry, host: int) -> int:
+    """How many answers a host owes; one that has died owes none any more."""
+    link = entry.links.get(host)
+    return 0 if link is None else len(link.pending)
+
+
 def _for_operation(death: m.Died, operation: str) -> m.Died:
-    return m.Died(
-        death.host,
-        death.reason,
-        death.exit_code,
-        death.signal,
-        death.detail,
-        death.tail,
-        operation,
-    )
+    return replace(death, operation=operation)
 
 
 def _signal_name(number: int | None) -> str | None:

@@ -144,6 +144,7 @@ class Server:
 _HANDLERS: dict[type[m.Message], Callable[[Jails, Asker, Any], None]] = {
     m.OpenJail: Jails.open,
     m.StartHosts: Jails.start_more,
+    m.KeepJail: Jails.keep,
     m.CloseJail: Jails.close_jail,
     m.ReadOutput: Jails.read_output,
     m.GetStatus: Jails.status,

@@ -286,6 +286,7 @@ class Jail:
         self._folder = folder
         self._count = 0
         self._pidfd = -1
+        self._host_pidfds: dict[int, int] = {}
         self._killed = False
         self._report: list[dict[str, Any]] = []
         self._group: cgroups.Group | None = None
@@ -319,6 +320,10 @@ class Jail:
         """A pidfd of the jail's init, or -1 before it is known and after it has gone."""
         return self._pidfd
 
+    def host_pidfd(self, host_id: int) -> int:
+        """A pidfd of a host, or -1 before it has started and after it has gone."""
+        return self._host_pidfds.get(host_id, -1)
+
     def fileno(self) -> int:
         """Readable when ``poll`` has something to say; -1 once the jail has gone."""
         return self._channel.fileno()
@@ -332,6 +337,7 @@ class Jail:
         events = [event for message, fds in messages for event in self._translate(message, fds)]
         if ended:
             self._channel.close()
+            self._close_host_pidfds(list(self._host_pidfds))
             events.append(Disconnected())
         return events
 
@@ -344,11 +350,15 @@ class Jail:
             return [Failed(message["layer"], message["reason"], message["fix"])]
         if kind == "host_started":
             report = self._report + message["report"]
+            self._host_pidfds[message["host"]] = fds[0]
             pid = process.pid_of(fds[0])
-            close_fds(fds)
             return [Ready(report), HostStarted(message["host"], pid, report)]
+        self._close_host_pidfds([message["host"]])
         names = ("host", "code", "signal", "reason", "detail")
         return [HostExited(*(message[name] for name in names))]
+
+    def _close_host_pidfds(self, hosts: Sequence[int]) -> None:
+        close_fds([self._host_pidfds.pop(host) for host in hosts if host in self._host_pidfds])
 
     def start_host(self, fds: Sequence[int] = ()) -> tuple[int, socket.socket]:
         """Ask for a host in this jail; it starts once the jail is ready.
@@ -394,6 +404,7 @@ class Jail:
         if self._pidfd >= 0:
             os.close(self._pidfd)
             self._pidfd = -1
+        self._close_host_pidfds(list(self._host_pidfds))
         if self._group is not None:
             self._group.remove()
         if self._folder is not None:

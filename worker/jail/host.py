@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 import cloudpickle  # type: ignore[import-untyped]
+import numpy as np
 
 from envhub_worker.jail import describe, loader
 from envhub_worker.jail.failure import raised
@@ -141,6 +142,18 @@ class Host:
         flags = (batch.rewards, batch.terminations, batch.truncations)
         return m.StepDone(batch.observation(), *flags, infos)
 
+    def revive(self, request: m.Revive) -> m.Message:
+        """Begin anew in the place of sub-environments that died: see ``m.Revive``."""
+        env = self._envs[request.env]
+        if isinstance(env, SubEnvs):
+            infos = join(env.run_revive(request.seeds), env.num_envs)
+            batch = env.batch
+            flags = (batch.rewards, batch.terminations, batch.truncations)
+            return m.StepDone(batch.observation(), *flags, infos)
+        observation, info = env.reset(seed=request.seeds)
+        no, yes = np.zeros(env.num_envs, np.bool_), np.ones(env.num_envs, np.bool_)
+        return m.StepDone(observation, np.zeros(env.num_envs), no, yes, info)
+
     def attach(self, request: m.Attach) -> m.Message:
         """Serve an environment's steps over slabs from now on."""
         env = self._envs[request.env]
@@ -220,6 +233,7 @@ _HANDLERS: dict[type[m.Message], Callable[[Host, Any], m.Message]] = {
     m.Build: Host.build,
     m.Reset: Host.reset,
     m.Step: Host.step,
+    m.Revive: Host.revive,
     m.Call: Host.call,
     m.SetAttr: Host.set_attr,
     m.Render: Host.render,

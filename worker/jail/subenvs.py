@@ -8,6 +8,7 @@ bit by bit. Followed: ``gymnasium.vector.SyncVectorEnv`` 1.4.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from operator import itemgetter
 from typing import Any
 
 import gymnasium as gym
@@ -30,6 +31,8 @@ class Batch:
         rewards: float64 ``(count, *reward_shape)``.
         terminations, truncations: bool ``(count,)``.
         store: Writes a sub-environment's observation into its row.
+        rows: Where each observation goes as it is, if its dtype and shape are the rows'; empty
+            where the space is no array.
     """
 
     def __init__(self, space: gym.Space[Any], count: int, reward_shape: tuple[int, ...]) -> None:
@@ -39,7 +42,8 @@ class Batch:
         self.rewards = np.zeros((count, *reward_shape))
         self.terminations = np.zeros(count, np.bool_)
         self.truncations = np.zeros(count, np.bool_)
-        self._slots: list[tuple[list[Any], Store]] = []
+        self.rows: list[Any] = []
+        self._slots: list[tuple[list[Any], Store, list[Any]]] = []
         self._slot = 0
         layout = slabs.observation_layout(space, count, 1)
         if layout is None:
@@ -49,13 +53,19 @@ class Batch:
 
     def write_to(self, slots: list[list[Any]]) -> None:
         """Write observations into these leaves from now on: one list for each slot."""
-        self._slots = [(leaves, _writer(self._space, iter(leaves))) for leaves in slots]
+        self._slots = [
+            (leaves, _writer(self._space, iter(leaves)), self._rows_of(leaves)) for leaves in slots
+        ]
         self.choose(0)
+
+    def _rows_of(self, leaves: list[Any]) -> list[Any]:
+        flat = isinstance(self._space, _ARRAYS)
+        return [leaves[0][index, ...] for index in range(self._count)] if flat else []
 
     def choose(self, slot: int) -> None:
         """Write the next observations into another slot."""
         self._slot = slot
-        self.store = self._slots[slot][1]
+        _, self.store, self.rows = self._slots[slot]
 
     def observation(self) -> Any:
         """The batched observation; views of the arrays that the next step writes."""
@@ -105,6 +115,21 @@ class SubEnvs(SyncVectorEnv):
                 infos.append((index, info))
         return infos
 
+    def run_revive(self, seeds: Any) -> Pairs:
+        """Reset all in the place of others, whose episodes are truncated; returns the infos.
+
+        Their last observations died with them: the fresh ones stand for those, too.
+        """
+        infos = self.run_reset(seeds, None, None)
+        self.batch.rewards[...] = 0.0
+        self.batch.truncations[...] = True
+        if self._mode == "SameStep":
+            fresh = iterate(self.observation_space, self.batch.observation())
+            finals = [(i, {"final_obs": row, "final_info": {}}) for i, row in enumerate(fresh)]
+            return sorted([*finals, *infos], key=itemgetter(0))
+        self._done = [True] * self.num_envs
+        return infos
+
     def run_step(self, actions: Any) -> Pairs:
         """Step every sub-environment, or reset it where its episode is over; returns the infos.
 
@@ -114,7 +139,9 @@ class SubEnvs(SyncVectorEnv):
         if self._mode == "Disabled" and any(self._done):
             raise AssertionError(f"self._autoreset_envs={np.array(self._done)!r}")
         batch, same_step, count = self.batch, self._mode == "SameStep", self.num_envs
-        store, rewards = batch.store, batch.rewards
+        store, rows, rewards = batch.store, batch.rows, batch.rewards
+        dtype, shape = (rows[0].dtype, rows[0].shape) if rows else (None, None)
+        array = np.ndarray
         terminations, truncations = batch.terminations, batch.truncations
         done = [False] * count
         infos: Pairs = []
@@ -135,7 +162,14 @@ class SubEnvs(SyncVectorEnv):
                         observation, info = env.reset()
                     else:
                         done[index] = True
-            store(index, observation)
+            if (
+                type(observation) is array
+                and observation.dtype is dtype
+                and observation.shape == shape
+            ):
+                rows[index][...] = observation
+            else:
+                store(index, observation)
             if info:
                 infos.append((index, info))
         self._done = done
@@ -176,10 +210,11 @@ def _writer(space: gym.Space[Any], leaves: Iterator[Any]) -> Store:
 
 def _leaf_writer(rows: Any) -> Store:
     dtype, shape = rows.dtype, rows.shape[1:]
+    each = [rows[index, ...] for index in range(len(rows))]
 
     def write(index: int, member: Any) -> None:
         if type(member) is np.ndarray and member.dtype is dtype and member.shape == shape:
-            rows[index] = member
+            each[index][...] = member
         else:  # the casts that SyncVectorEnv permits, and its errors for the others
             np.stack([member], out=rows[index : index + 1])
 
