@@ -17,8 +17,6 @@ from contextlib import suppress
 from time import perf_counter_ns
 from typing import Any
 
-import numpy as np
-
 from envhub_sandbox.cores import CPUS, Cores
 from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import RemoteProtocolError, WorkerTimeoutError
@@ -41,6 +39,9 @@ _ORDERED_STORES = platform.machine() in ("x86_64", "AMD64")
 Outcome = tuple[int, m.Message | None]
 """``slabs.DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``, and what came encoded."""
 _OUTCOMES = frozenset({slabs.DONE, slabs.RAISED, slabs.FETCH, slabs.COLUMNS})
+
+
+_NOTHING: list[Outcome] = []
 
 
 class JailGoneError(Exception):
@@ -70,11 +71,9 @@ class LaneShard:
         self._asks = slabs.words(self._request)
         self._tells = slabs.words(self._reply)
         self._columns: list[tuple[Column, Any]] = []
-        count, start = layout.count, layout.results
-        self._rewards = np.frombuffer(self._reply, np.float64, count, start)
-        self._flags = np.frombuffer(self._reply, np.uint8, 2 * count, start + 8 * count)
         self._views: dict[tuple[int, Any], Any] = {}
         self._codes = [-1] * len(layout.actions)
+        self._wishes = (0, 0, 0)
         self.sequence = 0
 
     def handed_over(self) -> None:
@@ -91,14 +90,23 @@ class LaneShard:
                 found = self._view(index, leaf.dtype)
             if self._codes[index] != found[0]:
                 asks[slabs.DTYPES + index] = self._codes[index] = found[0]
+                asks[slabs.CHANGES] += 1
             found[1][...] = leaf
+        wishes = (spin_ns, slot, cpu)
+        if wishes != self._wishes:
+            self._wish(*wishes)
         self.sequence += 1
-        asks[slabs.SPIN] = spin_ns
-        asks[slabs.SLOT] = slot
-        asks[slabs.CPU] = cpu
         asks[slabs.SEQUENCE] = self.sequence
         if self._tells[slabs.PARKED]:
             os.write(self._host_bell, _RING)
+
+    def _wish(self, spin_ns: int, slot: int, cpu: int) -> None:
+        asks = self._asks
+        self._wishes = (spin_ns, slot, cpu)
+        asks[slabs.SPIN] = spin_ns
+        asks[slabs.SLOT] = slot
+        asks[slabs.CPU] = cpu
+        asks[slabs.CHANGES] += 1
 
     def _view(self, index: int, dtype: Any) -> tuple[int, Any]:
         code = slabs.DTYPE_CODES[dtype]
@@ -109,6 +117,19 @@ class LaneShard:
     def answered(self) -> bool:
         """Whether the reply to the last request is there."""
         return self._tells[slabs.SEQUENCE] == self.sequence
+
+    def answered_until(self, until_ns: int) -> bool:
+        """Whether it comes before that time; waits awake."""
+        tells, sequence = self._tells, self.sequence
+        while tells[slabs.SEQUENCE] != sequence:
+            if perf_counter_ns() > until_ns:
+                return False
+        return True
+
+    def has_nothing_to_say(self) -> bool:
+        """Whether the reply is results and nothing else."""
+        tells = self._tells
+        return tells[slabs.OUTCOME] == slabs.DONE and not tells[slabs.LENGTH]
 
     def park(self, parked: int) -> None:
         """Say whether we sleep and want our doorbell rung."""
@@ -146,13 +167,6 @@ class LaneShard:
             raise RemoteProtocolError("the worker sent columns before their schema")
         return {column.key: view.astype(column.dtype) for column, view in self._columns}
 
-    def results(self) -> tuple[Any, Any, Any]:
-        """Copies of rewards (float64), terminations and truncations (bool)."""
-        # cast, not viewed: a hostile byte of 2 would make a bool that is neither
-        flags = self._flags.astype(np.bool_)
-        count = self.layout.count
-        return self._rewards.copy(), flags[:count], flags[count:]
-
     def close(self) -> None:
         """Give everything back."""
         self.handed_over()
@@ -170,7 +184,7 @@ class FastLane:
         manifest: Its spaces.
         bounds: The slices of the sub-environments, one for each shard.
         observed: Where the observations lie.
-        layouts: Where each shard's actions and results lie.
+        layouts: Where each shard's actions and infos lie.
         process_fd: Readable once the worker server has ended.
     """
 
@@ -200,7 +214,8 @@ class FastLane:
         # on the client's while it sleeps: so it waits for those first, and for the others awake.
         self._awake = min(len(self.shards), len(CPUS) - 1)
         self._cores = Cores(len(self.shards), self._awake)
-        self._order = [*self.shards[self._awake :], *self.shards[: self._awake]]
+        self._sleepers = self.shards[self._awake :]
+        self._wakers = self.shards[: self._awake]
 
     @classmethod
     def for_spaces(
@@ -246,33 +261,32 @@ class FastLane:
             rows = [leaf[start:stop] for leaf in leaves]
             shard.ask(rows, slot, spin_ns if index < self._awake else 0, cpus[index])
 
-    def wait(self, deadline: Deadline) -> list[Outcome]:
-        """Every shard's outcome.
+    def wait(self, timeout_s: float | None) -> list[Outcome]:
+        """Every shard's outcome; nothing at all if none says more than its results.
 
         Raises:
             WorkerTimeoutError: The deadline came first.
             JailGoneError: The jail has ended.
             RemoteProtocolError: A shard wrote what the rules forbid.
         """
-        asleep = len(self._order) - self._awake
-        for index, shard in enumerate(self._order):
-            if not shard.answered() and (index < asleep or not self._spin_for(shard)):
+        deadline = None
+        for shard in self._sleepers:
+            deadline = deadline or Deadline(timeout_s)
+            self._sleep_for(shard, deadline)
+        budget_ns = self._spin.budget_ns
+        until_ns = perf_counter_ns() + budget_ns
+        for shard in self._wakers:
+            if not budget_ns or not shard.answered_until(until_ns):
+                if budget_ns:
+                    self._spin.missed()
+                deadline = deadline or Deadline(timeout_s)
                 self._sleep_for(shard, deadline)
         self.elapsed_ns = perf_counter_ns() - self._asked_ns
         self._spin.measured(self.elapsed_ns)
-        return [shard.outcome() for shard in self.shards]
-
-    def _spin_for(self, shard: LaneShard) -> bool:
-        budget = self._spin.budget_ns
-        if not budget:
-            return False
-        until = perf_counter_ns() + budget
-        answered = shard.answered
-        while not answered():
-            if perf_counter_ns() > until:
-                self._spin.missed()
-                return False
-        return True
+        for shard in self.shards:
+            if not shard.has_nothing_to_say():
+                return [shard.outcome() for shard in self.shards]
+        return _NOTHING
 
     def _sleep_for(self, shard: LaneShard, deadline: Deadline) -> None:
         shard.park(1)
@@ -304,11 +318,7 @@ class FastLane:
 
     def flags(self) -> tuple[Any, Any, Any]:
         """Rewards float64, terminations and truncations bool: fresh arrays ``(num_envs,)``."""
-        if len(self.shards) == 1:
-            return self.shards[0].results()
-        columns = zip(*[shard.results() for shard in self.shards], strict=True)
-        rewards, terminations, truncations = map(np.concatenate, columns)
-        return rewards, terminations, truncations
+        return self.observations.results()
 
     def close(self) -> None:
         """Give everything back."""

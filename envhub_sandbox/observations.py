@@ -1,4 +1,4 @@
-"""Observations out of shared memory: copies that the caller owns, or slots that it borrows.
+"""Results out of shared memory: copies that the caller owns, or slots that it borrows.
 
 With one slot every batch is copied out. With a ring of slots (``copy=False``) a batch is handed
 out where it lies, and its slot is written again only when nobody holds an array of it any more:
@@ -28,7 +28,7 @@ _SPARE = 0
 
 
 class ObservationSlab:
-    """The slab that all shards write their rows into.
+    """The slab that all shards write their rows into: observations, rewards and flags.
 
     Args:
         space: The single observation space.
@@ -41,8 +41,7 @@ class ObservationSlab:
 
     def __init__(self, space: gym.Space[Any], layout: slabs.ObservationLayout) -> None:
         self.layout = layout
-        size = layout.slots * layout.slot_bytes
-        self._memory, self.fd = slab("observations", size)
+        self._memory, self.fd = slab("observations", layout.total_bytes)
         self._assemble = slabs.assembler(space)
         whole = memoryview(self._memory)
         self._slots = [
@@ -50,8 +49,11 @@ class ObservationSlab:
             for index in range(layout.slots)
         ]
         self._copies = [_copier(self._slots[_SPARE], leaf) for leaf in layout.leaves]
+        flat = len(self._copies) == 1 and not layout.leaves[0].path
+        self._single = self._copies[0] if flat else None
         self._unheld = [sys.getrefcount(slot) for slot in self._slots]
         self._chosen = _SPARE
+        self._rewards, self._flags = slabs.results(self._memory, layout)
 
     def choose(self) -> int:
         """The slot for the next batch: the lowest that nobody holds, so that few stay hot."""
@@ -65,9 +67,18 @@ class ObservationSlab:
     def take(self) -> Any:
         """The batch in the chosen slot, in the structure of the space."""
         if self._chosen == _SPARE:
+            if self._single is not None:
+                return self._single()
             return self._assemble([copy() for copy in self._copies])
         slot = self._slots[self._chosen]
         return self._assemble([_borrowed(slot, leaf) for leaf in self.layout.leaves])
+
+    def results(self) -> tuple[Any, Any, Any]:
+        """Copies of rewards (float64), terminations and truncations (bool), ``(num_envs,)``."""
+        # cast, not viewed: a hostile byte of 2 would make a bool that is neither
+        flags = self._flags.astype(np.bool_)
+        count = self.layout.count
+        return self._rewards.copy(), flags[:count], flags[count:]
 
     def close(self) -> None:
         """Give the descriptor back; the memory goes with the last array over it."""

@@ -49,10 +49,10 @@ MessageFor = Callable[[int, tuple[int, int]], m.Message]
 """Makes the message for a shard out of the environment's number and the shard's bounds."""
 
 T = TypeVar("T")
+D = TypeVar("D")
 _CAUSE_S = 10.0
 _CAUSE_POLL_S = 0.01
 _BY_LANE = (0, "step")
-_EMPTY = (slabs.DONE, None)
 _numbers = itertools.count(1)
 
 
@@ -174,10 +174,9 @@ class RemoteEnv:
         """What ``VectorEnv.step`` returns; raises as ``collect`` does."""
         with self._lock:
             try:
-                deadline = Deadline(timeout_s)
                 if self._pending is _BY_LANE:
-                    return self._collect_by_lane(deadline, timeout_s)
-                replies = self._collect(deadline, timeout_s)
+                    return self._collect_by_lane(timeout_s)
+                replies = self._collect(Deadline(timeout_s), timeout_s)
                 self.counters.stepped(perf_counter_ns() - self._asked_ns)
                 for reply in replies:
                     check(reply)
@@ -190,19 +189,20 @@ class RemoteEnv:
                     raise self._closed("step") from error
                 raise
 
-    def _collect_by_lane(self, deadline: Deadline, timeout_s: float | None) -> StepResult:
+    def _collect_by_lane(self, timeout_s: float | None) -> StepResult:
         lane = self._lane
         assert lane is not None
-        outcomes = self._finish(lambda: self._wait_on_lane(lane, deadline), timeout_s)
+        outcomes = self._finish(self._wait_on_lane, timeout_s, timeout_s)
         self.counters.stepped(lane.elapsed_ns)
         infos: dict[Any, Any] = {}
-        if any(outcome != _EMPTY for outcome in outcomes):
-            infos = self.results.lane_infos(self._lane_infos(lane, outcomes, deadline, timeout_s))
+        if outcomes:
+            infos = self.results.lane_infos(self._lane_infos(lane, outcomes, timeout_s))
         return (lane.observation(), *lane.flags(), infos)
 
-    def _wait_on_lane(self, lane: FastLane, deadline: Deadline) -> list[Outcome]:
+    def _wait_on_lane(self, timeout_s: float | None) -> list[Outcome]:
+        assert self._lane is not None
         try:
-            return lane.wait(deadline)
+            return self._lane.wait(timeout_s)
         except JailGoneError:
             raise self._cause_of_death() from None
 
@@ -210,7 +210,6 @@ class RemoteEnv:
         self,
         lane: FastLane,
         outcomes: list[Outcome],
-        deadline: Deadline,
         timeout_s: float | None,
     ) -> list[Any]:
         infos: list[Any] = []
@@ -218,7 +217,7 @@ class RemoteEnv:
             if kind == slabs.COLUMNS:
                 infos.append(shard.columns())
             elif kind == slabs.FETCH:
-                infos.append(self._fetch_infos(host, deadline, timeout_s))
+                infos.append(self._fetch_infos(host, timeout_s))
             elif message is None:
                 infos.append({})
             else:
@@ -226,9 +225,9 @@ class RemoteEnv:
                 infos.append(typed(message, m.Value).value)
         return infos
 
-    def _fetch_infos(self, host: int, deadline: Deadline, timeout_s: float | None) -> Any:
+    def _fetch_infos(self, host: int, timeout_s: float | None) -> Any:
         self._send("step", [(host, m.FetchInfos(self._number))])
-        [reply] = self._collect(deadline, timeout_s)
+        [reply] = self._collect(Deadline(timeout_s), timeout_s)
         check(reply)
         return typed(reply, m.Value).value
 
@@ -268,7 +267,7 @@ class RemoteEnv:
             if pending is None:  # interrupted on the way out: nobody knows what was sent
                 raise WorkerTimeoutError("the request was interrupted")
             if pending is _BY_LANE and self._lane is not None:
-                self._wait_on_lane(self._lane, deadline)
+                self._wait_on_lane(_GRACE_S)
             else:
                 loaded.jail.receive(pending[0], deadline)
         except (WorkerDiedError, WorkerTimeoutError) as error:
@@ -319,13 +318,13 @@ class RemoteEnv:
         if loaded is None or pending is None:
             state = self.lifecycle.state.value
             raise WorkerError(f"there is no request to wait for: the environment is {state}")
-        return self._finish(lambda: loaded.jail.receive(pending[0], deadline), timeout_s)
+        return self._finish(lambda at: loaded.jail.receive(pending[0], at), deadline, timeout_s)
 
-    def _finish(self, receive: Callable[[], T], timeout_s: float | None) -> T:
+    def _finish(self, receive: Callable[[D], T], until: D, timeout_s: float | None) -> T:
         """Wait for the pending reply, and move on to the state that it leads to."""
         assert self._pending is not None
         try:
-            received = receive()
+            received = receive(until)
         except WorkerTimeoutError as error:
             self.counters.timeouts += 1
             self._moved(Event.TIMEOUT)

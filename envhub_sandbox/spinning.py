@@ -30,23 +30,20 @@ class SpinChooser:
     """
 
     def __init__(self, allowed: bool) -> None:
-        self._allowed = allowed
         self.budget_ns = 0
         self._chosen = self._spinning = False
         self._best = {False: 0, True: 0}
         self._samples: list[int] = []
         self._misses = 0
+        self._missed_at: float = 0
         self._trials = 2 if allowed else 0
         self._interval = _FIRST_INTERVAL
-        self._left = _TRIAL
+        # steps until the next decision: none ever comes where spinning is not allowed
+        self._left: float = _TRIAL if allowed else float("inf")
 
     def measured(self, elapsed_ns: int) -> None:
         """Take note of how long a step took, and decide when it is time to."""
-        if not self._allowed:
-            return
         self._left -= 1
-        if elapsed_ns < self.budget_ns:
-            self._misses = 0
         if self._trials:
             self._samples.append(elapsed_ns)
         if self._left > 0:
@@ -58,7 +55,8 @@ class SpinChooser:
 
     def missed(self) -> None:
         """A wait used its whole budget up: somebody else has the core. A few in a row end it."""
-        self._misses += 1
+        self._misses = self._misses + 1 if self._missed_at - self._left <= 1 else 1
+        self._missed_at = self._left
         if self._misses >= _MISSES and self._spinning:
             self._samples.clear()
             self._trials = 0

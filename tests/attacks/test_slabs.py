@@ -113,16 +113,18 @@ def test_the_reply_slab_is_theirs_to_write(shard: LaneShard) -> None:
     assert attack(shard, "outcome(mmap.mmap, reply, reply_bytes)") == "done"
 
 
-def test_a_punched_hole_is_zeros(shard: LaneShard) -> None:
+def test_a_punched_hole_is_zeros(shard: LaneShard, observations: ObservationSlab) -> None:
     """Pages can be taken away, and read as zeros; nothing faults."""
     os.pwrite(shard.fds[1], b"\xff" * mmap.PAGESIZE, 0)
+    os.pwrite(observations.fd, b"\xff" * observations.layout.total_bytes, 0)
     code = """
 libc = ctypes.CDLL(None, use_errno=True)
 libc.fallocate.argtypes = [ctypes.c_int, ctypes.c_int, ctypes.c_long, ctypes.c_long]
-print(libc.fallocate(reply, 3, 0, 4096), errno.errorcode.get(ctypes.get_errno()))
+for slab in (reply, observations):
+    print(libc.fallocate(slab, 3, 0, 4096), errno.errorcode.get(ctypes.get_errno()))
 """
-    assert attack(shard, code) == "0 None"
-    rewards, terminations, truncations = shard.results()
+    assert attack(shard, code) == "0 None\n0 None"
+    rewards, terminations, truncations = observations.results()
     assert rewards.tolist() == [0.0, 0.0]
     assert not terminations.any()
     assert not truncations.any()
@@ -170,10 +172,9 @@ def test_bytes_that_are_no_booleans_become_booleans(
     shard: LaneShard, observations: ObservationSlab
 ) -> None:
     """A flag or a boolean observation of 2 would be neither true nor false: it is made true."""
-    layout = shard.layout
-    os.pwrite(shard.fds[1], b"\x02" * 4, layout.results + 16)
+    os.pwrite(observations.fd, b"\x02" * 4, observations.layout.results + 16)
     os.pwrite(observations.fd, b"\x02" * 16, 0)
-    _, terminations, truncations = shard.results()
+    _, terminations, truncations = observations.results()
     observation = observations.take()
     for array in (terminations, truncations, observation):
         assert array.dtype == np.bool_
@@ -184,12 +185,12 @@ def test_what_the_caller_has_is_not_rewritten(
     shard: LaneShard, observations: ObservationSlab
 ) -> None:
     """Results are copies: a later write of the jail changes nothing that was handed out."""
-    rewards, terminations, _ = shard.results()
+    rewards, terminations, _ = observations.results()
     observation = observations.take()
     attack(
         shard,
-        "m = mmap.mmap(reply, reply_bytes); m[:] = b'\\x01' * reply_bytes\n"
-        "os.pwrite(observations, b'\\x01' * 64, 0)",
+        "size = os.fstat(observations).st_size\n"
+        "m = mmap.mmap(observations, size); m[:] = b'\\x01' * size",
     )
     assert rewards.tolist() == [0.0, 0.0]
     assert not terminations.any()

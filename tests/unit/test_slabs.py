@@ -55,9 +55,10 @@ def test_nothing_in_a_slab_overlaps(space: gym.Space[Any], count: int) -> None:
     observed = slabs.observation_layout(space, count, 3)
     assert layout is not None
     assert observed is not None
-    results = (layout.results, layout.results + 10 * count)
     infos = (layout.infos, layout.infos + slabs.INFO_BYTES)
-    assert_apart([(0, slabs.HEADER_BYTES), results, infos], layout.reply_bytes)
+    assert_apart([(0, slabs.HEADER_BYTES), infos], layout.reply_bytes)
+    results = (observed.results, observed.results + 10 * count)
+    assert_apart([(0, 3 * observed.slot_bytes), results], observed.total_bytes)
     assert_apart(sizes(observed.leaves), observed.slot_bytes)
     assert observed.slot_bytes % slabs.LINE == 0
     assert layout.actions[0].offset >= slabs.HEADER_BYTES

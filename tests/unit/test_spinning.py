@@ -42,6 +42,7 @@ def test_waits_in_vain_end_spinning_at_once() -> None:
     assert chooser.budget_ns > 0
     for _ in range(3):
         chooser.missed()
+        chooser.measured(1_000_000)
     assert chooser.budget_ns == 0
 
 
@@ -58,6 +59,7 @@ def test_a_slow_step_now_and_then_does_not_end_spinning() -> None:
     run(chooser, 1_000, awake_ns=10_000, asleep_ns=20_000)
     for _ in range(10):
         chooser.missed()
+        chooser.measured(1_000_000)
         run(chooser, 1, awake_ns=10_000, asleep_ns=20_000)
     assert chooser.budget_ns > 0
 

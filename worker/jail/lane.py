@@ -44,7 +44,7 @@ class Lane:
         *slab_fds, self.bell, self._client_bell = fds
         self._request = mmap.mmap(slab_fds[0], layout.request_bytes, prot=mmap.PROT_READ)
         self._reply = mmap.mmap(slab_fds[1], layout.reply_bytes)
-        self._observations = mmap.mmap(slab_fds[2], observed.slots * observed.slot_bytes)
+        self._observations = mmap.mmap(slab_fds[2], observed.total_bytes)
         for fd in slab_fds:
             os.close(fd)
         os.set_blocking(self.bell, False)
@@ -55,21 +55,21 @@ class Lane:
         self._env = env
         self._assemble = slabs.assembler(env.single_action_space)
         self._served = 0
-        self._leaves = len(layout.actions)
         self._codes: list[int] = []
         self._views: list[Any] = []
         self._pairs: Pairs = []
         self._writer = InfoWriter(self._reply, layout.infos, layout.count)
-        self._slot = self._cpu = 0
+        self._changes = self._cpu = self._spin_ns = 0
         self._move(attach.start, observed)
 
     def _move(self, start: int, observed: slabs.ObservationLayout) -> None:
         """Have the environment write into the slabs."""
-        batch, count, results = self._env.batch, self._layout.count, self._layout.results
-        block = np.frombuffer(self._reply, np.uint8, 10 * count, results)
-        batch.rewards = block[: 8 * count].view(np.float64)
-        batch.terminations = block[8 * count : 9 * count].view(np.bool_)
-        batch.truncations = block[9 * count :].view(np.bool_)
+        batch, count, stop = self._env.batch, observed.count, start + self._layout.count
+        rewards, flags = slabs.results(self._observations, observed)
+        bools = flags.view(np.bool_)
+        batch.rewards = rewards[start:stop]
+        batch.terminations = bools[:count][start:stop]
+        batch.truncations = bools[count:][start:stop]
         bases = [slot * observed.slot_bytes for slot in range(observed.slots)]
         rows = [[self._rows(leaf, base, start) for leaf in observed.leaves] for base in bases]
         batch.write_to(rows)
@@ -87,10 +87,9 @@ class Lane:
     def _wait_awake(self) -> bool:
         """Wait for the next request without sleeping, for as long as the client says."""
         asked, served = self._asked, self._served
-        budget = asked[slabs.SPIN]
-        if budget:
+        if self._spin_ns:
             self._told[slabs.PARKED] = 0
-            until = perf_counter_ns() + budget
+            until = perf_counter_ns() + self._spin_ns
             while perf_counter_ns() < until:
                 if asked[slabs.SEQUENCE] != served:
                     return True
@@ -112,16 +111,30 @@ class Lane:
 
     def _run(self) -> tuple[int, int]:
         try:
-            slot = self._asked[slabs.SLOT]
-            if slot != self._slot:
-                self._env.batch.choose(slot)
-                self._slot = slot
-            if self._asked[slabs.CPU] != self._cpu:
-                self._keep_to(self._asked[slabs.CPU])
-            pairs = self._pairs = self._env.run_step(self._actions())
+            changes = self._asked[slabs.CHANGES]
+            if changes != self._changes:
+                self._changes = changes
+                self._change()
+            # copied, because an environment may keep its action and the client writes the next one
+            actions = self._assemble([view.copy() for view in self._views])
+            pairs = self._pairs = self._env.run_step(actions)
             return self._writer.write(pairs) if pairs else (slabs.DONE, 0)
         except BaseException as error:
             return slabs.RAISED, self._writer.put(_raised_frame(error))
+
+    def _change(self) -> None:
+        asked = self._asked
+        self._spin_ns = asked[slabs.SPIN]
+        self._env.batch.choose(asked[slabs.SLOT])
+        if asked[slabs.CPU] != self._cpu:
+            self._keep_to(asked[slabs.CPU])
+        codes = asked[slabs.DTYPES : slabs.DTYPES + len(self._layout.actions)].tolist()
+        if codes != self._codes:
+            self._codes = codes
+            pairs = zip(self._layout.actions, codes, strict=True)
+            self._views = [
+                slabs.view(self._request, leaf, slabs.ACTION_DTYPES[code]) for leaf, code in pairs
+            ]
 
     def _keep_to(self, cpu: int) -> None:
         self._cpu = cpu
@@ -131,17 +144,6 @@ class Lane:
     def infos(self) -> dict[Any, Any]:
         """The last step's infos."""
         return join(self._pairs, self._layout.count)
-
-    def _actions(self) -> Any:
-        # copied, because an environment may keep its action and the client writes the next one
-        codes = self._asked[slabs.DTYPES : slabs.DTYPES + self._leaves].tolist()
-        if codes != self._codes:
-            self._codes = codes
-            pairs = zip(self._layout.actions, codes, strict=True)
-            self._views = [
-                slabs.view(self._request, leaf, slabs.ACTION_DTYPES[code]) for leaf, code in pairs
-            ]
-        return self._assemble([view.copy() for view in self._views])
 
 
 def _raised_frame(error: BaseException) -> Any:

@@ -3,15 +3,15 @@
 Two slabs a shard. The *request* slab is written by the client and sealed against the jail's
 writes; the *reply* slab is written by the jail. Each starts with a header of 64-bit words, those
 that are polled on a cache line of their own. All shards share the *observation* slab, and write
-their rows of the batch in it; it holds one batch, or several in turn (slots). Arrays lie at
-64-byte boundaries. The client never follows an offset or a length that it has not computed or
-bounded itself.
+their rows of the batch in it; it holds one batch, or several in turn (slots), and one batch of
+rewards and flags. Arrays lie at 64-byte boundaries. The client never follows an offset or a
+length that it has not computed or bounded itself.
 
 ::
 
     request       header | one area per action leaf
-    reply         header | rewards, terminations, truncations | infos, encoded
-    observations  slot 0: one area per leaf | slot 1 ...
+    reply         header | infos, encoded
+    observations  slot 0: one area per leaf | slot 1 ... | rewards, terminations, truncations
 
 Only ``step`` goes this way; everything else is a message.
 """
@@ -50,6 +50,8 @@ SLOT = 17
 """Request: the slot of the observation slab that the shard writes."""
 CPU = 18
 """Request: one more than the number of the core that the shard should keep to; 0 for any."""
+CHANGES = 19
+"""Request: grows with every change of ``SPIN``, ``SLOT``, ``CPU`` and the dtypes."""
 DTYPES = 24
 """Request: the dtype code of each action leaf, one word each, up to ``MAX_LEAVES``."""
 MAX_LEAVES = 64
@@ -95,13 +97,12 @@ class Leaf:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a shard's actions and results lie.
+    """Where a shard's actions and infos lie.
 
     Attributes:
         count: Sub-environments of the shard.
         actions: Leaves of the action space, in the request slab.
         request_bytes: Size of the request slab.
-        results: Offset of the block of rewards (float64), terminations and truncations (bool).
         infos: Offset of the encoded infos.
         reply_bytes: Size of the reply slab.
     """
@@ -109,7 +110,6 @@ class Layout:
     count: int
     actions: tuple[Leaf, ...]
     request_bytes: int
-    results: int
     infos: int
     reply_bytes: int
 
@@ -123,12 +123,16 @@ class ObservationLayout:
         leaves: Leaves of the observation space in the first slot.
         slots: Number of batches.
         slot_bytes: Size of one.
+        results: Offset of the rewards (float64), the terminations and the truncations (bool).
+        total_bytes: Size of the slab.
     """
 
     count: int
     leaves: tuple[Leaf, ...]
     slots: int
     slot_bytes: int
+    results: int
+    total_bytes: int
 
 
 def layout_of(action: gym.Space[Any], count: int) -> Layout | None:
@@ -137,10 +141,9 @@ def layout_of(action: gym.Space[Any], count: int) -> Layout | None:
     if None in leaves or len(leaves) > MAX_LEAVES:
         return None
     actions, request_bytes = _placed(leaves, count, HEADER_BYTES, _ACTION_ITEM_BYTES)
-    infos = _aligned(HEADER_BYTES + count * (8 + 1 + 1))
     if request_bytes > MAX_SLAB_BYTES:
         return None
-    return Layout(count, actions, request_bytes, HEADER_BYTES, infos, infos + INFO_BYTES)
+    return Layout(count, actions, request_bytes, HEADER_BYTES, HEADER_BYTES + INFO_BYTES)
 
 
 def observation_layout(space: gym.Space[Any], count: int, slots: int) -> ObservationLayout | None:
@@ -149,9 +152,11 @@ def observation_layout(space: gym.Space[Any], count: int, slots: int) -> Observa
     if None in leaves or len(leaves) > MAX_LEAVES:
         return None
     placed, slot_bytes = _placed(leaves, count, 0, None)
-    if slot_bytes * slots > MAX_SLAB_BYTES:
+    results = slot_bytes * slots
+    total_bytes = _aligned(results + count * (8 + 1 + 1))
+    if total_bytes > MAX_SLAB_BYTES:
         return None
-    return ObservationLayout(count, placed, slots, max(slot_bytes, LINE))
+    return ObservationLayout(count, placed, slots, slot_bytes, results, total_bytes)
 
 
 def _leaves(space: gym.Space[Any], path: tuple[Any, ...] = ()) -> Iterator[Any]:
@@ -185,6 +190,14 @@ def view(buffer: Any, leaf: Leaf, dtype: np.dtype[Any] | None = None, base: int 
     """A leaf's array in a mapped slab; ``base`` is the offset of its slot."""
     made: Array = np.ndarray(leaf.shape, dtype or leaf.dtype, buffer, base + leaf.offset)
     return made
+
+
+def results(buffer: Any, layout: ObservationLayout) -> tuple[Array, Array]:
+    """Rewards, float64 ``(count,)``, and the bytes of terminations and truncations."""
+    rewards: Array = np.frombuffer(buffer, np.float64, layout.count, layout.results)
+    start = layout.results + rewards.nbytes
+    flags: Array = np.frombuffer(buffer, np.uint8, 2 * layout.count, start)
+    return rewards, flags
 
 
 def words(buffer: Any) -> memoryview:
