@@ -55,7 +55,8 @@ def make_env(
         use_async_envs: Passed on likewise; sub-environments may then run in several processes.
         hub_cache_dir: huggingface_hub's ``cache_dir``.
         trust_remote_code: Only for ``sandbox=None``.
-        sandbox: ``"process"``, or None to run the code here, as LeRobot does.
+        sandbox: ``"process"``, ``"docker"`` (or a ``DockerSandbox``), or None to run the code here,
+            as LeRobot does.
         env_kwargs: Further keyword arguments for the repository's ``make_env``.
         policy: What the code may reach; see ``Policy``.
         timeouts: How long operations may take; see ``Timeouts``.
@@ -144,7 +145,7 @@ class _Maker:
         self._repository = repository
         self._num_workers = num_workers
         load = repository.arguments.message()
-        key = manifest_key(repository.snapshot, load, repository.policy, repository.python)
+        key = manifest_key(repository.snapshot, load, repository.policy, repository.interpreter)
         self._cache = ManifestCache(snapshot_store.cache_root() / "manifests", key)
 
     def make(self) -> EnvSuites:
@@ -237,7 +238,13 @@ def _sandbox(sandbox: str | Sandbox) -> Sandbox:
         from envhub_sandbox.sandboxes.process import PROCESS
 
         return PROCESS
-    raise PolicyError(f"sandbox is {sandbox!r}; it is 'process', or None to run the code here")
+    if sandbox == "docker":
+        from envhub_sandbox.sandboxes.docker import DockerSandbox
+
+        return DockerSandbox()
+    raise PolicyError(
+        f"sandbox is {sandbox!r}; it is 'process', 'docker', or None to run the code here"
+    )
 
 
 def _interpreter(python: str | Path | None) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from envhub_sandbox.log import CRASHES
 from envhub_sandbox.policy import Policy, Timeouts
 from envhub_sandbox.provenance import provenance_of
 from envhub_sandbox.recipe import Recipe
-from envhub_sandbox.sandboxes.base import Sandbox, WorkerServer
+from envhub_sandbox.sandboxes.base import EnclosedServer, PerRepository, Sandbox, WorkerServer
 from envhub_sandbox.snapshot import Snapshot
 from envhub_sandbox.snapshot_store import cache_root
 from envhub_worker.protocol import messages as m
@@ -106,6 +106,10 @@ class Repository:
         self.report: list[dict[str, Any]] = []
         self.recipe: Recipe | None = None
         self._sandbox = sandbox
+        self.interpreter = python
+        if isinstance(sandbox, PerRepository):
+            own = sandbox.for_repository(snapshot.root, policy, python)
+            self._sandbox, self.interpreter = own, own.interpreter
         self._store = store
 
     @property
@@ -218,24 +222,29 @@ class Repository:
         client = WorkerClient(server.endpoint, server.process_fd, self.wire_limits)
         try:
             client.hello(deadline)
-            jail = open_jail(client, self._order(), self.wire_limits, deadline)
+            jail = open_jail(client, self._order(server), self.wire_limits, deadline)
         except BaseException:
             client.close()
             raise
         try:
-            self.report = jail.report
+            around = server.layers if isinstance(server, EnclosedServer) else ()
+            self.report = [*map(dict, around), *jail.report]
             return self._load(jail, server, deadline)
         except BaseException:
             jail.close(Deadline(_CLOSE_S))
             raise
 
-    def _order(self) -> m.OpenJail:
+    def _order(self, server: WorkerServer) -> m.OpenJail:
+        snapshot, confinement = str(self.snapshot.root), self.policy.confinement()
+        if isinstance(server, EnclosedServer):
+            snapshot = server.snapshot
+            confinement = replace(confinement, profile=server.profile)
         return m.OpenJail(
             name=self.label,
             python=self.python,
-            snapshot=str(self.snapshot.root),
+            snapshot=snapshot,
             entry=self.snapshot.path,
-            confinement=asdict(self.policy.confinement()),
+            confinement=asdict(confinement),
             hosts=1,
         )
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+if TYPE_CHECKING:
+    from envhub_sandbox.policy import Policy
 
 
 class WorkerServer(Protocol):
@@ -38,3 +42,49 @@ class Sandbox(Protocol):
 
     def release(self, server: WorkerServer) -> None:
         """Give a server back; the last one who does ends it."""
+
+
+@runtime_checkable
+class EnclosedServer(WorkerServer, Protocol):
+    """A server that is itself confined, with all of its jails: in a container.
+
+    Attributes:
+        layers: What holds around it, one mapping a layer: ``layer``, ``enforced``, ``detail``.
+        profile: The profile of its jails, chosen among what can be had in there.
+        snapshot: Where its jails find the repository's files.
+    """
+
+    @property
+    def layers(self) -> Sequence[Mapping[str, Any]]: ...  # noqa: D102
+    @property
+    def profile(self) -> str: ...  # noqa: D102
+    @property
+    def snapshot(self) -> str: ...  # noqa: D102
+
+
+class RepositorySandbox(Sandbox, Protocol):
+    """A sandbox for one repository.
+
+    Attributes:
+        interpreter: What runs the repository; a remembered manifest holds for this only.
+    """
+
+    interpreter: str
+
+
+@runtime_checkable
+class PerRepository(Protocol):
+    """A place where each repository gets a server of its own, which sees no other's files."""
+
+    def for_repository(self, snapshot: Path, policy: Policy, python: str) -> RepositorySandbox:
+        """The sandbox for the files in ``snapshot``. Starts nothing.
+
+        Args:
+            snapshot: The verified files.
+            policy: What the jails may do.
+            python: The interpreter that the caller named, or empty.
+
+        Raises:
+            PolicyError: The place cannot permit what the policy does.
+            SandboxUnavailableError: There is no such place here.
+        """

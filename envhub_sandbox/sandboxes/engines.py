@@ -1,0 +1,214 @@
+"""Container engines, docker and podman alike, through their stable command line."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
+
+ENGINES = ("docker", "podman")
+_ANSWER_S = 60.0
+_KEPT = ("PATH", "HOME", "USER", "LOGNAME", "LANG", "LC_ALL", "TMPDIR", "DBUS_SESSION_BUS_ADDRESS")
+_KEPT_PREFIXES = ("XDG_", "DOCKER_", "CONTAINER_", "CONTAINERS_", "REGISTRY_AUTH_")
+
+
+class EngineError(Exception):
+    """The engine's command failed; its text is what it wrote to stderr."""
+
+
+@dataclass(frozen=True)
+class Engine:
+    """An engine that answers.
+
+    Attributes:
+        kind: ``"docker"`` or ``"podman"``: whose options it takes.
+        command: Path of its program.
+        version: The engine's own.
+        rootless: Whether it runs as a plain user.
+        remapped: Whether it maps the users of containers to others (``userns-remap``).
+    """
+
+    kind: str
+    command: str
+    version: str
+    rootless: bool
+    remapped: bool = False
+
+    def run(self, *arguments: str) -> str:
+        """What a command prints.
+
+        Raises:
+            EngineError: It failed.
+        """
+        return run(self.command, *arguments)
+
+
+def environment() -> dict[str, str]:
+    """What the engine's program needs of ours; a token of the Hub is not among it."""
+    return {
+        name: value
+        for name, value in os.environ.items()
+        if name in _KEPT or name.startswith(_KEPT_PREFIXES)
+    }
+
+
+def run(command: str, *arguments: str, stdin: str = "") -> str:
+    """What an engine's program prints.
+
+    Raises:
+        EngineError: It failed, or did not answer.
+    """
+    try:
+        done = subprocess.run(
+            [command, *arguments],
+            input=stdin.encode(),
+            capture_output=True,
+            env=environment(),
+            timeout=_ANSWER_S,
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise EngineError(str(error)) from error
+    if done.returncode != 0:
+        raise EngineError(done.stderr.decode(errors="replace").strip())
+    return done.stdout.decode(errors="replace")
+
+
+def find_engine(name: str | None) -> Engine:
+    """The engine of that name; with None, docker if it answers, else podman.
+
+    Raises:
+        PolicyError: There is no engine of that name.
+        SandboxUnavailableError: It is not installed, does not run, or may not be used.
+    """
+    if name is not None and name not in ENGINES:
+        raise PolicyError(f"engine is {name!r}; it is one of {', '.join(ENGINES)}, or None")
+    problems = []
+    for candidate in (name,) if name else ENGINES:
+        # a failure is not remembered: it may be repaired meanwhile
+        try:
+            return _engine(candidate, os.environ.get("PATH"), os.environ.get("DOCKER_HOST"))
+        except SandboxUnavailableError as error:
+            problems.append(f"{candidate}: {error}")
+    raise SandboxUnavailableError("no container engine can be used. " + " ".join(problems))
+
+
+@lru_cache(maxsize=8)
+def _engine(name: str, path: str | None, host: str | None) -> Engine:
+    command = shutil.which(name, path=path)
+    if command is None:
+        raise SandboxUnavailableError(f"there is no {name} on PATH; run: {_INSTALL[name]}.")
+    if name == "docker" and host and not host.startswith("unix:"):
+        raise SandboxUnavailableError(
+            f"DOCKER_HOST is {host}: a container over there cannot share memory with this process. "
+            "Run the worker there, and connect to it with sandbox='tcp://...'."
+        )
+    try:
+        kind = "podman" if "podman" in run(command, "--version") else name
+        return _described(kind, command)
+    except EngineError as error:
+        raise SandboxUnavailableError(explained(name, str(error))) from error
+
+
+def _described(kind: str, command: str) -> Engine:
+    try:
+        facts = json.loads(run(command, "info", "--format", "{{json .}}"))
+    except ValueError as error:
+        raise EngineError(f"its answer is no JSON: {error}") from error
+    if kind == "podman":
+        rootless = bool(_at(facts, "host", "security", "rootless"))
+        return Engine(kind, command, str(_at(facts, "version", "Version")), rootless)
+    if not facts.get("ServerVersion"):  # podman's docker answers by failing; docker may not
+        raise EngineError(" ".join(map(str, facts.get("ServerErrors") or ["it does not answer"])))
+    options = " ".join(facts.get("SecurityOptions") or [])
+    return Engine(
+        kind,
+        command,
+        str(facts["ServerVersion"]),
+        rootless="name=rootless" in options,
+        remapped="name=userns" in options,
+    )
+
+
+def _at(facts: Mapping[str, Any], *path: str) -> Any:
+    value: Any = facts
+    for name in path:
+        value = value.get(name) if isinstance(value, Mapping) else None
+    return value
+
+
+_INSTALL = {
+    "docker": "sudo apt-get install docker.io (or see docs.docker.com/engine/install)",
+    "podman": "sudo apt-get install podman",
+}
+_EXPLAINED = (
+    (
+        "permission denied while trying to connect",
+        "you may not use it. Run: sudo usermod -aG docker $USER, and log in again (members of that "
+        "group can become root on this machine), or use podman, which needs no such right.",
+    ),
+    ("Cannot connect to the Docker daemon", "it does not run. Run: sudo systemctl start docker."),
+    ("Is the docker daemon running", "it does not run. Run: sudo systemctl start docker."),
+    ("dial unix", "it does not run. Run: sudo systemctl start docker."),
+    (
+        "nknown or invalid runtime name",
+        "it has no such runtime. Install it and name it in /etc/docker/daemon.json "
+        "(for gVisor: sudo runsc install), then run: sudo systemctl restart docker.",
+    ),
+    (
+        "could not select device driver",
+        "it cannot give GPUs to a container. Install the NVIDIA container toolkit and run: "
+        "sudo nvidia-ctk runtime configure --runtime=docker, then sudo systemctl restart docker.",
+    ),
+    (
+        "Range of CPUs",
+        "it has fewer processors than were asked for; see DockerSandbox(cpus=...).",
+    ),
+    (
+        "bind source path does not exist",
+        "it does not see this machine's files (an engine in a virtual machine, or one that was "
+        "installed as a snap): run the worker there and connect with sandbox='tcp://...'.",
+    ),
+    (
+        "cgroup",
+        "it cannot limit memory, processes and time here. Delegate control groups to it, or go "
+        "without the container's own limits: DockerSandbox(cgroups=False). Each jail's hold.",
+    ),
+)
+
+
+def explained(engine: str, stderr: str) -> str:
+    """What an engine's complaint means, and the command that mends it."""
+    for text, meaning in _EXPLAINED:
+        if text in stderr:
+            return f"{meaning} ({engine} says: {_last_line(stderr)})"
+    return f"it failed: {_last_line(stderr) or 'without a word'}"
+
+
+def _last_line(text: str) -> str:
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    said = [line for line in lines if not line.startswith(("See '", "Run '"))] or lines
+    return said[-1][:500] if said else ""
+
+
+def find_image(engine: Engine, image: str) -> str:
+    """The id of an image, so that what was looked at is what runs.
+
+    Raises:
+        SandboxUnavailableError: The engine does not have it.
+    """
+    try:
+        return engine.run("image", "inspect", "--format", "{{.Id}}", image).strip()
+    except EngineError as error:
+        text = str(error)
+        if "no such image" not in text.lower() and "not known" not in text:
+            raise SandboxUnavailableError(explained(engine.kind, text)) from error
+    build = f"{engine.kind} build -t {image} ."
+    get = f"{engine.kind} pull {image}" if "/" in image else f"{build} (in a checkout of envhub)"
+    raise SandboxUnavailableError(f"{engine.kind} has no image {image!r}; run: {get}")
