@@ -66,7 +66,7 @@ _SYSTEM_V = """
 # What locks a jail down. Outside of a user namespace these need capabilities that nobody here has.
 _LOCKDOWN = """
     landlock_add_rule landlock_create_ruleset landlock_restrict_self mount mount_setattr move_mount
-    open_tree pivot_root seccomp setns umount2 unshare
+    open_tree pivot_root seccomp sethostname setns umount2 unshare
 """
 ALLOWED = frozenset(
     " ".join((_MEMORY, _FILES, _PROCESSES, _SIGNALS, _SOCKETS, _SYSTEM_V, _LOCKDOWN)).split()
