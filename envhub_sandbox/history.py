@@ -259,9 +259,9 @@ def _refuse(value: object) -> bytes:
 
 def _copied(value: Any) -> Any:
     """Actions that their owner cannot change any more: arrays copied, containers rebuilt."""
-    if isinstance(value, np.ndarray):
+    if type(value) is np.ndarray:
         return value.copy()
-    if isinstance(value, Mapping):
+    if type(value) is dict or isinstance(value, Mapping):
         return {key: _copied(item) for key, item in value.items()}
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         return type(value)(*map(_copied, value))
@@ -271,9 +271,9 @@ def _copied(value: Any) -> Any:
 
 
 def _size(value: Any) -> int:
-    if isinstance(value, np.ndarray):
+    if type(value) is np.ndarray:
         return int(value.nbytes) + _ENTRY_BYTES
-    if isinstance(value, Mapping):
+    if type(value) is dict or isinstance(value, Mapping):
         return sum(map(_size, value.values())) + _ENTRY_BYTES
     if isinstance(value, (tuple, list)):
         return sum(map(_size, value)) + _ENTRY_BYTES

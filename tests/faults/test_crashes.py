@@ -1,0 +1,251 @@
+"""Crash bundles: what is in them, and that the same requests bring about the same death."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import stat
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envhub_sandbox import crashes, errors, make_env
+from envhub_sandbox.bundles import load_bundle
+from envhub_worker.protocol import messages as m
+from tests.support.processes import eventually
+from tests.support.samples import sample
+
+pytestmark = pytest.mark.usefixtures("neighbour")
+
+
+def envhub(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Run the command line to its end."""
+    return subprocess.run(
+        [sys.executable, "-m", "envhub_sandbox", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+
+
+def replayed(bundle: str, *arguments: str | Path, code: int) -> dict[str, Any]:
+    """The document of ``envhub replay --json``."""
+    done = envhub("replay", bundle, *arguments, "--json")
+    assert done.returncode == code, done.stderr
+    document: dict[str, Any] = json.loads(done.stdout)
+    return document
+
+
+def brittle(folder: Path, actions: str = "array", ending: str = "exit", **options: Any) -> Any:
+    """An environment that dies of its seed and its actions, with bundles in a folder."""
+    policy = {"crash_folder": str(folder), **options.pop("policy", {})}
+    kwargs = {"ending": ending, "actions": actions}
+    return make_env(sample("brittle"), env_kwargs=kwargs, policy=policy, **options)
+
+
+def play(env: Any, steps: int = 2000) -> errors.WorkerDiedError:
+    """Sample actions until it dies."""
+    env.action_space.seed(5)
+    try:
+        for _ in range(steps):
+            env.step(env.action_space.sample())
+    except errors.WorkerDiedError as error:
+        return error
+    pytest.fail("it does not die")
+
+
+SHARDS = [(1, 1), (3, 1), (3, 2)]
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+@pytest.mark.parametrize(("n_envs", "shards"), SHARDS)
+def test_a_replay_dies_at_the_same_step(
+    tmp_path: Path, lane: str, n_envs: int, shards: int
+) -> None:
+    """Over both lanes, with autoresets, masks, calls and attributes on the way."""
+    place = {"use_async_envs": True, "num_workers": shards, "lane": lane}
+    with brittle(tmp_path, n_envs=n_envs, **place) as suites:
+        env = suites.env
+        env.set_attr("weight", 0.5)
+        env.reset(seed=3)
+        env.step(np.zeros((n_envs, 2), np.float32))
+        env.call("borrow", 2.5)
+        mask = np.arange(n_envs) == n_envs - 1
+        env.reset(options={"reset_mask": mask, "toll": 1.5})
+        error = play(env)
+    assert f"envhub replay {error.bundle}" in str(error)
+    found = replayed(str(error.bundle), code=0)
+    assert found["verdict"] == "same"
+    assert found["doubts"] == found["changed_files"] == []
+    assert found["replayed"]["requests"] == found["recorded"]["requests"] > 10
+    # the luck that it died with, to the last digit: chance has gone the same way
+    assert error.log_tail.startswith("no luck: -")
+    assert error.log_tail in found["replayed"]["death"]["message"]
+
+
+@pytest.mark.parametrize("actions", ["dict", "text"])
+@pytest.mark.parametrize("ending", ["segfault", "memory"])
+def test_every_ending_and_every_action_comes_again(
+    tmp_path: Path, actions: str, ending: str
+) -> None:
+    """Signals and memory; actions in mappings, and such as have no fixed layout."""
+    limits = {"memory_bytes": 400 << 20}
+    with brittle(tmp_path, actions, ending, n_envs=2, policy={"limits": limits}) as suites:
+        suites.env.reset(seed=11)
+        error = play(suites.env)
+    found = replayed(str(error.bundle), code=0)
+    assert found["verdict"] == "same"
+    assert found["recorded"]["reason"] == error.reason
+    assert error.reason == ("signal" if ending == "segfault" else "out-of-memory")
+
+
+def test_a_bundle_holds_what_is_promised(tmp_path: Path) -> None:
+    """For its owner alone, whole, in plain formats, and readable by people."""
+    with brittle(tmp_path, n_envs=2) as suites:
+        suites.env.reset(seed=[4, 5], options={"toll": 1})
+        error = play(suites.env)
+        provenance = suites.provenance
+    folder = Path(str(error.bundle))
+    assert [entry.name for entry in tmp_path.iterdir()] == [folder.name]
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert sorted(path.name for path in folder.iterdir()) == [
+        *("README.txt", "actions-float32.npy", "arguments.bin", "bundle.json", "requests.bin"),
+    ]
+    document = json.loads((folder / "bundle.json").read_text())
+    assert document["provenance"] == json.loads(json.dumps(provenance))
+    assert document["death"]["exit_code"] == 9
+    assert document["death"]["output"] == error.log_tail
+    assert document["make_env"]["policy"]["limits"]["processes"] == 512
+    assert document["history"]["exact"]
+    words = (folder / "README.txt").read_text()
+    for text in ("envhub replay", "exit code 9", "no luck", "seeds=[4, 5]", "steps, the last with"):
+        assert text in words
+    bundle = load_bundle(folder)
+    first: Any = bundle.requests[0]
+    assert isinstance(first, m.Reset)
+    assert (first.seeds, first.options) == ([4, 5], {"toll": 1})
+    assert bundle.load.env_kwargs == {"ending": "exit", "actions": "array"}
+
+
+def test_an_older_reset_is_forgotten_and_a_new_jail_begins_anew(tmp_path: Path) -> None:
+    """The second death's bundle has nothing of what led to the first."""
+    with brittle(tmp_path, policy={"restart": "on_reset", "restart_backoff_s": 0}) as suites:
+        env = suites.env
+        env.set_attr("weight", 3.0)
+        env.reset(seed=1)
+        first = play(env)
+        env.reset(seed=2)
+        second = play(env)
+    assert first.bundle != second.bundle
+    bundle = load_bundle(Path(str(second.bundle)))
+    assert bundle.before == ()
+    assert [type(one).__name__ for one in bundle.requests[:2]] == ["Reset", "Step"]
+
+
+def test_a_mended_repository_survives(tmp_path: Path) -> None:
+    """The file is named that has changed, and the exit code says that nothing died."""
+    repository = tmp_path / "repository"
+    shutil.copytree(sample("brittle"), repository, ignore=shutil.ignore_patterns("__pycache__"))
+    policy = {"crash_folder": str(tmp_path / "crashes")}
+    with make_env(repository, policy=policy) as suites:
+        suites.env.reset(seed=1)
+        error = play(suites.env)
+    entry = repository / "env.py"
+    entry.write_text(entry.read_text().replace("os._exit(9)", "None"))
+    found = replayed(str(error.bundle), code=8)
+    assert (found["verdict"], found["changed_files"]) == ("survived", ["env.py"])
+    entry.write_text(entry.read_text().replace('"exit": lambda: None', '"exit": lambda: 1 / 0'))
+    assert replayed(str(error.bundle), code=8)["replayed"]["death"] is None
+    entry.write_text(entry.read_text().replace("lambda: 1 / 0", "lambda: os._exit(10)"))
+    found = replayed(str(error.bundle), code=7)
+    assert found["verdict"] == "different"
+    assert found["replayed"]["death"]["exit_code"] == 10
+
+
+def test_a_death_in_make_env_is_repeated_too(tmp_path: Path) -> None:
+    """There are no requests then, and no environment."""
+    kwargs = {"when": "make", "ending": "exit"}
+    policy = {"crash_folder": str(tmp_path)}
+    with pytest.raises(errors.WorkerDiedError) as caught:
+        make_env(sample("exits"), env_kwargs=kwargs, policy=policy)
+    found = replayed(str(caught.value.bundle), code=0)
+    assert (found["verdict"], found["replayed"]["requests"]) == ("same", 0)
+
+
+def test_a_process_that_was_given_up_leaves_a_bundle(tmp_path: Path) -> None:
+    """The reset that gives up on a hanging step raises nothing, and writes down why."""
+    kwargs = {"moment": "step", "fault": "hang"}
+    policy = {"crash_folder": str(tmp_path)}
+    timeouts = {"step_s": 0.5}
+    with make_env(sample("faulty"), env_kwargs=kwargs, policy=policy, timeouts=timeouts) as suites:
+        suites.env.reset(seed=1)
+        with pytest.raises(errors.WorkerTimeoutError):
+            suites.env.step([1])
+        suites.env.reset(seed=1)
+    [folder] = tmp_path.iterdir()
+    assert load_bundle(folder).death["reason"] == "timeout"
+    assert replayed(str(folder), code=0)["verdict"] == "same"
+
+
+def test_what_was_forgotten_is_said(tmp_path: Path) -> None:
+    """A replay of half of the requests does not claim to be one of all, nor ends like one."""
+    with brittle(tmp_path, policy={"crash_history": 10}) as suites:
+        suites.env.reset(seed=1)
+        error = play(suites.env)
+    found = replayed(str(error.bundle), code=7)
+    assert found["replayed"]["requests"] < found["recorded"]["requests"]
+    assert "had been forgotten" in found["doubts"][0]
+
+
+def test_no_bundle_where_none_is_wanted(tmp_path: Path) -> None:
+    """Neither with a history of 0, nor for what the caller has closed."""
+    with brittle(tmp_path, policy={"crash_history": 0}) as suites:
+        suites.env.reset(seed=1)
+        error = play(suites.env)
+    assert error.bundle is None
+    assert "envhub replay" not in str(error)
+    suites = brittle(tmp_path)
+    suites.env.reset(seed=1)
+    suites.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_death_is_told_although_no_bundle_can_be_written(tmp_path: Path) -> None:
+    """What hinders the bundle does not hide the death."""
+    (tmp_path / "taken").write_text("a file")
+    with brittle(tmp_path / "taken") as suites:
+        suites.env.reset(seed=1)
+        error = play(suites.env)
+    assert (error.exit_code, error.bundle) == (9, None)
+
+
+def test_the_oldest_bundles_give_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other things in the folder stay."""
+    monkeypatch.setattr(crashes, "KEPT", 2)
+    (tmp_path / "mine").mkdir()
+    policy = {"restart": "on_reset", "restart_backoff_s": 0}
+    with brittle(tmp_path, policy=policy) as suites:
+        bundles = []
+        for seed in range(4):
+            suites.env.reset(seed=seed)
+            bundles.append(str(play(suites.env).bundle))
+    assert (tmp_path / "mine").is_dir()
+    left = {str(path) for path in tmp_path.iterdir()} - {str(tmp_path / "mine")}
+    assert len(left) == 2
+    assert left <= set(bundles)
+    assert bundles[-1] in left or len({Path(one).name[:15] for one in bundles}) == 1
+
+
+def test_envhub_run_names_the_bundle() -> None:
+    """In its text, after the last output."""
+    arguments = ("--env-kwargs", "moment=step", "--env-kwargs", "fault=kill", "--episodes", "1")
+    done = envhub("run", sample("faulty"), *arguments, "--steps", "50")
+    assert done.returncode == 5
+    output, _, command = done.stderr.partition("To try the same again: envhub replay ")
+    assert "about to kill" in output
+    assert eventually(lambda: (Path(command.strip()) / "bundle.json").exists())

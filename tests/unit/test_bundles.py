@@ -1,0 +1,256 @@
+"""Bundles are untrusted: what is broken is refused, what is asked for is told, nothing is run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from envhub_sandbox import bundles, crashes
+from envhub_sandbox.bundles import load_bundle, replayed_arguments, wishes
+from envhub_sandbox.cli.console import safe_line
+from envhub_sandbox.errors import BundleError, WorkerDiedError
+from envhub_sandbox.history import History
+from envhub_sandbox.policy import Limits, Policy, Timeouts
+from envhub_sandbox.replay import Verdict, replay
+from envhub_worker.protocol import messages as m
+
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+
+
+def bundle(folder: Path, **options: Any) -> Path:
+    """A bundle of a reset and three steps, as ``crashes`` writes it."""
+    manifest: Any = SimpleNamespace(single_action_space=spaces.Discrete(5), num_envs=2)
+    history = History(manifest, 100)
+    history.requested(lambda number, bounds: m.Reset(0, [1, 2], None, None))
+    for number in range(3):
+        history.step(np.array([number, number]))
+    given = {"policy": Policy(), "timeouts": Timeouts(), "python": None, "endpoint": None}
+    crash = crashes.Crash(
+        error=WorkerDiedError("it died", exit_code=7, request="step"),
+        label="org/repo",
+        provenance={
+            "repository": "org/repo",
+            "repo_type": "model",
+            "commit": COMMIT,
+            "path": "env.py",
+            "files": {"env.py": "git-sha1:00"},
+        },
+        load=m.Load(2, False, None, {"size": np.arange(3)}),
+        options=given | options,
+        task={"suite": "s", "task": 0, "num_envs": 2, "shards": 1, "lane": "frames"},
+        shared=False,
+        recording=history.recording(),
+    )
+    return crashes.keep(folder, crash)
+
+
+def edit(folder: Path, *path: Any, value: Any) -> None:
+    """Change one member of ``bundle.json``."""
+    file = folder / "bundle.json"
+    document = json.loads(file.read_text())
+    place = document
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    file.write_text(json.dumps(document))
+
+
+def test_a_bundle_comes_back(tmp_path: Path) -> None:
+    """What was written is what is read."""
+    found = load_bundle(bundle(tmp_path))
+    assert found.reference == f"models/org/repo@{COMMIT}"
+    assert found.doubts == ()
+    assert found.steps == 3
+    assert [type(one).__name__ for one in found.requests] == ["Reset", "Step", "Step", "Step"]
+    assert found.load.env_kwargs["size"].tolist() == [0, 1, 2]  # type: ignore[attr-defined]
+    assert wishes(found) == []
+    arguments = replayed_arguments(found, granted=False)
+    assert arguments["policy"]["crash_history"] == 0
+    assert (arguments["num_workers"], arguments["lane"]) == (1, "frames")
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("format",), 2),
+        (("label",), 5),
+        (("provenance",), []),
+        (("provenance", "commit"), "main"),
+        (("provenance", "repository"), "../.."),
+        (("provenance", "repo_type"), "trap"),
+        (("provenance", "path"), "/etc/passwd"),
+        (("provenance", "files"), {"env.py": 5}),
+        (("death", "reason"), None),
+        (("task", "task"), 1.5),
+        (("task", "num_envs"), "2"),
+        (("history", "requests", 0), "reset"),
+        (("history", "requests", 1, "steps"), [0, 4]),
+        (("history", "requests", 1, "steps"), [-1, 2]),
+        (("history", "requests", 1, "steps"), [0, 1e9]),
+        (("history", "requests", 1, "of"), "../../../etc/passwd"),
+        (("history", "requests", 1, "of"), "actions-object.npy"),
+        (("history", "requests", 1, "of"), "actions-float32.npy"),
+        (("history", "requests"), [{"operation": "reset"}] * 2),
+        (("history", "dropped"), True),
+    ],
+)
+def test_a_broken_index_is_refused(tmp_path: Path, path: tuple[Any, ...], value: Any) -> None:
+    """Types, bounds, names of files: everything is checked before it is used."""
+    folder = bundle(tmp_path)
+    edit(folder, *path, value=value)
+    with pytest.raises(BundleError, match="no crash bundle that can be read"):
+        load_bundle(folder)
+
+
+def _pickled(folder: Path) -> None:
+    array = np.empty((3, 2), object)
+    np.save(folder / "actions-int64.npy", array, allow_pickle=True)
+
+
+def _claims_more(folder: Path) -> None:
+    data = (folder / "actions-int64.npy").read_bytes()
+    (folder / "actions-int64.npy").write_bytes(data.replace(b"(3, 2), }    ", b"(3, 2000), } "))
+
+
+def _link(folder: Path) -> None:
+    (folder / "bundle.json").rename(folder.parent / "elsewhere.json")
+    (folder / "bundle.json").symlink_to(folder.parent / "elsewhere.json")
+
+
+def _nested(folder: Path) -> None:
+    (folder / "bundle.json").write_text("[" * 200_000)
+
+
+def _huge(folder: Path) -> None:
+    with open(folder / "requests.bin", "r+b") as file:
+        file.truncate(bundles.MAX_FILE_BYTES + 1)
+
+
+def _noise(folder: Path) -> None:
+    (folder / "requests.bin").write_bytes(bytes(range(256)))
+
+
+def _pickled_argument(folder: Path) -> None:
+    frames = m.pack(m.Load(1, False, None, {"a": object()}), 0, pickler=lambda value: b"cos\n.")
+    (folder / "arguments.bin").write_bytes(crashes._packet(frames))
+
+
+@pytest.mark.parametrize(
+    "harm",
+    [_pickled, _claims_more, _link, _nested, _huge, _noise, _pickled_argument],
+    ids=lambda harm: harm.__name__.strip("_"),
+)
+def test_a_hostile_file_is_refused(tmp_path: Path, harm: Callable[[Path], None]) -> None:
+    """Nothing is unpickled, nothing followed, nothing read beyond the bounds."""
+    folder = bundle(tmp_path)
+    harm(folder)
+    with pytest.raises(BundleError):
+        load_bundle(folder)
+
+
+def test_repetition_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small file cannot stand for an endless number of steps."""
+    monkeypatch.setattr(bundles, "MAX_REQUESTS", 100)
+    folder = bundle(tmp_path)
+    again = {"steps": [0, 3], "of": "actions-int64.npy"}
+    edit(folder, "history", "requests", value=[{"operation": "reset"}, *[again] * 33])
+    assert load_bundle(folder).steps == 99
+    edit(folder, "history", "requests", value=[{"operation": "reset"}, *[again] * 34])
+    with pytest.raises(BundleError, match="more than 100 requests"):
+        load_bundle(folder)
+
+
+def test_wishes_beyond_an_ordinary_run_are_told(tmp_path: Path) -> None:
+    """They are granted by the user, or left out."""
+    policy = Policy(
+        profile="no-userns",
+        network="host",
+        readable=("/data",),
+        environment=("SECRET",),
+        limits=Limits(memory_bytes=64 << 30, processes=7, cpu_s=5),
+    )
+    found = load_bundle(
+        bundle(tmp_path, policy=policy, python="/tmp/python", endpoint="https://evil.example")
+    )
+    assert [wish.partition("=")[0] for wish in wishes(found)] == [
+        *("profile", "network", "readable", "environment", "limits.memory_bytes"),
+        *("endpoint", "python"),
+    ]
+    refused = replayed_arguments(found, granted=False)
+    assert set(refused["policy"]) == {"limits", "crash_history"}
+    assert refused["policy"]["limits"]["processes"] == 7
+    assert refused["policy"]["limits"]["cpu_s"] == 5
+    assert "memory_bytes" not in refused["policy"]["limits"]
+    assert not {"python", "endpoint"} & set(refused)
+    granted = replayed_arguments(found, granted=True)
+    assert granted["policy"]["network"] == "host"
+    assert granted["policy"]["limits"]["memory_bytes"] == 64 << 30
+    assert granted["python"] == "/tmp/python"
+    assert Policy(**{**granted["policy"], "limits": Limits(**granted["policy"]["limits"])})
+
+
+def test_text_of_a_bundle_cannot_paint(tmp_path: Path) -> None:
+    """Whatever is shown has lost its control characters."""
+    folder = bundle(tmp_path)
+    edit(folder, "label", value="\x1b[31mred")
+    edit(folder, "death", "signal", value="\x1b]0;title\x07")
+    found = load_bundle(folder)
+    assert "\x1b" not in found.label + found.death["signal"] + safe_line(found.label)
+
+
+class Recorder:
+    """An environment that writes down what it is asked, and dies at its fourth step."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+        self.num_envs = 2
+
+    def reset(self, **arguments: Any) -> None:
+        """Note it."""
+        self.asked.append(f"reset {arguments['seed']}")
+
+    def step(self, actions: Any) -> None:
+        """Note it; the third is the last."""
+        self.asked.append(f"step {actions.tolist()}")
+        if len(self.asked) == 4:
+            raise WorkerDiedError("again", exit_code=7)
+
+    def close(self) -> None:
+        """Nothing that a bundle may ask for."""
+        self.asked.append("close")
+
+
+def test_a_replay_asks_the_same(tmp_path: Path) -> None:
+    """In order; the verdict compares how and where it ended."""
+    env = Recorder()
+    found = replay(lambda: env, load_bundle(bundle(tmp_path)))
+    assert env.asked == ["reset [1, 2]", "step [0, 0]", "step [1, 1]", "step [2, 2]"]
+    assert (found.verdict, found.requests, found.steps) == (Verdict.SAME, 4, 3)
+
+
+def test_a_bundle_cannot_call_the_proxy_itself(tmp_path: Path) -> None:
+    """Only names that the repository's environment has beyond ours."""
+    folder = bundle(tmp_path)
+    calls: list[m.Message] = [m.CallOwn(0, "close", (), {}), m.GetOwn(0, "__dict__")]
+    packets = b"".join(crashes._packet(m.pack(call, 0)) for call in calls)
+    (folder / "requests.bin").write_bytes(packets)
+    edit(folder, "history", "requests", value=[{"operation": "callown"}] * 2)
+    env = Recorder()
+    assert replay(lambda: env, load_bundle(folder)).verdict is Verdict.SURVIVED
+    assert env.asked == []
+
+
+def test_a_request_that_does_not_fit_is_said(tmp_path: Path) -> None:
+    """An environment that has become another one takes other actions."""
+    env: Any = Recorder()
+    env.step = lambda actions: np.zeros(3).reshape(2)
+    found = replay(lambda: env, load_bundle(bundle(tmp_path)))
+    assert found.verdict is Verdict.DIFFERENT
+    assert "request 2 does not fit" in found.note

@@ -1,0 +1,196 @@
+"""The history of an environment: what is kept, in which order, and what gives way."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+
+from envhub_sandbox import history
+from envhub_sandbox.history import History, Recording, Requested, Steps
+from envhub_worker.protocol import messages as m
+from tests.support.compare import assert_same
+
+
+def made(space: Any = None, num_envs: int = 2, limit: int = 1000) -> History:
+    """A history of an environment with this single action space."""
+    manifest: Any = SimpleNamespace(
+        single_action_space=spaces.Discrete(5) if space is None else space, num_envs=num_envs
+    )
+    return History(manifest, limit)
+
+
+def ask(kept: History, message: m.Message) -> None:
+    """Record any request but a step."""
+    kept.requested(lambda number, bounds: message)
+
+
+def reset(kept: History, seeds: Any = None, mask: Any = None) -> None:
+    """Record a reset."""
+    ask(kept, m.Reset(0, seeds, None, mask))
+
+
+def actions_of(recording: Recording) -> list[Any]:
+    """The actions of all steps, as lists."""
+    runs = [request.actions for request in recording.requests if isinstance(request, Steps)]
+    return [row.tolist() for run in runs for row in run]
+
+
+def names_of(recording: Recording) -> list[str]:
+    """What was asked beside plain steps."""
+    return [one.operation for one in recording.requests if isinstance(one, Requested)]
+
+
+def test_requests_come_back_in_order() -> None:
+    """Steps in a row are one array; whatever lies between them keeps its place."""
+    kept = made()
+    reset(kept, [1, 2])
+    kept.step(np.array([0, 1]))
+    kept.step(np.array([2, 3]))
+    ask(kept, m.Render(0))
+    kept.step(np.array([4, 4]))
+    first, steps, render, last = kept.recording().requests
+    assert isinstance(first, Requested)
+    assert_same(m.unpack(first.frames)[1], m.Reset(0, [1, 2], None, None))
+    assert isinstance(steps, Steps)
+    assert_same(steps.actions, np.array([[0, 1], [2, 3]]))
+    assert isinstance(render, Requested)
+    assert isinstance(last, Steps)
+    assert kept.recording().exact
+
+
+@given(st.lists(st.sampled_from(["int64", "int32", "uint8"]), max_size=12))
+def test_every_step_keeps_its_dtype(dtypes: list[str]) -> None:
+    """An environment may tell them apart."""
+    kept = made()
+    expected = [np.array([1, 2], dtype) for dtype in dtypes]
+    for actions in expected:
+        kept.step(actions)
+    runs = kept.recording().requests
+    found = [row for run in runs if isinstance(run, Steps) for row in run.actions]
+    assert_same(found, expected)
+
+
+def test_the_caller_may_change_his_actions() -> None:
+    """What was sent is kept, whatever becomes of the array, the mapping or the options."""
+    flat = made()
+    array = np.array([1, 2])
+    flat.step(array)
+    array[:] = 0
+    assert actions_of(flat.recording()) == [[1, 2]]
+    nested = made(spaces.Dict(a=spaces.Discrete(3)))
+    parts = {"a": np.array([1, 2])}
+    nested.step(parts)
+    parts["a"][:] = 0
+    [request] = nested.recording().requests
+    assert isinstance(request, Requested)
+    step: Any = m.unpack(request.frames)[1]
+    assert_same(step.actions, {"a": np.array([1, 2])})
+    options = {"level": [1]}
+    ask(flat, m.Reset(0, None, options, np.array([True, False])))
+    options["level"].append(2)
+    last = flat.recording().requests[-1]
+    assert isinstance(last, Requested)
+    kept: Any = m.unpack(last.frames)[1]
+    assert kept.options == {"level": [1]}
+
+
+def test_a_reset_that_seeds_all_begins_anew() -> None:
+    """One without seeds, or of some sub-environments only, goes on."""
+    kept = made()
+    reset(kept, [1, 2])
+    kept.step(np.array([1, 1]))
+    reset(kept)
+    reset(kept, [None, 3])
+    reset(kept, [5, 6], np.array([True, False]))
+    assert names_of(kept.recording()) == ["reset"] * 4
+    assert kept.recording().seeded
+    reset(kept, [7, 8])
+    assert names_of(kept.recording()) == ["reset"]
+    assert actions_of(kept.recording()) == []
+
+
+def test_what_was_never_seeded_is_called_so() -> None:
+    """Then only the last reset counts: nobody knows what came before it either."""
+    kept = made()
+    reset(kept)
+    kept.step(np.array([1, 1]))
+    reset(kept, [1, None])
+    assert not kept.recording().seeded
+    assert names_of(kept.recording()) == ["reset"]
+
+
+def test_attributes_and_calls_outlast_a_reset() -> None:
+    """The last of each name comes before everything else; with arguments, each of them."""
+    kept = made()
+    ask(kept, m.SetAttr(0, "a", (1, 1)))
+    ask(kept, m.Call(0, "task", (), {}))
+    ask(kept, m.Call(0, "add", (1,), {}))
+    ask(kept, m.Call(0, "add", (2,), {}))
+    ask(kept, m.Call(0, "task", (), {}))
+    ask(kept, m.SetAttr(0, "a", (2, 2)))
+    reset(kept, [1, 2])
+    before: list[Any] = [m.unpack(one.frames)[1] for one in kept.recording().before]
+    assert [(type(one).__name__, one.name) for one in before] == [
+        ("Call", "add"),
+        ("Call", "add"),
+        ("Call", "task"),
+        ("SetAttr", "a"),
+    ]
+    assert before[-1].values == (2, 2)
+    kept.started()
+    reset(kept, [1, 2])
+    assert kept.recording().before == ()
+
+
+@given(limit=st.integers(1, 40), steps=st.integers(0, 200))
+def test_the_oldest_gives_way(limit: int, steps: int) -> None:
+    """At most as many as the limit says, the newest ones, and the rest is counted."""
+    kept = made(limit=limit)
+    for number in range(steps):
+        kept.step(np.array([number, number]))
+    found = actions_of(kept.recording())
+    assert len(found) <= limit
+    assert found == [[number, number] for number in range(steps - len(found), steps)]
+    assert kept.recording().dropped == steps - len(found)
+    assert kept.recording().exact is (steps == len(found))
+    assert len(found) >= min(steps, limit - limit // 64 - 2)
+
+
+@pytest.mark.parametrize(
+    "space", [spaces.Box(-1, 1, (1000,)), spaces.Dict(a=spaces.Box(-1, 1, (1000,)))]
+)
+def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch, space: Any) -> None:
+    """Large actions are fewer; so are large options."""
+    monkeypatch.setattr(history, "HISTORY_BYTES", 100_000)
+    kept = made(space, 1, limit=1000)
+    actions: Any = np.zeros((1, 1000))
+    for _ in range(100):
+        kept.step({"a": actions} if isinstance(space, spaces.Dict) else actions)
+    assert 5 <= 100 - kept.recording().dropped <= 12
+    for _ in range(30):
+        ask(kept, m.Reset(0, None, {"map": np.zeros(5000)}, np.array([True])))
+    assert len(kept.recording().requests) <= 3
+
+
+def test_what_only_pickle_could_carry_is_described() -> None:
+    """The recording knows that it is not the thing itself."""
+    kept = made()
+    ask(kept, m.Call(0, "add", (object(),), {}))
+    [request] = kept.recording().requests
+    assert isinstance(request, Requested)
+    assert not kept.recording().exact
+    assert "remote object" in repr(m.unpack(request.frames)[1])
+
+
+def test_nothing_is_kept_where_nothing_is_wanted() -> None:
+    """A limit of 0 turns it off."""
+    kept = made(limit=0)
+    reset(kept, [1, 2])
+    kept.step(np.array([1, 2]))
+    assert kept.recording() == Recording()
