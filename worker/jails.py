@@ -312,6 +312,15 @@ class Jails:
             entry.output.read()
             self._answers.reply(asker, m.Output(entry.output.text()))
 
+    def follow_output(self, asker: Asker, request: m.FollowOutput) -> None:
+        """Tell what a jail has printed since, also if it is dead."""
+        entry = self._jails.get(request.jail)
+        if entry is None or entry.session != asker.session:
+            self._answers.refuse(asker, "WorkerError", f"there is no jail {request.jail}")
+            return
+        entry.output.read()
+        self._answers.reply(asker, m.OutputBytes(*entry.output.since(request.offset)))
+
     def status(self, asker: Asker, request: m.GetStatus) -> None:
         """Tell what the asker's jails are doing."""
         mine = [entry for entry in self._jails.values() if entry.session == asker.session]

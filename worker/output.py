@@ -7,6 +7,8 @@ import os
 from envhub_worker.protocol.text import printable
 
 _CHUNK = 1 << 16
+MAX_BYTES = 1 << 20
+"""What one reply tells at most."""
 
 
 class OutputTail:
@@ -16,6 +18,7 @@ class OutputTail:
         self._fd = fd
         self._limit = limit
         self._kept = bytearray()
+        self._total = 0
 
     def fileno(self) -> int:
         """The descriptor, or -1 when the pipe has ended."""
@@ -23,6 +26,8 @@ class OutputTail:
 
     def read(self) -> None:
         """Take what is there. One read a call, so that a flood cannot hold up the server."""
+        if self._fd < 0:
+            return
         try:
             data = os.read(self._fd, _CHUNK)
         except BlockingIOError:
@@ -30,8 +35,15 @@ class OutputTail:
         if not data:
             self.close()
         self._kept += data
+        self._total += len(data)
         if len(self._kept) > 2 * self._limit:
             del self._kept[: -self._limit]
+
+    def since(self, offset: int) -> tuple[int, bytes]:
+        """What came from this byte on, and where that begins: later, if it is not kept any more."""
+        first = self._total - len(self._kept)
+        start = min(max(offset, first), self._total)
+        return start, bytes(self._kept[start - first : start - first + MAX_BYTES])
 
     def text(self, lines: int = 40) -> str:
         """The last lines, fit for a terminal."""

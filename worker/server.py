@@ -147,5 +147,6 @@ _HANDLERS: dict[type[m.Message], Callable[[Jails, Asker, Any], None]] = {
     m.KeepJail: Jails.keep,
     m.CloseJail: Jails.close_jail,
     m.ReadOutput: Jails.read_output,
+    m.FollowOutput: Jails.follow_output,
     m.GetStatus: Jails.status,
 }

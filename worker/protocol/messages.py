@@ -351,6 +351,27 @@ class Sessions(Message):
     sessions: tuple[object, ...]
 
 
+@_message(28)
+@dataclass(frozen=True, slots=True)
+class FollowOutput(Message):
+    """Ask for what a jail has printed from its ``offset``-th byte on. Reply: ``OutputBytes``.
+
+    Also after the jail's death, until it is closed.
+    """
+
+    jail: int
+    offset: int
+
+
+@_message(29)
+@dataclass(frozen=True, slots=True)
+class OutputBytes(Message):
+    """Bytes that a jail printed. Trust: raw; what lay before ``start`` is not kept any more."""
+
+    start: int
+    data: bytes
+
+
 # --- client and jail host ----------------------------------------------------------------------
 
 
