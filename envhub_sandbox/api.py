@@ -20,6 +20,7 @@ from envhub_sandbox.reference import HubRef, is_local
 from envhub_sandbox.remote_env import RemoteEnv
 from envhub_sandbox.repository import LoadArguments, LoadedJail, Repository
 from envhub_sandbox.sandboxes.base import Sandbox
+from envhub_sandbox.sharding import bounds_for
 from envhub_sandbox.snapshot import Snapshot, fetch, local
 from envhub_sandbox.suites import EnvSuites
 from envhub_sandbox.vector_env import SandboxVectorEnv
@@ -65,7 +66,7 @@ def make_env(
         endpoint: As in huggingface_hub.
         python: The interpreter that runs the repository; this one by default.
         num_workers: Processes over which the sub-environments are spread; by default one, or with
-            ``use_async_envs`` as many as there are cores.
+            ``use_async_envs`` as many as are useful for the cores there are.
         lane: ``"auto"`` steps over shared memory where that is possible, ``"frames"`` never does.
         copy: False lends observations instead of copying them, as in Gymnasium; still no later
             step changes an array that somebody holds, but the worker could.
@@ -188,7 +189,9 @@ class _Maker:
     def _remote(self, env: EnvManifest, shared: SharedJail | None) -> RemoteEnv:
         own = OwnJails(self._repository, self._cache.forget)
         source: JailSource = own if shared is None else shared
-        return RemoteEnv(source, env, _shards(env, self._num_workers))
+        paces = self._cache.paces
+        bounds = bounds_for(env, self._num_workers, paces.of(env))
+        return RemoteEnv(source, env, bounds, paces)
 
     def _use(self, loaded: LoadedJail, remotes: list[RemoteEnv]) -> None:
         """The jail that told the manifest becomes the only task's; a suite holds none in stock."""
@@ -197,14 +200,6 @@ class _Maker:
                 remotes[0].adopt(loaded)
         else:
             self._repository.close(loaded)
-
-
-def _shards(env: EnvManifest, num_workers: int | None) -> int:
-    if not env.shardable:
-        return 1
-    if num_workers is not None:
-        return max(1, min(num_workers, env.num_envs))
-    return 1 if env.sync else min(len(os.sched_getaffinity(0)), env.num_envs)
 
 
 def _reference(cfg: Any) -> tuple[str, Any]:

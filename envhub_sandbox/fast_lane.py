@@ -21,6 +21,7 @@ from envhub_sandbox.cores import CPUS, Cores
 from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import RemoteProtocolError, WorkerTimeoutError
 from envhub_sandbox.observations import RING, ObservationSlab
+from envhub_sandbox.sharding import Pace, awake_shards
 from envhub_sandbox.slab import SEAL_FUTURE_WRITE, slab
 from envhub_sandbox.spinning import SpinChooser
 from envhub_sandbox.tensors import to_tensor
@@ -32,6 +33,8 @@ from envhub_worker.protocol.manifest import EnvManifest
 _RING = (1).to_bytes(8, "little")
 _RECHECK_MS = 2
 _CONNECT_S = 5.0
+_PACE_STEPS = 256
+"""Steps after which what they took is worth remembering."""
 # elsewhere a core may see the sequence word before the data it announces: sleep, do not poll
 _ORDERED_STORES = platform.machine() in ("x86_64", "AMD64")
 
@@ -131,6 +134,11 @@ class LaneShard:
         tells = self._tells
         return tells[slabs.OUTCOME] == slabs.DONE and not tells[slabs.LENGTH]
 
+    @property
+    def busy_ns(self) -> int:
+        """What the last measured step took the host. Trust: it says so itself."""
+        return self._tells[slabs.BUSY]
+
     def park(self, parked: int) -> None:
         """Say whether we sleep and want our doorbell rung."""
         self._asks[slabs.PARKED] = parked
@@ -212,7 +220,7 @@ class FastLane:
         self.elapsed_ns = 0
         # One core is the client's. Shards that find no other sleep until they are asked, then run
         # on the client's while it sleeps: so it waits for those first, and for the others awake.
-        self._awake = min(len(self.shards), len(CPUS) - 1)
+        self._awake = awake_shards(len(self.shards))
         self._cores = Cores(len(self.shards), self._awake)
         self._sleepers = self.shards[self._awake :]
         self._wakers = self.shards[: self._awake]
@@ -311,6 +319,15 @@ class FastLane:
                 shard.silence()
                 return True
         return False
+
+    def pace(self, step_s: float) -> Pace | None:
+        """What the steps took, given their median; None after too few of them."""
+        busy = [shard.busy_ns for shard in self.shards]
+        if self.shards[0].sequence < _PACE_STEPS or not all(busy):
+            return None
+        step_ns = sum(busy) / self.observations.layout.count
+        asleep = busy[self._awake :]
+        return Pace(step_ns, max(1.0, step_s * 1e9 - max(asleep)) if asleep else None)
 
     def observation(self) -> Any:
         """The batched observation: arrays that no later step changes."""

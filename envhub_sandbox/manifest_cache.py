@@ -15,6 +15,7 @@ from pathlib import Path
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.policy import Policy
+from envhub_sandbox.sharding import PaceBook
 from envhub_sandbox.snapshot import Snapshot
 from envhub_worker import protocol
 from envhub_worker.protocol import messages as m
@@ -35,6 +36,11 @@ class ManifestCache:
 
     def __init__(self, folder: Path, key: str | None) -> None:
         self._path = None if key is None else folder / key
+
+    @property
+    def paces(self) -> PaceBook:
+        """What the environments took, which lies beside the entry."""
+        return PaceBook(None if self._path is None else self._path.with_suffix(".pace"))
 
     def load(self, *, max_elements: int) -> Manifest | None:
         """The remembered manifest, if there is one that can be read."""

@@ -33,10 +33,10 @@ from envhub_sandbox.jail_sources import JailSource, SharedJail
 from envhub_sandbox.repository import LoadedJail, Repository
 from envhub_sandbox.restarts import Restarts
 from envhub_sandbox.results import Results, StepResult
+from envhub_sandbox.sharding import PaceBook
 from envhub_sandbox.stats import Counters
 from envhub_worker.protocol import batches, slabs
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.batches import even_bounds
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from envhub_worker.protocol.manifest import EnvManifest
 
@@ -64,12 +64,20 @@ class RemoteEnv:
     Args:
         jails: Gives and takes back the jail.
         manifest: What the environment is expected to be.
-        shards: Over how many processes its sub-environments are spread.
+        bounds: The slices of its sub-environments, one for each shard.
+        paces: Takes note of what its steps took.
     """
 
-    def __init__(self, jails: JailSource, manifest: EnvManifest, shards: int) -> None:
+    def __init__(
+        self,
+        jails: JailSource,
+        manifest: EnvManifest,
+        bounds: Sequence[tuple[int, int]],
+        paces: PaceBook,
+    ) -> None:
         self.manifest = manifest
-        self.bounds = even_bounds(manifest.num_envs, shards)
+        self.bounds = list(bounds)
+        self._paces = paces
         self.lifecycle = Lifecycle()
         self._jails = jails
         self._lock = threading.RLock()  # a signal handler may close what its own thread waits for
@@ -499,6 +507,7 @@ class RemoteEnv:
         try:
             state, loaded = self.lifecycle.state, self._loaded
             self._moved(Event.CLOSE)
+            self._note_pace()
             if loaded is not None:
                 if state is State.READY:
                     self._close_politely(loaded)
@@ -533,6 +542,11 @@ class RemoteEnv:
                 self._let_server_go()
             finally:
                 self._lock.release()
+
+    def _note_pace(self) -> None:
+        pace = self._lane and self._lane.pace(self.counters.median_step_s())
+        if pace:
+            self._paces.note(self.manifest, pace)
 
     def _close_lane(self) -> None:
         lane, self._lane = self._lane, None

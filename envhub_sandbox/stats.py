@@ -47,6 +47,10 @@ class Counters:
             "step_latency_s": self._percentiles(),
         }
 
+    def median_step_s(self) -> float:
+        """The median of the last steps, in seconds; 0 before there is one."""
+        return self._percentiles().get("p50", 0.0)
+
     def _percentiles(self) -> dict[str, float]:
         kept = np.array(self._latencies[: min(self._steps, KEPT)], np.float64) / 1e9
         if not kept.size:

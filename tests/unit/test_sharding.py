@@ -1,0 +1,140 @@
+"""Who gets how many sub-environments, and what is remembered of them."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+
+from envhub_sandbox import sharding
+from envhub_sandbox.sharding import Pace, PaceBook, bounds_for
+from envhub_worker.protocol.manifest import EnvManifest
+
+SHORT = Pace(step_ns=3_000, wake_ns=15_000)
+LONG = Pace(step_ns=2e6, wake_ns=15_000)
+
+
+@pytest.fixture(autouse=True)
+def _two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sharding, "CPUS", [0, 1])
+    monkeypatch.setattr(sharding.os, "sched_getaffinity", lambda pid: {0, 1})
+
+
+def environment(count: int, *, sync: bool = False, shardable: bool = True) -> EnvManifest:
+    """An environment of so many sub-environments."""
+    space = spaces.Discrete(2)
+    return EnvManifest(
+        suite="suite",
+        task=0,
+        num_envs=count,
+        single_observation_space=space,
+        single_action_space=space,
+        observation_space=spaces.MultiDiscrete([2] * count),
+        action_space=spaces.MultiDiscrete([2] * count),
+        autoreset_mode="NextStep",
+        metadata={},
+        render_mode=None,
+        spec=None,
+        attributes=(),
+        shardable=shardable,
+        sync=sync,
+        type_name="",
+    )
+
+
+def sizes(*arguments: object) -> list[int]:
+    """How many each shard gets."""
+    return [stop - start for start, stop in bounds_for(*arguments)]  # type: ignore[arg-type]
+
+
+def test_the_first_use_is_shared_out_evenly() -> None:
+    """Nobody knows yet how long a step takes."""
+    assert sizes(environment(16), None, None) == [8, 8]
+
+
+def test_a_shard_that_sleeps_gets_less_of_short_steps() -> None:
+    """Its wake-up is worth four of these steps."""
+    assert sizes(environment(16), None, SHORT) == [10, 6]
+
+
+def test_long_steps_are_shared_out_evenly() -> None:
+    """A wake-up is nothing beside them."""
+    assert sizes(environment(16), None, LONG) == [8, 8]
+
+
+def test_a_shard_that_brings_nothing_is_not_started() -> None:
+    """Four short steps are done before the second shard is awake."""
+    assert sizes(environment(4), None, SHORT) == [4]
+
+
+def test_a_number_of_workers_is_kept() -> None:
+    """Who asks for two gets two, if there are two sub-environments."""
+    assert sizes(environment(4), 2, SHORT) == [3, 1]
+    assert sizes(environment(1), 2, SHORT) == [1]
+
+
+@pytest.mark.parametrize("pace", [None, SHORT, LONG])
+def test_what_may_share_state_stays_together(pace: Pace | None) -> None:
+    """A SyncVectorEnv's sub-environments live in one process, and so does what is no such env."""
+    assert sizes(environment(16, sync=True), None, pace) == [16]
+    assert sizes(environment(16, shardable=False), 4, pace) == [16]
+
+
+@given(
+    count=st.integers(1, 200),
+    workers=st.none() | st.integers(1, 20),
+    step_ns=st.floats(1, 1e12, exclude_max=True),
+    wake_ns=st.none() | st.floats(1, 1e12, exclude_max=True),
+)
+def test_every_sub_environment_has_one_shard(
+    count: int, workers: int | None, step_ns: float, wake_ns: float | None
+) -> None:
+    """Slices are adjacent, none is empty, and together they are all."""
+    bounds = bounds_for(environment(count), workers, Pace(step_ns, wake_ns))
+    assert [start for start, _ in bounds] == [0, *(stop for _, stop in bounds[:-1])]
+    assert bounds[-1][1] == count
+    assert all(start < stop for start, stop in bounds)
+
+
+def test_a_pace_is_remembered(tmp_path: Path) -> None:
+    """For one environment of many, until another is noted."""
+    book = PaceBook(tmp_path / "entry.pace")
+    env, other = environment(2), replace(environment(2), task=1)
+    assert book.of(env) is None
+    book.note(env, SHORT)
+    book.note(other, LONG)
+    assert (book.of(env), book.of(other)) == (SHORT, LONG)
+
+
+def test_a_use_without_a_sleeping_shard_forgets_a_little(tmp_path: Path) -> None:
+    """A machine that was busy once is not taken for a busy one for ever."""
+    book = PaceBook(tmp_path / "entry.pace")
+    env = environment(2)
+    book.note(env, Pace(3_000, 1e6))
+    for _ in range(30):
+        book.note(env, Pace(3_000, None))
+    assert book.of(env) == SHORT
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "[]", '{"[\\"suite\\", \\"0\\"]": [0, -1]}', '{"[\\"suite\\", \\"0\\"]": [NaN, 1]}'],
+)
+def test_an_unreadable_book_is_empty(tmp_path: Path, text: str) -> None:
+    """A cache that somebody spoilt costs speed and nothing else."""
+    path = tmp_path / "entry.pace"
+    path.write_text(text)
+    assert PaceBook(path).of(environment(2)) is None
+
+
+def test_nothing_is_written_where_nothing_may_be_remembered() -> None:
+    """Arguments without a stable form have no entry, and no pace."""
+    book = PaceBook(None)
+    book.note(environment(2), SHORT)
+    assert book.of(environment(2)) is None
