@@ -74,7 +74,7 @@ def _weighted(
     small = round((count - awake * fewer) / shards)
     if small < 1 and may_drop:
         return even_bounds(count, awake)
-    small = max(1, small)
+    small = min(max(1, small), (count - awake) // sleepers)
     large = count - sleepers * small
     bounds = even_bounds(large, awake)
     starts = range(large, count, small)

@@ -124,7 +124,7 @@ def test_a_use_without_a_sleeping_shard_forgets_a_little(tmp_path: Path) -> None
 
 @pytest.mark.parametrize(
     "text",
-    ["", "[]", '{"[\\"suite\\", \\"0\\"]": [0, -1]}', '{"[\\"suite\\", \\"0\\"]": [NaN, 1]}'],
+    ["", "[]", *(json.dumps({'["suite", "0"]': pair}) for pair in ([0, -1], [math.nan, 1]))],
 )
 def test_an_unreadable_book_is_empty(tmp_path: Path, text: str) -> None:
     """A cache that somebody spoilt costs speed and nothing else."""
