@@ -56,8 +56,8 @@ def make_env(
         use_async_envs: Passed on likewise; sub-environments may then run in several processes.
         hub_cache_dir: huggingface_hub's ``cache_dir``.
         trust_remote_code: Only for ``sandbox=None``.
-        sandbox: ``"process"``, ``"docker"`` (or a ``DockerSandbox``), or None to run the code here,
-            as LeRobot does.
+        sandbox: ``"process"``; ``"docker"``, ``"docker:IMAGE"`` or a ``DockerSandbox``; or None to
+            run the code here, as LeRobot does.
         env_kwargs: Further keyword arguments for the repository's ``make_env``.
         policy: What the code may reach; see ``Policy``.
         timeouts: How long operations may take; see ``Timeouts``.
@@ -233,10 +233,11 @@ def _sandbox(sandbox: str | Sandbox) -> Sandbox:
         from envhub_sandbox.sandboxes.process import PROCESS
 
         return PROCESS
-    if sandbox == "docker":
+    kind, _, image = sandbox.partition(":")
+    if kind == "docker":
         from envhub_sandbox.sandboxes.docker import DockerSandbox
 
-        return DockerSandbox()
+        return DockerSandbox(image=image) if image else DockerSandbox()
     raise PolicyError(
         f"sandbox is {sandbox!r}; it is 'process', 'docker', or None to run the code here"
     )

@@ -15,6 +15,8 @@ from typing import Any
 from envhub_worker import __version__
 from envhub_worker.lockdown import landlock, probe
 
+ENVIRONMENT = Path("/opt/environment/bin/python")
+"""The interpreter of jails in an image that was derived for a repository."""
 _CGROUPS = Path("/sys/fs/cgroup")
 _NAMESPACED = frozenset({"user-namespace", "namespaces", "mount-namespace", "landlock", "seccomp"})
 _LANDLOCK_FOR_NO_USERNS = 3
@@ -32,7 +34,8 @@ def surroundings() -> dict[str, Any]:
         ``profiles``: those of a jail that can be had here, the strongest first; ``landlock``: its
         ABI; ``user``: our id; ``capabilities``: what some set holds, as a number;
         ``no_new_privileges``, ``seccomp``, ``read_only``: whether they hold; ``devices``: names
-        of network devices; ``memory``, ``pids`` and ``cpus``: limits, or None.
+        of network devices; ``memory``, ``pids`` and ``cpus``: limits, or None; ``python``: the
+        interpreter for jails, empty for this one.
     """
     status = _status()
     return {
@@ -47,6 +50,7 @@ def surroundings() -> dict[str, Any]:
         "memory": memory_limit(_CGROUPS),
         "pids": pids_limit(_CGROUPS),
         "cpus": cpus_limit(_CGROUPS),
+        "python": str(ENVIRONMENT) if ENVIRONMENT.exists() else "",
     }
 
 

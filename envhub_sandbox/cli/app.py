@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from envhub_sandbox.cli import cache, doctor, inspect, replay, run, version
+from envhub_sandbox.cli import cache, doctor, gc, image, inspect, replay, run, version
 from envhub_sandbox.cli.exits import EXIT_CODES
 
 app = typer.Typer(
@@ -23,4 +23,6 @@ app.command("inspect", epilog=EXIT_CODES)(inspect.inspect)
 app.command("replay", epilog=EXIT_CODES)(replay.replay)
 app.command("doctor")(doctor.doctor)
 app.add_typer(cache.app, name="cache")
+app.add_typer(image.app, name="image")
+app.command("gc")(gc.gc)
 app.command("version")(version.version)

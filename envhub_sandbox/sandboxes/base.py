@@ -52,6 +52,7 @@ class EnclosedServer(WorkerServer, Protocol):
         layers: What holds around it, one mapping a layer: ``layer``, ``enforced``, ``detail``.
         profile: The profile of its jails, chosen among what can be had in there.
         snapshot: Where its jails find the repository's files.
+        python: The interpreter of its jails; empty for the server's own.
     """
 
     @property
@@ -60,6 +61,8 @@ class EnclosedServer(WorkerServer, Protocol):
     def profile(self) -> str: ...  # noqa: D102
     @property
     def snapshot(self) -> str: ...  # noqa: D102
+    @property
+    def python(self) -> str: ...  # noqa: D102
 
 
 class RepositorySandbox(Sandbox, Protocol):

@@ -118,6 +118,7 @@ class ContainerServer:
     Attributes:
         layers: What holds around it.
         profile: That of its jails.
+        python: Their interpreter; empty for the server's own.
     """
 
     folder: Path
@@ -125,7 +126,7 @@ class ContainerServer:
     process_fd: int
     layers: list[Mapping[str, Any]]
     profile: str
-    name: str
+    python: str
     owner: int = field(default_factory=os.getpid)
     users: int = 0
     snapshot: str = containers.SNAPSHOT
@@ -227,7 +228,7 @@ class RepositoryContainer:
         layers = enclosure.layers(wanted, found, title)
         profile = enclosure.profile_for(self._policy.profile, found)
         fd = os.pidfd_open(process.pid)
-        return ContainerServer(folder, process, fd, [*layers], profile, wanted.name)
+        return ContainerServer(folder, process, fd, [*layers], profile, found.python)
 
     def _wanted(self, folder: Path) -> Container:
         options, policy = self._options, self._policy

@@ -39,6 +39,7 @@ class Surroundings:
     memory: int | None
     pids: int | None
     cpus: float | None
+    python: str
 
 
 def parse(line: bytes) -> Surroundings:
@@ -61,6 +62,7 @@ def parse(line: bytes) -> Surroundings:
             memory=None if said["memory"] is None else int(said["memory"]),
             pids=None if said["pids"] is None else int(said["pids"]),
             cpus=None if said["cpus"] is None else float(said["cpus"]),
+            python=str(said["python"]),
         )
     except (ValueError, LookupError, TypeError) as error:
         raise WorkerStartupError(

@@ -1,0 +1,48 @@
+"""``envhub gc``: remove what clients that were killed left behind."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from envhub_sandbox.cli.console import console, print_json, safe_line, say
+from envhub_sandbox.cli.exits import reported
+
+if TYPE_CHECKING:
+    from envhub_sandbox.sandboxes.leftovers import Leftover
+
+
+def gc(
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", "-n", help="Say what would be removed.")
+    ] = False,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document on stdout.")
+    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Remove containers, runtime folders and control groups whose client is gone.
+
+    Usually there are none: they end with the client. Never touched are those of a client that
+    still runs, of another user, or of anything but envhub.
+    """
+    with reported(debug=debug):
+        from envhub_sandbox.sandboxes import leftovers
+
+        found = leftovers.find()
+        removed = [] if dry_run else [one for one in found if one.remove()]
+        if json:
+            items = [
+                {"kind": one.kind, "name": one.name, "removed": one in removed} for one in found
+            ]
+            print_json({"found": items})
+            return
+        for one in found:
+            done = "removed" if one in removed else "found" if dry_run else "could not remove"
+            console().print(f"{done}: {one.kind} {safe_line(one.name, 300)}", soft_wrap=True)
+        say(f"{len(found)} left behind, {len(removed)} removed.")
+
+
+def _item(one: Leftover, removed: bool) -> dict[str, object]:
+    return {"kind": one.kind, "name": one.name, "removed": removed}

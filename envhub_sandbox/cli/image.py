@@ -1,0 +1,118 @@
+"""``envhub image build``: a worker's image with a repository's packages in it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from envhub_sandbox.cli import options as opt
+from envhub_sandbox.cli.console import console, print_json, safe_line, say
+from envhub_sandbox.cli.exits import reported
+from envhub_sandbox.cli.progress import Bar
+
+if TYPE_CHECKING:
+    from envhub_sandbox.snapshot import Snapshot
+
+app = typer.Typer(
+    help="Container images for repositories.", no_args_is_help=True, rich_markup_mode="rich"
+)
+
+
+@app.callback()
+def images() -> None:
+    """Container images for repositories."""
+
+
+@app.command("build")
+def build(
+    ref: opt.Ref,
+    base: Annotated[
+        str, typer.Option(metavar="IMAGE", help="The worker's image that it derives from.")
+    ] = "envhub-worker",
+    engine: Annotated[
+        str | None, typer.Option(metavar="docker|podman", help="Docker, if it answers.")
+    ] = None,
+    apt: Annotated[
+        list[str] | None,
+        typer.Option(metavar="PACKAGE", help="A Debian package that it needs too (repeatable)."),
+    ] = None,
+    exclude_newer: Annotated[
+        str | None,
+        typer.Option(metavar="DATE", help="See no package that was uploaded after this date."),
+    ] = None,
+    build_network: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="The network of the build, as in 'docker build'."),
+    ] = None,
+    json: opt.Json = False,
+    token: opt.Token = None,
+    endpoint: opt.Endpoint = None,
+    hub_cache_dir: opt.HubCacheDir = None,
+    debug: opt.Debug = False,
+) -> None:
+    """Derive an image from envhub-worker with a repository's requirements.txt in it.
+
+    Its packages are pinned with hashes, wheels only: nothing of the repository runs. The image is
+    tagged by the hash of all that it is made of, so the same again costs nothing.
+    """
+    with reported(debug=debug):
+        with Bar(quiet=json) as bar:
+            bar.begin(f"reading {ref}")
+            snapshot = _snapshot(ref, token, endpoint, hub_cache_dir)
+            bar.begin("resolving and building")
+            made = _build(snapshot, base, engine, apt or [], exclude_newer, build_network)
+        if json:
+            print_json(made)
+            return
+        console().print(safe_line(made["image"], 300), soft_wrap=True)
+        say(f"{len(made['packages'])} packages, lock sha256:{made['lock']}")
+        say(f"Use it: envhub run {safe_line(ref)} --sandbox docker:{made['image']}")
+
+
+def _snapshot(
+    ref: str, token: str | None, endpoint: str | None, hub_cache_dir: str | None
+) -> Snapshot:
+    from envhub_sandbox.reference import HubRef, is_local
+    from envhub_sandbox.snapshot import fetch, local
+
+    if is_local(ref):
+        return local(ref)
+    parsed = HubRef.parse(ref)
+    return fetch(parsed, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
+
+
+def _build(
+    snapshot: Snapshot,
+    base: str,
+    engine_name: str | None,
+    system: list[str],
+    exclude_newer: str | None,
+    network: str | None,
+) -> dict[str, Any]:
+    from envhub_sandbox import requirements
+    from envhub_sandbox.errors import DependencyError
+    from envhub_sandbox.sandboxes import images
+    from envhub_sandbox.sandboxes.engines import find_engine, find_image
+
+    wanted = snapshot.root / requirements.FILE
+    if not wanted.is_file() and not system:
+        raise DependencyError(
+            f"{snapshot.repo_id} has no {requirements.FILE}: it needs no image of its own. Use "
+            f"--sandbox docker:{base}"
+        )
+    asked = requirements.read(wanted) if wanted.is_file() else []
+    engine = find_engine(engine_name)
+    identity = find_image(engine, base)
+    target = images.target_of(engine, base)
+    lock = requirements.resolve(
+        asked, python=target.python, machine=target.machine, exclude_newer=exclude_newer
+    )
+    is_local = snapshot.repo_type == "local"
+    name = Path(snapshot.repo_id).name if is_local else snapshot.repo_id
+    tag = images.tag_for(name, identity, lock, system)
+    known = images.exists(engine, tag)
+    if not known:
+        images.build(engine, images.dockerfile(base, lock, system), lock, tag, network)
+    return {"image": tag, "built": not known, "lock": lock.digest, "packages": lock.packages}
