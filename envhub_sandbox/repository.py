@@ -235,13 +235,14 @@ class Repository:
             raise
 
     def _order(self, server: WorkerServer) -> m.OpenJail:
-        snapshot, confinement = str(self.snapshot.root), self.policy.confinement()
+        confinement = self.policy.confinement()
+        snapshot, python = str(self.snapshot.root), self.python
         if isinstance(server, EnclosedServer):
-            snapshot = server.snapshot
+            snapshot, python = server.snapshot, server.python
             confinement = replace(confinement, profile=server.profile)
         return m.OpenJail(
             name=self.label,
-            python=self.python,
+            python=python,
             snapshot=snapshot,
             entry=self.snapshot.path,
             confinement=asdict(confinement),
