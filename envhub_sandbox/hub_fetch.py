@@ -12,6 +12,7 @@ from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
 from envhub_sandbox.hashing import Mismatch, copy_verified
 from envhub_sandbox.hub import HubClient, Repository
 from envhub_sandbox.hub_failures import HubFailure, Kind
+from envhub_sandbox.log import SNAPSHOT
 from envhub_sandbox.reference import HubRef
 from envhub_sandbox.snapshot_records import (
     FileRecord,
@@ -73,10 +74,13 @@ class Candidate:
         files = within_limits(listing, self.limits, slot.title)
         check_names(files, slot.title)
         self._require_entry(files)
+        size = sum(file.size for file in files)
+        SNAPSHOT.info("%s: downloading %d files, %d bytes", slot.title, len(files), size)
         folder = self.hub.download(self.repo, slot.commit)
         note = {"endpoint": self.hub.public_endpoint, **self.repo._asdict()}
         note["revision"] = None if self.ref.is_pinned else self.ref.revision or "main"
         store.publish(slot, files, self._copier(slot, folder), note)
+        SNAPSHOT.info("%s: verified, and in the store", slot.title)
 
     def _copier(self, slot: store.Slot, folder: Path) -> Callable[[FileRecord, Path], None]:
         def copy(record: FileRecord, target: Path) -> None:

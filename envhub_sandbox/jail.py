@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import cloudpickle  # type: ignore[import-untyped]
@@ -32,6 +32,7 @@ class RemoteJail:
         number: The server's number for it.
         hosts: Its hosts' numbers; sub-environments are spread over them in this order.
         report: One mapping per layer of the confinement: ``layer``, ``enforced``, ``detail``.
+        before_end: Runs before it is ended; brings what it has printed last.
     """
 
     def __init__(
@@ -46,11 +47,14 @@ class RemoteJail:
         self.number = number
         self.hosts = list(hosts)
         self.report = report
+        self.before_end: Callable[[], None] = _nothing
         self._limits = limits
 
     def through(self, client: WorkerClient) -> RemoteJail:
         """The same jail over another connection of ours."""
-        return RemoteJail(client, self.number, self.hosts, self.report, self._limits)
+        jail = RemoteJail(client, self.number, self.hosts, self.report, self._limits)
+        jail.before_end = self.before_end
+        return jail
 
     def start_hosts(self, count: int, deadline: Deadline) -> None:
         """Fork further hosts."""
@@ -110,12 +114,17 @@ class RemoteJail:
 
     def close(self, deadline: Deadline) -> None:
         """End the jail and everything in it. A server that has gone has ended it already."""
+        self.before_end()
         try:
             self.client.request(m.CloseJail(self.number), deadline=deadline)
         except WorkerError:
             pass
         finally:
             self.client.close()
+
+
+def _nothing() -> None:
+    """Nobody follows what it prints."""
 
 
 def open_jail(

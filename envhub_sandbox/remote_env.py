@@ -30,6 +30,7 @@ from envhub_sandbox.fast_lane import FastLane, JailGoneError, Outcome, deposit
 from envhub_sandbox.history import History
 from envhub_sandbox.jail import check, typed
 from envhub_sandbox.jail_sources import JailSource, SharedJail
+from envhub_sandbox.log import WORKER
 from envhub_sandbox.repository import LoadedJail, Repository
 from envhub_sandbox.restarts import Restarts
 from envhub_sandbox.results import Results, StepResult
@@ -351,6 +352,7 @@ class RemoteEnv:
     def _late(self, operation: str, timeout_s: float | None) -> WorkerTimeoutError:
         assert self._loaded is not None
         states = self.repository.states(self._loaded)
+        WORKER.info("%s: no answer to %s after %s s", self.repository.label, operation, timeout_s)
         busy = f" (its processes: {', '.join(states)})" if states else ""
         error = WorkerTimeoutError(
             f"{operation} has not finished after {timeout_s} s{busy}; reset() brings the "
@@ -368,6 +370,7 @@ class RemoteEnv:
             return self._closed(self._pending[1])
         self.counters.deaths += 1
         self._moved(Event.DEATH)
+        WORKER.info("%s: %s", self.repository.label, str(error).partition("\n")[0])
         if not isinstance(error, WorkerDiedError) and self._loaded is not None:
             self._jails.end(self._loaded)  # it lives, and cannot be trusted to do what it says
         if isinstance(error, WorkerDiedError):
@@ -484,6 +487,7 @@ class RemoteEnv:
 
     def _forget(self) -> None:
         """Give up the jail; the next request opens another, in the same server."""
+        WORKER.info("%s: the jail is given up for a fresh one", self.repository.label)
         self._let_server_go()
         self._release_server = self.repository.hold()
         if self._loaded is not None:

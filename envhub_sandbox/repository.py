@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +23,14 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.history import Recording
 from envhub_sandbox.jail import RemoteJail, check, open_jail
-from envhub_sandbox.log import CRASHES
+from envhub_sandbox.log import CRASHES, WORKER
 from envhub_sandbox.policy import Policy, Timeouts
 from envhub_sandbox.provenance import provenance_of
 from envhub_sandbox.recipe import Recipe
 from envhub_sandbox.sandboxes.base import EnclosedServer, PerRepository, Sandbox, WorkerServer
 from envhub_sandbox.snapshot import Snapshot
 from envhub_sandbox.snapshot_store import cache_root
+from envhub_sandbox.worker_output import OutputFollower, Wanted
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import WireLimits
 from envhub_worker.protocol.manifest import Manifest, decode_manifest
@@ -111,6 +113,7 @@ class Repository:
             own = sandbox.for_repository(snapshot.root, policy, python)
             self._sandbox, self.interpreter = own, own.interpreter
         self._store = store
+        self._jail_numbers = count(1)
 
     @property
     def label(self) -> str:
@@ -176,7 +179,7 @@ class Repository:
             shared: Whether other environments lived in it.
         """
         ours = self.policy.crash_history and error.bundle is None and self.recipe is not None
-        if not ours or getattr(error, "reason", "") == "killed":
+        if not ours or getattr(error, "reason", "") in ("killed", "idle"):
             return
         assert self.recipe is not None
         manifest = None if loaded is None else loaded.manifest
@@ -219,14 +222,20 @@ class Repository:
             raise
 
     def _open(self, server: WorkerServer, deadline: Deadline) -> LoadedJail:
+        wanted = self._wanted_output()
         client = WorkerClient(server.endpoint, server.process_fd, self.wire_limits)
         try:
             client.hello(deadline)
             jail = open_jail(client, self._order(server), self.wire_limits, deadline)
         except BaseException:
             client.close()
+            wanted.close()
             raise
+        WORKER.info("%s: jail %x opened", self.label, jail.number)
         try:
+            if wanted.sinks:
+                follower = OutputFollower(lambda: self._connected(server), jail.number, wanted)
+                jail.before_end = follower.stop
             around = server.layers if isinstance(server, EnclosedServer) else ()
             self.report = [*map(dict, around), *jail.report]
             return self._load(jail, server, deadline)
@@ -256,6 +265,24 @@ class Repository:
             raise LoadError(f"the worker answered Load with {type(reply).__name__}")
         manifest = decode_manifest(reply.manifest, max_elements=self.policy.limits.elements)
         return LoadedJail(jail, manifest, reply.manifest, {host}, server)
+
+    def _wanted_output(self) -> Wanted:
+        """Where the next jail's output goes: each has a file of its own."""
+        output = self.policy.output
+        path = None if output == "tail" else Path(output)
+        number = next(self._jail_numbers)
+        if path is not None and number > 1:
+            path = path.with_name(f"{path.stem}-{number}{path.suffix}")
+        return Wanted(self.label, path)
+
+    def _connected(self, server: WorkerServer) -> WorkerClient:
+        client = WorkerClient(server.endpoint, server.process_fd, self.wire_limits)
+        try:
+            client.hello(Deadline(_CLOSE_S))
+        except BaseException:
+            client.close()
+            raise
+        return client
 
     def spread(self, loaded: LoadedJail, shards: int, deadline: Deadline) -> list[int]:
         """The first ``shards`` hosts of a jail, forked and loaded if they are not yet."""
@@ -294,6 +321,7 @@ class Repository:
         if loaded.closed:
             return
         loaded.closed = True
+        WORKER.info("%s: jail %x closes", self.label, loaded.jail.number)
         try:
             loaded.jail.close(Deadline(_CLOSE_S))
         finally:
@@ -319,6 +347,7 @@ class Repository:
 
     def interrupt(self, loaded: LoadedJail) -> None:
         """End a jail over a connection of its own, while another thread waits on the first."""
+        loaded.jail.before_end()
         client = WorkerClient(loaded.server.endpoint, loaded.server.process_fd, self.wire_limits)
         deadline = Deadline(_CLOSE_S)
         try:

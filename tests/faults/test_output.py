@@ -1,0 +1,119 @@
+"""What a worker prints reaches a file or a log, whatever becomes of the worker."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox import errors, make_env
+from tests.support.processes import eventually
+from tests.support.samples import sample
+
+pytestmark = pytest.mark.usefixtures("neighbour")
+
+
+def made(path: Path | None, fault: str, moment: str = "step", **policy: Any) -> Any:
+    """An environment that prints, and then does something."""
+    if path is not None:
+        policy["output"] = str(path)
+    kwargs = {"moment": moment, "fault": fault}
+    return make_env(sample("faulty"), n_envs=2, env_kwargs=kwargs, policy=policy)
+
+
+def followers() -> list[threading.Thread]:
+    """Threads of ours that follow an output."""
+    return [thread for thread in threading.enumerate() if thread.name == "envhub-output"]
+
+
+def test_the_last_words_are_in_the_file(tmp_path: Path) -> None:
+    """Those of a death too, and those of a jail that was ended because it did not answer."""
+    for fault, error in (("exit", errors.WorkerDiedError), ("hang", errors.WorkerTimeoutError)):
+        path = tmp_path / f"{fault}.log"
+        with made(path, fault) as suites:
+            suites.env.reset()
+            suites.env.step_async([0, 1])
+            with pytest.raises(error):
+                suites.env.step_wait(timeout=1)
+        assert path.read_text() == f"about to {fault}\n"
+    assert followers() == []
+
+
+def test_output_of_loading_and_closing_is_there(tmp_path: Path) -> None:
+    """From the first line to the last."""
+    with pytest.raises(errors.LoadError):
+        made(tmp_path / "make.log", "raise", "make")
+    assert "about to raise" in (tmp_path / "make.log").read_text()
+    with made(tmp_path / "close.log", "raise", "close") as suites:
+        suites.env.reset()
+    assert "about to raise" in (tmp_path / "close.log").read_text()
+    assert followers() == []
+
+
+def test_a_file_for_each_jail(tmp_path: Path) -> None:
+    """So that a restarted worker's output is not taken for the first one's."""
+    with made(tmp_path / "w.log", "kill", restart="on_reset", restart_backoff_s=0) as suites:
+        for _ in range(2):
+            suites.env.reset()
+            with pytest.raises(errors.WorkerDiedError):
+                suites.env.step([0, 1])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["w-2.log", "w.log"]
+    for path in tmp_path.iterdir():
+        assert path.read_text() == "about to kill\n"
+
+
+def test_a_flood_is_bounded_and_said(tmp_path: Path) -> None:
+    """What came too fast is counted, and nothing of what is there paints."""
+    path = tmp_path / "w.log"
+    with made(path, "flood") as suites:
+        suites.env.reset()
+        suites.env.step([0, 1])
+        assert eventually(lambda: "bytes are lost: it printed too fast]" in path.read_text())
+    text = path.read_text()
+    assert "y\\x1b[31m" in text
+    assert "\x1b" not in text
+
+
+def test_a_file_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    """Before anything runs."""
+    with made(tmp_path / "nowhere" / "w.log", "exit") as suites:
+        with pytest.raises(errors.PolicyError, match="output"):
+            suites.env.reset()
+        assert suites.env.sandbox_report == []
+
+
+def test_the_log_tells_the_life_of_a_jail(caplog: pytest.LogCaptureFixture) -> None:
+    """Opened, late, given up, died, closed at INFO; what it prints at DEBUG."""
+    caplog.set_level(logging.DEBUG, "envhub_sandbox")
+    with made(None, "exit") as suites:
+        suites.env.reset()
+        with pytest.raises(errors.WorkerDiedError):
+            suites.env.step([0, 1])
+    with made(None, "hang") as suites:
+        suites.env.reset()
+        suites.env.step_async([0, 1])
+        with pytest.raises(errors.WorkerTimeoutError):
+            suites.env.step_wait(timeout=0.3)
+        suites.env.reset()
+    told = [(one.name, one.levelname, one.getMessage()) for one in caplog.records]
+    for name, level, text in (
+        ("envhub_sandbox.worker", "INFO", "opened"),
+        ("envhub_sandbox.worker", "INFO", "died during step: it exited (exit code 7)"),
+        ("envhub_sandbox.crashes", "INFO", "crash bundle"),
+        ("envhub_sandbox.worker", "INFO", "no answer to step after 0.3 s"),
+        ("envhub_sandbox.worker", "INFO", "given up for a fresh one"),
+        ("envhub_sandbox.worker", "INFO", "closes"),
+        ("envhub_sandbox.worker.output", "DEBUG", "about to exit"),
+        ("envhub_sandbox.worker.output", "DEBUG", "about to hang"),
+    ):
+        assert any(one[:2] == (name, level) and text in one[2] for one in told), text
+
+
+def test_nobody_is_followed_without_need() -> None:
+    """No thread, no request: the default costs nothing."""
+    with made(None, "exit") as suites:
+        suites.env.reset()
+        assert followers() == []

@@ -1,0 +1,101 @@
+"""A worker's output: lines of any bytes, bounded, fit for a terminal."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from envhub_sandbox import worker_output
+from envhub_sandbox.worker_output import Lines, OutputFile, Wanted
+from envhub_worker.output import OutputTail
+
+
+def lines_of(*chunks: bytes) -> list[str]:
+    """What a sink gets of some bytes."""
+    found: list[str] = []
+    lines = Lines([found.append])
+    for chunk in chunks:
+        lines.feed(chunk)
+    lines.end()
+    return found
+
+
+def test_lines_are_cut_at_every_end() -> None:
+    """Carriage returns count, for progress bars; the last line need not be ended."""
+    assert lines_of(b"a\nb\r\nc\rd") == ["a", "b", "c", "d"]
+    assert lines_of(b"one ", b"line\nand", b" another") == ["one line", "and another"]
+
+
+def test_control_characters_are_escaped() -> None:
+    """Escape sequences and broken encodings become visible text."""
+    assert lines_of(b"\x1b[31mred\x07\n\xff\xfe\n") == ["\\x1b[31mred\\x07", "\\xff\\xfe"]
+
+
+@given(st.lists(st.binary(max_size=60), max_size=20))
+def test_any_bytes_become_printable_lines(chunks: list[bytes]) -> None:
+    """Nothing that is printed can end a line of ours, or paint."""
+    for line in lines_of(*chunks):
+        assert line.isprintable() or "\t" in line
+
+
+def test_a_line_without_end_is_cut() -> None:
+    """It does not pile up here."""
+    found = lines_of(*[b"x" * 10_000] * 10)
+    assert sum(map(len, found)) >= 20_000
+    assert max(map(len, found)) <= 4096 + 100
+
+
+def test_a_file_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rest is left out, and the file says so; what was in it before counts."""
+    monkeypatch.setattr(worker_output, "FILE_BYTES", 100)
+    path = tmp_path / "out.log"
+    path.write_text("before\n")
+    file = OutputFile(path)
+    for number in range(50):
+        file(f"line {number}")
+    file.close()
+    lines = path.read_text().splitlines()
+    assert lines[:2] == ["before", "line 0"]
+    assert lines[-1] == "[the rest is left out]"
+    assert path.stat().st_size < 150
+
+
+def test_a_file_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+    """Whoever asked for it hears of it before anything runs."""
+    with pytest.raises(worker_output.PolicyError, match="output"):
+        Wanted("label", tmp_path)
+
+
+@given(
+    prints=st.lists(st.integers(0, 30), max_size=12),
+    limit=st.integers(1, 20),
+    asks=st.sets(st.integers(0, 12)),
+)
+def test_a_follower_gets_every_byte_that_is_kept(
+    prints: list[int], limit: int, asks: set[int]
+) -> None:
+    """Each once, in order; what it misses is the bytes that were dropped, and it can tell."""
+    reads, writes = os.pipe2(os.O_NONBLOCK)
+    tail = OutputTail(reads, limit)
+    printed, followed, offset = b"", b"", 0
+    for index, size in enumerate(prints):
+        data = bytes((len(printed) + place) % 256 for place in range(size))
+        printed += data
+        os.write(writes, data)
+        tail.read()
+        if index in asks:
+            start, got = tail.since(offset)
+            assert start >= offset
+            assert got == printed[start:]
+            assert len(printed) - start >= min(len(printed) - offset, limit)
+            followed, offset = followed + got, start + len(got)
+    assert tail.since(len(printed) + 5) == (len(printed), b"")
+    os.close(writes)
+    tail.read()
+    assert tail.fileno() == -1
+    tail.read()  # after its end: nothing happens
+    tail.close()
