@@ -190,7 +190,13 @@ def call(env: Any, run: Run, payload: str, arguments: Mapping[str, Any]) -> None
 def control_run(payload: str, arguments: Mapping[str, Any], secret: str = "") -> Iterator[Run]:
     """Run a payload in a plain interpreter, which lives as long as the context."""
     run = Run(new_alias(), False)
-    process = start_control(payload, arguments, run.alias)
+    with answered(start_control(payload, arguments, run.alias), run, secret):
+        yield run
+
+
+@contextlib.contextmanager
+def answered(process: subprocess.Popen[bytes], run: Run, secret: str = "") -> Iterator[None]:
+    """Note what ``hostile/outside.py`` answers in a process, which lives as long as the context."""
     try:
         assert process.stdin is not None
         assert process.stdout is not None
@@ -198,7 +204,7 @@ def control_run(payload: str, arguments: Mapping[str, Any], secret: str = "") ->
         process.stdin.flush()
         answer = _last_line(process)
         run.value, run.error = answer["value"], answer["error"]
-        yield run
+        yield
     finally:
         process.stdin.close()
         process.stdout.close()

@@ -1,0 +1,1 @@
+"""The worker in containers of a real engine."""

@@ -1,0 +1,120 @@
+"""Looking at containers from outside."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import subprocess
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from envhub_sandbox import make_env
+from envhub_sandbox.sandboxes.containers import CLIENT_LABEL, SNAPSHOT
+from envhub_sandbox.sandboxes.docker import DockerSandbox
+from envhub_sandbox.sandboxes.engines import Engine
+from envhub_sandbox.sandboxes.identity import identity_of
+from tests.attacks.harness import HOSTILE, TIMEOUTS, Arena, Run, answered, new_alias
+from tests.support.processes import eventually
+
+_PYTHON = "/opt/envhub-worker/bin/python"
+IMAGE = os.environ.get("ENVHUB_TEST_IMAGE", "envhub-worker")
+
+
+def container_of(env: Any) -> str:
+    """The name of the container that an environment runs in, out of its report."""
+    [detail] = [layer["detail"] for layer in env.sandbox_report if layer["layer"] == "container"]
+    found = re.search(r"envhub-[0-9a-f]{12}", detail)
+    assert found is not None
+    return found[0]
+
+
+def containers_of(engine: Engine, identity: str) -> list[str]:
+    """Ids of all containers of a client, whatever their state."""
+    label = f"label={CLIENT_LABEL}={identity}"
+    return engine.run("ps", "--all", "--quiet", "--filter", label).split()
+
+
+def folders() -> set[str]:
+    """The runtime folders of containers."""
+    return {path.name for path in Path(tempfile.gettempdir()).glob("envhub-docker-*")}
+
+
+def nothing_left(engine: Engine, identity: str | None = None) -> bool:
+    """Whether no container of a client is left, ours by default; waits for it."""
+    wanted = identity or identity_of(os.getpid())
+    return eventually(lambda: not containers_of(engine, wanted), 60.0)
+
+
+def pids_in(engine: Engine, container: str) -> list[int]:
+    """The processes of a container, as this machine numbers them."""
+    if engine.kind == "podman":
+        lines = engine.run("top", container, "hpid").splitlines()[1:]
+        return [int(line) for line in lines]
+    rows = engine.run("top", container, "-o", "pid").splitlines()[1:]
+    return [int(row.split()[0]) for row in rows]
+
+
+class Walls(Arena):
+    """Attacks in a container: inside of a jail in it, or next to the server, without any jail.
+
+    The second kind shows what the container's own walls hold, should a jail be broken.
+    """
+
+    def __init__(self, place: str, engine: Engine) -> None:
+        super().__init__(place, "Containers")
+        self.engine = engine
+        self.options: dict[str, Any] = {}
+
+    @contextlib.contextmanager
+    def inside(
+        self,
+        payload: str,
+        arguments: Mapping[str, Any],
+        policy: Mapping[str, Any] | None = None,
+        limits: Mapping[str, Any] | None = None,
+    ) -> Iterator[Run]:
+        """Run a payload in the place; its container lives as long as the context."""
+        if self.profile != "walls":
+            with super().inside(payload, arguments, policy, limits) as run:
+                yield run
+            return
+        run = Run(new_alias(), True)
+        with self.environment(policy, limits) as env:
+            env.reset()
+            with self._executed(container_of(env), payload, arguments, run):
+                yield run
+
+    @contextlib.contextmanager
+    def _executed(
+        self, container: str, payload: str, arguments: Mapping[str, Any], run: Run
+    ) -> Iterator[None]:
+        """The control's own runner, next to the server."""
+        words = [f"{SNAPSHOT}/outside.py", payload, json.dumps(dict(arguments)), run.alias]
+        process = subprocess.Popen(
+            [self.engine.command, "exec", "--interactive", container, _PYTHON, *words],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
+        with answered(process, run):
+            yield
+
+    @contextlib.contextmanager
+    def environment(
+        self,
+        policy: Mapping[str, Any] | None = None,
+        limits: Mapping[str, Any] | None = None,
+        **options: Any,
+    ) -> Iterator[Any]:
+        """The hostile repository's environment, in a container of its own."""
+        profile = "container" if self.profile == "bare-jail" else "strict"
+        sandbox = DockerSandbox(image=IMAGE, engine=self.engine.kind, **self.options)
+        wanted = {"profile": profile, **(policy or {})}
+        with make_env(
+            str(HOSTILE), policy=wanted, limits=limits, timeouts=TIMEOUTS, sandbox=sandbox
+        ) as suites:
+            yield suites.env

@@ -1,0 +1,207 @@
+"""The attacks that a container is for, each with a control that succeeds without one.
+
+In a jail with namespaces, in a jail without, and in no jail at all, next to the server: the last
+one shows what the container's own walls hold.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import stat
+from pathlib import Path
+
+import psutil
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.sandboxes.docker import DockerSandbox
+from envhub_sandbox.sandboxes.engines import Engine
+from tests.attacks.harness import HOSTILE, Run, token
+from tests.attacks.listeners import Listener, listening
+from tests.attacks.test_bombs import memory, tasks
+from tests.attacks.victim import victim
+from tests.containers.kit import Walls, container_of, pids_in
+
+MIB = 1 << 20
+MEMORY, BOMB = 512 * MIB, 896 * MIB
+PIDS, FORKS = 96, 240
+_SOCKET = Path("/var/run/docker.sock")
+_EXT_UUID, _UUID_BYTES = 1024 + 104, 16
+
+
+@pytest.fixture(params=["strict-jail", "bare-jail", "walls"])
+def walls(request: pytest.FixtureRequest, engine: Engine) -> Walls:
+    """Where an attack is tried."""
+    return Walls(request.param, engine)
+
+
+def an_address_of_this_machine() -> str:
+    """One that a network of any kind would lead to; the loopback has another meaning inside."""
+    found = [
+        one.address
+        for name, addresses in psutil.net_if_addrs().items()
+        for one in addresses
+        if one.family == socket.AF_INET and name != "lo"
+    ]
+    return found[0] if found else pytest.skip("this machine has no network but its loopback")
+
+
+def sends(walls: Walls, title: str, payload: str, listener: Listener, **arguments: object) -> None:
+    """Attack with a message that the listener must hear in the control, and never from inside."""
+    message = token()
+
+    def heard(run: Run) -> bool:
+        return listener.heard(message, wait=not run.inside)
+
+    walls.attack(title, payload, heard, before=listener.forget, message=message, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("payload", "kind"), [("tcp", socket.SOCK_STREAM), ("udp", socket.SOCK_DGRAM)]
+)
+def test_nothing_reaches_the_network(walls: Walls, payload: str, kind: int) -> None:
+    """A listener on this machine hears the control only."""
+    address = an_address_of_this_machine()
+    with listening(socket.AF_INET, kind, (address, 0)) as listener:
+        sends(walls, payload.upper(), payload, listener, host=address, port=listener.port)
+
+
+def test_abstract_sockets_of_this_machine_are_out_of_reach(walls: Walls) -> None:
+    """They belong to the network, though they look like files."""
+    name = f"@{token()}"
+    with listening(socket.AF_UNIX, socket.SOCK_STREAM, "\0" + name[1:]) as listener:
+        sends(walls, "abstract socket", "unix_stream", listener, path=name)
+
+
+def test_socket_files_of_this_machine_are_out_of_reach(walls: Walls, open_ground: Path) -> None:
+    """A folder that everybody may enter is not there."""
+    path = str(open_ground / "socket")
+    with listening(socket.AF_UNIX, socket.SOCK_STREAM, path) as listener:
+        os.chmod(path, 0o777)
+        sends(walls, "socket file", "unix_stream", listener, path=path)
+
+
+@pytest.mark.skipif(not os.access(_SOCKET, os.W_OK), reason=f"{_SOCKET} is not ours to use")
+def test_the_engine_is_out_of_reach(walls: Walls, engine: Engine) -> None:
+    """Whoever reaches its socket is root on this machine."""
+    secret = json.loads(engine.run("info", "--format", "{{json .ID}}"))
+    walls.attack("docker.sock", "docker_api", lambda run: secret in run.text, path=str(_SOCKET))
+
+
+def test_files_of_this_machine_cannot_be_read(walls: Walls, open_ground: Path) -> None:
+    """Not even those that everybody may read."""
+    secret = token()
+    (open_ground / "canary").write_text(secret)
+    path = str(open_ground / "canary")
+    walls.attack("read a file", "read_file", lambda run: secret in run.text, path=path)
+
+
+def test_files_of_this_machine_cannot_be_written(walls: Walls, open_ground: Path) -> None:
+    """Nothing appears in a folder that everybody may write."""
+    path = open_ground / "planted"
+    walls.attack(
+        "write a file",
+        "create_file",
+        lambda run: path.exists(),
+        before=lambda: path.unlink(missing_ok=True),
+        path=str(path),
+        text="x",
+    )
+
+
+def test_the_snapshot_cannot_be_written(walls: Walls, open_ground: Path) -> None:
+    """The repository's files are shown, and are this machine's: read-only for everybody."""
+    stored = make_env(str(HOSTILE))  # only to learn where they lie
+    tree = stored.env._remote.repository.snapshot.root
+    stored.close()
+    outside, inside = open_ground / "planted", tree / "planted"
+    walls.attack(
+        "write into the snapshot",
+        "create_file",
+        lambda run: (inside if run.inside else outside).exists(),
+        inside={"path": "/snapshots/this/planted"},
+        path=str(outside),
+        text="x",
+    )
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can read a disk, so there is no control")
+def test_disks_cannot_be_read(walls: Walls, open_ground: Path) -> None:
+    """Making a device node takes a capability, and opening one a rule: there is neither."""
+    disk = Path("/").stat().st_dev
+    node = open_ground / "disk"
+    os.mknod(node, stat.S_IFBLK | 0o600, disk)
+    try:
+        with node.open("rb") as file:
+            file.seek(_EXT_UUID)
+            secret = file.read(_UUID_BYTES).hex()
+    except OSError:
+        pytest.skip("the root file system lies on no disk")
+    walls.attack(
+        "read a disk",
+        "read_device",
+        lambda run: secret in run.text,
+        major=os.major(disk),
+        minor=os.minor(disk),
+        offset=_EXT_UUID,
+        length=_UUID_BYTES,
+    )
+
+
+def test_environments_of_other_processes_cannot_be_read(walls: Walls) -> None:
+    """A process of this machine is not there to be looked at."""
+    secret = token()
+    with victim(secret) as other:
+        walls.attack(
+            "read an environment",
+            "environment_of_others",
+            lambda run: secret in run.text,
+            pid=other.pid,
+        )
+
+
+def test_memory_stops_at_the_containers_limit(walls: Walls) -> None:
+    """Even where the jail's own limit would permit more."""
+    walls.options = {"memory": MEMORY}
+    walls.attack(
+        "memory bomb",
+        "memory_bomb",
+        lambda run: memory(run) > MEMORY + 64 * MIB,
+        limits={"memory_bytes": 8 << 30},
+        kind="heap",
+        size=BOMB,
+    )
+
+
+def test_processes_stop_at_the_containers_limit(walls: Walls) -> None:
+    """Likewise."""
+    walls.options = {"pids": PIDS}
+    walls.attack(
+        "fork bomb",
+        "fork_bomb",
+        lambda run: tasks(run) > PIDS,
+        limits={"processes": 4096},
+        count=FORKS,
+    )
+
+
+def test_no_process_in_a_container_has_a_capability(docker: DockerSandbox, engine: Engine) -> None:
+    """Read from outside, of the server, the zygote and the hosts alike; none is root."""
+    with make_env(str(HOSTILE), sandbox=docker) as suites:
+        suites.env.reset(seed=0)
+        found = pids_in(engine, container_of(suites.env))
+        assert len(found) >= 4
+        for pid in found:
+            text = Path(f"/proc/{pid}/status").read_text()
+            status = dict(line.split(":\t", 1) for line in text.splitlines() if ":\t" in line)
+            assert int(status["CapBnd"], 16) == 0 or _in_a_namespace_of_its_own(pid)
+            assert status["NoNewPrivs"].strip() == "1"
+            assert status["Seccomp"].strip() == "2"
+            assert "0" not in status["Uid"].split()
+
+
+def _in_a_namespace_of_its_own(pid: int) -> bool:
+    """A capability over a user namespace of one's own is none over anything outside."""
+    return os.readlink(f"/proc/{pid}/ns/user") != os.readlink("/proc/self/ns/user")

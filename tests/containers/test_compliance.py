@@ -1,0 +1,66 @@
+"""An environment in a container is the same as the one in process, over both lanes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.sandboxes.docker import DockerSandbox
+from tests.compliance.pair import Pair
+from tests.compliance.vector_env import Case, VectorEnvCompliance, cases
+from tests.support.samples import reference, sample
+
+
+@pytest.fixture(scope="class")
+def pair(
+    request: pytest.FixtureRequest, case: Case, lane: str, docker: DockerSandbox
+) -> Iterator[Pair]:
+    """The reference and the environment in a container; the tests of a case share them."""
+    suite: type[VectorEnvCompliance] = request.cls
+    expected = reference(suite.sample, case.n_envs, **case.env_kwargs)
+    suites = make_env(
+        sample(suite.sample),
+        n_envs=case.n_envs,
+        use_async_envs=case.use_async_envs,
+        env_kwargs=case.env_kwargs,
+        num_workers=case.num_workers,
+        lane=lane,
+        sandbox=docker,
+    )
+    with suites:
+        yield Pair(expected, suites.env)
+    expected.close()
+
+
+class TestCounter(VectorEnvCompliance):
+    """Every kind of value in the infos, in one process and in two."""
+
+    sample = "counter"
+    cases = cases(use_async_envs=(False,), modes=("SameStep",)) + cases(
+        use_async_envs=(True,), modes=("NextStep",)
+    )
+    steps = 100
+
+
+class TestCartPole(VectorEnvCompliance):
+    """Discrete actions, float32 observations; thousands of steps."""
+
+    sample = "cartpole"
+    cases = cases(n_envs=(4,), use_async_envs=(False,), modes=("NextStep",))
+    steps = 2000
+
+    def test_lane_is_the_one_that_was_asked_for(self, pair: Pair, lane: str) -> None:
+        """Descriptors cross the container's wall: memory is shared with the jail itself."""
+        pair.reset(seed=1)
+        in_use = pair.sandboxed._remote._lane is not None
+        assert in_use is (lane == "auto")
+
+
+class TestExoticSpaces(VectorEnvCompliance):
+    """Spaces that have no fixed layout."""
+
+    sample = "exotic_spaces"
+    cases = cases(n_envs=(2,), use_async_envs=(False,), modes=("NextStep",))
+    steps = 40
