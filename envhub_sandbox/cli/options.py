@@ -194,6 +194,7 @@ class MakeOptions:
     token: str | None
     endpoint: str | None
     hub_cache_dir: str | None
+    output: str | None = None
 
     @property
     def in_process(self) -> bool:
@@ -261,6 +262,7 @@ class MakeOptions:
             "gpu": self.gpu or None,
             "readable": tuple(self.readable or ()) or None,
             "environment": tuple(self.variables or ()) or None,
+            "output": self.output,
             "limits": _given(limits) or None,
         }
         return _given(policy)

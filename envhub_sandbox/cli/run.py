@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from envhub_sandbox.cli import logs
 from envhub_sandbox.cli import options as opt
 from envhub_sandbox.cli.console import console, print_json, safe_line, say
 from envhub_sandbox.cli.exits import code_for, describe, reported
@@ -54,6 +55,8 @@ def run(
         ),
     ] = None,
     json: opt.Json = False,
+    worker_output: logs.WorkerOutput = None,
+    verbose: logs.Verbose = False,
     suite: opt.Suite = None,
     task: opt.Task = None,
     n_envs: opt.NEnvs = 1,
@@ -84,7 +87,7 @@ def run(
 
     [bold]envhub run ./examples/cartpole --episodes 20 --n-envs 4 --video cartpole.mp4[/bold]
     """
-    with reported(debug=debug):
+    with reported(debug=debug), logs.logged(verbose=verbose, worker_output=worker_output):
         make = opt.MakeOptions(
             ref=ref,
             n_envs=n_envs,
@@ -107,6 +110,7 @@ def run(
             token=token,
             endpoint=endpoint,
             hub_cache_dir=hub_cache_dir,
+            output=logs.output_policy(worker_output),
         )
         play = Play(episodes=episodes, policy=policy.value, seed=seed, steps=steps, video=video)
         _Run(make, play, suite, task, as_json=json).execute()
@@ -254,6 +258,7 @@ class _Run:
                 "type": type(error).__name__,
                 "message": describe(error),
                 "exit_code": int(code_for(error)),
+                "bundle": getattr(error, "bundle", None),
             }
         return document
 

@@ -84,6 +84,7 @@ def test_a_failing_task_ends_the_run_and_closes_all(monkeypatch: pytest.MonkeyPa
         "type": "WorkerDiedError",
         "message": "it died",
         "exit_code": 5,
+        "bundle": None,
     }
 
 
