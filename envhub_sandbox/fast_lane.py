@@ -210,7 +210,7 @@ class FastLane:
         self._action_space = manifest.single_action_space
         leaves = layouts[0].actions
         self._flat_actions = len(leaves) == 1 and not leaves[0].path
-        self._pidfds: list[int] = []
+        self._pidfds: dict[int, int] = {}
         self._poller = select.poll()
         self._poller.register(process_fd, select.POLLIN)
         for shard in self.shards:
@@ -250,10 +250,36 @@ class FastLane:
         layout = self.observations.layout
         return m.Attach(env, self._bounds[shard][0], layout.count, layout.slots)
 
-    def watch_jail(self, pidfd: int) -> None:
-        """End waits when the jail ends. Takes the descriptor over."""
-        self._pidfds.append(pidfd)
+    def watch_host(self, index: int, pidfd: int) -> None:
+        """End waits when a shard's host ends, or all of its jail. Takes the descriptor over."""
+        self._pidfds[index] = pidfd
         self._poller.register(pidfd, select.POLLIN)
+
+    def renew(self, index: int) -> None:
+        """Give a shard whose host has died slabs that the dead one never saw."""
+        old, pidfd = self.shards[index], self._pidfds.pop(index)
+        self._poller.unregister(pidfd)
+        os.close(pidfd)
+        self._poller.unregister(old.bell)
+        fresh = self.shards[index] = LaneShard(old.layout, self.observations.fd)
+        self._poller.register(fresh.bell, select.POLLIN)
+        self._sleepers = self.shards[self._awake :]
+        self._wakers = self.shards[: self._awake]
+        old.close()
+
+    @property
+    def waited_s(self) -> float:
+        """Seconds since the last request."""
+        return (perf_counter_ns() - self._asked_ns) / 1e9
+
+    def survivors(self, deadline: Deadline) -> list[int]:
+        """After ``JailGoneError``: the shards that have answered, once no other will any more.
+
+        Raises:
+            WorkerTimeoutError: The deadline came first.
+        """
+        pairs = [(shard, self._pidfds[index]) for index, shard in enumerate(self.shards)]
+        return [i for i, (shard, pidfd) in enumerate(pairs) if _answers(shard, pidfd, deadline)]
 
     def ask(self, actions: Any) -> None:
         """Send a validated batch of actions to every shard."""
@@ -343,11 +369,32 @@ class FastLane:
             shard.close()
         self.observations.close()
         while self._pidfds:
-            os.close(self._pidfds.pop())
+            os.close(self._pidfds.popitem()[1])
+
+
+def _answers(shard: LaneShard, pidfd: int, deadline: Deadline) -> bool:
+    """Whether a shard's answer comes before its host's death."""
+    poller = select.poll()
+    poller.register(shard.bell, select.POLLIN)
+    poller.register(pidfd, select.POLLIN)
+    shard.park(1)
+    try:
+        timeout: int | None = _RECHECK_MS
+        while not shard.answered():
+            ready = [fd for fd, _ in poller.poll(timeout)]
+            shard.silence()
+            if pidfd in ready:
+                return shard.answered()
+            if deadline.passed and not shard.answered():
+                raise WorkerTimeoutError("the worker did not answer in time")
+            timeout = deadline.left_ms()
+        return True
+    finally:
+        shard.park(0)
 
 
 def deposit(path: str, session: bytes, jail: int, host: int, fds: Sequence[int]) -> int:
-    """Hand descriptors to the server for a host; returns a pidfd of the jail.
+    """Hand descriptors to the server for a host; returns a pidfd of the jail, or of the host.
 
     Raises:
         OSError: The server did not take them.

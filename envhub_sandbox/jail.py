@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import islice
 from typing import Any
 
 import cloudpickle  # type: ignore[import-untyped]
 
-from envhub_sandbox.client import WorkerClient, expect
+from envhub_sandbox.client import WorkerClient, death, expect
 from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import (
     DependencyError,
     EnvHubError,
     LoadError,
     RemoteProtocolError,
+    WorkerDiedError,
     WorkerError,
     remote_error,
 )
@@ -25,12 +27,38 @@ from envhub_worker.protocol.limits import WireLimits
 from envhub_worker.protocol.text import printable
 
 
+class HostsDiedError(WorkerDiedError):
+    """Hosts of a kept jail have died; the others have answered.
+
+    Never seen by a user: he is told ``first``, or nothing.
+
+    Attributes:
+        replies: In the order of the request; None where a host has died.
+        deaths: How, by its place in the request.
+        jail_gone: Whether the jail has ended, too.
+    """
+
+    def __init__(
+        self,
+        replies: Sequence[m.Message | None],
+        deaths: dict[int, WorkerDiedError],
+        *,
+        jail_gone: bool = False,
+    ) -> None:
+        self.first = next(iter(deaths.values()))
+        super().__init__(str(self.first), reason=self.first.reason)
+        self.replies = list(replies)
+        self.deaths = deaths
+        self.jail_gone = jail_gone
+
+
 class RemoteJail:
     """An open jail. Not thread-safe: its owner holds a lock.
 
     Attributes:
         number: The server's number for it.
         hosts: Its hosts' numbers; sub-environments are spread over them in this order.
+        kept: Whether it goes on without a host that has died.
         report: One mapping per layer of the confinement: ``layer``, ``enforced``, ``detail``.
         before_end: Runs before it is ended; brings what it has printed last.
     """
@@ -46,6 +74,7 @@ class RemoteJail:
         self.client = client
         self.number = number
         self.hosts = list(hosts)
+        self.kept = False
         self.report = report
         self.before_end: Callable[[], None] = _nothing
         self._limits = limits
@@ -56,10 +85,25 @@ class RemoteJail:
         jail.before_end = self.before_end
         return jail
 
-    def start_hosts(self, count: int, deadline: Deadline) -> None:
-        """Fork further hosts."""
+    def start_hosts(self, count: int, deadline: Deadline) -> list[int]:
+        """Fork further hosts; returns their numbers."""
         reply, _ = self.client.request(m.StartHosts(self.number, count), deadline=deadline)
-        self.hosts += expect(reply, m.JailOpened).hosts
+        started = list(expect(reply, m.JailOpened).hosts)
+        if len(started) != count:
+            raise RemoteProtocolError(f"the worker started {len(started)} hosts, not {count}")
+        self.hosts += started
+        return started
+
+    def keep(self, deadline: Deadline) -> None:
+        """From now on it goes on without a host that dies."""
+        reply, _ = self.client.request(m.KeepJail(self.number), deadline=deadline)
+        expect(reply, m.Done)
+        self.kept = True
+
+    def replace_hosts(self, dead: Sequence[int], deadline: Deadline) -> list[int]:
+        """Fork a host in the place of each that has died; returns the new numbers, in order."""
+        self.hosts = [host for host in self.hosts if host not in dead]
+        return self.start_hosts(len(dead), deadline)
 
     def send(self, operation: str, requests: Sequence[tuple[int, m.Message]]) -> int:
         """Send one message to each of some hosts, in one request; returns its id."""
@@ -78,18 +122,22 @@ class RemoteJail:
         Raises:
             WorkerTimeoutError: The deadline came first.
             WorkerDiedError: The jail ended.
+            HostsDiedError: Hosts of a kept jail did.
             RemoteProtocolError: A host broke the rules.
         """
         reply, payload = self.client.receive(request_id, deadline)
-        relayed = expect(reply, m.Relayed)
-        if sum(relayed.parts) != len(payload) or any(count < 1 for count in relayed.parts):
-            raise RemoteProtocolError("the worker's frames do not add up")
-        replies = []
-        start = 0
-        for count in relayed.parts:
-            replies.append(self._unpack(payload[start : start + count]))
-            start += count
-        return replies
+        if self.kept and isinstance(reply, m.RelayedPartly):
+            raise self._died(reply, payload)
+        return [self._unpack(part) for part in _cut(payload, expect(reply, m.Relayed).parts)]
+
+    def _died(self, reply: m.RelayedPartly, payload: list[Buffer]) -> HostsDiedError:
+        """Who has died is the server's word, which no host can say."""
+        parts = _cut(payload, reply.parts)
+        if not reply.dead or not set(reply.dead) <= set(range(len(parts))):
+            raise RemoteProtocolError("the worker names dead hosts that were not asked")
+        deaths = {index: death(typed(self._unpack(parts[index]), m.Died)) for index in reply.dead}
+        living = [None if i in deaths else self._unpack(part) for i, part in enumerate(parts)]
+        return HostsDiedError(living, deaths)
 
     def _unpack(self, frames: Sequence[Buffer]) -> m.Message:
         return m.unpack(frames, limits=self._limits, tensors=to_tensor)[1]
@@ -98,7 +146,10 @@ class RemoteJail:
         self, operation: str, requests: Sequence[tuple[int, m.Message]], deadline: Deadline
     ) -> list[m.Message]:
         """``send`` and ``receive``; a host's exception is raised."""
-        replies = self.receive(self.send(operation, requests), deadline)
+        try:
+            replies = self.receive(self.send(operation, requests), deadline)
+        except HostsDiedError as error:
+            raise error.first from None
         for reply in replies:
             check(reply)
         return replies
@@ -121,6 +172,14 @@ class RemoteJail:
             pass
         finally:
             self.client.close()
+
+
+def _cut(payload: list[Buffer], counts: Sequence[int]) -> list[list[Buffer]]:
+    """The frames of each part."""
+    if sum(counts) != len(payload) or any(count < 1 for count in counts):
+        raise RemoteProtocolError("the worker's frames do not add up")
+    frames = iter(payload)
+    return [list(islice(frames, count)) for count in counts]
 
 
 def _nothing() -> None:

@@ -19,7 +19,7 @@ __all__ = ["Limits", "Policy", "Timeouts", "limits_from", "policy_from", "timeou
 
 PROFILES = ("strict", "no-userns", "container")
 NETWORKS = ("none", "loopback", "host")
-RESTARTS = ("never", "on_reset")
+RESTARTS = ("never", "on_reset", "transparent")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,8 +61,9 @@ class Policy:
         gpu: Grant the render and NVIDIA device nodes and the driver's libraries.
         environment: Names of environment variables whose values the jail may see.
         limits: Hard caps.
-        restart: What happens after the worker has died: ``"never"``, or a fresh one at the next
-            ``reset()`` with ``"on_reset"``.
+        restart: What happens after the worker has died: ``"never"``; a fresh one at the next
+            ``reset()`` with ``"on_reset"``; or ``"transparent"``: the sub-environments of the
+            process that died come back reset, reported as truncated (``docs/faults.md``).
         restart_budget: How many such restarts one environment gets in its life.
         restart_backoff_s: Seconds to wait before a restart that follows another within a minute;
             they double with each, up to half a minute.
@@ -89,11 +90,6 @@ class Policy:
     def __post_init__(self) -> None:
         _one_of("profile", self.profile, PROFILES)
         _one_of("network", self.network, NETWORKS)
-        if self.restart == "transparent":
-            raise PolicyError(
-                "policy: restart is 'transparent', which cannot be had: the death of one process "
-                "ends its whole jail, so the other sub-environments could not go on; use 'on_reset'"
-            )
         _one_of("restart", self.restart, RESTARTS)
         _count("restart_budget", self.restart_budget)
         _seconds("restart_backoff_s", self.restart_backoff_s)

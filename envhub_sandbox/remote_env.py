@@ -7,33 +7,35 @@ Sub-environments are spread over shards; every request goes to all of them in on
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import threading
 import time
 import weakref
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from time import perf_counter_ns
 from typing import Any, TypeVar
 
-from envhub_sandbox.client import SESSION
+from envhub_sandbox.building import Builder, Place
 from envhub_sandbox.deadline import Deadline, StartupDeadline
 from envhub_sandbox.errors import (
     EnvHubError,
-    LoadError,
+    RemoteProtocolError,
     WorkerDiedError,
     WorkerError,
     WorkerTimeoutError,
     name_source,
 )
-from envhub_sandbox.fast_lane import FastLane, JailGoneError, Outcome, deposit
+from envhub_sandbox.fast_lane import FastLane, JailGoneError, Outcome
 from envhub_sandbox.history import History
-from envhub_sandbox.jail import check, typed
+from envhub_sandbox.jail import HostsDiedError, check, typed
 from envhub_sandbox.jail_sources import JailSource, SharedJail
 from envhub_sandbox.log import WORKER
 from envhub_sandbox.repository import LoadedJail, Repository
 from envhub_sandbox.restarts import Restarts
 from envhub_sandbox.results import Results, StepResult
+from envhub_sandbox.reviving import SeedBook, marked, resets, truncated
 from envhub_sandbox.sharding import PaceBook
 from envhub_sandbox.stats import Counters
 from envhub_worker.protocol import batches, slabs
@@ -54,7 +56,6 @@ D = TypeVar("D")
 _CAUSE_S = 10.0
 _CAUSE_POLL_S = 0.01
 _BY_LANE = (0, "step")
-_numbers = itertools.count(1)
 
 
 class RemoteEnv:
@@ -82,6 +83,11 @@ class RemoteEnv:
         self.lifecycle = Lifecycle()
         self._jails = jails
         self._lock = threading.RLock()  # a signal handler may close what its own thread waits for
+        self._builder = Builder(jails, manifest, self.bounds)
+        self._revives = jails.repository.policy.restart == "transparent"
+        self._seeds = SeedBook(manifest.num_envs, manifest.shardable)
+        self._asked: MessageFor | None = None
+        self._place: Place | None = None
         self._loaded: LoadedJail | None = None
         self._hosts: list[int] = []
         self._number = 0
@@ -126,6 +132,9 @@ class RemoteEnv:
                 for host, bounds in zip(self._hosts, self.bounds, strict=True)
             ]
             self._send(operation, requests)
+            self._asked = message_for
+            if self._revives and operation == "reset":
+                self._seeds.remember(self._reset_of((0, self.manifest.num_envs)))
             self.history.requested(message_for)
 
     def collect(self, timeout_s: float | None) -> list[m.Message]:
@@ -133,11 +142,14 @@ class RemoteEnv:
 
         Raises:
             WorkerTimeoutError: The environment is then LATE: ``reset`` brings it back.
-            WorkerDiedError: The environment is then DEAD.
+            WorkerDiedError: The environment is then DEAD; with ``restart="transparent"`` READY.
             RemoteEnvError: The repository's code raised; the environment is still usable.
         """
         with self._lock, self.repository.named():
-            replies = self._collect(Deadline(timeout_s), timeout_s)
+            try:
+                replies = self._collect(Deadline(timeout_s), timeout_s)
+            except HostsDiedError as deaths:
+                replies = self._survive_request(deaths)
             for reply in replies:
                 check(reply)
             return replies
@@ -190,6 +202,9 @@ class RemoteEnv:
                 for reply in replies:
                     check(reply)
                 return self.results.step([typed(reply, m.StepDone) for reply in replies])
+            except HostsDiedError as deaths:
+                with self.repository.named():
+                    return self._survive_step(deaths)
             except EnvHubError as error:
                 name_source(error, self.repository.label)
                 raise
@@ -213,6 +228,8 @@ class RemoteEnv:
         try:
             return self._lane.wait(timeout_s)
         except JailGoneError:
+            if self._loaded is not None and self._loaded.jail.kept:
+                return self._wait_for_survivors(self._lane, timeout_s)
             raise self._cause_of_death() from None
 
     def _lane_infos(
@@ -236,7 +253,10 @@ class RemoteEnv:
 
     def _fetch_infos(self, host: int, timeout_s: float | None) -> Any:
         self._send("step", [(host, m.FetchInfos(self._number))])
-        [reply] = self._collect(Deadline(timeout_s), timeout_s)
+        try:
+            [reply] = self._collect(Deadline(timeout_s), timeout_s)
+        except HostsDiedError as deaths:
+            raise self._with_all_shards(deaths, [self._hosts.index(host)]) from None
         check(reply)
         return typed(reply, m.Value).value
 
@@ -265,7 +285,7 @@ class RemoteEnv:
                 self._catch_up()
             may_restart = self.repository.policy.restart != "never"
             if self.lifecycle.state is State.DEAD and may_restart:
-                self._restarts.spend()
+                self._restarts.spend("reset")
                 self._forget()
 
     def _catch_up(self) -> None:
@@ -279,6 +299,8 @@ class RemoteEnv:
                 self._wait_on_lane(_GRACE_S)
             else:
                 loaded.jail.receive(pending[0], deadline)
+        except HostsDiedError:
+            pass  # the reset that follows meets them
         except (WorkerDiedError, WorkerTimeoutError) as error:
             if pending is not None:
                 error.request = pending[1]
@@ -338,7 +360,11 @@ class RemoteEnv:
             self.counters.timeouts += 1
             self._moved(Event.TIMEOUT)
             raise self._late(self._pending[1], timeout_s) from error
+        except HostsDiedError:
+            raise
         except EnvHubError as error:
+            if self._revives and isinstance(error, WorkerError):
+                raise self._all_died(error) from error.__cause__
             raise self._dead(error) from error.__cause__
         except BaseException as error:  # Ctrl-C, or whatever else a signal handler raises or does
             if self.lifecycle.state is State.CLOSED and isinstance(error, Exception):
@@ -371,7 +397,8 @@ class RemoteEnv:
         self.counters.deaths += 1
         self._moved(Event.DEATH)
         WORKER.info("%s: %s", self.repository.label, str(error).partition("\n")[0])
-        if not isinstance(error, WorkerDiedError) and self._loaded is not None:
+        kept = self._loaded is not None and self._loaded.jail.kept
+        if self._loaded is not None and (kept or not isinstance(error, WorkerDiedError)):
             self._jails.end(self._loaded)  # it lives, and cannot be trusted to do what it says
         if isinstance(error, WorkerDiedError):
             self._keep_crash(error)
@@ -396,6 +423,201 @@ class RemoteEnv:
         # close() may have come meanwhile, from another thread
         if self.lifecycle.state is not State.CLOSED:
             self.lifecycle.on(event)
+
+    # --- deaths that are survived --------------------------------------------------------------
+
+    def _wait_for_survivors(self, lane: FastLane, timeout_s: float | None) -> list[Outcome]:
+        """After a death: what all the others answer; all outcomes if it came after its answer."""
+        if timeout_s is not None and self.lifecycle.state is State.PENDING:
+            timeout_s = max(0.0, timeout_s - lane.waited_s)
+        living = lane.survivors(Deadline(timeout_s))
+        dead = [index for index in range(len(lane.shards)) if index not in living]
+        if not dead:  # the next step meets it
+            return [shard.outcome() for shard in lane.shards]
+        for index in living:
+            lane.shards[index].outcome()  # wanted or not: later columns are of this schema
+        assert self._loaded is not None
+        jail = self._loaded.jail
+        asked = [(self._hosts[index], m.FetchInfos(self._number)) for index in dead]
+        try:
+            jail.receive(jail.send("step", asked), Deadline(_CAUSE_S))
+        except HostsDiedError as deaths:
+            raise self._with_all_shards(deaths, dead) from None
+        raise RemoteProtocolError("the worker says that a process lives which has died")
+
+    def _with_all_shards(self, deaths: HostsDiedError, asked: list[int]) -> HostsDiedError:
+        """The deaths of those that were asked, as deaths among all shards."""
+        if deaths.jail_gone:
+            return deaths
+        by_shard = {asked[place]: death for place, death in deaths.deaths.items()}
+        return HostsDiedError([None] * len(self.bounds), by_shard)
+
+    def _all_died(self, error: WorkerError) -> EnvHubError:
+        """The jail has ended, and all shards with it."""
+        if self.lifecycle.state is State.CLOSED:
+            return self._dead(error)
+        if not isinstance(error, WorkerDiedError):  # a sibling has given the jail up
+            error = WorkerDiedError(str(error), reason="killed")
+        shards = range(len(self.bounds))
+        return HostsDiedError([None for _ in shards], dict.fromkeys(shards, error), jail_gone=True)
+
+    def _survive_request(self, deaths: HostsDiedError) -> list[m.Message]:
+        """A reset is done in fresh hosts; anything else is not repeated.
+
+        Raises:
+            WorkerDiedError: It was something else; the next step or reset brings them back.
+        """
+        replies = self._of_survivors(deaths)
+        assert self._pending is not None
+        if self._pending[1] != "reset":
+            self._pending = None
+            self._moved(Event.REPLY)
+            raise deaths.first
+        for index, reply in self._revive(deaths, self._resets).items():
+            done = typed(reply, m.ResetDone)
+            replies[index] = replace(done, info=marked(done.info, self._size(index)))
+        return [reply for reply in replies if reply is not None]
+
+    def _survive_step(self, deaths: HostsDiedError) -> StepResult:
+        """The step's results, with fresh observations in the rows of the dead."""
+        started = perf_counter_ns()
+        parts = self._of_survivors(deaths)
+        for index, reply in self._revive(deaths, self._revivals).items():
+            parts[index] = truncated(typed(reply, m.StepDone), self._size(index))
+        self.counters.stepped(perf_counter_ns() - started)
+        return self.results.step([typed(part, m.StepDone) for part in parts if part is not None])
+
+    def _of_survivors(self, deaths: HostsDiedError) -> list[m.Message | None]:
+        """What the others answered; None where nobody did.
+
+        Raises:
+            RemoteEnvError: One of them raised. The next request meets the deaths.
+        """
+        assert self._pending is not None
+        try:
+            by_lane = self._lane is not None and self._pending[1] == "step"
+            replies = self._of_lane(deaths) if by_lane else deaths.replies
+            for reply in replies:
+                if reply is not None:
+                    check(reply)
+        except EnvHubError:
+            self._pending = None
+            self._moved(Event.REPLY)
+            raise
+        return replies
+
+    def _of_lane(self, deaths: HostsDiedError) -> list[m.Message | None]:
+        lane, loaded = self._lane, self._loaded
+        assert lane is not None
+        assert loaded is not None
+        parts: list[m.Message | None] = [None] * len(self.bounds)
+        space = self.manifest.single_observation_space
+        observations = batches.split(space, lane.observation(), self.bounds)
+        flags = lane.flags()
+        for index, bounds in enumerate(self.bounds):
+            if index in deaths.deaths:
+                continue
+            asked = [(self._hosts[index], m.FetchInfos(self._number))]
+            fetch = partial(loaded.jail.exchange, "step", asked, Deadline(_CAUSE_S))
+            try:
+                info = self.results.lane_info(lane.shards[index], fetch)
+            except WorkerDiedError as error:
+                deaths.deaths[index] = error
+                continue
+            rewards, over, cut = (column[slice(*bounds)] for column in flags)
+            parts[index] = m.StepDone(observations[index], rewards, over, cut, info)
+        return parts
+
+    def _revive(
+        self, deaths: HostsDiedError, requests: Callable[[int], list[m.Message]]
+    ) -> dict[int, m.Message]:
+        """Bring dead shards back; returns what their fresh hosts answer to the last request."""
+        self._moved(Event.LOSS)
+        self._keep_crash(deaths.first)
+        try:
+            replies = self._bring_back(deaths, requests)
+        except WorkerTimeoutError as error:
+            if self.lifecycle.state is State.CLOSED:
+                raise self._dead(error) from error
+            self._pending = None  # nobody knows how far it came: a reset starts afresh
+            self._moved(Event.TIMEOUT)
+            raise
+        except EnvHubError as error:
+            raise self._dead(error) from (error.__cause__ or deaths.first)
+        except BaseException as error:
+            if self.lifecycle.state is State.CLOSED and isinstance(error, Exception):
+                raise self._dead(WorkerDiedError("")) from error
+            self._pending = None
+            self._moved(Event.INTERRUPT)
+            raise
+        self._pending = None
+        self.counters.deaths += len(replies)
+        self.history.started()
+        self._moved(Event.REVIVAL)
+        return replies
+
+    def _bring_back(
+        self, deaths: HostsDiedError, requests: Callable[[int], list[m.Message]]
+    ) -> dict[int, m.Message]:
+        assert self._pending is not None
+        if any(death.reason == "protocol" for death in deaths.deaths.values()):
+            raise deaths.first  # whoever breaks the rules is given no second chance
+        try:
+            self._restarts.spend(self._pending[1])
+        except WorkerDiedError as spent:
+            raise deaths.first from spent
+        dead = sorted(deaths.deaths)
+        deadline = self._startup = StartupDeadline(self.repository.timeouts.startup_s)
+        try:
+            with self.repository.starting():
+                self._rebuild(None if deaths.jail_gone else dead, deadline)
+        finally:
+            self._startup = None
+            self._let_server_go()
+        return self._ask_anew(dead, requests)
+
+    def _rebuild(self, dead: list[int] | None, deadline: Deadline) -> None:
+        """Some shards in fresh hosts of the same jail, or None: all of them in a fresh jail."""
+        if dead is None:
+            self._leave()
+            self._move_into(self._jails.take(deadline), deadline)
+        else:
+            assert self._place is not None
+            self._settle(self._builder.rebuild(self._place, dead, deadline))
+
+    def _ask_anew(
+        self, dead: list[int], requests: Callable[[int], list[m.Message]]
+    ) -> dict[int, m.Message]:
+        assert self._loaded is not None
+        jail, reset_s = self._loaded.jail, self.repository.timeouts.reset_s
+        deadline = Deadline(reset_s)
+        replies: list[m.Message] = []
+        try:
+            for messages in zip(*[requests(index) for index in dead], strict=True):
+                hosts = [self._hosts[index] for index in dead]
+                replies = jail.exchange("reset", list(zip(hosts, messages, strict=True)), deadline)
+        except WorkerTimeoutError as error:
+            raise self._late("reset", reset_s) from error
+        return dict(zip(dead, replies, strict=True))
+
+    def _revivals(self, index: int) -> list[m.Message]:
+        return [m.Revive(self._number, self._derived(index))]
+
+    def _resets(self, index: int) -> list[m.Message]:
+        return resets(self._reset_of(self.bounds[index]), self._derived(index))
+
+    def _derived(self, index: int) -> Any:
+        return self._seeds.derived(self.bounds[index], self._restarts.count)
+
+    def _reset_of(self, bounds: tuple[int, int]) -> m.Reset:
+        assert self._asked is not None
+        reset = self._asked(self._number, bounds)
+        assert isinstance(reset, m.Reset)
+        return reset
+
+    def _size(self, index: int) -> int:
+        start, stop = self.bounds[index]
+        return stop - start
 
     # --- the jail ------------------------------------------------------------------------------
 
@@ -425,78 +647,42 @@ class RemoteEnv:
             self._build_in(loaded, deadline)
 
     def _build_in(self, loaded: LoadedJail, deadline: Deadline) -> None:
-        try:
-            self._check_manifest(loaded)
-            hosts = self.repository.spread(loaded, len(self.bounds), deadline)
-            number = next(_numbers)
-            wanted = self.manifest
-            builds = [
-                (host, m.Build(number, wanted.suite, wanted.task, start, stop))
-                for host, (start, stop) in zip(hosts, self.bounds, strict=True)
-            ]
-            loaded.jail.exchange("make_env", builds, deadline)
-            self._hosts, self._number = hosts, number
-            self._lane = self._open_lane(loaded, deadline)
-            if self.lifecycle.state is State.CLOSED:
-                raise self._closed("make_env")
-        except BaseException:
-            self._close_lane()
-            self._jails.give_back(loaded)
-            raise
-        self._loaded = loaded
+        self._move_into(loaded, deadline)
         self.history.started()
         self.lifecycle.on(Event.START)
 
-    def _open_lane(self, loaded: LoadedJail, deadline: Deadline) -> FastLane | None:
-        """Agree with the hosts on slabs and doorbells; None where frames have to serve."""
-        path = loaded.server.fd_path
-        if path is None or not self.manifest.shardable or self.repository.lane == "frames":
-            return None
-        manifest, jail = self.manifest, loaded.jail
-        fd, copy = loaded.server.process_fd, self.repository.copy
-        lane = FastLane.for_spaces(manifest, self.bounds, fd, copy=copy)
-        if lane is None:
-            return None
+    def _move_into(self, loaded: LoadedJail, deadline: Deadline) -> None:
         try:
-            for shard, host in zip(lane.shards, self._hosts, strict=True):
-                lane.watch_jail(deposit(path, SESSION, jail.number, host, shard.fds))
-                shard.handed_over()
-            attach = [
-                (host, lane.attach_message(self._number, index))
-                for index, host in enumerate(self._hosts)
-            ]
-            replies = jail.exchange("attach", attach, deadline)
+            place = self._builder.build(loaded, deadline)
+            if self.lifecycle.state is State.CLOSED:
+                if place.lane is not None:
+                    place.lane.close()
+                raise self._closed("make_env")
         except BaseException:
-            lane.close()
+            self._jails.give_back(loaded)
             raise
-        if any(typed(reply, m.Value).value is not True for reply in replies):
-            lane.close()
-            return None
-        return lane
+        self._settle(place)
 
-    def _check_manifest(self, loaded: LoadedJail) -> None:
-        key = (self.manifest.suite, self.manifest.task)
-        found = next((e for e in loaded.manifest.envs if (e.suite, e.task) == key), None)
-        if found is None or _shape(found) != _shape(self.manifest):
-            self._jails.forget_manifest()
-            raise LoadError(
-                f"make_env returned another environment for {key} than before: its result must "
-                "not change between calls. The remembered description has been dropped; call "
-                "make_env again"
-            )
+    def _settle(self, place: Place) -> None:
+        self._place, self._loaded, self._lane = place, place.loaded, place.lane
+        self._hosts, self._number = place.hosts, place.number
 
     def _forget(self) -> None:
         """Give up the jail; the next request opens another, in the same server."""
         WORKER.info("%s: the jail is given up for a fresh one", self.repository.label)
+        self._leave()
+        self._pending = None
+        self.lifecycle.on(Event.FORGET)
+
+    def _leave(self) -> None:
         self._let_server_go()
         self._release_server = self.repository.hold()
-        if self._loaded is not None:
-            self.counters.stale_replies += self._loaded.jail.client.stale_replies
-            self._jails.end(self._loaded)
-            self._jails.give_back(self._loaded)
+        loaded, self._loaded, self._place = self._loaded, None, None
+        if loaded is not None:
+            self.counters.stale_replies += loaded.jail.client.stale_replies
+            self._jails.end(loaded)
+            self._jails.give_back(loaded)
         self._close_lane()
-        self._loaded, self._pending = None, None
-        self.lifecycle.on(Event.FORGET)
 
     def close(self) -> None:
         """Close the environment and end its processes, in bounded time, from any thread."""
@@ -541,7 +727,8 @@ class RemoteEnv:
         if self._lock.acquire(timeout=_INTERRUPT_S):
             try:
                 self._moved(Event.CLOSE)  # the other may have moved at the same moment
-                self._jails.give_back(loaded)
+                if self._loaded is not None:  # it may have moved elsewhere, too
+                    self._jails.give_back(self._loaded)
                 self._close_lane()
                 self._let_server_go()
             finally:
@@ -578,13 +765,3 @@ os.register_at_fork(after_in_child=_abandon_all)
 
 def _nothing() -> None:
     """There is nothing to give back."""
-
-
-def _shape(manifest: EnvManifest) -> tuple[Any, ...]:
-    return (
-        manifest.num_envs,
-        manifest.shardable,
-        manifest.autoreset_mode,
-        manifest.single_observation_space,
-        manifest.single_action_space,
-    )

@@ -22,7 +22,7 @@ from envhub_sandbox.errors import (
     name_source,
 )
 from envhub_sandbox.history import Recording
-from envhub_sandbox.jail import RemoteJail, check, open_jail
+from envhub_sandbox.jail import RemoteJail, open_jail
 from envhub_sandbox.log import CRASHES, WORKER
 from envhub_sandbox.policy import Policy, Timeouts
 from envhub_sandbox.provenance import provenance_of
@@ -292,11 +292,14 @@ class Repository:
         hosts = jail.hosts[:shards]
         fresh = [host for host in hosts if host not in loaded.loaded]
         if fresh:
-            load = self.arguments.message()
-            for reply in jail.exchange("make_env", [(host, load) for host in fresh], deadline):
-                check(reply)
-            loaded.loaded.update(fresh)
+            self.load(loaded, fresh, deadline)
         return hosts
+
+    def load(self, loaded: LoadedJail, hosts: list[int], deadline: Deadline) -> None:
+        """Have further hosts of a jail call ``make_env``."""
+        load = self.arguments.message()
+        loaded.jail.exchange("make_env", [(host, load) for host in hosts], deadline)
+        loaded.loaded.update(hosts)
 
     def connect(self, loaded: LoadedJail, deadline: Deadline) -> LoadedJail:
         """A further connection to an open jail; environments that share one wait apart."""

@@ -24,8 +24,11 @@ class Restarts:
         self._in_a_row = 0
         self.count = 0
 
-    def spend(self) -> None:
+    def spend(self, operation: str) -> None:
         """Count one more, and wait if the last one was a moment ago.
+
+        Args:
+            operation: What needs it.
 
         Raises:
             WorkerDiedError: There are none left.
@@ -35,7 +38,7 @@ class Restarts:
             raise WorkerDiedError(
                 f"the worker process has died again, and all {budget} restarts are used up "
                 "(restart_budget of the policy); make the environment again",
-                request="reset",
+                request=operation,
             )
         calm = time.monotonic() - self._last >= _CALM_S
         self._in_a_row = 0 if calm else self._in_a_row + 1

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from envhub_sandbox.errors import RemoteProtocolError
-from envhub_worker.protocol import batches
+from envhub_sandbox.fast_lane import LaneShard
+from envhub_sandbox.jail import check, typed
+from envhub_worker.protocol import batches, slabs
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest import EnvManifest
 
@@ -47,6 +49,18 @@ class Results:
     def lane_infos(self, parts: list[Any]) -> dict[Any, Any]:
         """The infos that came by the fast lane."""
         return self._infos([self._info(part) for part in parts])
+
+    def lane_info(self, shard: LaneShard, fetch: Callable[[], list[m.Message]]) -> Any:
+        """A shard's infos of a step by the fast lane; ``fetch`` asks for what did not fit."""
+        kind, message = shard.outcome()
+        if kind == slabs.COLUMNS:
+            return shard.columns()
+        if kind == slabs.FETCH:
+            [message] = fetch()
+        if message is None:
+            return {}
+        check(message)
+        return self._info(typed(message, m.Value).value)
 
     def one_each(self, what: str, replies: list[m.Value]) -> tuple[Any, ...]:
         """One value for each sub-environment."""

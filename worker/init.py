@@ -20,6 +20,7 @@ The end of the channel ends the jail.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import signal
@@ -237,8 +238,16 @@ class Init:
             host = self._hosts.pop(pid, None)
             if host is not None:
                 self._tell_exit(host, status)
+                self._end_orphans(pid)
         if ended and not self._hosts:
             sweep.kill_descendants(keep=())  # daemons do not outlive the last host
+
+    def _end_orphans(self, session: int) -> None:
+        """End what a host leaves behind, while others go on. Daemons end with the last host."""
+        for pid in sweep.descendants(os.getpid(), keep=self._hosts):
+            with contextlib.suppress(ProcessLookupError):
+                if os.getsid(pid) == session:
+                    os.kill(pid, signal.SIGKILL)
 
     def _before_reaping(self, pid: int) -> None:
         host = self._hosts.get(pid)

@@ -52,12 +52,6 @@ def test_backoff_doubles_and_is_bounded() -> None:
     assert backoff_s(0.0, 10_000) == 0.0
 
 
-def test_transparent_is_refused_with_the_reason() -> None:
-    """What cannot be had honestly is refused, and the text names what can be had."""
-    with pytest.raises(errors.PolicyError, match=r"transparent.*whole jail.*'on_reset'"):
-        Policy(restart="transparent")
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [

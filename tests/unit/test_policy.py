@@ -54,7 +54,7 @@ def test_unknown_names_are_refused(make: Any, complaint: str) -> None:
         (lambda: Policy(profile="lax"), "profile is 'lax'; it is one of strict, no-userns"),
         (lambda: Policy(network="all"), "network is 'all'; it is one of none, loopback, host"),
         (lambda: Policy(restart="always"), "restart is 'always'"),
-        (lambda: Policy(restart="transparent"), "restart is 'transparent'"),
+        (lambda: Policy(restart="sometimes"), "restart is 'sometimes'"),
         (lambda: Policy(gpu="no"), "gpu is 'no'; it is True or False"),  # type: ignore[arg-type]
         (lambda: Policy(readable="/data"), "readable is '/data'; it takes a tuple"),  # type: ignore[arg-type]
         (lambda: Policy(environment="HOME"), "environment is 'HOME'"),  # type: ignore[arg-type]

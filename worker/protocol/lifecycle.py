@@ -11,6 +11,7 @@ class State(Enum):
     IDLE = "not started"
     READY = "ready"
     PENDING = "waiting for a reply"
+    REVIVING = "bringing back what has died"
     LATE = "waiting for a reply that is late"
     DEAD = "dead"
     FOREIGN = "another process's: this is a fork of it"
@@ -27,6 +28,8 @@ class Event(Enum):
     REPLY = "the reply came"
     TIMEOUT = "the deadline came first"
     INTERRUPT = "whoever waited was interrupted"
+    LOSS = "what died is to be brought back"
+    REVIVAL = "it is back"
     DEATH = "its jail ended"
     FORGET = "its jail was given up"
     FORK = "this process is a fork of the one that made it"
@@ -47,6 +50,12 @@ TABLE: dict[tuple[State, Event], State] = {
     (State.PENDING, Event.INTERRUPT): State.LATE,
     (State.PENDING, Event.DEATH): State.DEAD,
     (State.PENDING, Event.CLOSE): State.CLOSED,
+    (State.PENDING, Event.LOSS): State.REVIVING,
+    (State.REVIVING, Event.REVIVAL): State.READY,
+    (State.REVIVING, Event.TIMEOUT): State.LATE,
+    (State.REVIVING, Event.INTERRUPT): State.LATE,
+    (State.REVIVING, Event.DEATH): State.DEAD,
+    (State.REVIVING, Event.CLOSE): State.CLOSED,
     (State.LATE, Event.REPLY): State.READY,
     (State.LATE, Event.DEATH): State.DEAD,
     (State.LATE, Event.FORGET): State.IDLE,

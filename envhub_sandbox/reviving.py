@@ -1,0 +1,106 @@
+"""What ``restart="transparent"`` promises: rows of a shard that died, in its fresh host.
+
+Nothing here asks anybody: it makes the requests for a fresh host and reads its replies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from envhub_worker.protocol import messages as m
+
+RESTARTED = "worker_restarted"
+"""In the infos: whether a sub-environment was lost and came back reset."""
+
+Bounds = tuple[int, int]
+Seeds = list[int | None]
+
+
+class SeedBook:
+    """What sub-environments were last seeded with, and what those that come back get.
+
+    Where the caller gave a seed, what follows a death is derived of it, so that the same run can
+    be had again; where he gave none, the fresh one is drawn by the environment.
+
+    Args:
+        num_envs: Number of sub-environments.
+        each: Whether they are seeded one by one; otherwise the environment does that by itself.
+    """
+
+    def __init__(self, num_envs: int, each: bool) -> None:
+        self._each = each
+        self._last: Seeds = [None] * num_envs
+        self._own: Any = None
+
+    def remember(self, reset: m.Reset) -> None:
+        """Take note of a reset of all sub-environments, or of those in its mask."""
+        seeds: Any = reset.seeds
+        if seeds is None:
+            return
+        if not self._each:
+            self._own = seeds
+            return
+        chosen_of: Any = [True] * len(self._last) if reset.mask is None else reset.mask
+        for index, (chosen, seed) in enumerate(zip(chosen_of, seeds, strict=True)):
+            if chosen and seed is not None:
+                self._last[index] = seed
+
+    def derived(self, bounds: Bounds, restart: int) -> Any:
+        """Seeds for the sub-environments of a shard that comes back."""
+        if self._each:
+            return [derived_seed(seed, restart) for seed in self._last[slice(*bounds)]]
+        if isinstance(self._own, list):
+            return [derived_seed(seed, restart) for seed in self._own]
+        return derived_seed(self._own, restart)
+
+
+def derived_seed(seed: int | None, restart: int) -> int | None:
+    """The seed of a sub-environment that comes back with an environment's ``restart``-th restart.
+
+    Args:
+        seed: The last that it was given, or None.
+        restart: Counts from 1.
+    """
+    if seed is None:
+        return None
+    return int(np.random.SeedSequence((abs(seed), restart)).generate_state(1)[0])
+
+
+def resets(message: m.Reset, derived: Any) -> list[m.Message]:
+    """What a fresh host is asked in the place of one that died in a reset.
+
+    The reset itself; where it is one of some sub-environments only, all are reset before.
+
+    Args:
+        message: What the dead one was asked.
+        derived: Seeds for what the caller gave none for.
+    """
+    if message.mask is not None:
+        return [m.Reset(message.env, derived, None, None), message]
+    return [replace(message, seeds=_filled(message.seeds, derived))]
+
+
+def _filled(seeds: Any, derived: Any) -> Any:
+    if not isinstance(seeds, list) or not isinstance(derived, list):
+        return derived if seeds is None else seeds
+    return [new if seed is None else seed for seed, new in zip(seeds, derived, strict=True)]
+
+
+def truncated(reply: m.StepDone, count: int) -> m.StepDone:
+    """A fresh host's rows of the step in which another died. Trust: its flags are not asked."""
+    return m.StepDone(
+        reply.observation,
+        np.zeros(getattr(reply.rewards, "shape", (count,))),
+        np.zeros(count, np.bool_),
+        np.ones(count, np.bool_),
+        marked(reply.info, count),
+    )
+
+
+def marked(info: dict[Any, Any], count: int) -> dict[Any, Any]:
+    """Infos that say of every sub-environment of a shard that it was lost and came back."""
+    yes = np.ones(count, np.bool_)
+    return {**info, RESTARTED: yes, f"_{RESTARTED}": yes.copy()}

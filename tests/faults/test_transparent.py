@@ -1,0 +1,477 @@
+"""``restart="transparent"``: what died comes back reset and says so; the others go on."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+from gymnasium.error import ClosedEnvironmentError
+
+from envhub_sandbox import errors, make_env
+from envhub_sandbox.deadline import Deadline
+from envhub_sandbox.reviving import derived_seed
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.lifecycle import State
+from tests.support.processes import eventually
+from tests.support.samples import reference, sample
+
+LIVE, EXIT, KILL, CRASH, RAISE, SLOW, MEMORY = range(7)
+ALL_LIVE = [LIVE] * 4
+LAST_DIES = [LIVE, LIVE, LIVE, EXIT]
+DEAD = slice(2, 4)
+SEED = 11
+
+pytestmark = pytest.mark.usefixtures("neighbour")
+
+
+def made(
+    lane: str = "auto", shards: int = 2, env_kwargs: dict[str, Any] | None = None, **more: Any
+) -> Any:
+    """Four sub-environments in two processes, of which the second holds the last two."""
+    policy = {"restart": "transparent", "restart_backoff_s": 0, "crash_history": 0}
+    return make_env(
+        sample("mortal"),
+        n_envs=4,
+        use_async_envs=True,
+        num_workers=shards,
+        lane=lane,
+        policy=policy | more.pop("policy", {}),
+        env_kwargs=env_kwargs or {},
+        **more,
+    )
+
+
+def oracle(mode: str = "NextStep") -> Any:
+    """The same without a sandbox, where nobody dies."""
+    return reference("mortal", n_envs=4, mode=mode)
+
+
+def same(got: Any, expected: Any) -> bool:
+    """Whether two results of a step are equal, all infos included."""
+    *arrays, infos = got
+    *expected_arrays, expected_infos = expected
+    pairs = [*zip(arrays, expected_arrays, strict=True)]
+    pairs += [(infos[key], expected_infos[key]) for key in expected_infos]
+    return infos.keys() == expected_infos.keys() and all(np.array_equal(a, b) for a, b in pairs)
+
+
+def fresh(restart: int, rows: slice = DEAD) -> Any:
+    """What sub-environments seeded with SEED observe when they come back."""
+    seeds = [derived_seed(SEED + row, restart) for row in range(4)[rows]]
+    alone = reference("mortal", n_envs=len(seeds))
+    return alone.reset(seed=seeds)[0]
+
+
+def restarted(info: dict[str, Any], rows: slice = DEAD) -> bool:
+    """Whether the infos say of these rows, and of no other, that they came back."""
+    expected = np.zeros(4, bool)
+    expected[rows] = True
+    both = info["worker_restarted"], info["_worker_restarted"]
+    return all(np.array_equal(one, expected) for one in both)
+
+
+def state(env: Any) -> State:
+    """Where the environment is in its life."""
+    return env._remote.lifecycle.state  # type: ignore[no-any-return]
+
+
+def pids(env: Any) -> list[int]:
+    """The processes of an environment's jail, as its server knows them."""
+    jail = env._remote._loaded.jail
+    status, _ = jail.client.request(m.GetStatus(), deadline=Deadline(60))
+    assert isinstance(status, m.Status)
+    jails = [one for one in status.jails if isinstance(one, dict)]
+    return next(list(one["pids"]) for one in jails if one["jail"] == jail.number)
+
+
+lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
+
+
+@lanes
+@pytest.mark.parametrize("how", [EXIT, KILL, CRASH])
+def test_the_dead_come_back_and_the_others_go_on(lane: str, how: int) -> None:
+    """The rows of the dead are fresh and truncated, all others are what they would have been."""
+    beside = oracle()
+    with made(lane) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        beside.reset(seed=SEED)
+        assert same(env.step(ALL_LIVE), beside.step(ALL_LIVE))
+        got, expected = env.step([LIVE, LIVE, how, LIVE]), beside.step(ALL_LIVE)
+        for mine, other in zip(got[:4], expected[:4], strict=True):
+            assert np.array_equal(mine[:2], other[:2])
+        observation, rewards, terminated, truncated, info = got
+        assert np.array_equal(observation[DEAD], fresh(1))
+        assert rewards[DEAD].tolist() == [0, 0]
+        assert truncated.tolist() == [False, False, True, True]
+        assert not terminated.any()
+        assert restarted(info)
+        assert info["at"].tolist() == [2, 2, 0, 0]
+        assert state(env) is State.READY
+        assert env.stats()["deaths"] == env.stats()["restarts"] == 1
+
+
+@lanes
+def test_next_step_resets_what_came_back_truncated(lane: str) -> None:
+    """As after any truncation in this mode: the action after it resets, the next one counts."""
+    beside = oracle()
+    with made(lane) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        env.step(LAST_DIES)
+        beside.reset(seed=[0, 0, *[derived_seed(SEED + row, 1) for row in (2, 3)]])
+        beside._autoreset_envs[DEAD] = True
+        for _ in range(7):
+            mine, other = env.step(ALL_LIVE), beside.step(ALL_LIVE)
+            for got, expected in zip(mine[:4], other[:4], strict=True):
+                assert np.array_equal(got[DEAD], expected[DEAD])
+            assert "worker_restarted" not in mine[4]
+
+
+@lanes
+def test_same_step_has_begun_the_next_episode(lane: str) -> None:
+    """The fresh observation is the next episode's first, and stands for the lost final one."""
+    with made(lane, env_kwargs={"mode": "SameStep"}) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        observation, _, _, truncated, info = env.step(LAST_DIES)
+        assert truncated.tolist() == [False, False, True, True]
+        assert info["_final_obs"].tolist() == info["_final_info"].tolist() == truncated.tolist()
+        assert np.array_equal(np.stack(info["final_obs"][DEAD]), observation[DEAD])
+        after = env.step(ALL_LIVE)[0]
+        assert after[:, 1].tolist() == [2, 2, 1, 1]
+        assert np.array_equal(after[DEAD, 0], observation[DEAD, 0])
+
+
+@lanes
+def test_disabled_wants_a_reset_of_what_came_back(lane: str) -> None:
+    """A step is refused as after any episode's end, and a masked reset goes on with the others."""
+    with made(lane, env_kwargs={"mode": "Disabled"}) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        assert env.step(LAST_DIES)[3].tolist() == [False, False, True, True]
+        with pytest.raises(errors.RemoteEnvError):
+            env.step(ALL_LIVE)
+        env.reset(options={"reset_mask": np.array([False, False, True, True])})
+        assert env.step(ALL_LIVE)[0][DEAD, 1].tolist() == [1, 1]
+
+
+@lanes
+def test_the_only_process_comes_back_whole(lane: str) -> None:
+    """With one shard all rows are its own."""
+    with made(lane, shards=1) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        jail = env._remote._loaded.jail.number
+        for restart in (1, 2):
+            observation, rewards, _, truncated, info = env.step(LAST_DIES)
+            assert np.array_equal(observation, fresh(restart, slice(4)))
+            assert truncated.all()
+            assert not rewards.any()
+            assert restarted(info, slice(4))
+            assert not env.step(ALL_LIVE)[3].any()  # the reset after a truncation
+        assert env._remote._loaded.jail.number == jail
+
+
+def test_seeded_runs_with_the_same_deaths_are_the_same() -> None:
+    """Seeds after a death derive from those before it: chance has no part in it."""
+
+    def run() -> list[Any]:
+        with made() as suites:
+            env = suites.env
+            env.reset(seed=SEED)
+            return [env.step(LAST_DIES if at % 3 == 1 else ALL_LIVE)[0] for at in range(9)]
+
+    assert all(np.array_equal(a, b) for a, b in zip(run(), run(), strict=True))
+
+
+def test_unseeded_deaths_do_not_repeat_episodes() -> None:
+    """Nothing was seeded, so nothing comes back twice."""
+    with made() as suites:
+        env = suites.env
+        env.reset()
+        drawn = {env.step(LAST_DIES)[0][3, 0] for _ in range(3)}
+        assert len(drawn) == 3
+
+
+@lanes
+def test_a_reset_is_done_again_in_the_fresh_process(lane: str) -> None:
+    """Whoever dies in a reset is reset with the very seeds and options, once more."""
+    with made(lane) as suites:
+        env = suites.env
+        observation, info = env.reset(seed=SEED, options={"exit_once": True})
+        expected, _ = oracle().reset(seed=SEED)
+        assert np.array_equal(observation, expected)
+        assert info["worker_restarted"].tolist() in ([True, True, False, False],) or restarted(info)
+        assert env.step(ALL_LIVE)[0][:, 1].tolist() == [1, 1, 1, 1]
+
+
+@lanes
+def test_a_masked_reset_brings_back_whom_it_does_not_name(lane: str) -> None:
+    """A shard that dies in it has lost all its rows: the others begin anew, and are marked."""
+    with made(lane) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        env.step(ALL_LIVE)
+        mask = np.array([False, False, True, False])
+        seeds = [None, None, 99, None]
+        options = {"reset_mask": mask, "exit_once": True}
+        observation, info = env.reset(seed=seeds, options=options)
+        assert restarted(info)
+        assert observation[:, 1].tolist()[2:] == [0, 0]
+        assert np.array_equal(observation[2], reference("mortal").reset(seed=99)[0][0])
+        assert np.array_equal(observation[3], fresh(1)[1])
+        assert env.step(ALL_LIVE)[0][:, 1].tolist() == [2, 2, 1, 1]
+
+
+@lanes
+def test_who_dies_again_in_coming_back_is_dead(lane: str) -> None:
+    """There is one attempt; afterwards it is dead as without it, and a reset starts afresh."""
+    with made(lane) as suites:
+        env = suites.env
+        with pytest.raises(errors.WorkerDiedError) as caught:
+            env.reset(options={"exit": True})
+        assert caught.value.exit_code == 4
+        assert state(env) is State.DEAD
+        with pytest.raises(errors.WorkerDiedError, match="cannot step"):
+            env.step(ALL_LIVE)
+        env.reset(seed=SEED)
+        assert env.step(ALL_LIVE)[0][:, 1].tolist() == [1, 1, 1, 1]
+
+
+@lanes
+def test_a_call_is_not_repeated(lane: str) -> None:
+    """It says how they died; the next step brings them back, and the others have not moved."""
+    with made(lane) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        env.step(ALL_LIVE)
+        for _ in range(2):
+            with pytest.raises(errors.WorkerDiedError) as caught:
+                env.call("last_words")
+            assert caught.value.exit_code == 5
+            assert caught.value.request == "call"
+            assert state(env) is State.READY
+        observation, _, _, truncated, info = env.step(ALL_LIVE)
+        assert truncated.all()
+        assert restarted(info, slice(4))
+        assert observation[:, 1].tolist() == [0, 0, 0, 0]
+        assert env.call("hello") == ("hello",) * 4
+
+
+@lanes
+def test_a_death_between_requests_is_met_by_the_next(lane: str) -> None:
+    """Killed from outside while nothing is asked: a call says so, a step brings it back."""
+    with made(lane) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        victim = pids(env)[1]
+        os.kill(victim, signal.SIGKILL)
+        assert eventually(lambda: not psutil.pid_exists(victim))
+        with pytest.raises(errors.WorkerDiedError, match="SIGKILL"):
+            env.get_attr("steps")
+        observation, _, _, truncated, info = env.step(ALL_LIVE)
+        assert truncated.tolist() == [False, False, True, True]
+        assert observation[:, 1].tolist() == [1, 1, 0, 0]
+        assert restarted(info)
+
+
+@lanes
+def test_a_reset_brings_back_who_died_between_requests(lane: str) -> None:
+    """It is a reset as any other; the infos say what happened."""
+    with made(lane) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        os.kill(pids(env)[1], signal.SIGKILL)
+        observation, info = env.reset(seed=SEED)
+        assert np.array_equal(observation, oracle().reset(seed=SEED)[0])
+        assert restarted(info)
+
+
+@lanes
+def test_the_end_of_the_jail_takes_all_rows(lane: str) -> None:
+    """Its first process holds the others: all come back, in another jail."""
+    with made(lane) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        jail = env._remote._loaded.jail.number
+        init = psutil.Process(pids(env)[0]).parent()
+        assert init is not None
+        init.kill()
+        observation, _, _, truncated, info = env.step(ALL_LIVE)
+        assert truncated.all()
+        assert restarted(info, slice(4))
+        assert np.array_equal(observation, fresh(1, slice(4)))
+        assert env._remote._loaded.jail.number != jail
+
+
+@lanes
+def test_memory_of_all_takes_all_rows(lane: str) -> None:
+    """The limit is the jail's: where it cannot be told who has broken it, all shards come back."""
+    limits = {"memory_bytes": 400 << 20}
+    with made(lane, policy={"limits": limits}) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        _, _, _, truncated, info = env.step([LIVE, LIVE, LIVE, MEMORY])
+        assert truncated[DEAD].all()
+        assert info["worker_restarted"][DEAD].all()
+        assert np.array_equal(truncated, info["worker_restarted"])
+        assert not env.step(ALL_LIVE)[3].any()
+
+
+@lanes
+def test_one_that_raises_beside_a_death_is_told_first(lane: str) -> None:
+    """The exception is the step's; the death is met by the next step."""
+    with made(lane) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        with pytest.raises(errors.RemoteEnvError, match="as told"):
+            env.step([LIVE, RAISE, LIVE, EXIT])
+        assert state(env) is State.READY
+        assert restarted(env.step(ALL_LIVE)[4])
+
+
+@lanes
+def test_a_late_sibling_is_a_timeout_all_the_same(lane: str) -> None:
+    """The dead do not make the living answer; a reset brings everybody back."""
+    with made(lane) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        env.step_async([SLOW, LIVE, LIVE, EXIT])
+        with pytest.raises(errors.WorkerTimeoutError):
+            env.step_wait(timeout=0.1)
+        assert state(env) is State.LATE
+        observation, _ = env.reset(seed=SEED)
+        assert np.array_equal(observation, oracle().reset(seed=SEED)[0])
+        assert env.step(ALL_LIVE)[0][:, 1].tolist() == [1, 1, 1, 1]
+
+
+@lanes
+def test_a_slow_sibling_is_waited_for(lane: str) -> None:
+    """Its row is its real result."""
+    with made(lane) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        observation, _, _, truncated, _ = env.step([SLOW, LIVE, LIVE, EXIT])
+        assert observation[:, 1].tolist() == [1, 1, 0, 0]
+        assert truncated.tolist() == [False, False, True, True]
+
+
+@lanes
+def test_budget_ends_in_the_death_itself(lane: str) -> None:
+    """When all restarts are used up a death is told as it is, with the reason for staying dead."""
+    with made(lane, policy={"restart_budget": 1}) as suites:
+        env = suites.env
+        env.reset()
+        env.step(LAST_DIES)
+        env.step(ALL_LIVE)
+        with pytest.raises(errors.WorkerDiedError, match="died during step") as caught:
+            env.step(LAST_DIES)
+        assert caught.value.exit_code == 3
+        assert "all 1 restarts" in str(caught.value.__cause__)
+        assert state(env) is State.DEAD
+        with pytest.raises(errors.WorkerDiedError, match="all 1 restarts"):
+            env.reset()
+
+
+def test_lent_observations_come_back_too() -> None:
+    """Rows that are lent out are nobody's to overwrite."""
+    with made(copy=False) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        before = env.step(ALL_LIVE)[0]
+        kept = before.copy()
+        observation = env.step(LAST_DIES)[0]
+        assert np.array_equal(before, kept)
+        assert np.array_equal(observation[DEAD], fresh(1))
+        env.step(ALL_LIVE)
+        assert np.array_equal(observation[DEAD], fresh(1))
+
+
+def test_an_environment_with_a_step_of_its_own_comes_back_whole() -> None:
+    """It is reset, all rows are truncated, and its next step is a step."""
+    with made(shards=1, env_kwargs={"form": "whole"}) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        observation, rewards, _, truncated, info = env.step(LAST_DIES)
+        assert truncated.all()
+        assert not rewards.any()
+        assert restarted(info, slice(4))
+        assert observation[:, 1].tolist() == [0, 0, 0, 0]
+        assert env.step(ALL_LIVE)[0][:, 1].tolist() == [1, 1, 1, 1]
+
+
+def test_environments_of_one_jail_come_back_each_on_its_own() -> None:
+    """They share a process: its death is everybody's, and each is told at its own next step."""
+    with made(env_kwargs={"form": "built"}) as suites:
+        first, second = suites["suite"]["a"], suites["suite"]["b"]
+        for env in (first, second):
+            env.reset(seed=SEED)
+        dead, other = first.step(LAST_DIES), second.step(ALL_LIVE)
+        for _, _, _, truncated, info in (dead, other):
+            assert truncated.all()
+            assert restarted(info, slice(4))
+        assert not first.step(ALL_LIVE)[3].any()
+
+
+def test_close_does_not_wait_for_who_is_coming_back() -> None:
+    """From another thread, while ``make_env`` hangs in the fresh process."""
+    with made(env_kwargs={"form": "slow"}, shards=1) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        closing = threading.Timer(0.3, env.close)
+        closing.start()
+        with pytest.raises(ClosedEnvironmentError):
+            env.step(LAST_DIES)
+        closing.join()
+        assert state(env) is State.CLOSED
+
+
+def test_coming_back_has_a_deadline() -> None:
+    """A fresh process that does not load in time is a timeout; a reset starts afresh."""
+    timeouts = {"startup_s": 1.0}
+    with made(env_kwargs={"form": "slow"}, shards=1, timeouts=timeouts) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        with pytest.raises(errors.WorkerTimeoutError, match="make_env"):
+            env.step(LAST_DIES)
+        assert state(env) is State.LATE
+        assert np.array_equal(env.reset(seed=SEED)[0], oracle().reset(seed=SEED)[0])
+
+
+def test_interrupted_in_coming_back_it_starts_afresh() -> None:
+    """Ctrl-C ends the wait at once; a reset brings it back in another jail."""
+    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    try:
+        with made(env_kwargs={"form": "slow"}, shards=1) as suites:
+            env = suites.env
+            env.reset(seed=SEED)
+            signal.setitimer(signal.ITIMER_REAL, 0.3)
+            with pytest.raises(KeyboardInterrupt):
+                env.step(LAST_DIES)
+            assert state(env) is State.LATE
+            env.reset(seed=SEED)
+            assert env.step(ALL_LIVE)[0][:, 1].tolist() == [1, 1, 1, 1]
+    finally:
+        signal.signal(signal.SIGALRM, before)
+
+
+def test_the_dead_leave_nothing_in_their_jail() -> None:
+    """After twenty deaths the jail has two processes, and the client no more descriptors."""
+    with made() as suites:
+        env = suites.env
+        env.reset()
+        env.step(LAST_DIES)
+        held = len(os.listdir("/proc/self/fd"))
+        for _ in range(20):
+            env.step(LAST_DIES)
+            env.step(ALL_LIVE)
+        assert len(os.listdir("/proc/self/fd")) == held
+        init = psutil.Process(pids(env)[0]).parent()
+        assert init is not None
+        assert eventually(lambda: len(init.children(recursive=True)) == 2)
