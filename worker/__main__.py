@@ -17,6 +17,11 @@
 - environment: nothing is read from it but what Python itself needs.
 - exit code: 0 after a stop, 2 for wrong arguments.
 
+``envhub-worker listen [--bind tcp://127.0.0.1:5555] [--key FILE] [--authorized-clients FILE]
+[--insecure-loopback] [--state-dir D] [quotas]`` serves clients on other hosts. It keeps keys and
+snapshots in ``D``, by default below ``$XDG_STATE_HOME``. ``envhub-worker keygen [--out DIR]``
+makes a key pair, ``envhub-worker status`` says who uses a listening server.
+
 ``envhub-worker health [--port 5555]`` exits with 0 if a server of this container answers, else 1.
 """
 
@@ -68,6 +73,35 @@ def _health(arguments: argparse.Namespace) -> int:
     return 0 if answers("127.0.0.1", arguments.port) else 1
 
 
+def _listen(arguments: argparse.Namespace) -> int:
+    """Serve clients on other hosts."""
+    from envhub_worker import listen
+
+    return listen.run(arguments)
+
+
+def _status(arguments: argparse.Namespace) -> int:
+    """Say who uses a listening server."""
+    from envhub_worker import asking
+
+    return asking.run(arguments)
+
+
+def _keygen(arguments: argparse.Namespace) -> int:
+    """Make a key pair, and say its public key."""
+    from envhub_worker import keys
+    from envhub_worker.protocol.keys import key_text
+
+    pair = keys.generate()
+    try:
+        secret, public = keys.save(pair, arguments.out, arguments.name)
+    except OSError as error:
+        sys.stderr.write(f"envhub-worker keygen: {error}\n")
+        return 1
+    print(f"secret key: {secret} (keep it)\npublic key: {key_text(pair.public)} ({public})")
+    return 0
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="envhub-worker", description="Executes environments from the Hub under confinement."
@@ -83,10 +117,26 @@ def _parser() -> argparse.ArgumentParser:
     serve.add_argument("--until-eof", action="store_true")
     serve.add_argument("--announce", action="store_true")
     serve.set_defaults(run=_serve)
+    _add_remote(commands)
     health = commands.add_parser("health", help="whether a server of this container answers")
     health.add_argument("--port", type=int, default=5555)
     health.set_defaults(run=_health)
     return parser
+
+
+def _add_remote(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    from envhub_worker import asking, listen
+
+    listening = commands.add_parser("listen", help="serve clients on other hosts, with keys")
+    listen.add_arguments(listening)
+    listening.set_defaults(run=_listen)
+    status = commands.add_parser("status", help="who uses a listening server")
+    asking.add_arguments(status)
+    status.set_defaults(run=_status)
+    keygen = commands.add_parser("keygen", help="make a CURVE key pair")
+    keygen.add_argument("--out", type=Path, default=Path(), metavar="DIR")
+    keygen.add_argument("--name", default="client")
+    keygen.set_defaults(run=_keygen)
 
 
 if __name__ == "__main__":

@@ -42,15 +42,21 @@ ATTACH = "attach"
 """The operation that brings a host its descriptors."""
 MAX_JAILS = 256
 """Open jails of one server."""
+MAX_DEAD = 256
+"""Jails that were ended and not closed, whose deaths are remembered."""
 
 
 @dataclass(frozen=True)
 class Asker:
-    """Who asked: the reply goes to this identity under this id. Jails belong to its session."""
+    """Who asked: the reply goes to this identity under this id. Jails belong to its session.
+
+    ``key`` was proved in the handshake; empty where none is needed.
+    """
 
     identity: bytes
     request_id: int
     session: bytes = b""
+    key: bytes = b""
 
 
 @dataclass
@@ -159,7 +165,7 @@ class Jails:
 
     def open(self, asker: Asker, request: m.OpenJail) -> None:
         """Fork a jail for a snapshot, and its first hosts."""
-        if len(self._jails) >= MAX_JAILS or not 1 <= request.hosts <= MAX_HOSTS:
+        if len(self.open_ones()) >= MAX_JAILS or not 1 <= request.hosts <= MAX_HOSTS:
             self._answers.refuse(
                 asker, "WorkerError", f"at most {MAX_JAILS} jails of 1 to {MAX_HOSTS} hosts"
             )
@@ -285,7 +291,7 @@ class Jails:
         entry = self._jails.get(number)
         if entry is None or entry.session != asker.session:
             self._answers.refuse(
-                asker, "WorkerError", f"there is no jail {number}; it has been closed"
+                asker, "WorkerDiedError", f"there is no jail {number}; it has been closed"
             )
             return None
         if entry.death is not None:
@@ -325,6 +331,27 @@ class Jails:
         """Tell what the asker's jails are doing."""
         mine = [entry for entry in self._jails.values() if entry.session == asker.session]
         self._answers.reply(asker, m.Status(tuple(_status_of(entry) for entry in mine)))
+
+    # --- for the gate --------------------------------------------------------------------------
+
+    def open_ones(self, owner: bytes = b"") -> list[JailEntry]:
+        """Jails that live, of sessions whose name begins like that."""
+        return [
+            entry
+            for entry in self._jails.values()
+            if entry.death is None and not entry.closing and entry.session.startswith(owner)
+        ]
+
+    def statuses(self, owner: bytes) -> list[dict[str, object]]:
+        """What the jails of a session are doing."""
+        return [_status_of(entry) for entry in self.open_ones(owner)]
+
+    def end(self, entry: JailEntry, why: str) -> None:
+        """End a jail that nobody closes; its client is told why if it comes back."""
+        self._end(entry, m.Died(-1, "idle", None, None, why, "", ""))
+        dead = [number for number, one in self._jails.items() if one.released]
+        for number in dead[:-MAX_DEAD]:
+            del self._jails[number]
 
     # --- what happens --------------------------------------------------------------------------
 

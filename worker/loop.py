@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable
+from time import monotonic
 from typing import Any
 
 import zmq
@@ -19,6 +20,11 @@ class Loop:
         self._poller = zmq.Poller()
         self._callbacks: dict[Any, Callable[[], None]] = {}
         self._stopped = False
+        self._tick: Callable[[], None] | None = None
+
+    def tick(self, callback: Callable[[], None]) -> None:
+        """Call back about once a second, from now on."""
+        self._tick = callback
 
     def watch(self, source: Any, callback: Callable[[], None]) -> None:
         """Call back when there is something to read."""
@@ -48,8 +54,12 @@ class Loop:
 
     def run(self) -> None:
         """Call back until ``stop``."""
+        ticked = monotonic()
         while not self._stopped:
             for ready, _ in self._poller.poll(_POLL_MS):
                 callback = self._callbacks.get(ready)
                 if callback is not None:
                     callback()
+            if self._tick is not None and monotonic() - ticked >= _POLL_MS / 1000:
+                ticked = monotonic()
+                self._tick()

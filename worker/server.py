@@ -1,6 +1,7 @@
 """The worker server: ZeroMQ towards clients on one side, jails on the other.
 
-Trusted code in one thread and one poll loop.
+Trusted code in one thread and one poll loop. Who the clients are, and what they may, is the
+business of its gate.
 """
 
 from __future__ import annotations
@@ -13,13 +14,21 @@ from typing import Any
 import zmq
 
 from envhub_worker import __version__
+from envhub_worker.gate import Gate, LocalGate
 from envhub_worker.jails import Asker, Jails
 from envhub_worker.lockdown.scratch import remove_tree
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol import packing
 from envhub_worker.protocol.codec import Buffer
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+from envhub_worker.quotas import RefusedError
+from envhub_worker.sessions import Sessions
+
+_RCVHWM = 64
+_ROUND = 64
+"""Messages that are served before the jails have their turn."""
 
 
 class Server:
@@ -33,18 +42,26 @@ class Server:
         client_pidfd: int | None = None,
         limits: WireLimits = DEFAULT_LIMITS,
         fd_path: Path | None = None,
+        gate: Gate | None = None,
     ) -> None:
         self._runtime_dir = runtime_dir
         self._limits = limits
-        self._sessions: dict[bytes, bytes] = {}
+        self._gate: Gate = gate or LocalGate()
+        self._sessions = Sessions()
         self._loop = Loop()
         self._context = zmq.Context()
         self._router = self._listen(endpoint)
         self._loop.watch(self._router, self._serve_clients)
         fd_path = fd_path or runtime_dir / "fds"
         self._jails = Jails(self._loop, self, runtime_dir, readable_roots, limits, fd_path)
+        self._loop.tick(lambda: self._gate.tick(self._sessions, self._jails))
         if client_pidfd is not None:
             self._loop.watch(client_pidfd, self.stop)
+
+    @property
+    def endpoint(self) -> str:
+        """Where it listens, with the port that was found for it."""
+        return str(self._router.get_string(zmq.LAST_ENDPOINT))
 
     def stop_on(self, *signals: int) -> None:
         """End the loop at these signals; to be called on the main thread."""
@@ -58,8 +75,10 @@ class Server:
         router = self._context.socket(zmq.ROUTER)
         router.setsockopt(zmq.LINGER, 0)
         router.setsockopt(zmq.MAXMSGSIZE, self._limits.frame_bytes)
-        router.setsockopt(zmq.RCVHWM, 64)
+        router.setsockopt(zmq.RCVHWM, _RCVHWM)
         router.setsockopt(zmq.ROUTER_HANDOVER, 0)
+        router.setsockopt(zmq.IPV6, "[" in endpoint)
+        self._gate.secure(router, self._loop)
         router.bind(endpoint)
         return router
 
@@ -72,6 +91,7 @@ class Server:
 
     def _shut_down(self) -> None:
         self._jails.close()
+        self._gate.close()
         self._router.close()
         self._context.term()
         remove_tree(str(self._runtime_dir))  # its owner may not be there any more
@@ -79,44 +99,65 @@ class Server:
     # --- clients -------------------------------------------------------------------------------
 
     def _serve_clients(self) -> None:
-        while True:
+        for _ in range(_ROUND):
             try:
-                identity, *frames = self._router.recv_multipart(zmq.NOBLOCK)
+                sender = self._router.recv(zmq.NOBLOCK, copy=False)
             except zmq.Again:
                 return
-            self._serve(identity, frames)
+            frames = self._router.recv_multipart(zmq.NOBLOCK) if sender.more else []
+            self._serve(sender.bytes, self._gate.key_of(sender), frames)
 
-    def _serve(self, identity: bytes, frames: list[bytes]) -> None:
+    def _serve(self, identity: bytes, key: bytes, frames: list[Any]) -> None:
         if not frames or len(frames[0]) > self._limits.header_bytes:
             return
+        session = self._sessions.find(identity, key)
         try:
+            if self._sessions.compression(identity, key):
+                frames[:] = packing.unpack_frames(frames, self._limits)
             request_id, request = m.unpack(frames[:1], limits=self._limits)
         except ProtocolError:
             return  # not our protocol; there is no id to answer to
-        asker = Asker(identity, request_id, self._sessions.get(identity, b""))
+        asker = Asker(identity, request_id, b"" if session is None else session.owner, key)
         try:
             self._dispatch(asker, request, frames[1:])
+        except RefusedError as refused:
+            self.refuse(asker, refused.error, refused.message)
         except Exception as error:
-            self.reply(asker, m.Refused("WorkerError", f"{type(error).__name__}: {error}", "", ""))
+            self.refuse(asker, "WorkerError", f"{type(error).__name__}: {error}")
 
-    def _dispatch(self, asker: Asker, request: m.Message, payload: list[bytes]) -> None:
+    def _dispatch(self, asker: Asker, request: m.Message, payload: list[Any]) -> None:
         if isinstance(request, m.Hello):
             self._hello(asker, request)
-        elif not asker.session:
-            self.refuse(asker, "LocalProtocolError", "say Hello first")
-        elif isinstance(request, m.Relay):
+            return
+        if not asker.session:
+            self.refuse(asker, "HelloError", "say Hello first")
+            return
+        size = sum(map(len, payload))
+        request = self._gate.check(asker, request, size, self._sessions, self._jails)
+        if isinstance(request, m.Relay):
             self._jails.relay(asker, request, payload)
+        elif isinstance(request, m.Agree):
+            self._agree(asker, request)
+        elif handler := _HANDLERS.get(type(request)):
+            handler(self._jails, asker, request)
         else:
-            handler = _HANDLERS.get(type(request))
-            if handler is None:
-                self.refuse(asker, "LocalProtocolError", f"{type(request).__name__} is no request")
-            else:
-                handler(self._jails, asker, request)
+            self._serve_specially(asker, request, payload)
+
+    def _serve_specially(self, asker: Asker, request: m.Message, payload: list[Any]) -> None:
+        reply = self._gate.serve(asker, request, payload, self._jails)
+        if reply is None:
+            self.refuse(asker, "LocalProtocolError", f"{type(request).__name__} is no request")
+        else:
+            self.reply(asker, reply)
 
     def reply(self, asker: Asker, message: m.Message, payload: Sequence[Buffer] = ()) -> None:
         """Answer a request."""
-        frames = [asker.identity, *m.pack(message, asker.request_id), *payload]
-        self._router.send_multipart(frames, zmq.NOBLOCK, copy=False)
+        self._gate.answered(asker)
+        frames: list[Buffer] = [*m.pack(message, asker.request_id), *payload]
+        compression = self._sessions.compression(asker.identity, asker.key)
+        if compression:
+            frames = packing.pack_frames(frames, compression)
+        self._router.send_multipart([asker.identity, *frames], zmq.NOBLOCK, copy=False)
 
     def refuse(
         self, asker: Asker, error: str, message: str, layer: str = "", fix: str = ""
@@ -125,20 +166,26 @@ class Server:
         self.reply(asker, m.Refused(error, message, layer, fix))
 
     def _hello(self, asker: Asker, request: m.Hello) -> None:
-        if not request.oldest <= m.VERSION <= request.newest:
-            side = "client" if request.newest < m.VERSION else "worker"
-            self.refuse(
-                asker,
+        version = min(m.VERSION, request.newest)
+        if version < max(m.OLDEST_VERSION, request.oldest):
+            side = "client" if request.newest < m.OLDEST_VERSION else "worker"
+            raise RefusedError(
                 "VersionMismatchError",
                 f"the client speaks protocol {request.oldest} to {request.newest}, this worker "
-                f"{m.VERSION}: upgrade the {side}",
+                f"{m.OLDEST_VERSION} to {m.VERSION}: upgrade the {side}",
             )
-            return
         if not request.session:
-            self.refuse(asker, "LocalProtocolError", "a session has a name")
-            return
-        self._sessions[asker.identity] = request.session
-        self.reply(asker, m.Welcome(m.VERSION, __version__, os.getpid()))
+            raise RefusedError("LocalProtocolError", "a session has a name")
+        self._gate.greet(self._sessions, asker.key, request.session)
+        self._sessions.connect(asker.identity, asker.key, request.session)
+        self.reply(asker, m.Welcome(version, __version__, os.getpid()))
+
+    def _agree(self, asker: Asker, request: m.Agree) -> None:
+        """Answer before it holds, so that the answer itself can be read."""
+        known = packing.available() if self._gate.compresses else ()
+        chosen = next((name for name in request.compressions if name in known), "")
+        self.reply(asker, m.Agreed(str(chosen), self._gate.idle_s))
+        self._sessions.agree(asker.identity, asker.key, str(chosen))
 
 
 _HANDLERS: dict[type[m.Message], Callable[[Jails, Asker, Any], None]] = {

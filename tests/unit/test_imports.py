@@ -22,7 +22,11 @@ CLIENTS_OWN = {
     *("numpy", "packaging", "platformdirs", "psutil", "rich", "typer", "zmq"),
 }
 # used where they are installed, and only there
-OPTIONAL = {"envhub_sandbox.tensors": {"torch"}, "envhub_sandbox.video": {"imageio_ffmpeg"}}
+OPTIONAL = {
+    "envhub_worker.protocol.packing": {"lz4"},
+    "envhub_sandbox.tensors": {"torch"},
+    "envhub_sandbox.video": {"imageio_ffmpeg"},
+}
 DESERIALISERS = {"_pickle", "copyreg", "dill", "joblib", "marshal", "pickle", "shelve"}
 
 # module: what it must know nothing of
@@ -40,7 +44,11 @@ LOCKDOWN_KNOWS = {
     "envhub_worker.protocol.confinement",
 }
 WITHOUT_IO = {"asyncio", "multiprocessing", "os", "select", "socket", "subprocess", "zmq"}
-ZEROMQ = {"envhub_sandbox.client", "envhub_worker.loop", "envhub_worker.server"}
+ZEROMQ = {
+    *("envhub_sandbox.client", "envhub_worker.loop", "envhub_worker.server"),
+    # sockets, keys and handshakes of clients on other hosts
+    *("envhub_worker.gate", "envhub_worker.keys", "envhub_worker.zap", "envhub_worker.asking"),
+}
 # who runs code by a name that is not written in its source, and whose code that is
 IMPORTERS = {
     "envhub_sandbox": "our own public names",

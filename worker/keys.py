@@ -1,0 +1,120 @@
+"""CURVE key pairs on disk, and the file that says whose keys may come in."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import zmq
+from zmq.utils import z85
+
+from envhub_worker.protocol.keys import key_text, parse_key
+
+_SECRET_MODE = 0o600
+_MAX_FILE_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class KeyPair:
+    """A CURVE key pair: 32 bytes each."""
+
+    public: bytes
+    secret: bytes = field(repr=False)
+
+
+def generate() -> KeyPair:
+    """A new key pair."""
+    public, secret = zmq.curve_keypair()
+    return KeyPair(z85.decode(public), z85.decode(secret))
+
+
+def from_secret(secret: bytes) -> KeyPair:
+    """The pair that a secret key belongs to."""
+    return KeyPair(z85.decode(zmq.curve_public(z85.encode(secret))), secret)
+
+
+def load(path: Path) -> KeyPair:
+    """The pair of a secret key's file.
+
+    Raises:
+        OSError: It cannot be read.
+        ValueError: It holds no key.
+    """
+    return from_secret(parse_key(_read(path)))
+
+
+def save(pair: KeyPair, folder: Path, name: str) -> tuple[Path, Path]:
+    """Write ``name.key`` (secret, 0600) and ``name.pub``; what is there already is not replaced.
+
+    Raises:
+        OSError: They cannot be written, or are there.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    secret, public = folder / f"{name}.key", folder / f"{name}.pub"
+    _write(secret, key_text(pair.secret), _SECRET_MODE)
+    _write(public, key_text(pair.public), 0o644)
+    return secret, public
+
+
+def _write(path: Path, text: str, mode: int) -> None:
+    # created with its mode: nobody can read it in between
+    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "w") as file:
+        file.write(f"{text}\n")
+
+
+def _read(path: Path) -> str:
+    with path.open(encoding="ascii", errors="replace") as file:
+        return file.read(_MAX_FILE_BYTES)
+
+
+class AuthorizedClients:
+    """Public keys that may come in, and what their owners are called.
+
+    The file has one client a line: its public key and, after a blank, a name. ``#`` and a blank
+    begin a comment. It is read anew when it changes, so that a client can be taken off it.
+
+    Args:
+        path: The file, or None.
+        known: Keys that may come in without it.
+    """
+
+    def __init__(self, path: Path | None, known: dict[bytes, str]) -> None:
+        self._path = path
+        self._known = known
+        self._stamp: tuple[int, int] | None = None
+        self._names = dict(known)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Read the file if it has changed.
+
+        Raises:
+            OSError: It cannot be read.
+            ValueError: A line of it is none; the text says which.
+        """
+        if self._path is None:
+            return
+        found = self._path.stat()
+        if (found.st_mtime_ns, found.st_size) != self._stamp:
+            self._names = {**_parse(_read(self._path), self._path), **self._known}
+            self._stamp = (found.st_mtime_ns, found.st_size)
+
+    def name_of(self, key: bytes) -> str | None:
+        """What the owner of a key is called, or None if it may not come in."""
+        return self._names.get(key)
+
+
+def _parse(text: str, path: Path) -> dict[bytes, str]:
+    names = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split(None, 1)
+        # a key in Z85 may itself begin with '#'
+        if not words or words[0] == "#" or (len(words[0]) < 40 and words[0].startswith("#")):
+            continue
+        try:
+            key = parse_key(words[0])
+        except ValueError as error:
+            raise ValueError(f"{path}, line {number}: {error}") from None
+        names[key] = words[1].strip() if len(words) > 1 else key_text(key)[:8]
+    return names

@@ -1,0 +1,116 @@
+"""Who is connected: sessions of clients, and the connections that each of them has."""
+
+from __future__ import annotations
+
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+MAX_CONNECTIONS = 4096
+"""Of one session. libzmq does not tell which of them have gone: the longest unused is dropped."""
+
+
+@dataclass
+class Session:
+    """One client: a process of somebody who holds a key.
+
+    Attributes:
+        key: The client's public key, as ZAP gave it; empty where there is none.
+        name: The client's own random bytes.
+        heard: When it last said anything.
+        held: The jails that it last said it holds, and when; None before it said so.
+    """
+
+    key: bytes
+    name: bytes
+    heard: float
+    held: dict[int, float] | None = None
+    connections: OrderedDict[tuple[bytes, bytes], str] = field(default_factory=OrderedDict)
+
+    @property
+    def owner(self) -> bytes:
+        """What its jails are marked with: nobody with another key can have it."""
+        return self.key + self.name
+
+
+class Sessions:
+    """Every session, and which connection belongs to which.
+
+    A connection is known by its routing id **and** its key: a routing id is whatever the peer
+    claims, a key was proved.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._sessions: dict[bytes, Session] = {}
+        self._of: dict[tuple[bytes, bytes], Session] = {}
+
+    def all(self) -> list[Session]:
+        """Every session."""
+        return list(self._sessions.values())
+
+    def of_key(self, key: bytes) -> list[Session]:
+        """Every session of a key."""
+        return [session for session in self._sessions.values() if session.key == key]
+
+    def connect(self, identity: bytes, key: bytes, name: bytes) -> Session:
+        """A connection says which session it belongs to; one that is there is found again."""
+        session = self._sessions.get(key + name)
+        if session is None:
+            session = self._sessions[key + name] = Session(key, name, self._clock())
+        self._disconnect((identity, key))
+        self._of[identity, key] = session
+        session.connections[identity, key] = ""
+        if len(session.connections) > MAX_CONNECTIONS:
+            self._disconnect(next(iter(session.connections)))
+        return session
+
+    def _disconnect(self, connection: tuple[bytes, bytes]) -> None:
+        session = self._of.pop(connection, None)
+        if session is not None:
+            session.connections.pop(connection, None)
+
+    def find(self, identity: bytes, key: bytes) -> Session | None:
+        """The session of a connection that has said something just now."""
+        session = self._of.get((identity, key))
+        if session is not None:
+            session.heard = self._clock()
+            session.connections.move_to_end((identity, key))
+        return session
+
+    def agree(self, identity: bytes, key: bytes, compression: str) -> None:
+        """From here on a connection's frames may be compressed."""
+        self._of[identity, key].connections[identity, key] = compression
+
+    def compression(self, identity: bytes, key: bytes) -> str:
+        """What a connection has agreed to; empty for none."""
+        session = self._of.get((identity, key))
+        return "" if session is None else session.connections[identity, key]
+
+    def idle(self, idle_s: float) -> list[Session]:
+        """Sessions that have not been heard from for so long."""
+        now = self._clock()
+        return [one for one in self._sessions.values() if now - one.heard > idle_s]
+
+    def drop(self, session: Session) -> None:
+        """Forget a session and its connections."""
+        for connection in list(session.connections):
+            self._disconnect(connection)
+        self._sessions.pop(session.owner, None)
+
+    def age_s(self, session: Session) -> float:
+        """Seconds since it was heard from."""
+        return self._clock() - session.heard
+
+    def keep(self, session: Session, jails: tuple[int, ...]) -> None:
+        """Write down which jails the client holds."""
+        now = self._clock()
+        before = session.held or {}
+        session.held = {**before, **dict.fromkeys(jails, now)}
+
+    def unheld(self, session: Session, jail: int, idle_s: float) -> bool:
+        """Whether a jail has been held by nobody for so long; the first answer starts the time."""
+        if session.held is None:
+            return False
+        return self._clock() - session.held.setdefault(jail, self._clock()) > idle_s
