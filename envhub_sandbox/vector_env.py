@@ -128,8 +128,15 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             WorkerDiedError: The worker process ended.
             RemoteEnvError: The environment raised; it is still usable.
         """
-        self.step_async(actions)
-        return self.step_wait()
+        if self.closed or self._waiting is not None:
+            self._refuse_if_busy("step_async")
+        remote = self._remote  # both halves in one: this is the way that is taken most
+        try:
+            remote.submit_step(self._read_actions(actions))
+            return remote.collect_step(self._timeouts.step_s)
+        except WorkerDiedError:
+            self._raise_if_closed()  # close() in another thread ended it under us
+            raise
 
     def step_async(self, actions: Any) -> None:
         """Send the actions; ``step_wait`` returns the results."""
