@@ -2,14 +2,16 @@
 
 With one slot every batch is copied out. With a ring of slots (``copy=False``) a batch is handed
 out where it lies, and its slot is written again only when nobody holds an array of it any more:
-each array refers to its slot's ``memoryview``, whose reference count tells. When all are held, the
-batch goes through the spare slot and is copied.
+each slot is a map of its own, which is the base of every array over it, views of views included,
+so that its reference count tells. When all are held, the batch goes through the spare slot and is
+copied.
 
 Trust: a borrowed batch lies in memory that the jail can still write.
 """
 
 from __future__ import annotations
 
+import mmap
 import os
 import sys
 from collections.abc import Callable
@@ -43,15 +45,18 @@ class ObservationSlab:
         self.layout = layout
         self._memory, self.fd = slab("observations", layout.total_bytes)
         self._assemble = slabs.assembler(space)
-        whole = memoryview(self._memory)
-        self._slots = [
-            whole[index * layout.slot_bytes : (index + 1) * layout.slot_bytes]
-            for index in range(layout.slots)
-        ]
+        if layout.slots == 1:
+            self._slots = [self._memory]
+        else:
+            self._slots = [
+                mmap.mmap(self.fd, layout.slot_bytes, offset=index * layout.slot_bytes)
+                for index in range(layout.slots)
+            ]
         self._copies = [_copier(self._slots[_SPARE], leaf) for leaf in layout.leaves]
         flat = len(self._copies) == 1 and not layout.leaves[0].path
         self._single = self._copies[0] if flat else None
-        self._unheld = [sys.getrefcount(slot) for slot in self._slots]
+        # counted just as choose() does: a loop's variable would be one more
+        self._unheld = [sys.getrefcount(self._slots[index]) for index in range(len(self._slots))]
         self._chosen = _SPARE
         self._rewards, self._flags = slabs.results(self._memory, layout)
 
@@ -85,14 +90,14 @@ class ObservationSlab:
         os.close(self.fd)
 
 
-def _copier(slot: memoryview, leaf: slabs.Leaf) -> Callable[[], Any]:
+def _copier(slot: mmap.mmap, leaf: slabs.Leaf) -> Callable[[], Any]:
     if leaf.dtype.kind == "b":
         # a hostile byte of 2 would make a boolean that is neither
         return partial(slabs.view(slot, leaf, np.dtype(np.uint8)).astype, np.bool_)
     return slabs.view(slot, leaf).copy
 
 
-def _borrowed(slot: memoryview, leaf: slabs.Leaf) -> Any:
+def _borrowed(slot: mmap.mmap, leaf: slabs.Leaf) -> Any:
     if leaf.dtype.kind == "b":
         return slabs.view(slot, leaf, np.dtype(np.uint8)).astype(np.bool_)
     return slabs.view(slot, leaf)

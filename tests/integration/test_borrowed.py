@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,19 @@ def test_lent_and_owned_observations_are_the_same() -> None:
     lent, _ = rollout(1, copy=False, num_workers=1)
     owned, _ = rollout(1, copy=True, num_workers=1)
     assert_same(owned, lent)
+
+
+def test_batches_are_lent_where_they_lie() -> None:
+    """As long as there are slots that nobody holds; then they are copied, until one is free."""
+    with make_env(sample("cartpole"), n_envs=2, copy=False) as suites:
+        env = suites.env
+        env.reset(seed=1)
+        held = [env.step([0, 1])[0] for _ in range(RING)]
+        assert all(isinstance(observation.base, mmap.mmap) for observation in held)
+        assert len({id(observation.base) for observation in held}) == RING
+        assert env.step([0, 1])[0].base is None
+        slot = id(held.pop(0).base)
+        assert id(env.step([0, 1])[0].base) == slot
 
 
 def test_a_view_holds_its_batch() -> None:

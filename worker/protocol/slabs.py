@@ -19,6 +19,7 @@ Only ``step`` goes this way; everything else is a message.
 from __future__ import annotations
 
 import math
+import mmap
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -154,6 +155,8 @@ def observation_layout(space: gym.Space[Any], count: int, slots: int) -> Observa
     if None in leaves or len(leaves) > MAX_LEAVES:
         return None
     placed, slot_bytes = _placed(leaves, count, 0, None)
+    if slots > 1:  # each slot is a map of its own in the client
+        slot_bytes = -(-slot_bytes // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
     results = slot_bytes * slots
     total_bytes = _aligned(results + count * (8 + 1 + 1))
     if total_bytes > MAX_SLAB_BYTES:
