@@ -20,7 +20,7 @@ def identity_of(pid: int) -> str:
 
 
 def has_ended(identity: str) -> bool | None:
-    """Whether the process has ended; None if that cannot be told from here."""
+    """Whether the process has ended (reaped or not); None if that cannot be told from here."""
     parts = identity.split(":")
     if len(parts) != 4 or not parts[0].isdigit():
         return None
@@ -30,7 +30,7 @@ def has_ended(identity: str) -> bool | None:
     if namespace != _namespace():
         return None
     try:
-        return _start_time(int(pid)) != start_time
+        return _state(int(pid)) in ("Z", "X") or _start_time(int(pid)) != start_time
     except FileNotFoundError:
         return True
     except OSError:
@@ -38,9 +38,17 @@ def has_ended(identity: str) -> bool | None:
 
 
 def _start_time(pid: int) -> str:
+    return _fields(pid)[19]
+
+
+def _state(pid: int) -> str:
+    return _fields(pid)[0]
+
+
+def _fields(pid: int) -> list[str]:
     stat = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace")
     # the command may hold anything, parentheses and blanks included
-    return stat.rpartition(")")[2].split()[19]
+    return stat.rpartition(")")[2].split()
 
 
 def _boot() -> str:

@@ -1,0 +1,250 @@
+"""However a client or a container ends, nothing of it remains; and nobody else's is touched."""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import WorkerDiedError
+from envhub_sandbox.sandboxes import leftovers
+from envhub_sandbox.sandboxes.containers import CLIENT_LABEL, USER_LABEL
+from envhub_sandbox.sandboxes.docker import DockerSandbox
+from envhub_sandbox.sandboxes.engines import Engine
+from envhub_sandbox.sandboxes.identity import identity_of
+from tests.containers.kit import (
+    IMAGE,
+    container_of,
+    containers_of,
+    folders,
+    nothing_left,
+    pids_in,
+)
+from tests.support.processes import descendants, eventually
+from tests.support.samples import sample
+
+_CLIENT = """
+import json, os, sys
+from envhub_sandbox import make_env
+from envhub_sandbox.sandboxes.docker import DockerSandbox
+from envhub_sandbox.sandboxes.identity import identity_of
+docker = DockerSandbox(image=sys.argv[2], engine=sys.argv[3])
+suites = make_env(sys.argv[1], n_envs=2, sandbox=docker)
+env = suites.env
+env.reset(seed=0)
+env.step(env.action_space.sample())
+report = [layer["detail"] for layer in env.sandbox_report if layer["layer"] == "container"]
+print(json.dumps({"identity": identity_of(os.getpid()), "report": report}), flush=True)
+if sys.argv[4] == "exit":
+    sys.exit(0)
+if sys.argv[4] == "fork" and os.fork() == 0:
+    os.dup2(os.open(os.devnull, os.O_RDWR), 1)
+sys.stdin.read()
+"""
+
+
+@dataclass
+class Client:
+    """A client of its own process, which has a container."""
+
+    process: subprocess.Popen[str]
+    identity: str
+    container: str
+
+    def keeper(self) -> psutil.Process:
+        """The process that keeps its container."""
+        [found] = [
+            child
+            for child in psutil.Process(self.process.pid).children(recursive=True)
+            if any("keeper.py" in word for word in child.cmdline())
+        ]
+        return found
+
+
+@contextlib.contextmanager
+def client(engine: Engine, then: str = "wait") -> Iterator[Client]:
+    """A client that has stepped an environment in a container."""
+    words = [str(sample("counter")), IMAGE, engine.kind, then]
+    process = subprocess.Popen(
+        [sys.executable, "-c", _CLIENT, *words],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stdin is not None
+    assert process.stdout is not None
+    try:
+        said = json.loads(process.stdout.readline())
+        container = said["report"][0].rpartition(", ")[2]
+        yield Client(process, said["identity"], container)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.stdin.close()
+        process.stdout.close()
+        process.wait()
+
+
+def test_closing_leaves_nothing(docker: DockerSandbox, engine: Engine) -> None:
+    """No container, no process, no folder."""
+    before = folders()
+    with make_env(sample("counter"), sandbox=docker) as suites:
+        suites.env.reset(seed=0)
+        assert len(containers_of(engine, identity_of(os.getpid()))) == 1
+        assert len(folders() - before) == 1
+    assert nothing_left(engine)
+    assert folders() <= before
+    assert not [pid for pid in descendants() if "keeper.py" in _command(pid)]
+
+
+def _command(pid: int) -> str:
+    with contextlib.suppress(psutil.Error):
+        return " ".join(psutil.Process(pid).cmdline())
+    return ""
+
+
+@pytest.mark.parametrize("how", ["exit", "SIGTERM", "SIGKILL"])
+def test_a_container_ends_with_its_client(engine: Engine, how: str) -> None:
+    """Whatever ends the client; its processes are gone as this machine sees them, too."""
+    with client(engine, "exit" if how == "exit" else "wait") as made:
+        pids = [] if how == "exit" else pids_in(engine, made.container)
+        if how != "exit":
+            made.process.send_signal(getattr(signal, how))
+        made.process.wait()
+        assert nothing_left(engine, made.identity)
+        assert eventually(lambda: not any(psutil.pid_exists(pid) for pid in pids))
+        assert eventually(lambda: not _folder_of(made.identity))
+
+
+def _folder_of(identity: str) -> list[Path]:
+    found = []
+    for name in folders():
+        with contextlib.suppress(OSError):
+            path = Path("/tmp") / name
+            if (path / "client").read_text() == identity:
+                found.append(path)
+    return found
+
+
+def test_a_fork_of_the_client_does_not_keep_its_container(engine: Engine) -> None:
+    """The lifeline is held by nobody but the keeper: a child of the trainer may live on."""
+    with client(engine, "fork") as made:
+        assert eventually(lambda: len(_forks(made.process.pid)) == 1)
+        [fork] = _forks(made.process.pid)
+        made.process.kill()
+        made.process.wait()
+        assert nothing_left(engine, made.identity)
+        assert psutil.pid_exists(fork)
+
+
+def _forks(pid: int) -> list[int]:
+    children = psutil.Process(pid).children()
+    return [child.pid for child in children if "keeper.py" not in _command(child.pid)]
+
+
+def test_client_and_keeper_killed_together_leave_no_container(engine: Engine) -> None:
+    """The container's stdin ends with whoever held it; only a folder stays, for ``gc``."""
+    with client(engine) as made:
+        keeper = made.keeper()
+        keeper.suspend()
+        made.process.kill()
+        keeper.kill()
+        assert nothing_left(engine, made.identity)
+        [folder] = _folder_of(made.identity)
+        found = [one for one in leftovers.find() if one.name == str(folder)]
+        assert [one.remove() for one in found] == [True]
+        assert not folder.exists()
+
+
+def test_a_killed_container_is_a_dead_worker(docker: DockerSandbox, engine: Engine) -> None:
+    """A step that waits is told; the next ``make_env`` starts another."""
+    with make_env(sample("counter"), sandbox=docker) as suites:
+        env = suites.env
+        env.reset(seed=0)
+        engine.run("kill", container_of(env))
+        actions = env.action_space.sample()
+        with pytest.raises(WorkerDiedError, match="counter"):
+            collections.deque((env.step(actions) for _ in range(1000)), maxlen=0)
+    assert nothing_left(engine)
+    with make_env(sample("counter"), sandbox=docker) as suites:
+        suites.env.reset(seed=0)
+
+
+def test_tasks_of_a_repository_share_a_container(docker: DockerSandbox, engine: Engine) -> None:
+    """And two repositories do not."""
+    with make_env(sample("many_tasks"), sandbox=docker) as many:
+        envs = [env for tasks in many.values() for env in tasks.values()][:3]
+        for env in envs:
+            env.reset(seed=0)
+        assert len({container_of(env) for env in envs}) == 1
+        with make_env(sample("counter"), sandbox=docker) as other:
+            other.env.reset(seed=0)
+            assert container_of(other.env) != container_of(envs[0])
+
+
+def test_environments_are_made_in_threads_at_once(docker: DockerSandbox) -> None:
+    """Each thread's container is its own to close."""
+    done = []
+
+    def drive() -> None:
+        with make_env(sample("counter"), sandbox=docker) as suites:
+            suites.env.reset(seed=0)
+            done.append(suites.env.step(suites.env.action_space.sample()))
+
+    threads = [threading.Thread(target=drive) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(done) == 3
+
+
+@contextlib.contextmanager
+def idle_container(engine: Engine, labels: dict[str, str]) -> Iterator[str]:
+    """A container that was made and never started, with some labels."""
+    words = [word for item in labels.items() for word in ("--label", "=".join(item))]
+    name = engine.run("create", *words, IMAGE, "health").strip()
+    try:
+        yield name
+    finally:
+        with contextlib.suppress(Exception):
+            engine.run("rm", "--force", name)
+
+
+def test_gc_removes_what_is_ours_and_dead_and_nothing_else(engine: Engine) -> None:
+    """A running client's, another user's, another namespace's and a stranger's stay."""
+    me = str(os.geteuid())
+    ended = subprocess.Popen(["sleep", "60"])
+    dead = identity_of(ended.pid)
+    ended.kill()
+    ended.wait()
+    alive = identity_of(os.getpid())
+    elsewhere = f"{dead.rpartition(':')[0]}:1"
+    with contextlib.ExitStack() as stack:
+        made = {
+            who: stack.enter_context(idle_container(engine, labels))
+            for who, labels in {
+                "dead": {CLIENT_LABEL: dead, USER_LABEL: me},
+                "alive": {CLIENT_LABEL: alive, USER_LABEL: me},
+                "elsewhere": {CLIENT_LABEL: elsewhere, USER_LABEL: me},
+                "nonsense": {CLIENT_LABEL: "nonsense", USER_LABEL: me},
+                "stranger": {"org.example": dead},
+            }.items()
+        }
+        for found in leftovers.stale_containers(engine):
+            assert found.remove()
+        listed = engine.run("ps", "--all", "--no-trunc", "--format", "{{.ID}}").split()
+        assert {who for who, name in made.items() if name in listed} == set(made) - {"dead"}

@@ -1,0 +1,101 @@
+"""What cannot be had is refused, with the command that helps; nothing is quietly weaker."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
+from envhub_sandbox.sandboxes import docker as docker_module
+from envhub_sandbox.sandboxes.docker import DockerSandbox
+from envhub_sandbox.sandboxes.engines import Engine
+from tests.containers.kit import IMAGE, folders, nothing_left
+from tests.support.samples import sample
+
+
+def test_a_missing_image_says_how_to_build_it(engine: Engine) -> None:
+    """Nothing is pulled behind the caller's back."""
+    with pytest.raises(SandboxUnavailableError, match="build -t no-such-image"):
+        make_env(sample("counter"), sandbox=DockerSandbox(image="no-such-image"))
+
+
+def test_a_missing_runtime_says_what_to_install(engine: Engine) -> None:
+    """The engine's complaint becomes advice, and nothing is left of the attempt."""
+    before = folders()
+    sandbox = DockerSandbox(image=IMAGE, engine=engine.kind, runtime="no-such-runtime")
+    with pytest.raises(SandboxUnavailableError, match="runtime"):
+        make_env(sample("echo"), sandbox=sandbox, env_kwargs={"nobody_asked_before": 1})
+    assert nothing_left(engine)
+    assert folders() <= before
+
+
+def test_an_interpreter_of_this_machine_makes_no_sense(docker: DockerSandbox) -> None:
+    """A container has its own; another one is another image."""
+    with pytest.raises(PolicyError, match="image"):
+        make_env(sample("counter"), sandbox=docker, python="/usr/bin/python3")
+
+
+def test_an_image_of_something_else_is_no_worker(
+    engine: Engine, docker: DockerSandbox, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A program that announces nothing is not connected to."""
+    real = docker_module.containers.run_arguments
+
+    def other(engine: Engine, wanted: docker_module.Container) -> list[str]:
+        arguments = real(engine, wanted)
+        return [*arguments[: arguments.index(wanted.image) + 1], "health"]
+
+    monkeypatch.setattr(docker_module.containers, "run_arguments", other)
+    with pytest.raises(Exception, match="ended at once"):
+        make_env(sample("counter"), sandbox=docker).env.reset()
+    assert nothing_left(engine)
+
+
+@pytest.mark.parametrize(
+    ("flag", "layer"),
+    [
+        ("--read-only", "container-files"),
+        ("no-new-privileges", "container-privileges"),
+        ("--cap-drop", "container-capabilities"),
+        ("--network", "container-network"),
+        ("--memory", "container-memory"),
+        ("--pids-limit", "container-pids"),
+        ("--cpus", "container-cpus"),
+    ],
+)
+def test_a_wall_that_is_missing_is_noticed(
+    docker: DockerSandbox, engine: Engine, monkeypatch: pytest.MonkeyPatch, flag: str, layer: str
+) -> None:
+    """An engine that ignores a flag, as some do with a warning, gets no repository to run."""
+    real = docker_module.containers.run_arguments
+
+    def without(engine: Engine, wanted: docker_module.Container) -> list[str]:
+        words = real(engine, wanted)
+        at = words.index(flag)
+        if flag == "--read-only":
+            return words[:at] + words[at + 1 :]
+        if flag == "no-new-privileges":
+            return words[: at - 1] + words[at + 1 :]
+        dropped = words[:at] + words[at + 2 :]
+        if flag == "--memory":
+            dropped = [*dropped[:at], *dropped[at + 2 :]]  # --memory-swap means nothing alone
+        return dropped
+
+    monkeypatch.setattr(docker_module.containers, "run_arguments", without)
+    with pytest.raises(SandboxUnavailableError, match=layer):
+        make_env(sample("counter"), sandbox=docker).env.reset()
+    assert nothing_left(engine)
+
+
+def test_a_path_that_is_granted_is_there_and_no_other(
+    docker: DockerSandbox, open_ground: Path
+) -> None:
+    """``policy.readable`` is mounted where it is, read-only; a container's own folders are not."""
+    (open_ground / "given").write_text("of the caller's")
+    policy = {"readable": [str(open_ground)]}
+    with make_env(sample("counter"), sandbox=docker, policy=policy) as suites:
+        suites.env.reset(seed=0)
+    with pytest.raises(PolicyError, match="/usr"):
+        make_env(sample("counter"), sandbox=docker, policy={"readable": ["/usr"]})

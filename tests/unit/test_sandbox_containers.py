@@ -1,0 +1,341 @@
+"""From a policy to an engine's command line, and from what a container says to what holds."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
+from envhub_sandbox.policy import Limits, Policy
+from envhub_sandbox.sandboxes import containers, enclosure, engines, identity, seccomp
+from envhub_sandbox.sandboxes.containers import Container
+from envhub_sandbox.sandboxes.docker import DockerSandbox
+from envhub_sandbox.sandboxes.engines import Engine
+from envhub_worker.lockdown import seccomp_policy
+from tests.unit.test_imports import folder, modules
+
+DOCKER = Engine("docker", "/usr/bin/docker", "28", rootless=False)
+PODMAN = Engine("podman", "/usr/bin/podman", "5", rootless=True)
+WANTED = Container(
+    name="envhub-0",
+    image="sha256:1",
+    labels={"dev.envhub.client": "1:2:3:4"},
+    sockets="/tmp/f/sockets",
+    snapshot="/store/tree",
+    readable=("/data",),
+    seccomp="/tmp/f/seccomp.json",
+    user=(1000, 1000),
+    network="none",
+    memory=1 << 30,
+    pids=99,
+    cpus=1.5,
+    scratch=1 << 20,
+    runtime=None,
+    gpus=None,
+)
+SAID: dict[str, Any] = {
+    "envhub-worker": "0.1.0",
+    "profiles": ["strict", "no-userns", "container"],
+    "landlock": 7,
+    "user": 1000,
+    "capabilities": 0,
+    "no_new_privileges": True,
+    "seccomp": True,
+    "read_only": True,
+    "devices": ["lo"],
+    "memory": 1 << 30,
+    "pids": 99,
+    "cpus": 1.5,
+    "python": "",
+}
+
+
+def found(**changes: Any) -> enclosure.Surroundings:
+    """What a container's server said, with changes."""
+    return enclosure.parse(json.dumps({**SAID, **changes}).encode())
+
+
+def pairs(words: list[str]) -> set[tuple[str, str]]:
+    """Every option with the word that follows it."""
+    return set(itertools.pairwise(words))
+
+
+def test_the_command_line_is_this_one() -> None:
+    """Word for word: what stands here is what confines."""
+    assert containers.run_arguments(DOCKER, WANTED) == [
+        *("run", "--rm", "--interactive", "--pull", "never", "--log-driver", "none"),
+        *("--no-healthcheck", "--name", "envhub-0", "--hostname", "sandbox", "--workdir", "/"),
+        *("--label", "dev.envhub.client=1:2:3:4"),
+        *("--network", "none", "--read-only", "--cap-drop", "ALL"),
+        *("--security-opt", "no-new-privileges", "--security-opt", "seccomp=/tmp/f/seccomp.json"),
+        *("--security-opt", "systempaths=unconfined", "--ipc", "private", "--user", "1000:1000"),
+        *("--ulimit", "core=0:0", "--memory", "1073741824", "--memory-swap", "1073741824"),
+        *("--pids-limit", "99", "--cpus", "1.5"),
+        *("--tmpfs", "/tmp:rw,nosuid,nodev,size=1048576,mode=1777", "--shm-size", "1073741824"),
+        *("--mount", '"type=bind","src=/tmp/f/sockets","dst=/run/envhub"'),
+        *("--mount", '"type=bind","src=/store/tree","dst=/snapshots/this","readonly"'),
+        *("--mount", '"type=bind","src=/data","dst=/data","readonly"'),
+        "sha256:1",
+        *("serve", "--endpoint", "ipc:///run/envhub/server", "--fd-path", "/run/envhub/fds"),
+        *("--runtime-dir", "/tmp/envhub-worker", "--readable-root", "/snapshots"),
+        *("--until-eof", "--announce"),
+    ]
+
+
+def test_podman_gets_its_own_words() -> None:
+    """The same walls; a plain user keeps the id, and no writable folder is added."""
+    words = containers.run_arguments(PODMAN, WANTED)
+    assert ("--userns", "keep-id") in pairs(words)
+    assert ("--security-opt", "unmask=ALL") in pairs(words)
+    assert "--read-only-tmpfs=false" in words
+
+
+def test_an_engine_that_maps_users_does_not_map_ours() -> None:
+    """The socket folder is the caller's, and nobody else's."""
+    words = containers.run_arguments(replace(DOCKER, remapped=True), WANTED)
+    assert ("--userns", "host") in pairs(words)
+
+
+def test_a_comma_in_a_path_is_no_separator() -> None:
+    """A folder's name cannot add an option to a mount."""
+    wanted = replace(WANTED, snapshot='/store/a,dst=/etc,"b"')
+    words = containers.run_arguments(DOCKER, wanted)
+    assert '"type=bind","src=/store/a,dst=/etc,""b""","dst=/snapshots/this","readonly"' in words
+
+
+def test_runtime_and_gpus_are_handed_on() -> None:
+    """In each engine's own words."""
+    wanted = replace(WANTED, runtime="runsc", gpus="all")
+    docker, podman = (containers.run_arguments(one, wanted) for one in (DOCKER, PODMAN))
+    assert {("--runtime", "runsc"), ("--gpus", "all")} <= pairs(docker)
+    assert {("--runtime", "runsc"), ("--device", "nvidia.com/gpu=all")} <= pairs(podman)
+
+
+def test_without_control_groups_there_are_no_limits() -> None:
+    """They are left out altogether, by explicit choice."""
+    words = containers.run_arguments(PODMAN, replace(WANTED, memory=None, pids=None, cpus=None))
+    assert "--cgroups=disabled" in words
+    assert not {"--memory", "--pids-limit", "--cpus"} & set(words)
+
+
+def test_limits_leave_room_for_the_server() -> None:
+    """One jail may use what its policy permits."""
+    policy = Policy(limits=Limits(memory_bytes=1 << 30, processes=10))
+    assert containers.memory_for(policy) == 2 << 30
+    assert containers.pids_for(policy) == 266
+
+
+@pytest.mark.parametrize("path", ["/", "/usr", "/proc/", "//etc", "/data/../etc"])
+def test_a_containers_own_folders_cannot_be_replaced(path: str) -> None:
+    """A path that is granted would cover the interpreter, or worse."""
+    with pytest.raises(PolicyError, match="readable"):
+        containers.check_readable((path,))
+
+
+def test_every_wall_is_in_the_report() -> None:
+    """One line each, all of them enforced."""
+    report = enclosure.layers(WANTED, found(), "docker 28")
+    assert all(layer["enforced"] for layer in report)
+    assert [layer["layer"] for layer in report] == [
+        *("container", "container-user", "container-capabilities", "container-privileges"),
+        *("container-files", "container-network", "container-seccomp", "container-memory"),
+        *("container-pids", "container-cpus"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "layer"),
+    [
+        ({"user": 0}, "container-user"),
+        ({"user": 1001}, "container-user"),
+        ({"capabilities": 1}, "container-capabilities"),
+        ({"no_new_privileges": False}, "container-privileges"),
+        ({"read_only": False}, "container-files"),
+        ({"devices": ["lo", "eth0"]}, "container-network"),
+        ({"seccomp": False}, "container-seccomp"),
+        ({"memory": None}, "container-memory"),
+        ({"memory": 2 << 30}, "container-memory"),
+        ({"pids": None}, "container-pids"),
+        ({"cpus": 2.0}, "container-cpus"),
+    ],
+)
+def test_a_wall_that_does_not_stand_is_refused(changes: dict[str, Any], layer: str) -> None:
+    """Whatever the engine's command line said."""
+    with pytest.raises(SandboxUnavailableError, match=layer):
+        enclosure.layers(WANTED, found(**changes), "docker 28")
+
+
+def test_what_the_caller_goes_without_is_in_the_report() -> None:
+    """Not enforced, and said so."""
+    wanted = replace(WANTED, network="host", runtime="runsc", memory=None, pids=None, cpus=None)
+    report = enclosure.layers(wanted, found(devices=["eth0"], seccomp=False, memory=None), "x")
+    absent = {layer["layer"] for layer in report if not layer["enforced"]}
+    assert absent == {"container-network", "container-seccomp", "container-memory"}
+
+
+@pytest.mark.parametrize(
+    ("wanted", "profiles", "landlock", "chosen"),
+    [
+        ("strict", ["strict", "no-userns", "container"], 7, "strict"),
+        ("strict", ["no-userns", "container"], 7, "container"),
+        ("strict", ["container"], 1, "container"),
+        ("no-userns", ["strict", "no-userns", "container"], 7, "no-userns"),
+        ("container", ["container"], 0, "container"),
+    ],
+)
+def test_jails_get_the_strongest_profile_that_can_be_had(
+    wanted: str, profiles: list[str], landlock: int, chosen: str
+) -> None:
+    """The weaker ones by name only."""
+    assert enclosure.profile_for(wanted, found(profiles=profiles, landlock=landlock)) == chosen
+
+
+@pytest.mark.parametrize(
+    ("wanted", "profiles", "landlock"),
+    [("strict", ["container"], 0), ("no-userns", ["container"], 2), ("strict", [], 7)],
+)
+def test_a_jail_that_nothing_parts_from_the_server_is_refused(
+    wanted: str, profiles: list[str], landlock: int
+) -> None:
+    """Unless the policy says that the container's walls are enough."""
+    with pytest.raises(SandboxUnavailableError):
+        enclosure.profile_for(wanted, found(profiles=profiles, landlock=landlock))
+
+
+@pytest.mark.parametrize("line", [b"", b"{}", b"[]", b"hello", b'{"profiles": 3}'])
+def test_an_announcement_that_is_none_is_refused(line: bytes) -> None:
+    """Another program, or another version."""
+    with pytest.raises(WorkerStartupError, match="build the image"):
+        enclosure.parse(line)
+
+
+def test_the_profile_permits_what_jails_may_call() -> None:
+    """The container's filter lies around the jail's: it must not be the narrower one."""
+    inner = {
+        name
+        for namespaced in (True, False)
+        for network in ("none", "loopback", "host")
+        for name, verdict in seccomp_policy.table(
+            namespaced=namespaced, network=network, brokered=not namespaced
+        ).items()
+        if verdict not in (seccomp_policy.EPERM, seccomp_policy.ENOSYS)
+    }
+    outer = {name for rule in seccomp.profile("x86_64")["syscalls"] for name in rule["names"]}
+    assert len(inner) > 200
+    assert inner <= outer
+
+
+def test_the_profile_permits_what_lockdown_calls() -> None:
+    """Every system call that the worker makes by its number, but for what it tries in vain."""
+    tried = {"ptrace", "pidfd_getfd"}
+    called = set()
+    for name in modules():
+        if name.startswith("envhub_worker."):
+            path = folder("envhub_worker") / Path(*name.split(".")[1:]).with_suffix(".py")
+            words = path.read_text().split('number("') if path.exists() else []
+            called |= {word.partition('"')[0] for word in words[1:]}
+    assert {"landlock_create_ruleset", "open_tree", "seccomp"} <= called
+    assert called - tried <= seccomp.ALLOWED
+
+
+def test_the_profile_denies_what_reaches_the_kernels_innards() -> None:
+    """And everything that it does not name."""
+    assert seccomp.profile("aarch64")["defaultAction"] == "SCMP_ACT_ERRNO"
+    denied = """
+        acct add_key bpf delete_module fanotify_init finit_module init_module io_uring_enter
+        io_uring_setup ioperm iopl kcmp kexec_file_load kexec_load keyctl lookup_dcookie modify_ldt
+        name_to_handle_at open_by_handle_at perf_event_open pidfd_getfd process_madvise
+        process_vm_readv process_vm_writev ptrace quotactl reboot request_key setdomainname swapoff
+        swapon syslog userfaultfd vhangup
+    """
+    assert not set(denied.split()) & seccomp.ALLOWED
+
+
+def test_only_the_native_word_size_is_permitted() -> None:
+    """The 32-bit calls have other numbers, which nothing here has looked at."""
+    assert seccomp.profile("x86_64")["architectures"] == ["SCMP_ARCH_X86_64"]
+    with pytest.raises(SandboxUnavailableError, match="riscv64"):
+        seccomp.profile("riscv64")
+
+
+def test_a_process_is_known_by_more_than_its_pid() -> None:
+    """Its start, the boot and the namespace; what cannot be told is not said to have ended."""
+    me = identity.identity_of(os.getpid())
+    pid, start, boot, namespace = me.split(":")
+    assert identity.has_ended(me) is False
+    assert identity.has_ended(f"{pid}:{int(start) - 1}:{boot}:{namespace}") is True
+    assert identity.has_ended(f"{pid}:{start}:another-boot:{namespace}") is True
+    assert identity.has_ended(f"{pid}:{start}:{boot}:1") is None
+    assert identity.has_ended("nonsense") is None
+
+
+def test_a_process_that_was_not_reaped_has_ended() -> None:
+    """Nobody comes back from that."""
+    child = subprocess.Popen([sys.executable, "-S", "-c", "input()"], stdin=subprocess.PIPE)
+    name = identity.identity_of(child.pid)
+    assert identity.has_ended(name) is False
+    assert child.stdin is not None
+    child.stdin.close()
+    os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
+    assert identity.has_ended(name) is True
+    child.wait()
+    assert identity.has_ended(name) is True
+
+
+@pytest.mark.parametrize(
+    ("said", "advice"),
+    [
+        ("permission denied while trying to connect to the Docker daemon socket", "usermod"),
+        ("Cannot connect to the Docker daemon at unix:///x", "systemctl start docker"),
+        ("docker: Error response from daemon: Unknown runtime specified x.", "it failed"),
+        ("unknown or invalid runtime name: runsc", "runsc install"),
+        ('could not select device driver "" with capabilities: [[gpu]]', "nvidia-ctk"),
+        ("", "without a word"),
+    ],
+)
+def test_an_engines_complaint_becomes_advice(said: str, advice: str) -> None:
+    """With its own last line, for what we do not know."""
+    assert advice in engines.explained("docker", said)
+
+
+def test_without_an_engine_each_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """And how to get it."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(SandboxUnavailableError, match=r"docker\.io.*podman"):
+        engines.find_engine(None)
+
+
+def test_an_engine_on_another_machine_is_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """It could share neither memory nor a socket."""
+    program = tmp_path / "docker"
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("DOCKER_HOST", "tcp://far.example:2376")
+    with pytest.raises(SandboxUnavailableError, match=r"tcp://far\.example"):
+        engines.find_engine("docker")
+
+
+def test_secrets_do_not_go_to_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its program gets what it needs of our environment, and no more."""
+    monkeypatch.setenv("HF_TOKEN", "secret")
+    monkeypatch.setenv("DOCKER_CONFIG", "/somewhere")
+    assert "HF_TOKEN" not in engines.environment()
+    assert engines.environment()["DOCKER_CONFIG"] == "/somewhere"
+
+
+@pytest.mark.parametrize("options", [{"memory": 0}, {"pids": -1}, {"cpus": 0.0}])
+def test_impossible_limits_are_refused(options: dict[str, Any]) -> None:
+    """At once, without an engine."""
+    with pytest.raises(PolicyError, match="more than 0"):
+        DockerSandbox(**options)
