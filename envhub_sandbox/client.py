@@ -59,6 +59,8 @@ class WorkerClient:
         self._poller.register(self._socket, zmq.POLLIN)
         self._poller.register(process_fd, zmq.POLLIN)
         self.stale_replies = 0
+        self.sent_bytes = 0
+        self.received_bytes = 0
 
     def hello(self, deadline: Deadline) -> m.Welcome:
         """Agree on a protocol version."""
@@ -80,7 +82,9 @@ class WorkerClient:
         """Send a request; returns its id."""
         self.check_process()
         request_id = next(self._ids)
-        self._socket.send_multipart([*m.pack(message, request_id), *payload], copy=False)
+        frames = [*m.pack(message, request_id), *payload]
+        self._socket.send_multipart(frames, copy=False)
+        self.sent_bytes += sum(memoryview(frame).nbytes for frame in frames)
         return request_id
 
     def receive(self, request_id: int, deadline: Deadline) -> tuple[m.Message, list[Buffer]]:
@@ -95,6 +99,7 @@ class WorkerClient:
         while True:
             self._wait(deadline)
             frames: list[Buffer] = list(self._socket.recv_multipart(zmq.NOBLOCK))
+            self.received_bytes += sum(map(len, frames))
             reply_id, reply = m.unpack(frames[:1], limits=self._limits)
             if reply_id == request_id:
                 return reply, frames[1:]

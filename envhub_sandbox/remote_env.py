@@ -37,7 +37,7 @@ from envhub_sandbox.restarts import Restarts
 from envhub_sandbox.results import Results, StepResult
 from envhub_sandbox.reviving import SeedBook, marked, resets, truncated
 from envhub_sandbox.sharding import PaceBook
-from envhub_sandbox.stats import Counters
+from envhub_sandbox.stats import LEDGER, Counters, Labels, lane_step_bytes
 from envhub_worker.protocol import batches, slabs
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
@@ -96,7 +96,9 @@ class RemoteEnv:
         self._release_server: Callable[[], None] = _nothing
         self._startup: StartupDeadline | None = None
         self._restarts = Restarts(jails.repository.policy)
-        self.counters = Counters()
+        self.counters = Counters(lane_step_bytes(manifest))
+        labels = Labels(jails.repository.label, manifest.suite, str(manifest.task))
+        LEDGER.add(self, labels, self._restarts)
         self._asked_ns = 0
         self.results = Results(manifest, self.bounds)
         self.history = History(manifest, jails.repository.policy.crash_history)
@@ -110,8 +112,6 @@ class RemoteEnv:
     def stats(self) -> dict[str, Any]:
         """Counters, and where it is in its life."""
         found = self.counters.snapshot()
-        if self._loaded is not None:
-            found["stale_replies"] += self._loaded.jail.client.stale_replies
         return {**found, "restarts": self._restarts.count, "state": self.lifecycle.state.name}
 
     # --- requests ------------------------------------------------------------------------------
@@ -665,6 +665,7 @@ class RemoteEnv:
 
     def _settle(self, place: Place) -> None:
         self._place, self._loaded, self._lane = place, place.loaded, place.lane
+        self.counters.connected(place.loaded.jail.client)
         self._hosts, self._number = place.hosts, place.number
 
     def _forget(self) -> None:
@@ -679,7 +680,6 @@ class RemoteEnv:
         self._release_server = self.repository.hold()
         loaded, self._loaded, self._place = self._loaded, None, None
         if loaded is not None:
-            self.counters.stale_replies += loaded.jail.client.stale_replies
             self._jails.end(loaded)
             self._jails.give_back(loaded)
         self._close_lane()

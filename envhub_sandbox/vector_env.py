@@ -233,8 +233,10 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
         Returns:
             ``requests``, ``steps``, ``timeouts``, ``deaths``, ``restarts`` (after deaths),
-            ``stale_replies``, ``state``, and ``step_latency_s``: ``p50``, ``p90``, ``p99`` and
-            ``max`` in seconds of the last 1024 steps, from the request to the reply.
+            ``stale_replies``, ``sent_bytes`` and ``received_bytes`` (over both lanes; infos in
+            shared memory are not counted), ``state``, and ``step_latency_s``: from the request to
+            the reply in seconds, ``p50``, ``p90``, ``p99`` and ``max`` of the last 1024 steps, and
+            the ``total`` of all.
         """
         return self._remote.stats()
 

@@ -3,7 +3,7 @@ set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../lib.sh"
 make_venv "$(find_python 3.11 || command -v python3)" "$CI_WORK/lint"
 bin=$CI_WORK/lint/bin
-"$bin/uv" pip install --quiet --python "$bin/python" '.[video]' --group lint
+"$bin/uv" pip install --quiet --python "$bin/python" '.[video,metrics]' --group lint
 "$bin/uv" pip uninstall --quiet --python "$bin/python" envhub-sandbox
 
 "$bin/ruff" check .

@@ -30,6 +30,8 @@ def test_counters_follow_what_happens(lane: str) -> None:
         env.reset()
         found = env.stats()
         latency = found.pop("step_latency_s")
+        assert found.pop("sent_bytes") > 6 * 8
+        assert found.pop("received_bytes") > 6 * (8 + 8 + 1 + 1)
         assert found == {
             "requests": 3 + 5 + 1 + 1,
             "steps": 5,
@@ -39,6 +41,7 @@ def test_counters_follow_what_happens(lane: str) -> None:
             "stale_replies": 0,
             "state": "READY",
         }
+        assert latency["total"] >= latency["max"]
         assert 0 < latency["p50"] <= latency["p90"] <= latency["p99"] <= latency["max"]
     assert env.stats()["state"] == "CLOSED"
 
@@ -46,11 +49,11 @@ def test_counters_follow_what_happens(lane: str) -> None:
 def test_latencies_are_those_of_the_last_steps() -> None:
     """Old latencies are forgotten, new ones are not."""
     counters = Counters()
-    assert counters.snapshot()["step_latency_s"] == {}
+    assert counters.snapshot()["step_latency_s"] == {"total": 0.0}
     for _ in range(KEPT):
         counters.stepped(10**9)
     for _ in range(KEPT):
         counters.stepped(2 * 10**9)
-    expected = {"p50": 2.0, "p90": 2.0, "p99": 2.0, "max": 2.0}
+    expected = {"p50": 2.0, "p90": 2.0, "p99": 2.0, "max": 2.0, "total": 3.0 * KEPT}
     assert counters.snapshot()["step_latency_s"] == expected
     assert counters.snapshot()["steps"] == 2 * KEPT

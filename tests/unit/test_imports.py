@@ -24,6 +24,7 @@ CLIENTS_OWN = {
 # used where they are installed, and only there
 OPTIONAL = {
     "envhub_worker.protocol.packing": {"lz4"},
+    "envhub_sandbox.metrics": {"prometheus_client"},
     "envhub_sandbox.tensors": {"torch"},
     "envhub_sandbox.video": {"imageio_ffmpeg"},
 }

@@ -1,0 +1,182 @@
+"""What Prometheus reads is what has happened; read with its own parser."""
+
+from __future__ import annotations
+
+import gc
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+prometheus_client = pytest.importorskip("prometheus_client")
+
+from prometheus_client.parser import text_string_to_metric_families  # noqa: E402
+
+from envhub_sandbox import errors, make_env, stats  # noqa: E402
+from envhub_sandbox.metrics import EnvHubCollector  # noqa: E402
+from envhub_sandbox.stats import Counters, Labels, Ledger, lane_step_bytes  # noqa: E402
+from tests.support.samples import sample  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("neighbour")
+
+Key = tuple[str, frozenset[tuple[str, str]]]
+
+
+@pytest.fixture
+def registry() -> Any:
+    """A registry of its own with our collector, as a user would make it."""
+    found = prometheus_client.CollectorRegistry(auto_describe=True)
+    found.register(EnvHubCollector())
+    return found
+
+
+def scraped(registry: Any, repository: str) -> dict[Key, float]:
+    """The samples about one repository, out of the text that Prometheus would get."""
+    text = prometheus_client.generate_latest(registry).decode()
+    return {
+        (one.name, frozenset(one.labels.items()) - {("repository", repository)}): one.value
+        for family in text_string_to_metric_families(text)
+        for one in family.samples
+        if one.labels.get("repository") == repository
+    }
+
+
+def key(name: str, **labels: str) -> Key:
+    """A sample's place in ``scraped``, for the only task there is."""
+    return name, frozenset({"suite": "hub_env", "task": "0", **labels}.items())
+
+
+@pytest.fixture
+def repository(tmp_path: Path) -> Path:
+    """A repository that no other test's numbers are about."""
+    folder = tmp_path / "echo"
+    folder.mkdir()
+    (folder / "env.py").write_text((sample("echo") / "env.py").read_text())
+    return folder
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+def test_everything_is_exported(registry: Any, repository: Path, lane: str) -> None:
+    """Under standard names, with the numbers of ``stats()``."""
+    label = f"{repository}:env.py"
+    with make_env(repository, lane=lane, policy={"restart": "on_reset"}) as suites:
+        env = suites.env
+        env.reset()
+        for _ in range(7):
+            env.step([[1.0, 0.0]])
+        with pytest.raises(errors.WorkerDiedError):
+            env.step([[1.0, -1.0]])
+        env.reset()
+        found, told = scraped(registry, label), env.stats()
+    assert found[key("envhub_requests_total")] == told["requests"] == 10
+    assert found[key("envhub_steps_total")] == told["steps"] == 7
+    assert found[key("envhub_worker_deaths_total")] == 1
+    assert found[key("envhub_worker_restarts_total")] == 1
+    assert found[key("envhub_timeouts_total")] == 0
+    assert found[key("envhub_stale_replies_total")] == 0
+    assert found[key("envhub_sent_bytes_total")] == told["sent_bytes"]
+    assert found[key("envhub_received_bytes_total")] == told["received_bytes"]
+    assert found[key("envhub_environments", state="ready")] == 1
+    assert found[key("envhub_step_latency_seconds_count")] == 7
+    latency = told["step_latency_s"]
+    assert found[key("envhub_step_latency_seconds_sum")] == pytest.approx(latency["total"])
+    for quantile, name in (("0.5", "p50"), ("0.9", "p90"), ("0.99", "p99")):
+        sample_of = key("envhub_step_latency_seconds", quantile=quantile)
+        assert found[sample_of] == pytest.approx(latency[name])
+
+
+def test_counts_outlive_their_environments(registry: Any, repository: Path) -> None:
+    """A counter never falls: environments of the same labels add up, and stay when they go."""
+    label = f"{repository}:env.py"
+    counts = []
+    for _ in range(3):
+        with make_env(repository) as suites:
+            suites.env.reset()
+            suites.env.step([[1.0, 0.0]])
+            counts.append(scraped(registry, label)[key("envhub_steps_total")])
+        del suites
+        gc.collect()
+    assert counts == [1, 2, 3]
+    found = scraped(registry, label)
+    assert found[key("envhub_steps_total")] == 3
+    assert not [name for name, _ in found if name == "envhub_environments"]
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+def test_bytes_are_counted_over_both_lanes(lane: str) -> None:
+    """At least the arrays that went, at most a little more; also after a restart."""
+    policy = {"restart": "on_reset", "restart_backoff_s": 0}
+    with make_env(sample("echo"), n_envs=4, lane=lane, policy=policy) as suites:
+        env = suites.env
+        env.reset()
+        before = env.stats()
+        for _ in range(10):
+            env.step(np.ones((4, 2)) * [1.0, 0.0])
+        after = env.stats()
+        sent = after["sent_bytes"] - before["sent_bytes"]
+        received = after["received_bytes"] - before["received_bytes"]
+        assert 10 * 4 * 2 * 8 <= sent <= 10 * (4 * 2 * 8 + 500)
+        assert 10 * 4 * (2 * 8 + 10) <= received <= 10 * (4 * (2 * 8 + 10) + 500)
+        with pytest.raises(errors.WorkerDiedError):
+            env.step(np.ones((4, 2)) * [1.0, -1.0])
+        env.reset()
+        assert env.stats()["sent_bytes"] > after["sent_bytes"]
+    assert env.stats()["received_bytes"] > after["received_bytes"]
+
+
+def test_a_lane_step_is_its_arrays() -> None:
+    """Actions there; observations, rewards and two flags back."""
+    with make_env(sample("echo"), n_envs=4) as suites:
+        manifest = suites.env._remote.manifest
+    assert lane_step_bytes(manifest) == (4 * 2 * 8, 4 * (2 * 8 + 8 + 1 + 1))
+    with make_env(sample("exotic_spaces")) as suites:
+        assert lane_step_bytes(next(iter(suites.envs()))._remote.manifest) == (0, 0)  # type: ignore[attr-defined]
+
+
+class Env:
+    """What the ledger asks of an environment."""
+
+    def __init__(self) -> None:
+        self.counters = Counters()
+
+    def stats(self) -> dict[str, Any]:
+        """Its state."""
+        return {"state": "READY"}
+
+
+class Restarts:
+    """What it asks of whoever counts them."""
+
+    count = 2
+
+
+def test_what_is_gone_takes_no_room() -> None:
+    """A thousand environments leave one line of numbers."""
+    ledger, labels = Ledger(), Labels("r", "s", "t")
+    for _ in range(1000):
+        env = Env()
+        ledger.add(env, labels, Restarts())
+        env.counters.stepped(10**9)
+        del env
+    [row] = ledger.rows()
+    assert (row.numbers["steps"], row.numbers["step_seconds"]) == (1000, 1000.0)
+    assert (row.numbers["restarts"], row.states, row.latencies_s.size) == (2000, {}, 0)
+    assert not ledger._living
+    ledger.forget()
+    assert ledger.rows() == []
+
+
+def test_names_of_the_worker_cannot_break_the_exposition(
+    registry: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A task's name is a stranger's text."""
+    ledger, env = Ledger(), Env()
+    nasty = 'a"b\\c\nd} 5\x1b[31m'
+    ledger.add(env, Labels("r", nasty, nasty * 1000), Restarts())
+    monkeypatch.setattr("envhub_sandbox.metrics.LEDGER", ledger)
+    found = scraped(registry, "r")
+    assert all("\x1b" not in value for _, labels in found for _, value in labels)
+    suites = {dict(labels)["suite"] for _, labels in found}
+    assert suites == {'a"b\\c\nd} 5\\x1b[31m'}
+    assert stats.LEDGER is not ledger
