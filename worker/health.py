@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import socket
 
-# ZMTP 3: what both sides say first, before any key is needed (https://rfc.zeromq.org/spec/23).
-_SIGNATURE = b"\xff" + bytes(8) + b"\x7f"
+# ZMTP 3: how both sides begin, unasked, before any key is needed (https://rfc.zeromq.org/spec/23).
+_GREETING = b"\xff"
 _WAIT_S = 5.0
 
 
@@ -13,8 +13,7 @@ def answers(host: str, port: int) -> bool:
     """Whether a ZeroMQ peer greets us there."""
     try:
         with socket.create_connection((host, port), _WAIT_S) as connection:
-            connection.sendall(_SIGNATURE)
             greeting = connection.recv(1)
     except OSError:
         return False
-    return greeting == _SIGNATURE[:1]
+    return greeting == _GREETING

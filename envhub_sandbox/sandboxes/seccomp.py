@@ -39,16 +39,17 @@ _FILES = """
     writev
 """
 _PROCESSES = """
-    alarm arch_prctl capget capset clock_getres clock_gettime clock_nanosleep clone execve execveat
-    exit exit_group fork futex futex_requeue futex_wait futex_waitv futex_wake get_robust_list
-    get_thread_area getcpu getegid geteuid getgid getgroups getitimer getpgid getpgrp getpid getppid
-    getpriority getrandom getresgid getresuid getrlimit getrusage getsid gettid gettimeofday getuid
-    ioprio_get nanosleep pause pidfd_open pidfd_send_signal prctl prlimit64 restart_syscall rseq
-    sched_get_priority_max sched_get_priority_min sched_getaffinity sched_getattr sched_getparam
-    sched_getscheduler sched_rr_get_interval sched_setaffinity sched_setparam sched_setscheduler
-    sched_setattr sched_yield set_robust_list set_thread_area set_tid_address setfsgid setfsuid
-    setgid setgroups setitimer setpgid setpriority setregid setresgid setresuid setreuid setrlimit setsid setuid
-    sysinfo time timer_create timer_delete timer_getoverrun timer_gettime timer_settime times uname
+    alarm arch_prctl capget capset clock_getres clock_gettime clock_nanosleep clone execve
+    execveat exit exit_group fork futex futex_requeue futex_wait futex_waitv futex_wake
+    get_robust_list get_thread_area getcpu getegid geteuid getgid getgroups getitimer getpgid
+    getpgrp getpid getppid getpriority getrandom getresgid getresuid getrlimit getrusage getsid
+    gettid gettimeofday getuid ioprio_get nanosleep pause pidfd_open pidfd_send_signal prctl
+    prlimit64 restart_syscall rseq sched_get_priority_max sched_get_priority_min
+    sched_getaffinity sched_getattr sched_getparam sched_getscheduler sched_rr_get_interval
+    sched_setaffinity sched_setattr sched_setparam sched_setscheduler sched_yield
+    set_robust_list set_thread_area set_tid_address setfsgid setfsuid setgid setgroups setitimer
+    setpgid setpriority setregid setresgid setresuid setreuid setrlimit setsid setuid sysinfo
+    time timer_create timer_delete timer_getoverrun timer_gettime timer_settime times uname
     vfork wait4 waitid
 """
 _SIGNALS = """

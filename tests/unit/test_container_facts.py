@@ -95,7 +95,6 @@ def test_health_is_a_peer_that_speaks_zeromq(greeting: bytes, healthy: bool) -> 
         def greet() -> None:
             connection, _ = listener.accept()
             with connection:
-                connection.recv(64)
                 connection.sendall(greeting)
 
         thread = threading.Thread(target=greet)
