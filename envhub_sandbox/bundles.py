@@ -112,6 +112,8 @@ def _doubts(
     dropped = _member(history, "dropped", int)
     if dropped:
         yield f"{dropped} requests had been forgotten before it died (crash_history of the policy)"
+    elif history.get("mixed"):
+        yield "some sub-environments had lost attributes in a transparent restart"
     elif not _member(history, "exact", bool):
         yield "some requests held objects that only pickle could carry, and are not repeated"
     if not _member(arguments, "exact", bool):

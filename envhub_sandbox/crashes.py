@@ -126,6 +126,7 @@ def _write(folder: Path, crash: Crash) -> None:
             "exact": recording.exact,
             "seeded": recording.seeded,
             "dropped": recording.dropped,
+            "mixed": recording.mixed,
             "steps": requests.steps,
             "before": before.index,
             "requests": requests.index,

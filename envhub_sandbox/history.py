@@ -69,18 +69,21 @@ class Recording:
         before: What lasts beyond a reset: calls, and attributes that were set.
         requests: Everything since the last reset that seeded all, or since the start.
         dropped: Requests that were forgotten in between, for their number or size.
+        mixed: Whether some sub-environments have lost what lasts, by a transparent restart.
     """
 
     seeded: bool = False
     before: tuple[Requested, ...] = ()
     requests: tuple[Steps | Requested, ...] = ()
     dropped: int = 0
+    mixed: bool = False
 
     @property
     def exact(self) -> bool:
         """Whether the same requests again are all there was."""
         kept = [*self.before, *self.requests]
-        return not self.dropped and all(not isinstance(r, Requested) or r.exact for r in kept)
+        plain = all(not isinstance(one, Requested) or one.exact for one in kept)
+        return plain and not self.dropped and not self.mixed
 
 
 class History:
@@ -115,6 +118,16 @@ class History:
         self._lasting.clear()
         self._before: tuple[Requested, ...] = ()
         self._forgotten = 0
+        self._mixed = self._seeded = False
+        self._restart()
+
+    def revived(self) -> None:
+        """Some sub-environments are fresh: before all are seeded, nobody can say what follows.
+
+        Attributes that were set, the fresh ones have lost, and the others have not.
+        """
+        self._mixed = self._mixed or bool(self._lasting)
+        self._before = ()
         self._seeded = False
         self._restart()
 
@@ -208,6 +221,7 @@ class History:
             before=self._before,
             requests=tuple(self._runs()),
             dropped=self._dropped + self._forgotten,
+            mixed=self._mixed,
         )
 
     def _runs(self) -> list[Steps | Requested]:

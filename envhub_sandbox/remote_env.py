@@ -552,7 +552,7 @@ class RemoteEnv:
             raise
         self._pending = None
         self.counters.deaths += len(replies)
-        self.history.started()
+        self.history.revived()
         self._moved(Event.REVIVAL)
         return replies
 

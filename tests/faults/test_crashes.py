@@ -249,3 +249,25 @@ def test_envhub_run_names_the_bundle() -> None:
     output, _, command = done.stderr.partition("To try the same again: envhub replay ")
     assert "about to kill" in output
     assert eventually(lambda: (Path(command.strip()) / "bundle.json").exists())
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+def test_a_death_that_is_hidden_leaves_a_bundle_too(
+    tmp_path: Path, lane: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """With transparent restarts nothing is raised; the log names the bundle."""
+    caplog.set_level("INFO", "envhub_sandbox.crashes")
+    place = {"n_envs": 3, "use_async_envs": True, "num_workers": 2, "lane": lane}
+    policy = {"restart": "transparent", "restart_backoff_s": 0}
+    with brittle(tmp_path, policy=policy, **place) as suites:
+        env = suites.env
+        env.action_space.seed(5)
+        env.reset(seed=3)
+        for _ in range(2000):
+            if env.stats()["restarts"]:
+                break
+            env.step(env.action_space.sample())
+        assert env.stats()["restarts"] == 1
+    [folder] = tmp_path.iterdir()
+    assert str(folder) in caplog.text
+    assert replayed(str(folder), code=0)["verdict"] == "same"

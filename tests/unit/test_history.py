@@ -194,3 +194,23 @@ def test_nothing_is_kept_where_nothing_is_wanted() -> None:
     reset(kept, [1, 2])
     kept.step(np.array([1, 2]))
     assert kept.recording() == Recording()
+
+
+def test_after_a_transparent_restart_nobody_knows_before_all_are_seeded() -> None:
+    """Then it is exact again, unless attributes had been set that only some still have."""
+    kept = made()
+    reset(kept, [1, 2])
+    kept.step(np.array([1, 1]))
+    kept.revived()
+    kept.step(np.array([2, 2]))
+    assert not kept.recording().seeded
+    assert actions_of(kept.recording()) == [[2, 2]]
+    reset(kept, [1, 2])
+    assert kept.recording().seeded
+    assert kept.recording().exact
+    ask(kept, m.SetAttr(0, "a", (1, 1)))
+    kept.revived()
+    reset(kept, [1, 2])
+    assert not kept.recording().exact
+    kept.started()
+    assert kept.recording().exact
