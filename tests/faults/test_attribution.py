@@ -1,7 +1,8 @@
 """No result is ever attributed to another request, and the lifecycle's table is what happens.
 
 A state machine drives a real worker through timeouts, late replies, deaths, interrupts and
-closes. Every request carries a token of its own and every answer repeats it.
+closes. Every request carries a token of its own and every answer repeats it; but for the rows of
+what has died and comes back, under ``restart="transparent"``, which say so.
 """
 
 from __future__ import annotations
@@ -45,6 +46,8 @@ class Attribution(RuleBasedStateMachine):
 
     lane = "auto"
     shards = 1
+    restart = "on_reset"
+    after_death = State.DEAD
 
     @initialize()
     def begin(self) -> None:
@@ -55,7 +58,12 @@ class Attribution(RuleBasedStateMachine):
             use_async_envs=True,
             num_workers=self.shards,
             lane=self.lane,
-            policy={"restart": "on_reset", "restart_backoff_s": 0, "restart_budget": 10_000},
+            policy={
+                "restart": self.restart,
+                "restart_backoff_s": 0,
+                "restart_budget": 10_000,
+                "crash_history": 0,
+            },
         )
         self.env = self.suites.env
         self.expected = self.state
@@ -75,13 +83,21 @@ class Attribution(RuleBasedStateMachine):
             assert not refused or before is State.LATE
             self.expected = State.LATE
         except errors.WorkerDiedError:
-            self.expected = State.DEAD
+            self.expected = self.after_death
         except KeyboardInterrupt:
             self.expected = State.LATE
         else:
             assert before not in (State.LATE, State.DEAD, State.CLOSED)
             assert check(answer), answer
             self.expected = State.READY
+
+    def is_reset(self, got: Any, token: float) -> bool:
+        """Whether this is the answer to the reset with this token."""
+        return bool(got[0].tolist() == [[token, 0.0]] * 2)
+
+    def is_step(self, got: Any, token: float) -> bool:
+        """Whether this is the answer to the step with this token."""
+        return _is_step(got, token)
 
     @precondition(lambda self: self.expected is not State.CLOSED)
     @rule(delay=delays, wait=waits)
@@ -95,7 +111,7 @@ class Attribution(RuleBasedStateMachine):
             self.env.reset_async(options={"token": token, "delay": delay})
             return self.env.reset_wait(timeout=wait)
 
-        self.after(ask, lambda got: got[0].tolist() == [[token, 0.0]] * 2)
+        self.after(ask, lambda got: self.is_reset(got, token))
 
     @precondition(lambda self: self.expected is not State.CLOSED)
     @rule(delay=delays, wait=waits)
@@ -107,7 +123,7 @@ class Attribution(RuleBasedStateMachine):
             self.env.step_async([[token, delay]] * 2)
             return self.env.step_wait(timeout=wait)
 
-        self.after(ask, lambda got: _is_step(got, token))
+        self.after(ask, lambda got: self.is_step(got, token))
 
     @precondition(lambda self: self.expected is not State.CLOSED)
     @rule(delay=delays, wait=waits)
@@ -150,7 +166,7 @@ class Attribution(RuleBasedStateMachine):
             finally:
                 signal.setitimer(signal.ITIMER_REAL, 0)
 
-        self.after(ask, lambda got: _is_step(got, token))
+        self.after(ask, lambda got: self.is_step(got, token))
         if not was_running and self.state is State.IDLE:
             self.expected = State.IDLE
 
@@ -163,7 +179,7 @@ class Attribution(RuleBasedStateMachine):
         try:
             token = float(next(_tokens))
             while running:
-                assert _is_step(self.env.step([[token, _SLOW_S]] * 2), token)
+                assert self.is_step(self.env.step([[token, _SLOW_S]] * 2), token)
         except (ClosedEnvironmentError, errors.WorkerError):
             pass
         closing.join()
@@ -195,6 +211,65 @@ class Attribution(RuleBasedStateMachine):
         assert self.state is State.CLOSED
 
 
+class Transparent(Attribution):
+    """The same, where the dead come back by themselves.
+
+    Attributes:
+        lost: Rows that are dead, for the next step or reset to bring back.
+        over: Rows whose episode was truncated by that, so that a step resets them.
+    """
+
+    restart = "transparent"
+    after_death = State.READY
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lost: set[int] = set()
+        self.over: set[int] = set()
+
+    def is_reset(self, got: Any, token: float) -> bool:
+        """All rows are its own; those that came back are marked, in a jail that was not left."""
+        marked, lost = _restarted(got[1]), self.lost
+        self.lost, self.over = set(), set()
+        return super().is_reset(got, token) and marked <= lost
+
+    def is_step(self, got: Any, token: float) -> bool:
+        """The lost rows, and no other, are fresh and marked; the next step resets just those."""
+        lost, over = self.lost, self.over - self.lost
+        self.lost, self.over = set(), lost
+        own = [row for row in range(2) if row not in lost | over]
+        observations, rewards, _, truncations, infos = got
+        expected = [[token, 1.0] if row in own else [0.0, 0.0] for row in range(2)]
+        tokens = infos["token"][own].tolist() if own else []
+        return (
+            _restarted(infos) == set(np.flatnonzero(truncations).tolist()) == lost
+            and observations.tolist() == expected
+            and rewards.tolist() == [token if row in own else 0.0 for row in range(2)]
+            and tokens == [token] * len(own)
+        )
+
+    @precondition(lambda self: self.expected is not State.CLOSED)
+    @rule(by_step=st.booleans())
+    def die(self, by_step: bool) -> None:
+        """The last row's process ends in a step, or all of them in a call."""
+        usable = self.expected in (State.IDLE, State.READY)
+        if not by_step:
+            self.lost = {0, 1} if usable else self.lost
+            self.after(lambda: self.env.call("echo", 0.0, -1.0), lambda got: False)
+            return
+        if usable and not self.lost and 1 not in self.over:
+            self.lost = {0, 1} if self.shards == 1 else {1}
+        self.after(
+            lambda: self.env.step([[0.0, 0.0], [0.0, -1.0]]), lambda got: self.is_step(got, 0.0)
+        )
+
+
+def _restarted(infos: dict[str, Any]) -> set[int]:
+    mask = infos.get("worker_restarted", np.zeros(2))
+    assert np.array_equal(mask, infos.get("_worker_restarted", np.zeros(2)))
+    return set(np.flatnonzero(mask).tolist())
+
+
 def _is_step(got: Any, token: float) -> bool:
     observations, rewards, _, _, infos = got
     same = observations.tolist() == [[token, 1.0]] * 2 and rewards.tolist() == [token] * 2
@@ -211,8 +286,11 @@ def _interrupts() -> Iterator[None]:
 @pytest.mark.usefixtures("neighbour", "_interrupts")
 @pytest.mark.parametrize("shards", [1, 2])
 @pytest.mark.parametrize("lane", ["auto", "frames"])
-def test_no_result_is_attributed_to_another_request(lane: str, shards: int) -> None:
+@pytest.mark.parametrize("machine", [Attribution, Transparent])
+def test_no_result_is_attributed_to_another_request(
+    lane: str, shards: int, machine: type[Attribution]
+) -> None:
     """Whatever is interleaved, an answer is the answer to its own request."""
-    machine = type("Machine", (Attribution,), {"lane": lane, "shards": shards})
+    machine = type("Machine", (machine,), {"lane": lane, "shards": shards})
     few = settings(max_examples=12, stateful_step_count=15, deadline=None, print_blob=True)
     run_state_machine_as_test(machine, settings=few)
