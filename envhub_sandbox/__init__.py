@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from envhub_sandbox.policy import Policy as Policy
     from envhub_sandbox.policy import Timeouts as Timeouts
     from envhub_sandbox.reference import HubRef as HubRef
+    from envhub_sandbox.sandboxes.remote import RemoteSandbox as RemoteSandbox
     from envhub_sandbox.suites import EnvSuites as EnvSuites
     from envhub_sandbox.vector_env import SandboxVectorEnv as SandboxVectorEnv
 
@@ -29,6 +30,7 @@ _HOMES = {
     "HubRef": "reference",
     "Limits": "policy",
     "Policy": "policy",
+    "RemoteSandbox": "sandboxes.remote",
     "SandboxVectorEnv": "vector_env",
     "Timeouts": "policy",
     "errors": "errors",

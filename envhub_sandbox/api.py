@@ -45,6 +45,7 @@ def make_env(
     num_workers: int | None = None,
     lane: str = "auto",
     copy: bool = True,
+    server_key: str | None = None,
 ) -> EnvSuites:
     """Make the vector environments of a repository, without its code entering this process.
 
@@ -56,8 +57,9 @@ def make_env(
         use_async_envs: Passed on likewise; sub-environments may then run in several processes.
         hub_cache_dir: huggingface_hub's ``cache_dir``.
         trust_remote_code: Only for ``sandbox=None``.
-        sandbox: ``"process"``; ``"docker"``, ``"docker:IMAGE"`` or a ``DockerSandbox``; or None to
-            run the code here, as LeRobot does.
+        sandbox: ``"process"``; ``"docker"``, ``"docker:IMAGE"`` or a ``DockerSandbox``;
+            ``"tcp://HOST:PORT"`` or a ``RemoteSandbox``; or None to run the code here, as LeRobot
+            does.
         env_kwargs: Further keyword arguments for the repository's ``make_env``.
         policy: What the code may reach; see ``Policy``.
         timeouts: How long operations may take; see ``Timeouts``.
@@ -70,6 +72,7 @@ def make_env(
         lane: ``"auto"`` steps over shared memory where that is possible, ``"frames"`` never does.
         copy: False lends observations instead of copying them, as in Gymnasium; still no later
             step changes an array that somebody holds, but the worker could.
+        server_key: For ``sandbox="tcp://..."``: that server's public key.
 
     Returns:
         ``{suite: {task_id: VectorEnv}}``. Environments of a known pin start no process before
@@ -93,7 +96,7 @@ def make_env(
         raise inprocess.refusal(reference)
     chosen_policy = policy_from(policy, limits_from(limits))
     chosen_timeouts = timeouts_from(timeouts)
-    place = None if sandbox is None else _sandbox(sandbox)
+    place = None if sandbox is None else _sandbox(sandbox, server_key)
     snapshot = _snapshot(reference, hub_cache_dir, token, endpoint)
     if place is None:
         envs = inprocess.make(snapshot, n_envs, use_async_envs, config, dict(env_kwargs or {}))
@@ -131,6 +134,7 @@ def make_env(
             "num_workers": num_workers,
             "lane": lane,
             "copy": copy,
+            "server_key": server_key,
         },
     )
     return _Maker(repository, num_workers).make()
@@ -226,7 +230,15 @@ def _snapshot(
     return fetch(ref, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
 
 
-def _sandbox(sandbox: str | Sandbox) -> Sandbox:
+def _sandbox(sandbox: str | Sandbox, server_key: str | None) -> Sandbox:
+    if isinstance(sandbox, str) and sandbox.startswith("tcp://"):
+        from envhub_sandbox.sandboxes.remote import RemoteSandbox
+
+        return RemoteSandbox(sandbox, server_key=server_key)
+    if server_key is not None:
+        raise PolicyError(
+            "server_key is for sandbox='tcp://HOST:PORT'; a RemoteSandbox has its own"
+        )
     if not isinstance(sandbox, str):
         return sandbox
     if sandbox == "process":
@@ -239,7 +251,8 @@ def _sandbox(sandbox: str | Sandbox) -> Sandbox:
 
         return DockerSandbox(image=image) if image else DockerSandbox()
     raise PolicyError(
-        f"sandbox is {sandbox!r}; it is 'process', 'docker', or None to run the code here"
+        f"sandbox is {sandbox!r}; it is 'process', 'docker', 'tcp://HOST:PORT', or None to run the "
+        "code here"
     )
 
 

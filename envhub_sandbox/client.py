@@ -11,18 +11,24 @@ import zmq
 
 from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import (
+    PolicyError,
     RemoteProtocolError,
     SandboxUnavailableError,
+    SnapshotIntegrityError,
     VersionMismatchError,
     WorkerDiedError,
     WorkerError,
     WorkerTimeoutError,
 )
+from envhub_sandbox.far import Far, Link
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol import packing
 from envhub_worker.protocol.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.text import printable
 
+_FAR_VERSION = 2
+_FIRST_OF_VERSION_2 = 17
 SESSION = secrets.token_bytes(16)
 _contexts: dict[int, zmq.Context[zmq.Socket[bytes]]] = {}
 
@@ -36,6 +42,10 @@ def _context() -> zmq.Context[zmq.Socket[bytes]]:
     return _contexts[pid]
 
 
+_LOOK_MS = 500
+"""One wait on a connection over a network: whether it is still there is asked in between."""
+
+
 class WorkerClient:
     """A connection. Not thread-safe: its owner holds a lock.
 
@@ -43,9 +53,20 @@ class WorkerClient:
         endpoint: The server's ZeroMQ endpoint.
         process_fd: A descriptor that becomes readable when the server's process ends.
         limits: Bounds on what the server may send.
+        far: The server's key and ours, where it is on another host.
+
+    Attributes:
+        version: The protocol's version that was agreed on; 0 before ``hello``.
+        patience_s: How long the server keeps the jails of a client that says nothing; 0: for ever.
     """
 
-    def __init__(self, endpoint: str, process_fd: int, limits: WireLimits = DEFAULT_LIMITS) -> None:
+    def __init__(
+        self,
+        endpoint: str,
+        process_fd: int,
+        limits: WireLimits = DEFAULT_LIMITS,
+        far: Far | None = None,
+    ) -> None:
         self._pid = os.getpid()
         self._limits = limits
         self._ids = itertools.count(1)
@@ -53,24 +74,50 @@ class WorkerClient:
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.MAXMSGSIZE, limits.frame_bytes)
         self._socket.setsockopt(zmq.RCVHWM, 64)
+        self._far = far
+        self._link = None if far is None else Link(self._socket, endpoint, far)
         self._socket.connect(endpoint)
         self._process_fd = process_fd
         self._poller = zmq.Poller()
         self._poller.register(self._socket, zmq.POLLIN)
         self._poller.register(process_fd, zmq.POLLIN)
+        if self._link is not None:
+            self._poller.register(self._link.monitor, zmq.POLLIN)
+        self._sent: dict[int, tuple[int, list[Buffer]]] = {}
+        self._compression = ""
+        self.version = 0
+        self.patience_s = 0
         self.stale_replies = 0
         self.sent_bytes = 0
         self.received_bytes = 0
 
     def hello(self, deadline: Deadline) -> m.Welcome:
         """Agree on a protocol version."""
-        reply, _ = self.request(m.Hello(m.VERSION, m.VERSION, SESSION), deadline=deadline)
+        self._compression = ""
+        greeting = m.Hello(m.OLDEST_VERSION, m.VERSION, SESSION)
+        reply, _ = self.request(greeting, deadline=deadline)
         welcome = expect(reply, m.Welcome)
-        if welcome.version != m.VERSION:
+        if not m.OLDEST_VERSION <= welcome.version <= m.VERSION:
             raise VersionMismatchError(
-                f"this client speaks protocol {m.VERSION}, the worker chose {welcome.version}"
+                f"this client speaks protocol {m.OLDEST_VERSION} to {m.VERSION}, the worker chose "
+                f"{welcome.version}"
             )
+        self.version = welcome.version
+        if self._link is not None:
+            self._agree(deadline)
         return welcome
+
+    def _agree(self, deadline: Deadline) -> None:
+        if self.version < _FAR_VERSION:
+            raise VersionMismatchError(
+                f"the worker speaks protocol {self.version}, and a server on another host needs "
+                f"{_FAR_VERSION}: upgrade the worker"
+            )
+        reply, _ = self.request(m.Agree(packing.available()), deadline=deadline)
+        agreed = expect(reply, m.Agreed)
+        if agreed.compression not in ("", *packing.available()):
+            raise RemoteProtocolError("the worker chose a compression that was not offered")
+        self._compression, self.patience_s = agreed.compression, agreed.idle_s
 
     def request(
         self, message: m.Message, payload: Sequence[Buffer] = (), *, deadline: Deadline
@@ -81,39 +128,83 @@ class WorkerClient:
     def send(self, message: m.Message, payload: Sequence[Buffer] = ()) -> int:
         """Send a request; returns its id."""
         self.check_process()
+        if self.version == 1 and _FIRST_OF_VERSION_2 <= message.kind < m.FIRST_HOST_KIND:
+            raise VersionMismatchError(
+                f"the worker speaks protocol 1, and {type(message).__name__} needs 2: upgrade it"
+            )
         request_id = next(self._ids)
-        frames = [*m.pack(message, request_id), *payload]
-        self._socket.send_multipart(frames, copy=False)
-        self.sent_bytes += sum(memoryview(frame).nbytes for frame in frames)
+        self._send(request_id, [*m.pack(message, request_id), *payload])
         return request_id
+
+    def _send(self, request_id: int, frames: list[Buffer]) -> None:
+        travelling = frames
+        if self._link is not None:
+            self._sent[request_id] = self._link.next_number(), frames
+            if self._compression:
+                travelling = packing.pack_frames(frames, self._compression)
+        self._socket.send_multipart(travelling, copy=False)
+        self.sent_bytes += sum(memoryview(frame).nbytes for frame in travelling)
 
     def receive(self, request_id: int, deadline: Deadline) -> tuple[m.Message, list[Buffer]]:
         """The reply to a request, with its payload. Replies to others are dropped and counted.
 
         Raises:
             WorkerTimeoutError: The deadline came first. The reply may still come; it is dropped.
-            WorkerDiedError: The worker server has ended.
+            WorkerDiedError: The worker server has ended, or the connection to it is lost.
+            SandboxUnavailableError: A server on another host does not let us in.
             RemoteProtocolError: What came is not a reply.
         """
         self.check_process()
         while True:
-            self._wait(deadline)
+            self._wait(request_id, deadline)
             frames: list[Buffer] = list(self._socket.recv_multipart(zmq.NOBLOCK))
             self.received_bytes += sum(map(len, frames))
+            if self._link is not None:
+                frames = packing.unpack_frames(frames, self._limits)
             reply_id, reply = m.unpack(frames[:1], limits=self._limits)
-            if reply_id == request_id:
+            if reply_id != request_id:
+                self._sent.pop(reply_id, None)
+                self.stale_replies += 1
+            elif not self._must_say_hello(request_id, reply):
+                self._sent.pop(request_id, None)
                 return reply, frames[1:]
-            self.stale_replies += 1
+            else:
+                _, unanswered = self._sent.pop(request_id)
+                self.hello(deadline)
+                self._send(request_id, unanswered)
 
-    def _wait(self, deadline: Deadline) -> None:
+    def _must_say_hello(self, request_id: int, reply: m.Message) -> bool:
+        """Whether we came back over a new connection: nothing was done, so it can be asked anew."""
+        unknown = isinstance(reply, m.Refused) and reply.error == "HelloError"
+        return unknown and request_id in self._sent
+
+    def _wait(self, request_id: int, deadline: Deadline) -> None:
         while True:
-            ready = dict(self._poller.poll(deadline.left_ms()))
+            ready = dict(self._poller.poll(self._wait_ms(deadline)))
             if self._socket in ready:
                 return
-            if ready:
+            if self._process_fd in ready:
                 raise WorkerDiedError("the worker server has ended", reason="server")
+            if self._link is not None and request_id in self._sent:
+                self._link.check(self._sent[request_id][0])
             if deadline.passed:
                 raise WorkerTimeoutError("the worker did not answer in time")
+
+    def _wait_ms(self, deadline: Deadline) -> int | None:
+        left = deadline.left_ms()
+        if self._link is None:
+            return left
+        return _LOOK_MS if left is None else min(left, _LOOK_MS)
+
+    def hold(self, jail: int) -> None:
+        """A jail on another host is ours: the server is told so while we live."""
+        if self._far is not None:
+            self._far.held.add(jail)
+
+    def let_go(self, jail: int) -> None:
+        """It no longer is; the server ends it, if it has not heard so already."""
+        if self._far is not None:
+            self._far.held.discard(jail)
 
     def check_process(self) -> None:
         """Refuse in a forked child: the connection belongs to the parent.
@@ -129,7 +220,9 @@ class WorkerClient:
 
     def close(self) -> None:
         """Close the connection. Idempotent; in a forked child nothing is touched."""
-        if os.getpid() == self._pid:
+        if os.getpid() == self._pid and not self._socket.closed:
+            if self._link is not None:
+                self._link.close()
             self._socket.close(0)
 
 
@@ -159,9 +252,16 @@ def refusal(reply: m.Refused) -> Exception:
         layer = f"{printable(reply.layer)}: " if reply.layer else ""
         fix = f"\n{printable(reply.fix)}" if reply.fix else ""
         return SandboxUnavailableError(f"this host cannot enforce {layer}{message}{fix}")
-    if reply.error == "VersionMismatchError":
-        return VersionMismatchError(message)
-    return WorkerError(message)
+    if reply.error == "WorkerDiedError":
+        return WorkerDiedError(message, reason="gone")
+    return _REFUSALS.get(reply.error, WorkerError)(message)
+
+
+_REFUSALS: dict[str, type[Exception]] = {
+    "PolicyError": PolicyError,
+    "SnapshotIntegrityError": SnapshotIntegrityError,
+    "VersionMismatchError": VersionMismatchError,
+}
 
 
 _REASONS = {
@@ -173,6 +273,7 @@ _REASONS = {
     "protocol": "it broke the rules of the wire and was killed",
     "killed": "it was closed",
     "zygote": "the process that forks workers ended",
+    "idle": "the server ended it",
 }
 
 

@@ -171,6 +171,7 @@ class RemoteJail:
         except WorkerError:
             pass
         finally:
+            self.client.let_go(self.number)
             self.client.close()
 
 
@@ -200,6 +201,7 @@ def open_jail(
     if len(opened.hosts) != request.hosts:
         raise RemoteProtocolError(f"the worker opened a jail of {len(opened.hosts)} hosts")
     report = [dict(layer) for layer in opened.report if isinstance(layer, dict)]
+    client.hold(opened.jail)
     return RemoteJail(client, opened.jail, opened.hosts, report, limits)
 
 

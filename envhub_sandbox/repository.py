@@ -27,7 +27,13 @@ from envhub_sandbox.log import CRASHES, WORKER
 from envhub_sandbox.policy import Policy, Timeouts
 from envhub_sandbox.provenance import provenance_of
 from envhub_sandbox.recipe import Recipe
-from envhub_sandbox.sandboxes.base import EnclosedServer, PerRepository, Sandbox, WorkerServer
+from envhub_sandbox.sandboxes.base import (
+    EnclosedServer,
+    FarServer,
+    PerRepository,
+    Sandbox,
+    WorkerServer,
+)
 from envhub_sandbox.snapshot import Snapshot
 from envhub_sandbox.snapshot_store import cache_root
 from envhub_sandbox.worker_output import OutputFollower, Wanted
@@ -223,9 +229,11 @@ class Repository:
 
     def _open(self, server: WorkerServer, deadline: Deadline) -> LoadedJail:
         wanted = self._wanted_output()
-        client = WorkerClient(server.endpoint, server.process_fd, self.wire_limits)
+        client = self._client(server)
         try:
             client.hello(deadline)
+            if isinstance(server, FarServer):
+                server.bring(client, deadline)
             jail = open_jail(client, self._order(server), self.wire_limits, deadline)
         except BaseException:
             client.close()
@@ -242,6 +250,10 @@ class Repository:
         except BaseException:
             jail.close(Deadline(_CLOSE_S))
             raise
+
+    def _client(self, server: WorkerServer) -> WorkerClient:
+        far = server.far if isinstance(server, FarServer) else None
+        return WorkerClient(server.endpoint, server.process_fd, self.wire_limits, far)
 
     def _order(self, server: WorkerServer) -> m.OpenJail:
         confinement = self.policy.confinement()
@@ -276,7 +288,7 @@ class Repository:
         return Wanted(self.label, path)
 
     def _connected(self, server: WorkerServer) -> WorkerClient:
-        client = WorkerClient(server.endpoint, server.process_fd, self.wire_limits)
+        client = self._client(server)
         try:
             client.hello(Deadline(_CLOSE_S))
         except BaseException:
@@ -304,7 +316,7 @@ class Repository:
     def connect(self, loaded: LoadedJail, deadline: Deadline) -> LoadedJail:
         """A further connection to an open jail; environments that share one wait apart."""
         server = self._sandbox.acquire(self._store)
-        client = WorkerClient(server.endpoint, server.process_fd, self.wire_limits)
+        client = self._client(server)
         try:
             client.hello(deadline)
         except BaseException:
@@ -335,7 +347,7 @@ class Repository:
 
         The late reply may come at any moment on the jail's own connection, and would be dropped.
         """
-        client = WorkerClient(loaded.server.endpoint, loaded.server.process_fd, self.wire_limits)
+        client = self._client(loaded.server)
         deadline = Deadline(_STATUS_S)
         try:
             client.hello(deadline)
@@ -351,7 +363,7 @@ class Repository:
     def interrupt(self, loaded: LoadedJail) -> None:
         """End a jail over a connection of its own, while another thread waits on the first."""
         loaded.jail.before_end()
-        client = WorkerClient(loaded.server.endpoint, loaded.server.process_fd, self.wire_limits)
+        client = self._client(loaded.server)
         deadline = Deadline(_CLOSE_S)
         try:
             client.hello(deadline)

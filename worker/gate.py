@@ -35,8 +35,8 @@ from envhub_worker.zap import DOMAIN, Zap
 
 TICK_S = 1.0
 _HANDSHAKE_MS = 5_000
-_HEARTBEAT_MS = 5_000
-_HEARTBEAT_TIMEOUT_MS = 20_000
+_HEARTBEAT_MS = 15_000
+_HEARTBEAT_TIMEOUT_MS = 60_000
 _BACKLOG = 64
 _SNDHWM = 32
 ANYBODY = bytes(KEY_BYTES)
@@ -243,7 +243,7 @@ class RemoteGate:
         if rules.keys is None or key in rules.operators:
             return
         if rules.authorized.name_of(key) is None:
-            raise RefusedError("SandboxUnavailableError", "your key is not authorised any more")
+            raise RefusedError("WorkerError", "your key is not authorised any more")
 
     def _check_open(self, key: bytes, request: m.OpenJail, jails: Jails) -> m.OpenJail:
         try:

@@ -7,6 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
+    from envhub_sandbox.client import WorkerClient
+    from envhub_sandbox.deadline import Deadline
+    from envhub_sandbox.far import Far
     from envhub_sandbox.policy import Policy
 
 
@@ -63,6 +66,25 @@ class EnclosedServer(WorkerServer, Protocol):
     def snapshot(self) -> str: ...  # noqa: D102
     @property
     def python(self) -> str: ...  # noqa: D102
+
+
+@runtime_checkable
+class FarServer(EnclosedServer, Protocol):
+    """A server on another host, which sees no file of this one.
+
+    Attributes:
+        far: Its key and ours.
+    """
+
+    @property
+    def far(self) -> Far: ...  # noqa: D102
+
+    def bring(self, client: WorkerClient, deadline: Deadline) -> None:
+        """Bring the repository's files there; ``snapshot`` then says where they are.
+
+        Raises:
+            WorkerError: The server does not take them.
+        """
 
 
 class RepositorySandbox(Sandbox, Protocol):

@@ -46,7 +46,7 @@ LOCKDOWN_KNOWS = {
 }
 WITHOUT_IO = {"asyncio", "multiprocessing", "os", "select", "socket", "subprocess", "zmq"}
 ZEROMQ = {
-    *("envhub_sandbox.client", "envhub_worker.loop", "envhub_worker.server"),
+    *("envhub_sandbox.client", "envhub_sandbox.far", "envhub_worker.loop", "envhub_worker.server"),
     # sockets, keys and handshakes of clients on other hosts
     *("envhub_worker.gate", "envhub_worker.keys", "envhub_worker.zap", "envhub_worker.asking"),
 }

@@ -23,7 +23,7 @@ from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 VERSION = 2
 """The newest version of the protocol: ``Hello`` offers a range, ``Welcome`` agrees to one.
 
-Version 2 added kinds 17 to 27; nothing of version 1 changed.
+Version 2 added kinds 17 to 31; nothing of version 1 changed.
 """
 OLDEST_VERSION = 1
 """The oldest version that this code still speaks."""

@@ -1,0 +1,160 @@
+"""A connection to a server on another host: its key, its heartbeat, and what became of it.
+
+libzmq reconnects for ever and says nothing: a wrong key, a port where nobody listens and a cable
+that is out look alike. Its monitor knows; this turns what it says into errors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from time import monotonic
+
+import zmq
+from zmq.utils import z85
+from zmq.utils.monitor import parse_monitor_message
+
+from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError, WorkerDiedError
+
+CONNECT_S = 10.0
+"""How long a server may take to answer at all, and to come back after the connection was lost."""
+_RECONNECT_MS = 100
+_RECONNECT_MAX_MS = 2_000
+_PINGS = 4
+_EVENTS = (
+    zmq.EVENT_HANDSHAKE_SUCCEEDED
+    | zmq.EVENT_HANDSHAKE_FAILED_AUTH
+    | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+    | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+    | zmq.EVENT_DISCONNECTED
+)
+
+
+@dataclass(frozen=True)
+class Far:
+    """A server on another host, as its clients know it.
+
+    Attributes:
+        server_key: Its public key; None only for ``insecure_loopback``.
+        client_key: Our secret key; None likewise.
+        heartbeat_s: After so long without a sign of life a connection counts as lost.
+        held: The numbers of the jails that we have open there.
+    """
+
+    server_key: bytes | None
+    client_key: bytes | None = field(repr=False)
+    heartbeat_s: float = 30.0
+    held: set[int] = field(default_factory=set, compare=False)
+
+    def public_key(self) -> str:
+        """Our public key, as the server's list of clients has it."""
+        if self.client_key is None:
+            return "none"
+        return z85.decode(zmq.curve_public(z85.encode(self.client_key))).hex()
+
+
+class Link:
+    """What is known of one socket's connection. To be made before it connects."""
+
+    def __init__(self, socket: zmq.Socket[bytes], endpoint: str, far: Far) -> None:
+        self._endpoint = endpoint
+        self._far = far
+        self._socket = socket
+        self._since = monotonic()
+        self._up = False
+        self._number = 0
+        self._lost = 0
+        self._set_options(socket, far)
+        self.monitor = socket.get_monitor_socket(_EVENTS)
+
+    def _set_options(self, socket: zmq.Socket[bytes], far: Far) -> None:
+        heartbeat_ms = max(1, int(far.heartbeat_s * 1000))
+        socket.setsockopt(zmq.IPV6, "[" in self._endpoint)
+        socket.setsockopt(zmq.HEARTBEAT_IVL, max(1, heartbeat_ms // _PINGS))
+        socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, heartbeat_ms)
+        socket.setsockopt(zmq.CONNECT_TIMEOUT, int(CONNECT_S * 1000))
+        socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
+        socket.setsockopt(zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS)
+        if far.server_key is not None and far.client_key is not None:
+            socket.setsockopt(zmq.CURVE_SERVERKEY, far.server_key)
+            socket.setsockopt(zmq.CURVE_SECRETKEY, z85.encode(far.client_key))
+            socket.setsockopt(zmq.CURVE_PUBLICKEY, zmq.curve_public(z85.encode(far.client_key)))
+
+    def next_number(self) -> int:
+        """The connection that what is sent now travels on."""
+        self.drain()
+        return self._number if self._up else self._number + 1
+
+    def drain(self) -> None:
+        """Read what has happened.
+
+        Raises:
+            SandboxUnavailableError: The server does not let us in, or is another one.
+            WorkerDiedError: The same, after it had let us in before.
+        """
+        while True:
+            try:
+                frames = self.monitor.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            self._happened(parse_monitor_message(frames)["event"])
+
+    def _happened(self, event: int) -> None:
+        if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+            self._up = True
+            self._number += 1
+        elif event == zmq.EVENT_DISCONNECTED:
+            if self._up:
+                self._up, self._lost, self._since = False, self._number, monotonic()
+        elif event == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
+            raise self._refused(
+                f"the server does not know our key: add {self._far.public_key()} to its "
+                "--authorized-clients, or use the key that it printed"
+            )
+        elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
+            raise self._refused(
+                "it does not speak ZeroMQ with CURVE keys as we do: is it an envhub-worker, and "
+                "are both of us with keys, or both without (insecure_loopback)?"
+            )
+        elif self._number == 0:
+            raise self._refused(
+                "it ended the handshake, as a server does whose public key is another than the "
+                "server_key that was given"
+            )
+
+    def _refused(self, why: str) -> EnvHubError:
+        text = f"{self._endpoint}: {why}"
+        if self._number:
+            return WorkerDiedError(text, reason="connection")
+        return SandboxUnavailableError(text)
+
+    def check(self, number: int) -> None:
+        """Raise if the reply to what travelled on that connection can no longer come.
+
+        Raises:
+            WorkerDiedError: The connection was lost.
+            SandboxUnavailableError: There has never been one.
+        """
+        self.drain()
+        if number <= self._lost:
+            raise WorkerDiedError(
+                f"the connection to {self._endpoint} was lost while an answer was awaited; the "
+                "server, the network or its peer's heartbeat has failed",
+                reason="connection",
+            )
+        if self._up or monotonic() - self._since < CONNECT_S:
+            return
+        if self._number:
+            raise WorkerDiedError(
+                f"the connection to {self._endpoint} was lost and has not come back after "
+                f"{CONNECT_S:.0f} s",
+                reason="connection",
+            )
+        raise SandboxUnavailableError(
+            f"nothing answers at {self._endpoint} after {CONNECT_S:.0f} s; is 'envhub-worker "
+            "listen' running there, and does a firewall let us through?"
+        )
+
+    def close(self) -> None:
+        """Stop watching."""
+        self._socket.disable_monitor()
+        self.monitor.close(0)

@@ -1,0 +1,347 @@
+"""``sandbox="tcp://host:5555"``: the worker on another host, over ZeroMQ with CURVE keys.
+
+There ``envhub-worker listen`` runs. The repository's files travel from here, by content, so the
+server needs neither the Hub nor a token. A thread of ours tells it that we live; a client that
+has gone loses its jails.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import ipaddress
+import os
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from envhub_sandbox import upload
+from envhub_sandbox.client import WorkerClient
+from envhub_sandbox.deadline import Deadline
+from envhub_sandbox.errors import EnvHubError, PolicyError, SandboxUnavailableError
+from envhub_sandbox.far import Far
+from envhub_sandbox.policy import Policy
+from envhub_sandbox.sandboxes.base import WorkerServer
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.keys import parse_key
+
+SERVER_KEY_VARIABLE = "ENVHUB_SERVER_KEY"
+CLIENT_KEY_VARIABLE = "ENVHUB_CLIENT_KEY"
+CONFIG_VARIABLE = "ENVHUB_CONFIG"
+_KEEP_ALIVE_S = 10.0
+_FIRST_S = 0.5
+_STOP_S = 1.0
+
+
+@dataclass
+class RemoteSandbox:
+    """Workers on another host.
+
+    Attributes:
+        endpoint: ``tcp://HOST:PORT`` of its ``envhub-worker listen``.
+        server_key: Its public key; by default ``$ENVHUB_SERVER_KEY``, or what ``known_hosts`` in
+            the configuration folder says (a line is ``HOST:PORT KEY``).
+        client_key: Our secret key, or a file that holds it; by default ``$ENVHUB_CLIENT_KEY``
+            (likewise), or ``client.key`` in the configuration folder.
+        insecure_loopback: Without keys, for a server on this machine that has none either.
+        heartbeat_s: After so many seconds without a sign of life the connection counts as lost.
+            On a line where one batch of observations takes longer than that, raise it.
+    """
+
+    endpoint: str
+    server_key: str | None = None
+    client_key: str | os.PathLike[str] | None = field(default=None, repr=False)
+    insecure_loopback: bool = False
+    heartbeat_s: float = 30.0
+    name: str = field(default="remote", init=False)
+
+    def __post_init__(self) -> None:
+        address_of(self.endpoint)
+        if self.insecure_loopback and not _is_loopback(self.endpoint):
+            raise PolicyError(
+                f"insecure_loopback=True is for a server on this machine, and {self.endpoint} is "
+                "not on a loopback address: anybody on the way could read and change everything"
+            )
+        if not self.heartbeat_s > 0:
+            raise PolicyError(f"heartbeat_s is {self.heartbeat_s!r}; it takes seconds above 0")
+
+    def for_repository(self, snapshot: Path, policy: Policy, python: str) -> RemoteRepository:
+        """The sandbox for one repository. Connects to nothing.
+
+        Raises:
+            PolicyError: The policy names what a client on another host cannot have.
+            SandboxUnavailableError: A key is missing.
+        """
+        check_policy(policy, python)
+        return RemoteRepository(self.endpoint, self._far(), snapshot, policy)
+
+    def _far(self) -> Far:
+        if self.insecure_loopback:
+            return Far(None, None, self.heartbeat_s)
+        server_key = _server_key(self.endpoint, self.server_key)
+        return Far(server_key, _client_key(self.client_key), self.heartbeat_s)
+
+    def acquire(self, store: Path) -> WorkerServer:
+        """Not without a repository: its files have to be brought there."""
+        raise SandboxUnavailableError("a remote server is asked for a repository, not for a store")
+
+    def release(self, server: WorkerServer) -> None:
+        """Nothing was acquired here."""
+
+
+def check_policy(policy: Policy, python: str) -> None:
+    """Refuse what names this machine's things; the server would refuse it, too.
+
+    Raises:
+        PolicyError: With what to do instead.
+    """
+    if python:
+        raise PolicyError(
+            f"python={python!r} is an interpreter of this machine, and a remote server has its "
+            "own: start it in the environment or image that the repository needs"
+        )
+    if policy.readable:
+        raise PolicyError(
+            f"readable={policy.readable!r} are paths of this machine, and a remote server shows "
+            "its jails the repository's files only: put what is needed into the repository"
+        )
+
+
+# --- addresses and keys --------------------------------------------------------------------------
+
+
+def address_of(endpoint: str) -> str:
+    """``host:port`` of an endpoint.
+
+    Raises:
+        PolicyError: It is none.
+    """
+    parts = urlsplit(endpoint)
+    try:
+        port = parts.port
+    except ValueError:
+        port = None
+    if parts.scheme != "tcp" or not parts.hostname or port is None or parts.path:
+        raise PolicyError(f"sandbox is {endpoint!r}; a remote server is tcp://HOST:PORT")
+    return f"{parts.hostname}:{port}"
+
+
+def _is_loopback(endpoint: str) -> bool:
+    host = urlsplit(endpoint).hostname or ""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def config_folder() -> Path:
+    """``$ENVHUB_CONFIG``, or the user's configuration folder for ``envhub-sandbox``."""
+    chosen = os.environ.get(CONFIG_VARIABLE)
+    if chosen:
+        return Path(chosen).expanduser().absolute()
+    import platformdirs
+
+    return Path(platformdirs.user_config_dir("envhub-sandbox", appauthor=False))
+
+
+def _server_key(endpoint: str, given: str | None) -> bytes:
+    text = given or os.environ.get(SERVER_KEY_VARIABLE) or _known(address_of(endpoint))
+    if not text:
+        raise SandboxUnavailableError(
+            f"the public key of {endpoint} is not known, and without it anybody could pretend to "
+            f"be that server. It prints its key when it starts; pass it as server_key=, set "
+            f"{SERVER_KEY_VARIABLE}, or write '{address_of(endpoint)} KEY' into "
+            f"{config_folder() / 'known_hosts'}"
+        )
+    return _parsed(text, "server_key")
+
+
+def _known(address: str) -> str | None:
+    with contextlib.suppress(OSError):
+        for line in (config_folder() / "known_hosts").read_text().splitlines():
+            words = line.split()
+            if len(words) == 2 and words[0] == address:
+                return words[1]
+    return None
+
+
+def _client_key(given: str | os.PathLike[str] | None) -> bytes:
+    default = config_folder() / "client.key"
+    text = given or os.environ.get(CLIENT_KEY_VARIABLE) or (default if default.exists() else None)
+    if text is None:
+        raise SandboxUnavailableError(
+            f"a remote server lets only known clients in, and we have no key: run 'envhub-worker "
+            f"keygen --out {default.parent}' and give the public key to the server's "
+            f"--authorized-clients, or set {CLIENT_KEY_VARIABLE} to the key that the server printed"
+        )
+    path = Path(text)
+    with contextlib.suppress(OSError):
+        if isinstance(text, os.PathLike) or os.sep in text or path.is_file():
+            return _parsed(path.expanduser().read_text(), "client_key")
+    return _parsed(os.fspath(text), "client_key")
+
+
+def _parsed(text: str, what: str) -> bytes:
+    try:
+        return parse_key(text)
+    except ValueError as error:
+        raise PolicyError(f"{what}: {error}") from None
+
+
+# --- servers ---------------------------------------------------------------------------------
+
+
+class RemoteRepository:
+    """The sandbox of one repository: its files on the other host.
+
+    Attributes:
+        interpreter: Names the server; a remembered manifest holds for this one only.
+    """
+
+    name = "remote"
+
+    def __init__(self, endpoint: str, far: Far, snapshot: Path, policy: Policy) -> None:
+        key = "" if far.server_key is None else far.server_key.hex()
+        self.interpreter = f"{endpoint} {key}"
+        self._endpoint, self._far = endpoint, far
+        self._snapshot, self._policy = snapshot, policy
+        self._files: tuple[upload.Sent, ...] = ()
+
+    def acquire(self, store: Path) -> RemoteServer:
+        """The server; nothing is sent before a jail is opened."""
+        host = HOSTS.acquire(self._endpoint, self._far)
+        return RemoteServer(host, self, self._policy.profile)
+
+    def release(self, server: WorkerServer) -> None:
+        """Give it back; after the last one who does, nobody tells it that we live."""
+        assert isinstance(server, RemoteServer)
+        HOSTS.release(server.host)
+
+    def bring(self, client: WorkerClient, deadline: Deadline) -> str:
+        """Bring the files there; returns the server's name for them."""
+        self._files = self._files or upload.listing(self._snapshot)
+        return upload.bring(client, self._snapshot, self._files, deadline)[0]
+
+
+class RemoteServer:
+    """One use of a server on another host."""
+
+    fd_path = None
+    layers: Sequence[Mapping[str, Any]] = ()
+    python = ""
+
+    def __init__(self, host: Host, repository: RemoteRepository, profile: str) -> None:
+        self.host = host
+        self.profile = profile
+        self.snapshot = ""
+        self._repository = repository
+
+    @property
+    def endpoint(self) -> str:
+        """Its ZeroMQ endpoint."""
+        return self.host.endpoint
+
+    @property
+    def far(self) -> Far:
+        """Its key and ours."""
+        return self.host.far
+
+    @property
+    def process_fd(self) -> int:
+        """Readable once we have given it up."""
+        return self.host.stopped
+
+    def bring(self, client: WorkerClient, deadline: Deadline) -> None:
+        """Bring the repository's files there. One of our threads at a time."""
+        with self.host.uploading:
+            self.snapshot = self._repository.bring(client, deadline)
+
+
+class Host:
+    """A server on another host that environments of this process use."""
+
+    def __init__(self, endpoint: str, far: Far) -> None:
+        self.endpoint = endpoint
+        self.far = far
+        self.users = 0
+        self.owner = os.getpid()
+        self.uploading = threading.Lock()
+        self.stopped, self._stops = os.pipe()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(
+            target=self._keep_alive, name=f"envhub keep-alive {endpoint}", daemon=True
+        )
+        self._thread.start()
+
+    def _keep_alive(self) -> None:
+        """Tell the server that we live, and what we hold; what fails is tried again."""
+        client: WorkerClient | None = None
+        every_s = _FIRST_S
+        while not self._stop.wait(every_s):
+            try:
+                if client is None:
+                    client = WorkerClient(self.endpoint, self.stopped, far=self.far)
+                    client.hello(Deadline(_KEEP_ALIVE_S))
+                    every_s = min(_KEEP_ALIVE_S, client.patience_s / 4 or _KEEP_ALIVE_S)
+                client.request(m.KeepAlive(tuple(self.far.held)), deadline=Deadline(_KEEP_ALIVE_S))
+            except EnvHubError:
+                if client is not None:
+                    client.close()
+                client = None
+        if client is not None:
+            client.close()
+
+    def stop(self) -> None:
+        """No longer tell it. A fork of its owner does nothing."""
+        if os.getpid() == self.owner:
+            self._stop.set()
+            self._thread.join(_STOP_S)
+            os.close(self._stops)
+            os.close(self.stopped)
+
+
+class Hosts:
+    """The servers that this process uses, each once. Thread-safe."""
+
+    def __init__(self) -> None:
+        # reentrant: the garbage collector may close an environment in the middle of acquire()
+        self._lock = threading.RLock()
+        self._hosts: dict[tuple[int, str, Far], Host] = {}
+
+    def acquire(self, endpoint: str, far: Far) -> Host:
+        """The server at an endpoint under these keys."""
+        key = (os.getpid(), endpoint, far)
+        with self._lock:
+            host = self._hosts.get(key)
+            if host is None:
+                host = self._hosts[key] = Host(endpoint, far)
+            host.users += 1
+            return host
+
+    def release(self, host: Host) -> None:
+        """Give it back; the last one who does ends its thread."""
+        with self._lock:
+            host.users -= 1
+            if host.users > 0:
+                return
+            self._hosts.pop((host.owner, host.endpoint, host.far), None)
+        host.stop()
+
+    def forked(self) -> None:
+        """In a fork: whichever thread held the lock is not here."""
+        self._lock = threading.RLock()
+
+    def stop_all(self) -> None:
+        """End all threads, as at this process's exit."""
+        with self._lock:
+            hosts, self._hosts = list(self._hosts.values()), {}
+        for host in hosts:
+            host.stop()
+
+
+HOSTS = Hosts()
+atexit.register(HOSTS.stop_all)
+os.register_at_fork(after_in_child=HOSTS.forked)
