@@ -1,0 +1,125 @@
+"""The image, and those that ``envhub image build`` derives from it for a repository."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import DependencyError
+from envhub_sandbox.sandboxes.docker import DockerSandbox
+from envhub_sandbox.sandboxes.engines import Engine
+from tests.containers.kit import IMAGE
+from tests.support.processes import eventually
+from tests.support.samples import SAMPLES
+
+
+def inspected(engine: Engine, image: str) -> dict[str, Any]:
+    """What the engine knows of an image."""
+    said: list[dict[str, Any]] = json.loads(engine.run("image", "inspect", image))
+    return said[0]
+
+
+def test_the_image_holds_the_worker_and_nothing_of_the_client(engine: Engine) -> None:
+    """Neither the client's package nor the Hub's is in it."""
+    code = "import importlib.util as u, sys; sys.exit(any(map(u.find_spec, sys.argv[1:])))"
+    python = ("--entrypoint", "/opt/envhub-worker/bin/python", IMAGE, "-I", "-c", code)
+    engine.run("run", "--rm", *python, "envhub_sandbox", "huggingface_hub", "typer", "torch")
+
+
+def test_the_image_says_what_it_is(engine: Engine) -> None:
+    """Labels, a plain user, a health check, and a worker as its program."""
+    config = inspected(engine, IMAGE)["Config"]
+    assert config["Entrypoint"] == ["envhub-worker"]
+    assert config["User"] == "65532:65532"
+    assert config["Healthcheck"]["Test"] == ["CMD", "envhub-worker", "health"]
+    assert config["Labels"]["org.opencontainers.image.title"] == "envhub-worker"
+
+
+def test_no_file_of_the_worker_can_be_changed_by_it(engine: Engine) -> None:
+    """Even where a container is started without ``--read-only``."""
+    words = ("--entrypoint", "find", IMAGE, "/opt", "-writable", "!", "-type", "l")
+    assert engine.run("run", "--rm", *words).strip() == ""
+
+
+def test_the_image_serves_at_once(engine: Engine) -> None:
+    """As everybody would first try it, and locked down; it says how to connect."""
+    hardened = ("--read-only", "--tmpfs", "/tmp", "--cap-drop", "ALL")
+    for words in ((), (*hardened, "--security-opt", "no-new-privileges")):
+        container = engine.run("run", "--rm", "--detach", *words, IMAGE).strip()
+        try:
+            check = ("exec", container, "envhub-worker", "health")
+            assert eventually(lambda check=check: succeeds(engine, *check))
+            log = engine.run("logs", container)
+            assert "tcp://" in log
+            assert "key" in log
+        finally:
+            engine.run("rm", "--force", container)
+
+
+def succeeds(engine: Engine, *arguments: str) -> bool:
+    """Whether a command of the engine does."""
+    nothing = subprocess.DEVNULL
+    done = subprocess.run([engine.command, *arguments], stdout=nothing, stderr=nothing)
+    return done.returncode == 0
+
+
+@pytest.fixture(scope="module")
+def derived(engine: Engine) -> Iterator[dict[str, Any]]:
+    """What ``envhub image build`` says of an image for a repository with requirements."""
+    said = built(engine, SAMPLES / "minigrid")
+    yield said
+    engine.run("image", "rm", "--force", said["image"])
+
+
+def built(engine: Engine, repository: Path, *options: str) -> dict[str, Any]:
+    """Build by the command line."""
+    words = ("image", "build", str(repository), "--base", IMAGE, "--engine", engine.kind)
+    done = subprocess.run(
+        [sys.executable, "-m", "envhub_sandbox", *words, "--build-network", "host", "--json"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    return dict(json.loads(done.stdout))
+
+
+def test_a_repositorys_packages_are_in_its_image(derived: dict[str, Any], engine: Engine) -> None:
+    """The jail runs in their interpreter; the worker's own image has none of them."""
+    sandbox = DockerSandbox(image=derived["image"], engine=engine.kind)
+    with make_env(SAMPLES / "minigrid", sandbox=sandbox) as suites:
+        suites.env.reset(seed=0)
+        suites.env.step(suites.env.action_space.sample())
+        assert suites.provenance["interpreter"]["executable"] == "/opt/environment/bin/python"
+    plain = DockerSandbox(image=IMAGE, engine=engine.kind)
+    with pytest.raises(DependencyError, match="minigrid"):
+        make_env(SAMPLES / "minigrid", sandbox=plain)
+
+
+def test_every_package_is_pinned_and_the_image_bears_the_lock(
+    derived: dict[str, Any], engine: Engine
+) -> None:
+    """By version and by hash; the same again is not built again."""
+    assert all("==" in package for package in derived["packages"])
+    assert {"minigrid", "gymnasium", "numpy"} <= {
+        package.partition("==")[0] for package in derived["packages"]
+    }
+    labels = inspected(engine, derived["image"])["Config"]["Labels"]
+    assert labels["dev.envhub.lock"] == derived["lock"]
+    again = built(engine, SAMPLES / "minigrid")
+    assert again == {**derived, "built": False}
+
+
+def test_nothing_runs_at_the_start_of_a_derived_interpreter(
+    derived: dict[str, Any], engine: Engine
+) -> None:
+    """A package cannot have code run before it is imported."""
+    named = ("-name", "*.pth", "-o", "-name", "sitecustomize*", "-o", "-name", "usercustomize*")
+    words = ("--entrypoint", "find", derived["image"], "/opt/environment/lib", *named)
+    assert engine.run("run", "--rm", *words).strip() == ""
