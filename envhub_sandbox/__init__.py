@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from envhub_sandbox.policy import Policy as Policy
     from envhub_sandbox.policy import Timeouts as Timeouts
     from envhub_sandbox.reference import HubRef as HubRef
+    from envhub_sandbox.sandboxes.docker import DockerSandbox as DockerSandbox
     from envhub_sandbox.sandboxes.remote import RemoteSandbox as RemoteSandbox
     from envhub_sandbox.suites import EnvSuites as EnvSuites
     from envhub_sandbox.vector_env import SandboxVectorEnv as SandboxVectorEnv
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
+    "DockerSandbox": "sandboxes.docker",
     "EnvSuites": "suites",
     "HubRef": "reference",
     "Limits": "policy",
