@@ -8,5 +8,6 @@ PYTHON=$(find_python 3.11 || command -v python3)
 [ "$(id -u)" != 0 ] || [ ! -x /usr/bin/python3 ] || PYTHON=/usr/bin/python3
 export PYTHON
 permit_what_this_machine_lacks
-# the step "container" has those that need an engine
-with_summary tests ./test --ignore tests/containers
+# The step "container" has those that need an engine.
+export PYTEST_ADDOPTS=--ignore=tests/containers
+with_summary tests ./test

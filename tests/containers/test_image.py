@@ -50,8 +50,11 @@ def test_no_file_of_the_worker_can_be_changed_by_it(engine: Engine) -> None:
 
 def test_the_image_serves_at_once(engine: Engine) -> None:
     """As everybody would first try it, and locked down; it says how to connect."""
+    profile = SAMPLES.parent.parent / "examples" / "deployment" / "seccomp.json"
     hardened = ("--read-only", "--tmpfs", "/tmp", "--cap-drop", "ALL")
-    for words in ((), (*hardened, "--security-opt", "no-new-privileges")):
+    for option in ("no-new-privileges", f"seccomp={profile}", "systempaths=unconfined"):
+        hardened += ("--security-opt", option)
+    for words in ((), hardened):
         container = engine.run("run", "--rm", "--detach", *words, IMAGE).strip()
         try:
             check = ("exec", container, "envhub-worker", "health")

@@ -266,6 +266,16 @@ def test_only_the_native_word_size_is_permitted() -> None:
         seccomp.profile("riscv64")
 
 
+def test_the_profile_for_ones_own_containers_is_the_same() -> None:
+    """The file that the documents name, for either machine."""
+    path = Path(__file__).resolve().parents[2] / "examples" / "deployment" / "seccomp.json"
+    architectures = sorted(seccomp.ARCHITECTURES.values())
+    assert json.loads(path.read_text()) == {
+        **seccomp.profile("x86_64"),
+        "architectures": architectures,
+    }
+
+
 def test_a_process_is_known_by_more_than_its_pid() -> None:
     """Its start, the boot and the namespace; what cannot be told is not said to have ended."""
     me = identity.identity_of(os.getpid())
