@@ -110,7 +110,7 @@ class Link:
                 f"the server does not know our key: add {self._far.public_key()} to its "
                 "--authorized-clients, or use the key that it printed"
             )
-        elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
+        elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL or self._is_plain_and_refused():
             raise self._refused(
                 "it does not speak ZeroMQ with CURVE keys as we do: is it an envhub-worker, and "
                 "are both of us with keys, or both without (insecure_loopback)?"
@@ -120,6 +120,9 @@ class Link:
                 "it ended the handshake, as a server does whose public key is another than the "
                 "server_key that was given"
             )
+
+    def _is_plain_and_refused(self) -> bool:
+        return self._far.server_key is None and self._number == 0
 
     def _refused(self, why: str) -> EnvHubError:
         text = f"{self._endpoint}: {why}"

@@ -1,6 +1,7 @@
 # What tests need of the operating system: git for the Hub, GL for mujoco and OpenCV, venv for
-# the plain user. With no right to install, the tests themselves say what is missing.
-packages=(git python3-venv libegl1 libgl1 libglib2.0-0 libosmesa6)
+# the plain user, a cable to another network namespace. With no right to install, the tests
+# themselves say what is missing.
+packages=(git iproute2 iptables python3-venv libegl1 libgl1 libglib2.0-0 libosmesa6)
 missing=()
 for package in "${packages[@]}"; do
   dpkg-query -W -f='${Status}' "$package" 2>/dev/null | grep -q 'ok installed' ||

@@ -1,0 +1,1 @@
+"""Servers on other hosts: keys, quotas, uploads, and networks that fail."""

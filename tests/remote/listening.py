@@ -1,0 +1,132 @@
+"""A listening worker server of our own, and what it said."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+import envhub_worker.protocol
+from envhub_sandbox import RemoteSandbox
+from tests.support.processes import eventually
+
+_BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
+WORKER = (sys.executable, "-I", str(_BOOTSTRAP), "worker")
+
+# counts its steps, so that everybody sees whether it is still the same one
+COUNTING = """
+import time
+import gymnasium as gym
+import numpy as np
+
+class Counting(gym.Env):
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = gym.spaces.Discrete(100)
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.count = 0
+        return np.zeros(1, np.float32), {}
+    def step(self, action):
+        time.sleep(int(action) / 10)
+        self.count += 1
+        return np.full(1, self.count, np.float32), 0.0, False, False, {}
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([Counting] * n_envs)
+"""
+
+
+def counting(folder: Path, *, files: dict[str, bytes] | None = None) -> Path:
+    """A repository whose action says how many tenths of a second a step takes."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "env.py").write_text(COUNTING)
+    for name, data in (files or {}).items():
+        (folder / name).write_bytes(data)
+    return folder
+
+
+@dataclass
+class Listening:
+    """A running server.
+
+    Attributes:
+        endpoint: Where it listens.
+        public: Its public key.
+        state: Its state folder.
+    """
+
+    process: subprocess.Popen[bytes]
+    endpoint: str
+    public: str
+    state: Path
+    log: Path
+    client_key: str = field(repr=False, default="")
+
+    @property
+    def port(self) -> int:
+        """Its port."""
+        return int(self.endpoint.rpartition(":")[2])
+
+    def sandbox(self, **changes: Any) -> RemoteSandbox:
+        """The client's side; ``changes`` are wrong on purpose."""
+        options = {"server_key": self.public, "client_key": self.client_key, **changes}
+        return RemoteSandbox(options.pop("endpoint", self.endpoint), **options)
+
+    def said(self) -> str:
+        """Everything that it has printed."""
+        return self.log.read_text("utf-8", "replace")
+
+    def memory(self) -> int:
+        """Bytes that are its own."""
+        return int(psutil.Process(self.process.pid).memory_info().rss)
+
+    def sessions(self) -> list[dict[str, Any]]:
+        """What ``envhub-worker status`` says, without the asker itself."""
+        done = subprocess.run(
+            [*WORKER, "status", "--state-dir", str(self.state), "--json"],
+            capture_output=True,
+            check=True,
+            timeout=60,
+        )
+        return [one for one in json.loads(done.stdout) if one["client"] != "operator"]
+
+    def jails(self) -> int:
+        """How many are open, of whomever."""
+        return sum(len(one["jails"]) for one in self.sessions())
+
+
+@contextmanager
+def listening(
+    folder: Path,
+    *options: str,
+    bind: str = "tcp://127.0.0.1:*",
+    prefix: Sequence[str] = (),
+) -> Iterator[Listening]:
+    """Start a server and end it; ``prefix`` runs it elsewhere."""
+    folder.mkdir(parents=True, exist_ok=True)
+    state, log = folder / "state", folder / "log"
+    arguments = [*prefix, *WORKER, "listen", "--bind", bind, "--state-dir", str(state), *options]
+    with log.open("wb") as out:
+        process = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, stdout=out, stderr=out)
+    try:
+        server = Listening(process, "", "", state, log)
+        assert eventually(lambda: (state / "endpoint").exists() or process.poll() is not None)
+        assert process.poll() is None, server.said()
+        assert eventually(lambda: "sandbox=" in server.said())
+        server.endpoint = re.search(r"tcp://\S+", server.said())[0]  # type: ignore[index]
+        public = state / "server.pub"
+        server.public = public.read_text().strip() if public.exists() else ""
+        key = state / "client.key"
+        server.client_key = key.read_text().strip() if key.exists() else ""
+        yield server
+    finally:
+        process.terminate()
+        process.wait(30)

@@ -1,0 +1,185 @@
+"""Two hosts for real: delay, loss, a cable that is out, and what comes back after it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import SandboxUnavailableError, WorkerDiedError
+from tests.remote.hosts import OtherHost, other_host
+from tests.remote.listening import Listening, counting, listening
+from tests.remote.relay import relay
+from tests.support.processes import eventually
+
+HEARTBEAT_S = 1.0
+
+
+@pytest.fixture
+def far() -> Iterator[OtherHost]:
+    """Another host."""
+    with other_host() as host:
+        yield host
+
+
+@pytest.fixture
+def far_server(far: OtherHost, tmp_path: Path) -> Iterator[Listening]:
+    """A server on it, which waits long for silent clients."""
+    bind = f"tcp://{far.address}:5555"
+    with listening(tmp_path / "server", "--idle-s", "60", bind=bind, prefix=far.prefix) as found:
+        yield found
+
+
+def test_another_host_serves_what_it_was_sent(
+    far_server: Listening, far: OtherHost, repository: Path
+) -> None:
+    """With packets lost on the way, steps are the ones of the one environment over there."""
+    far.disturb(delay_ms=5, loss_percent=2)
+    with make_env(repository, n_envs=2, sandbox=far_server.sandbox()) as suites:
+        suites.env.reset(seed=1)
+        for count in range(1, 30):
+            assert suites.env.step(np.zeros(2, int))[0].tolist() == [[count], [count]]
+        assert {layer["layer"] for layer in suites.env.sandbox_report} >= {"seccomp", "landlock"}
+    assert eventually(lambda: far_server.jails() == 0)
+
+
+def test_a_partition_ends_a_step_and_a_reset_begins_anew(
+    far_server: Listening, far: OtherHost, repository: Path
+) -> None:
+    """Who waits hears of it by the heartbeat; with the cable in again, reset() has a fresh jail."""
+    sandbox = far_server.sandbox(heartbeat_s=HEARTBEAT_S)
+    options = {"timeouts": {"step_s": 120.0}, "policy": {"restart": "on_reset"}}
+    with make_env(repository, sandbox=sandbox, **options) as suites:
+        suites.env.reset(seed=1)
+        suites.env.step_async(np.array([50]))
+        far.unplug()
+        with pytest.raises(WorkerDiedError, match=r"connection to tcp://.* was lost") as caught:
+            suites.env.step_wait()
+        assert caught.value.reason == "connection"
+        far.plug()
+        suites.env.reset(seed=1)
+        assert suites.env.step(np.array([0]))[0].tolist() == [[1.0]]
+
+
+def test_a_client_that_comes_back_finds_its_jail_again(
+    far_server: Listening, far: OtherHost, repository: Path
+) -> None:
+    """A connection that was lost between two steps is made anew; the episode goes on."""
+    with make_env(repository, sandbox=far_server.sandbox(heartbeat_s=HEARTBEAT_S)) as suites:
+        suites.env.reset(seed=1)
+        suites.env.step(np.array([0]))
+        link = suites.env._remote._loaded.jail.client._link
+        far.unplug()
+        assert eventually(lambda: link.drain() or not link._up)
+        far.plug()
+        assert suites.env.step(np.array([0]))[0].tolist() == [[2.0]]
+
+
+def test_nobody_at_the_other_end_is_said_to_be_so(
+    repository: Path, server: Listening, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A port where nobody listens is an error in bounded time, not a wait for ever."""
+    monkeypatch.setattr("envhub_sandbox.far.CONNECT_S", 2.0)
+    with relay(server.port) as wire:
+        endpoint = wire.endpoint
+    with pytest.raises(SandboxUnavailableError, match="nothing answers at"):
+        make_env(repository, sandbox=server.sandbox(endpoint=endpoint))
+
+
+def test_a_connection_that_breaks_between_steps_is_made_anew(
+    server: Listening, repository: Path
+) -> None:
+    """Without another host: the wire breaks, the session is found again."""
+    with (
+        relay(server.port) as wire,
+        make_env(repository, sandbox=server.sandbox(endpoint=wire.endpoint)) as suites,
+    ):
+        suites.env.reset(seed=1)
+        for count in range(1, 4):
+            assert suites.env.step(np.array([0]))[0].tolist() == [[count]]
+            link = suites.env._remote._loaded.jail.client._link
+            before = link._lost
+            wire.cut()
+            assert eventually(lambda: link.drain() or link._lost > before)  # noqa: B023
+
+
+def test_a_slow_wire_changes_no_result(server: Listening, repository: Path) -> None:
+    """Each piece is delayed; a step is one round trip, and step_async waits for nothing."""
+    with (
+        relay(server.port, delay_s=0.02) as wire,
+        make_env(repository, sandbox=server.sandbox(endpoint=wire.endpoint)) as suites,
+    ):
+        suites.env.reset(seed=1)
+        for count in range(1, 5):
+            suites.env.step_async(np.array([0]))
+            assert suites.env.step_wait()[0].tolist() == [[count]]
+
+
+def test_a_long_step_is_no_lost_connection(server: Listening, repository: Path) -> None:
+    """Heartbeats are answered while the environment computes for several of them."""
+    with make_env(repository, sandbox=server.sandbox(heartbeat_s=0.4)) as suites:
+        suites.env.reset(seed=1)
+        assert suites.env.step(np.array([20]))[0].tolist() == [[1.0]]
+
+
+def test_a_client_that_was_silent_for_too_long_is_told_so(
+    server: Listening, repository: Path
+) -> None:
+    """Its jail was ended; when it comes back it hears why."""
+    with make_env(repository, sandbox=server.sandbox()) as suites:
+        suites.env.reset(seed=1)
+        host = suites.env._remote._loaded.server.host
+        host._stop.set()  # the thread that says that we live
+        assert eventually(lambda: server.jails() == 0)
+        with pytest.raises(WorkerDiedError, match="nothing was heard of its client for 2 s"):
+            suites.env.step(np.array([0]))
+
+
+def test_a_restarted_server_says_that_the_jail_is_gone(tmp_path: Path) -> None:
+    """Same keys, same port, another process: it knows nothing of the jail, and says so."""
+    repository = counting(tmp_path / "repository")
+    with listening(tmp_path / "one") as first:
+        suites = make_env(repository, sandbox=first.sandbox(), policy={"restart": "on_reset"})
+        suites.env.reset(seed=1)
+    with listening(tmp_path / "one", bind=first.endpoint):
+        with pytest.raises(WorkerDiedError, match="it has been closed"):
+            suites.env.step(np.array([0]))
+        suites.env.reset(seed=1)
+        assert suites.env.step(np.array([0]))[0].tolist() == [[1.0]]
+        suites.close()
+
+
+_CLIENT = """
+import sys
+from envhub_sandbox import RemoteSandbox, make_env
+endpoint, server_key, client_key, repository = sys.argv[1:]
+suites = make_env(repository, sandbox=RemoteSandbox(endpoint, server_key, client_key))
+suites.env.reset()
+print("ready", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_killed_clients_jails_end(server: Listening, repository: Path) -> None:
+    """SIGKILL leaves nobody who says that he lives."""
+    client = subprocess.Popen(
+        [
+            *(sys.executable, "-c", _CLIENT, server.endpoint),
+            *(server.public, server.client_key, str(repository)),
+        ],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    assert client.stdout is not None
+    assert client.stdout.readline() == b"ready\n"
+    assert server.jails() == 1
+    os.kill(client.pid, signal.SIGKILL)
+    client.communicate()
+    assert eventually(lambda: server.jails() == 0)

@@ -1,0 +1,194 @@
+"""Who has no key, or the wrong one: refused, bounded and logged, while a client's work goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zmq
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerError
+from envhub_worker import keys
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.keys import key_text
+from tests.remote.listening import Listening, listening
+from tests.remote.relay import relay
+from tests.support.processes import eventually
+
+_MIB = 1 << 20
+# ZMTP 3.1, as a client that has no keys: signature, version, mechanism NULL, no server, filler
+_GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x01" + b"NULL".ljust(20, b"\0") + b"\0" + bytes(31)
+
+
+@pytest.fixture
+def good(server: Listening, repository: Path) -> Iterator[Any]:
+    """A client's environment, which must go on; afterwards it is still the same one."""
+    with make_env(repository, sandbox=server.sandbox()) as suites:
+        suites.env.reset(seed=1)
+        yield suites.env
+        assert suites.env.step(np.array([0]))[0].tolist() == [[1.0]]
+
+
+def knock(server: Listening) -> socket.socket:
+    """A TCP connection to the server."""
+    return socket.create_connection(("127.0.0.1", server.port), 10)
+
+
+def ends(connection: socket.socket) -> bool:
+    """Whether the server ends a connection; what it says before is not ours to read."""
+    connection.settimeout(30)
+    with contextlib.suppress(ConnectionError):
+        while connection.recv(1 << 16):
+            pass
+    return True
+
+
+def test_another_clients_key_is_refused_at_once(server: Listening, repository: Path) -> None:
+    """The error names our public key, which the server's operator has to add; so does its log."""
+    pair = keys.generate()
+    with pytest.raises(SandboxUnavailableError, match=key_text(pair.public)):
+        make_env(repository, sandbox=server.sandbox(client_key=key_text(pair.secret)))
+    assert eventually(lambda: key_text(pair.public) in server.said())
+
+
+def test_another_servers_key_is_refused_at_once(server: Listening, repository: Path) -> None:
+    """Nobody but the server that was meant can answer."""
+    other = key_text(keys.generate().public)
+    with pytest.raises(SandboxUnavailableError, match=r"is another than the\s+server_key"):
+        make_env(repository, sandbox=server.sandbox(server_key=other))
+    assert eventually(lambda: "a handshake failed" in server.said())
+
+
+def test_no_key_is_refused_at_once(server: Listening, repository: Path) -> None:
+    """A client without keys does not get to say anything."""
+    with pytest.raises(SandboxUnavailableError, match="does not speak ZeroMQ with CURVE"):
+        make_env(repository, sandbox=server.sandbox(insecure_loopback=True))
+
+
+def test_a_peer_without_keys_hears_nothing(server: Listening) -> None:
+    """A plain ZeroMQ socket gets no reply; the control, with keys, does."""
+    with zmq.Context() as context:
+        assert not _greets(context, server, with_keys=False)
+        assert _greets(context, server, with_keys=True)
+
+
+def _greets(context: zmq.Context[Any], server: Listening, *, with_keys: bool) -> bool:
+    with context.socket(zmq.DEALER) as peer:
+        peer.setsockopt(zmq.LINGER, 0)
+        if with_keys:
+            pair = keys.load(server.state / "client.key")
+            peer.setsockopt(zmq.CURVE_SERVERKEY, bytes.fromhex(server.public))
+            peer.setsockopt(zmq.CURVE_SECRETKEY, pair.secret)
+            peer.setsockopt(zmq.CURVE_PUBLICKEY, pair.public)
+        peer.connect(server.endpoint)
+        peer.send_multipart(m.pack(m.Hello(1, 2, b"stranger"), 1))
+        return bool(peer.poll(10_000 if with_keys else 1_000))
+
+
+def test_captured_bytes_are_worth_nothing(server: Listening, repository: Path, good: Any) -> None:
+    """What a client once sent, sent again: the server's keys of the connection are others."""
+    with relay(server.port) as wire:
+        with make_env(repository, sandbox=server.sandbox(endpoint=wire.endpoint)) as suites:
+            suites.env.reset(seed=1)
+        captured = [bytes(kept) for kept in wire.captured if len(kept) > len(_GREETING)]
+    assert captured
+    before = server.said().count("a handshake failed")
+    jails = server.jails()
+    for data in captured:
+        with knock(server) as connection:
+            with contextlib.suppress(ConnectionError):
+                connection.sendall(data)
+            assert ends(connection)
+    assert eventually(lambda: server.said().count("a handshake failed") > before)
+    assert server.jails() == jails
+
+
+def test_a_flood_of_frames_without_keys_costs_no_memory(
+    server: Listening, good: Any, tmp_path: Path
+) -> None:
+    """Endless MORE frames fill the memory of a peer that takes them, as the control does."""
+    assert flood(server) < 64 * _MIB
+    with listening(tmp_path / "control", "--insecure-loopback") as control:
+        assert flood(control) > 128 * _MIB
+
+
+def flood(server: Listening) -> int:
+    """Send 256 MiB of frames that are never the last one; by how much the server grows."""
+    before = server.memory()
+    frame = b"\x03" + _MIB.to_bytes(8, "big") + bytes(_MIB)
+    with knock(server) as connection:
+        with contextlib.suppress(ConnectionError):
+            connection.sendall(_GREETING + b"\x04\x1c\x05READY\x0bSocket-Type\0\0\0\x06DEALER")
+            for _ in range(256):
+                connection.sendall(frame)
+        return server.memory() - before
+
+
+def test_a_port_scan_is_a_few_lines_in_the_log(server: Listening, good: Any) -> None:
+    """Hundreds of connections that say nothing, or noise, and go."""
+    before = server.memory()
+    for number in range(300):
+        with knock(server) as connection, contextlib.suppress(ConnectionError):
+            connection.sendall([b"", b"GET / HTTP/1.0\r\n\r\n", bytes(range(256))][number % 3])
+    good.call("count")
+    assert server.memory() - before < 64 * _MIB
+    assert server.said().count("a handshake failed") <= 10
+
+
+def test_slow_strangers_are_shown_the_door(server: Listening, good: Any) -> None:
+    """Whoever does not finish a handshake in a few seconds is disconnected."""
+    connections = [knock(server) for _ in range(100)]
+    try:
+        for connection in connections:
+            connection.sendall(_GREETING[:3])
+        good.call("count")
+        assert all(map(ends, connections))
+    finally:
+        for connection in connections:
+            connection.close()
+
+
+def test_without_keys_it_listens_on_loopback_only(tmp_path: Path, repository: Path) -> None:
+    """``--insecure-loopback`` serves on 127.0.0.1, and refuses every other address."""
+    with listening(tmp_path / "open", "--insecure-loopback") as open_server:
+        sandbox = open_server.sandbox(server_key=None, client_key=None, insecure_loopback=True)
+        with make_env(repository, sandbox=sandbox) as suites:
+            suites.env.reset(seed=1)
+    for address in ("0.0.0.0", "*", "10.0.0.1", "localhost"):
+        with (
+            pytest.raises(AssertionError, match="needs a loopback address"),
+            listening(tmp_path / "closed", "--insecure-loopback", bind=f"tcp://{address}:*"),
+        ):
+            pass
+    with pytest.raises(PolicyError, match="not on a loopback address"):
+        open_server.sandbox(endpoint="tcp://192.0.2.1:5555", insecure_loopback=True)
+
+
+def test_a_key_that_is_taken_off_the_list_is_out(tmp_path: Path, repository: Path) -> None:
+    """The list is read anew when it changes: also for who is in already."""
+    pair, other = keys.generate(), keys.generate()
+    authorized = tmp_path / "authorized"
+    authorized.write_text(f"# who may come in\n{key_text(pair.public)} alice\n")
+    with listening(tmp_path / "server", "--authorized-clients", str(authorized)) as server:
+        sandbox = server.sandbox(client_key=key_text(pair.secret))
+        with make_env(repository, sandbox=sandbox) as suites:
+            suites.env.reset(seed=1)
+            assert [one["client"] for one in server.sessions()] == ["alice"]
+            authorized.write_text(f"{key_text(other.public)} bob\n")
+            assert eventually(lambda: _is_refused(suites.env))
+        with pytest.raises(SandboxUnavailableError, match="does not know our key"):
+            make_env(repository, n_envs=2, sandbox=sandbox)
+
+
+def _is_refused(env: Any) -> bool:
+    try:
+        env.step(np.array([0]))
+    except WorkerError as error:
+        return "not authorised any more" in str(error)
+    return False
