@@ -1,0 +1,142 @@
+"""What a client on another host may have, and how much of it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import PolicyError, WorkerError
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.confinement import Confinement
+from envhub_worker.quotas import (
+    InFlight,
+    Permissions,
+    Quotas,
+    RefusedError,
+    Use,
+    check_jail,
+    check_policy,
+)
+from envhub_worker.sessions import Sessions
+from tests.remote.listening import Listening, listening
+from tests.support.processes import eventually
+
+
+def order(python: str = "", **policy: Any) -> tuple[m.OpenJail, Confinement]:
+    """What a client asks for."""
+    confinement = Confinement(**policy)
+    return m.OpenJail("x", python, "sha256:0", "env.py", asdict(confinement), 1), confinement
+
+
+@pytest.mark.parametrize(
+    ("asked", "permitted"),
+    [
+        ({"python": "/usr/bin/python3"}, None),
+        ({"readable": ("/etc",)}, None),
+        ({"network": "host"}, {"network": True}),
+        ({"gpu": True}, {"gpu": True}),
+        ({"profile": "no-userns"}, {"weakest_profile": "no-userns"}),
+        ({"profile": "container"}, {"weakest_profile": "container"}),
+    ],
+)
+def test_a_policy_needs_the_operators_permission(
+    asked: dict[str, Any], permitted: dict[str, Any] | None
+) -> None:
+    """Refused by default; paths and interpreters of the server always."""
+    with pytest.raises(RefusedError) as caught:
+        check_policy(*order(**asked), Permissions())
+    assert caught.value.error == "PolicyError"
+    if permitted is not None:
+        check_policy(*order(**asked), Permissions(**permitted))
+
+
+def test_the_sums_of_a_key_are_bounded() -> None:
+    """Jails, hosts and memory limits of everything that is open, and the new one."""
+    quotas = Quotas(jails=2, hosts=4, memory_bytes=100)
+    check_jail([Use(40, 2)], Use(60, 2), quotas)
+    for uses, more, what in (
+        ([Use(1, 1), Use(1, 1)], Use(1, 1), "jails"),
+        ([Use(1, 2)], Use(1, 3), "hosts"),
+        ([Use(1, 4)], Use(0, 1), "hosts"),
+        ([Use(50, 1)], Use(51, 1), "memory"),
+    ):
+        with pytest.raises(RefusedError, match=what):
+            check_jail(uses, more, quotas)
+
+
+def test_bytes_in_flight_are_bounded_until_they_are_answered() -> None:
+    """Of one key; another's are its own."""
+    flying = InFlight()
+    flying.add(b"a", (b"one", 1), 60, 100)
+    flying.add(b"b", (b"two", 1), 60, 100)
+    with pytest.raises(RefusedError, match="not answered yet"):
+        flying.add(b"a", (b"one", 2), 60, 100)
+    flying.answered((b"one", 1))
+    flying.answered((b"one", 1))
+    flying.add(b"a", (b"one", 3), 60, 100)
+
+
+def test_a_session_belongs_to_its_key() -> None:
+    """The same name or the same routing id under another key is another session."""
+    sessions = Sessions()
+    mine = sessions.connect(b"id", b"a" * 32, b"name")
+    theirs = sessions.connect(b"id", b"b" * 32, b"name")
+    assert mine.owner != theirs.owner
+    assert sessions.find(b"id", b"a" * 32) is mine
+    assert sessions.find(b"id", b"c" * 32) is None
+
+
+def test_jails_that_nobody_holds_are_found() -> None:
+    """Held once is held until it is no longer listed for as long as it takes."""
+    now = [0.0]
+    sessions = Sessions(lambda: now[0])
+    session = sessions.connect(b"id", b"", b"name")
+    assert not sessions.unheld(session, 1, 5)
+    sessions.keep(session, (1, 2))
+    now[0] = 4
+    sessions.keep(session, (2,))
+    assert not sessions.unheld(session, 3, 5)
+    now[0] = 6
+    assert sessions.unheld(session, 1, 5)
+    assert not sessions.unheld(session, 2, 5)
+    assert not sessions.unheld(session, 3, 5)
+    now[0] = 10
+    assert sessions.unheld(session, 3, 5)
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"python": "/usr/bin/python3"}, "python="),
+        ({"policy": {"readable": ("/etc",)}}, "readable"),
+    ],
+)
+def test_this_machines_paths_are_refused_before_anything_is_sent(
+    server: Listening, repository: Path, options: dict[str, Any], what: str
+) -> None:
+    """They would mean other things there."""
+    with pytest.raises(PolicyError, match=what):
+        make_env(repository, sandbox=server.sandbox(), **options)
+
+
+def test_a_second_jail_over_the_quota_is_refused_and_the_first_goes_on(
+    tmp_path: Path, repository: Path
+) -> None:
+    """The error names the quota; closing the first makes room."""
+    with listening(tmp_path / "server", "--max-jails", "1") as server:
+        sandbox = server.sandbox()
+        with make_env(repository, sandbox=sandbox) as first:
+            first.env.reset(seed=1)
+            with pytest.raises(WorkerError, match=r"2 jails .* \(--max-jails\)"):
+                make_env(repository, n_envs=2, sandbox=sandbox)
+            assert first.env.step(np.array([0]))[0].tolist() == [[1.0]]
+        with make_env(repository, n_envs=2, sandbox=sandbox) as second:
+            second.env.reset(seed=1)
+        with pytest.raises(PolicyError, match="--allow-network"):
+            make_env(repository, n_envs=3, sandbox=sandbox, policy={"network": "host"})
+        assert eventually(lambda: server.jails() == 0)
