@@ -89,6 +89,12 @@ class DockerSandbox:
             )
         if self.gpus is not None and not policy.gpu:
             raise PolicyError("DockerSandbox(gpus=...) takes a policy with gpu=True")
+        if not sys.platform.startswith("linux"):
+            raise SandboxUnavailableError(
+                f"sandbox='docker' needs Linux, and this is {sys.platform}, where containers run "
+                "in a virtual machine: run `docker run envhub-worker` and connect to it with "
+                "sandbox='tcp://...'"
+            )
         containers.check_readable(policy.readable)
         engine = find_engine(self.engine)
         _check_users(engine)

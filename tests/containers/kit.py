@@ -38,9 +38,14 @@ def containers_of(engine: Engine, identity: str) -> list[str]:
     return engine.run("ps", "--all", "--quiet", "--filter", label).split()
 
 
-def folders() -> set[str]:
-    """The runtime folders of containers."""
-    return {path.name for path in Path(tempfile.gettempdir()).glob("envhub-docker-*")}
+def folders(identity: str | None = None) -> list[Path]:
+    """The runtime folders of a client's containers, ours by default."""
+    wanted, found = identity or identity_of(os.getpid()), []
+    for path in Path(tempfile.gettempdir()).glob("envhub-docker-*"):
+        with contextlib.suppress(OSError):
+            if (path / "client").read_text() == wanted:
+                found.append(path)
+    return found
 
 
 def nothing_left(engine: Engine, identity: str | None = None) -> bool:
