@@ -28,6 +28,9 @@ finish() {
   [ -n "$engine" ] || return 0
   kill "$engine"
   wait "$engine" || true
+  # it leaves a network namespace mounted
+  awk -v below="$CI_WORK/docker/" 'index($2, below) == 1 {print $2}' /proc/mounts |
+    sort -r | xargs -r umount
 }
 trap finish EXIT
 if ! docker info >/dev/null 2>&1; then
