@@ -16,11 +16,16 @@ class Relay:
     Args:
         port: Where to.
         delay_s: How long every piece takes, each way.
+
+    Attributes:
+        captured: What clients sent, one for each connection.
+        received: How many bytes the server sent.
     """
 
     def __init__(self, port: int, delay_s: float = 0.0) -> None:
         self.delay_s = delay_s
         self.captured: list[bytearray] = []
+        self.received = 0
         self._to = port
         self._sockets: list[socket.socket] = []
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -46,7 +51,9 @@ class Relay:
     def _pump(self, source: socket.socket, target: socket.socket, kept: bytearray | None) -> None:
         with contextlib.suppress(OSError):
             while data := source.recv(1 << 16):
-                if kept is not None:
+                if kept is None:
+                    self.received += len(data)
+                else:
                     kept += data
                 time.sleep(self.delay_s)
                 target.sendall(data)

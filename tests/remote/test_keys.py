@@ -1,0 +1,196 @@
+"""Keys as text and as files, what a server says when it starts, and who may ask it."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import stat
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq
+from zmq.utils import z85
+
+from envhub_sandbox import RemoteSandbox, make_env
+from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
+from envhub_worker import keys, listen
+from envhub_worker.keys import AuthorizedClients
+from envhub_worker.protocol.keys import key_text, parse_key
+from envhub_worker.refusals import LINES, Log
+from tests.remote.listening import WORKER, Listening, listening
+
+
+def test_keys_are_read_in_both_forms() -> None:
+    """Ours, and ZeroMQ's own."""
+    for _ in range(20):
+        public, secret = zmq.curve_keypair()
+        assert parse_key(public.decode()) == z85.decode(public)
+        assert parse_key(f" {z85.decode(secret).hex()}\n") == z85.decode(secret)
+        assert keys.from_secret(z85.decode(secret)).public == z85.decode(public)
+
+
+@pytest.mark.parametrize("text", ["", "00", "g" * 64, "0" * 63, " " * 40, "~" * 40, "#" * 40])
+def test_what_is_no_key_is_refused_without_being_repeated(text: str) -> None:
+    """It may be a secret with a typing error."""
+    with pytest.raises(ValueError, match="64 hexadecimal digits") as caught:
+        parse_key(text)
+    assert not text.strip() or text not in str(caught.value)
+
+
+def test_keygen_writes_a_secret_that_nobody_else_reads(tmp_path: Path) -> None:
+    """0600 from the start, the public key printed, the secret not; nothing is overwritten."""
+    command = [*WORKER, "keygen", "--out", str(tmp_path / "new")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    secret = tmp_path / "new" / "client.key"
+    pair = keys.load(secret)
+    assert stat.S_IMODE(secret.stat().st_mode) == 0o600
+    assert key_text(pair.public) in done.stdout
+    assert key_text(pair.secret) not in done.stdout
+    assert (tmp_path / "new" / "client.pub").read_text().strip() == key_text(pair.public)
+    assert "secret" not in repr(pair).replace("KeyPair", "")
+    again = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert again.returncode == 1
+    assert keys.load(secret) == pair
+
+
+def test_the_list_of_clients_knows_names_and_comments(tmp_path: Path) -> None:
+    """A key in Z85 may begin like a comment; a line that is none is named."""
+    one, other = keys.generate(), keys.generate()
+    path = tmp_path / "clients"
+    path.write_text(
+        f"# comment\n#comment\n\n{key_text(one.public)} alice in lab 3\n"
+        f"{z85.encode(other.public).decode()}\n"
+    )
+    clients = AuthorizedClients(path, {})
+    assert clients.name_of(one.public) == "alice in lab 3"
+    assert clients.name_of(other.public) == key_text(other.public)[:8]
+    assert clients.name_of(keys.generate().public) is None
+    path.write_text("no key\n")
+    with pytest.raises(ValueError, match="line 1"):
+        clients.refresh()
+    assert clients.name_of(one.public) is not None
+
+
+@pytest.mark.parametrize(
+    "bind", ["tcp://", "5555", "ipc:///tmp/x", "udp://127.0.0.1:1", "tcp://127.0.0.1:http"]
+)
+def test_only_tcp_addresses_are_bound(bind: str) -> None:
+    """Anything else is a mistake."""
+    with pytest.raises(listen.UsageError, match="--bind takes"):
+        listen.check_bind(bind, False)
+
+
+def test_the_default_is_loopback() -> None:
+    """Nobody listens on all interfaces without saying so."""
+    parser = argparse.ArgumentParser()
+    listen.add_arguments(parser)
+    assert parser.parse_args([]).bind.startswith("tcp://127.0.0.1:")
+
+
+def test_a_server_says_what_its_client_has_to_write(
+    server: Listening, monkeypatch: pytest.MonkeyPatch, repository: Path
+) -> None:
+    """The printed line, executed, is a sandbox that works; so are the variables."""
+    said = server.said()
+    line = next(line for line in said.splitlines() if "RemoteSandbox(" in line)
+    expression = line.strip().removeprefix("sandbox=envhub_sandbox.")
+    sandbox: Any = eval(expression, {"RemoteSandbox": RemoteSandbox})
+    assert sandbox == server.sandbox()
+    assert server.client_key not in repr(sandbox)
+    words = dict(word.split("=") for word in said.splitlines()[-1].split() if "KEY=" in word)
+    for name, value in words.items():
+        monkeypatch.setenv(name, value.strip("'"))
+    with make_env(repository, sandbox=server.endpoint) as suites:
+        suites.env.reset(seed=1)
+
+
+def test_a_second_start_keeps_the_keys_and_does_not_print_the_secret(tmp_path: Path) -> None:
+    """Clients go on working; logs hold the secret once."""
+    with listening(tmp_path / "same") as first:
+        assert first.client_key in first.said()
+    with listening(tmp_path / "same") as second:
+        assert (second.public, second.client_key) == (first.public, first.client_key)
+        assert second.client_key not in second.said()
+
+
+def test_keys_are_found_in_the_configuration_folder(
+    server: Listening, repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``known_hosts`` and ``client.key``; without them the error says where they belong."""
+    monkeypatch.setenv("ENVHUB_CONFIG", str(tmp_path))
+    with pytest.raises(SandboxUnavailableError, match="known_hosts"):
+        make_env(repository, sandbox=server.endpoint)
+    address = server.endpoint.removeprefix("tcp://")
+    (tmp_path / "known_hosts").write_text(f"other:5555 {'0' * 64}\n{address} {server.public}\n")
+    with pytest.raises(SandboxUnavailableError, match="envhub-worker keygen"):
+        make_env(repository, sandbox=server.endpoint)
+    (tmp_path / "client.key").write_text(f"{server.client_key}\n")
+    with make_env(repository, sandbox=server.endpoint) as suites:
+        suites.env.reset(seed=1)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"sandbox": "tcp://nowhere"},
+        {"sandbox": "tcp://host:99999"},
+        {"sandbox": "tcp://host:1/path"},
+        {"sandbox": "tcp://host:1", "server_key": "no key"},
+        {"sandbox": "process", "server_key": "0" * 64},
+    ],
+)
+def test_what_cannot_be_reached_is_refused_at_once(
+    repository: Path, options: dict[str, str]
+) -> None:
+    """Before anything is downloaded or sent."""
+    with pytest.raises(PolicyError):
+        make_env(repository, **options)
+
+
+def test_status_says_what_jails_do(server: Listening, repository: Path) -> None:
+    """For people, as its operator; a client sees itself."""
+    with make_env(repository, sandbox=server.sandbox()) as suites:
+        suites.env.reset(seed=1)
+        command = [*WORKER, "status", "--state-dir", str(server.state)]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+        assert "the one client" in done.stdout
+        assert "repository:env.py: waiting" in done.stdout
+        client = [*WORKER, "status", "--endpoint", server.endpoint, "--server-key", server.public]
+        command = [*client, "--key", str(server.state / "client.key")]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+        assert "operator" not in done.stdout
+
+
+def test_status_without_a_server_says_so(tmp_path: Path) -> None:
+    """It fails, for scripts, and at once."""
+    command = [*WORKER, "status", "--state-dir", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 1
+    assert "no 'envhub-worker listen'" in done.stderr
+
+
+def test_a_log_cannot_be_filled_by_strangers() -> None:
+    """A few lines of a kind in a minute, then how many more there were."""
+    now, lines = [0.0], list[str]()
+    log = Log(lines.append, lambda: now[0])
+    for _ in range(1000):
+        log.say("refused", "noise")
+    log.say("ended", "something else")
+    assert len(lines) == LINES + 1
+    now[0] = 61
+    log.tick()
+    assert lines[-1].endswith(f"and {1000 - LINES} more in a minute")
+
+
+def test_a_state_folder_of_somebody_else_is_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The temporary folder is everybody's: what others may write there is none of ours."""
+    monkeypatch.setenv("XDG_STATE_HOME", "/proc/nowhere")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    folder = tmp_path / f"envhub-worker-{os.getuid()}"
+    assert listen.state_dir(None, create=True) == folder
+    folder.chmod(0o777)
+    assert listen.state_dir(None, create=True) is None

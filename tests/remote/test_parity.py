@@ -1,0 +1,63 @@
+"""The compliance suite against a server over TCP, with keys: the same, bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from envhub_sandbox import make_env
+from tests.compliance.conftest import pytest_generate_tests as pytest_generate_tests
+from tests.compliance.pair import Pair
+from tests.compliance.vector_env import Case, VectorEnvCompliance, cases
+from tests.remote.listening import Listening
+from tests.support.samples import reference, sample
+
+
+@pytest.fixture(scope="class")
+def pair(request: pytest.FixtureRequest, case: Case, server: Listening) -> Iterator[Pair]:
+    """The reference here and the environment over there; a class's tests share them."""
+    suite: type[VectorEnvCompliance] = request.cls
+    expected = reference(suite.sample, case.n_envs, **case.env_kwargs)
+    suites = make_env(
+        sample(suite.sample),
+        n_envs=case.n_envs,
+        use_async_envs=case.use_async_envs,
+        env_kwargs=case.env_kwargs,
+        num_workers=case.num_workers,
+        sandbox=server.sandbox(),
+    )
+    with suites:
+        yield Pair(expected, suites.env)
+    expected.close()
+
+
+class TestCounter(VectorEnvCompliance):
+    """Every kind of value in the infos, over two processes."""
+
+    sample = "counter"
+    cases = cases(use_async_envs=(True,), modes=("NextStep",))
+    steps = 60
+
+
+class TestCartPole(VectorEnvCompliance):
+    """Discrete actions, float32 observations."""
+
+    sample = "cartpole"
+    cases = cases(n_envs=(4,), use_async_envs=(False,), modes=("SameStep",))
+    steps = 300
+
+
+class TestExoticSpaces(VectorEnvCompliance):
+    """Spaces that have no fixed layout."""
+
+    sample = "exotic_spaces"
+    cases = cases(n_envs=(2,), use_async_envs=(False,), modes=("Disabled",))
+    steps = 40
+
+
+class TestLeRobotPendulum(VectorEnvCompliance):
+    """Dict observations and ``is_success`` in every info."""
+
+    sample = "lerobot_pendulum"
+    cases = cases(n_envs=(2,), use_async_envs=(False,), modes=("NextStep",))
