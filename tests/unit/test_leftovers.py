@@ -1,0 +1,100 @@
+"""What ``envhub gc`` takes for left behind, and what it leaves alone."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox.sandboxes import leftovers
+from envhub_sandbox.sandboxes.identity import identity_of
+
+
+@pytest.fixture(scope="module")
+def dead() -> str:
+    """The identity of a process that has ended."""
+    child = subprocess.Popen([sys.executable, "-S", "-c", "input()"], stdin=subprocess.PIPE)
+    name = identity_of(child.pid)
+    child.communicate()
+    return name
+
+
+def folder(root: Path, name: str, files: dict[str, str], mode: int = 0o700) -> Path:
+    """A folder with files in it."""
+    path = root / name
+    path.mkdir()
+    for file, text in files.items():
+        (path / file).write_text(text)
+    path.chmod(mode)
+    return path
+
+
+def found(root: Path) -> set[str]:
+    """Names of the folders that would be removed."""
+    return {Path(one.name).name for one in leftovers.stale_folders(root)}
+
+
+def bound(path: Path) -> socket.socket:
+    """A socket of a server's kind."""
+    made = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    made.bind(str(path))
+    made.listen()
+    return made
+
+
+def test_a_containers_folder_is_left_behind_when_its_client_is(tmp_path: Path, dead: str) -> None:
+    """By the identity in it; without one nothing can be told."""
+    alive = identity_of(os.getpid())
+    folder(tmp_path, "envhub-docker-dead0000", {"client": dead})
+    folder(tmp_path, "envhub-docker-alive000", {"client": alive})
+    folder(tmp_path, "envhub-docker-nothing0", {})
+    folder(tmp_path, "envhub-docker-nonsense", {"client": "?"})
+    folder(tmp_path, "envhub-docker-not-ours-at-all", {"client": dead})
+    folder(tmp_path, "envhub-docker-open0000", {"client": dead}, mode=0o755)
+    assert found(tmp_path) == {"envhub-docker-dead0000"}
+
+
+def test_a_servers_folder_is_left_behind_when_nobody_listens(tmp_path: Path) -> None:
+    """At the socket in it; one that is only being made has none yet."""
+    for name in ("listens0", "deserted", "starting", "no_log00"):
+        log = {} if name == "no_log00" else {"server.log": ""}
+        folder(tmp_path, f"envhub-{name}", log)
+    with bound(tmp_path / "envhub-listens0" / "fds"):
+        for name in ("deserted", "no_log00"):
+            bound(tmp_path / f"envhub-{name}" / "fds").close()
+        assert found(tmp_path) == {"envhub-deserted"}
+
+
+def test_a_link_is_not_followed(tmp_path: Path, dead: str) -> None:
+    """A name in a folder that everybody may write proves nothing."""
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    folder(elsewhere, "data", {"client": dead})
+    (tmp_path / "envhub-docker-link0000").symlink_to(elsewhere / "data")
+    assert found(tmp_path) == set()
+
+
+def test_removing_removes_the_folder_and_nothing_beside(tmp_path: Path, dead: str) -> None:
+    """And says that it did."""
+    folder(tmp_path, "envhub-docker-dead0000", {"client": dead, "seccomp.json": "{}"})
+    beside = folder(tmp_path, "envhub-docker-alive000", {"client": identity_of(os.getpid())})
+    [one] = leftovers.stale_folders(tmp_path)
+    assert one.remove()
+    assert list(tmp_path.iterdir()) == [beside]
+
+
+def test_control_groups_of_ended_servers_are_left_behind(tmp_path: Path, dead: str) -> None:
+    """By the pid in the name; those of others have other names."""
+    pid = dead.partition(":")[0]
+    names = {f"memory/envhub-{pid}-zygote-1", f"envhub-{os.getpid()}-zygote-1", "envhub-x-y"}
+    for name in names | {f"user-{pid}-zygote-1"}:
+        (tmp_path / name / "jail-1").mkdir(parents=True)
+    groups = list(leftovers.stale_groups(tmp_path))
+    assert [Path(one.name).name for one in groups] == [f"envhub-{pid}-zygote-1"]
+    assert groups[0].remove()
+    assert not Path(groups[0].name).exists()
+    assert (tmp_path / f"envhub-{os.getpid()}-zygote-1" / "jail-1").exists()
