@@ -53,7 +53,6 @@ class Soak:
     def __init__(self, arguments: argparse.Namespace, lane: str) -> None:
         self._rng = np.random.default_rng(arguments.seed)
         self._n = arguments.n_envs
-        self._workers = arguments.num_workers
         self._faults = arguments.fault_every
         self._transparent = arguments.restart == "transparent"
         self.counts = dict.fromkeys(_COUNTED, 0)
@@ -63,7 +62,7 @@ class Soak:
             REPOSITORY,
             n_envs=self._n,
             use_async_envs=True,
-            num_workers=self._workers,
+            num_workers=arguments.num_workers,
             lane=lane,
             policy=policy | {"crash_history": 0},
         )
@@ -107,7 +106,7 @@ class Soak:
     def _revive(self, expected: Any, lost: Any) -> None:
         """Do to the oracle what was promised for the rows that came back."""
         observations, rewards, terminations, truncations, infos = expected
-        shards = np.array_split(lost, self._workers)
+        shards = [lost[start:stop] for start, stop in self.env._remote.bounds]
         if any(shard.any() != shard.all() for shard in shards):
             self.counts["mismatches"] += 1
         restart = self.env.stats()["restarts"]

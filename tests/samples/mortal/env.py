@@ -17,7 +17,7 @@ def _once(name: str) -> bool:
     """Whether this is the first time that anybody in this jail asks."""
     mark = Path(tempfile.gettempdir(), name)
     known = mark.exists()
-    mark.touch()
+    mark.write_text("")
     return not known
 
 
