@@ -77,7 +77,7 @@ SandboxName = Annotated[
     str,
     typer.Option(
         "--sandbox",
-        metavar="process|docker[:IMAGE]|none",
+        metavar="process|docker[:IMAGE]|tcp://HOST:PORT|none",
         help="Where it runs; 'none' is this process, unprotected.",
         rich_help_panel=_LIMITS,
     ),
