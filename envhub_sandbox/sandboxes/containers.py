@@ -52,6 +52,7 @@ class Container:
         scratch: Bytes of /tmp.
         runtime: The engine's runtime, or None for its default.
         gpus: What ``--gpus`` takes, or None.
+        ulimits: What ``--ulimit`` takes, besides that nobody dumps core.
     """
 
     name: str
@@ -69,6 +70,7 @@ class Container:
     scratch: int
     runtime: str | None
     gpus: str | None
+    ulimits: tuple[str, ...] = ()
 
 
 def run_arguments(engine: Engine, wanted: Container) -> list[str]:
@@ -108,7 +110,8 @@ def _confinement(engine: Engine, wanted: Container) -> list[str]:
 
 
 def _limits(wanted: Container) -> list[str]:
-    words = ["--ulimit", "core=0:0"]
+    limits = ("core=0:0", *wanted.ulimits)
+    words = [word for limit in limits for word in ("--ulimit", limit)]
     if wanted.memory is not None:
         words += ["--memory", str(wanted.memory), "--memory-swap", str(wanted.memory)]
     if wanted.pids is not None:

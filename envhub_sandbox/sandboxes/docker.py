@@ -13,6 +13,7 @@ import atexit
 import contextlib
 import json
 import os
+import resource
 import secrets
 import select
 import shutil
@@ -39,6 +40,8 @@ _STARTUP_S = 120.0
 _STOP_S = 45.0
 _ANNOUNCEMENT_BYTES = 65536
 _PREFIX = "envhub-docker-"
+# of the engine's own: it failed, it could not run the program, there is no such program
+_ENGINES_CODES = (125, 126, 127)
 # Far above the users of distributions, systemd and rootless containers.
 _UNUSED_USERS = range(0x6E000000, 0x6EFFFFFF)
 
@@ -269,6 +272,7 @@ class RepositoryContainer:
             scratch=containers.scratch_for(policy),
             runtime=options.runtime,
             gpus=(options.gpus or "all") if policy.gpu else None,
+            ulimits=_own_limits() if self._engine.kind == "podman" else (),
         )
 
 
@@ -278,6 +282,16 @@ def _user() -> tuple[int, int]:
         return os.geteuid(), os.getegid()
     user = _UNUSED_USERS[secrets.randbelow(len(_UNUSED_USERS))]
     return user, user
+
+
+def _own_limits() -> tuple[str, ...]:
+    """Ours: podman would raise them to numbers of its own, which not everybody may."""
+    _, files = resource.getrlimit(resource.RLIMIT_NOFILE)
+    _, processes = resource.getrlimit(resource.RLIMIT_NPROC)
+    # it has taken that much of this one from itself by then
+    highest = int(Path("/proc/sys/kernel/pid_max").read_text())
+    processes = highest if processes < 0 else min(processes, highest)
+    return f"nofile={files}:{files}", f"nproc={processes}:{processes}"
 
 
 def _execute(
@@ -324,7 +338,7 @@ def _check_started(engine: Engine, answer: bytes) -> None:
         return
     said = json.loads(answer)
     tail = str(said["tail"])
-    if said["ended"] == 125:  # the engine's own code, whatever the program's may mean
+    if said["ended"] in _ENGINES_CODES:
         raise SandboxUnavailableError(explained(engine.kind, tail))
     raise WorkerStartupError(
         f"the container's program ended at once (exit code {said['ended']}); an image that was "
