@@ -185,7 +185,7 @@ class Repository:
             shared: Whether other environments lived in it.
         """
         ours = self.policy.crash_history and error.bundle is None and self.recipe is not None
-        if not ours or getattr(error, "reason", "") in ("killed", "idle", "gone"):
+        if not ours or getattr(error, "reason", "") in ("killed", "idle", "gone", "connection"):
             return
         assert self.recipe is not None
         manifest = None if loaded is None else loaded.manifest
