@@ -1,0 +1,197 @@
+"""Clients with a key who keep no other rule: other clients, and the server's machine, are safe."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zmq
+
+from envhub_sandbox import make_env
+from envhub_worker import keys
+from envhub_worker.keys import KeyPair
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.confinement import Confinement
+from envhub_worker.protocol.keys import key_text
+from tests.remote.listening import Listening, listening
+from tests.support.processes import eventually
+
+ALICE, MALLORY = keys.generate(), keys.generate()
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Listening]:
+    """A server that Alice and Mallory use."""
+    folder = tmp_path_factory.mktemp("shared")
+    (folder / "clients").write_text(
+        f"{key_text(ALICE.public)} alice\n{key_text(MALLORY.public)} mallory\n"
+    )
+    options = ("--authorized-clients", str(folder / "clients"), "--max-inflight", "1")
+    with listening(folder / "server", *options) as server:
+        yield server
+
+
+@pytest.fixture
+def alice(shared: Listening, repository: Path) -> Iterator[Any]:
+    """Her environment, which goes on whatever Mallory does."""
+    with make_env(repository, sandbox=shared.sandbox(client_key=key_text(ALICE.secret))) as suites:
+        suites.env.reset(seed=1)
+        yield suites.env
+        assert suites.env.step(np.array([0]))[0].tolist() == [[1.0]]
+
+
+class Peer:
+    """A socket with a key, that says what it likes."""
+
+    def __init__(self, socket: zmq.Socket[bytes]) -> None:
+        self.socket = socket
+        self.number = 0
+
+    def tell(self, message: m.Message, *payload: bytes) -> None:
+        """Send a request."""
+        self.number += 1
+        self.socket.send_multipart([*m.pack(message, self.number), *payload])
+
+    def ask(self, message: m.Message, *payload: bytes) -> m.Message:
+        """Send a request; its reply."""
+        self.tell(message, *payload)
+        assert self.socket.poll(30_000)
+        return m.unpack(self.socket.recv_multipart()[:1])[1]
+
+    def refused(self, message: m.Message, *payload: bytes) -> m.Refused:
+        """The refusal of a request."""
+        reply = self.ask(message, *payload)
+        assert isinstance(reply, m.Refused), reply
+        return reply
+
+
+@contextmanager
+def peer(server: Listening, pair: KeyPair, *, routing_id: bytes = b"") -> Iterator[Peer]:
+    """A socket with the keys of somebody."""
+    with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.CURVE_SERVERKEY, bytes.fromhex(server.public))
+        socket.setsockopt(zmq.CURVE_PUBLICKEY, pair.public)
+        socket.setsockopt(zmq.CURVE_SECRETKEY, pair.secret)
+        if routing_id:
+            socket.setsockopt(zmq.ROUTING_ID, routing_id)
+        socket.connect(server.endpoint)
+        yield Peer(socket)
+
+
+@pytest.fixture
+def mallory(shared: Listening) -> Iterator[Peer]:
+    """She has said Hello, under Alice's session: what she claims to be is worth nothing."""
+    from envhub_sandbox.client import SESSION
+
+    with peer(shared, MALLORY) as found:
+        assert isinstance(found.ask(m.Hello(1, 2, SESSION)), m.Welcome)
+        yield found
+
+
+def test_another_clients_jail_is_not_there(alice: Any, mallory: Peer) -> None:
+    """By number and session, which are Alice's own; to Alice it is there, as the control."""
+    jail = alice._remote._loaded.jail
+    for request in (
+        m.StartHosts(jail.number, 1),
+        m.ReadOutput(jail.number, ""),
+        m.KeepJail(jail.number),
+        m.Relay(jail.number, "step", ((jail.hosts[0], 1),)),
+    ):
+        payload = (b"x",) if isinstance(request, m.Relay) else ()
+        assert "there is no jail" in mallory.refused(request, *payload).message
+    assert isinstance(mallory.ask(m.CloseJail(jail.number)), m.Done)
+    assert jail.output("", _deadline()) is not None
+    status = mallory.ask(m.GetStatus())
+    assert isinstance(status, m.Status)
+    assert status.jails == ()
+
+
+def _deadline() -> Any:
+    from envhub_sandbox.deadline import Deadline
+
+    return Deadline(30)
+
+
+def test_only_ones_own_sessions_are_shown(alice: Any, mallory: Peer) -> None:
+    """The operator sees both."""
+    reply = mallory.ask(m.GetSessions())
+    assert isinstance(reply, m.Sessions)
+    assert {one["client"] for one in reply.sessions if isinstance(one, dict)} == {"mallory"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"snapshot": "/etc"}, "no such snapshot"),
+        ({"snapshot": "sha256:../../../etc"}, "no such snapshot"),
+        ({"python": "/bin/sh"}, "interpreter"),
+        ({"entry": "../env.py"}, "entry file"),
+        ({"entry": "/etc/passwd"}, "entry file"),
+        ({"confinement": {}}, "no confinement"),
+        ({"confinement": asdict(Confinement(readable=("/",)))}, "readable"),
+        ({"confinement": asdict(Confinement(network="host"))}, "--allow-network"),
+        ({"confinement": asdict(Confinement(profile="nothing"))}, "--weakest-profile"),
+        ({"hosts": 10_000}, "hosts"),
+    ],
+)
+def test_a_jail_cannot_be_asked_more_than_a_policy_may(
+    mallory: Peer, changes: dict[str, Any], complaint: str
+) -> None:
+    """The server checks by itself what a client of ours would not even send."""
+    order = {
+        "name": "x",
+        "python": "",
+        "snapshot": "sha256:" + "0" * 64,
+        "entry": "env.py",
+        "confinement": asdict(Confinement()),
+        "hosts": 1,
+        **changes,
+    }
+    assert complaint in mallory.refused(m.OpenJail(**order)).message
+
+
+def test_more_bytes_than_may_be_in_flight_are_refused(alice: Any, mallory: Peer) -> None:
+    """Of one request, too; and nothing of it stays."""
+    reply = mallory.refused(m.Relay(1, "step", ((1, 1),)), bytes(2 << 20))
+    assert "not answered yet" in reply.message
+    assert "there is no jail" in mallory.refused(m.Relay(1, "s", ((1, 1),)), b"x").message
+
+
+def test_what_is_no_request_is_refused(mallory: Peer) -> None:
+    """Replies, descriptors, and messages for hosts."""
+    for message in (m.Done(), m.Deposit(b"", 1, 1), m.Close(1), m.Welcome(2, "", 1)):
+        assert "is no request" in mallory.refused(message).message
+
+
+def test_noise_with_a_key_is_dropped(shared: Listening, alice: Any) -> None:
+    """The server goes on; who has not said Hello is told to."""
+    with peer(shared, MALLORY) as found:
+        for frames in ([b""], [b"\xff" * 100], [b"", b"", b""], [b"\x00" * 4] * 100):
+            found.socket.send_multipart(frames)
+        assert found.refused(m.GetStatus()).error == "HelloError"
+
+
+def test_a_claimed_routing_id_is_nobodys_name(shared: Listening) -> None:
+    """The same id under two keys, one after the other: the second is not taken for the first."""
+    with peer(shared, ALICE, routing_id=b"the same") as first:
+        assert isinstance(first.ask(m.Hello(1, 2, b"one")), m.Welcome)
+        assert isinstance(first.ask(m.GetStatus()), m.Status)
+    with peer(shared, MALLORY, routing_id=b"the same") as second:
+        assert second.refused(m.GetStatus()).error == "HelloError"
+
+
+def test_a_key_has_so_many_sessions_and_no_more(tmp_path: Path) -> None:
+    """Each Hello under a new name is one; the old ones are found again."""
+    with listening(tmp_path / "server", "--max-sessions", "2") as server:
+        pair = keys.load(server.state / "client.key")
+        with peer(server, pair) as found:
+            for name in (b"one", b"two", b"one"):
+                assert isinstance(found.ask(m.Hello(1, 2, name)), m.Welcome)
+            assert "2 sessions" in found.refused(m.Hello(1, 2, b"three")).message
+        assert eventually(lambda: len(server.sessions()) == 2)
