@@ -740,7 +740,7 @@ class RemoteEnv:
             self._paces.note(self.manifest, pace)
 
     def _close_lane(self) -> None:
-        lane, self._lane = self._lane, None
+        lane, self._lane, self._place = self._lane, None, None
         if lane is not None:
             lane.close()
 
