@@ -13,7 +13,6 @@ import atexit
 import contextlib
 import json
 import os
-import resource
 import secrets
 import select
 import shutil
@@ -32,7 +31,14 @@ from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes import containers, enclosure, seccomp
 from envhub_sandbox.sandboxes.base import WorkerServer
 from envhub_sandbox.sandboxes.containers import Container
-from envhub_sandbox.sandboxes.engines import Engine, environment, explained, find_engine, find_image
+from envhub_sandbox.sandboxes.engines import (
+    Engine,
+    environment,
+    explained,
+    find_engine,
+    find_image,
+    own_limits,
+)
 from envhub_sandbox.sandboxes.identity import identity_of
 
 _KEEPER = Path(__file__).with_name("keeper.py")
@@ -272,7 +278,7 @@ class RepositoryContainer:
             scratch=containers.scratch_for(policy),
             runtime=options.runtime,
             gpus=(options.gpus or "all") if policy.gpu else None,
-            ulimits=_own_limits() if self._engine.kind == "podman" else (),
+            ulimits=own_limits(self._engine),
         )
 
 
@@ -282,16 +288,6 @@ def _user() -> tuple[int, int]:
         return os.geteuid(), os.getegid()
     user = _UNUSED_USERS[secrets.randbelow(len(_UNUSED_USERS))]
     return user, user
-
-
-def _own_limits() -> tuple[str, ...]:
-    """Ours: podman would raise them to numbers of its own, which not everybody may."""
-    _, files = resource.getrlimit(resource.RLIMIT_NOFILE)
-    _, processes = resource.getrlimit(resource.RLIMIT_NPROC)
-    # it has taken that much of this one from itself by then
-    highest = int(Path("/proc/sys/kernel/pid_max").read_text())
-    processes = highest if processes < 0 else min(processes, highest)
-    return f"nofile={files}:{files}", f"nproc={processes}:{processes}"
 
 
 def _execute(

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import shutil
 import subprocess
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
@@ -195,6 +197,18 @@ def _last_line(text: str) -> str:
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     said = [line for line in lines if not line.startswith(("See '", "Run '"))] or lines
     return said[-1][:500] if said else ""
+
+
+def own_limits(engine: Engine) -> tuple[str, ...]:
+    """For ``--ulimit``: podman would raise ours to numbers of its own, which not all may."""
+    if engine.kind != "podman":
+        return ()
+    _, files = resource.getrlimit(resource.RLIMIT_NOFILE)
+    _, processes = resource.getrlimit(resource.RLIMIT_NPROC)
+    # it has taken that much of this one from itself by then
+    highest = int(Path("/proc/sys/kernel/pid_max").read_text())
+    processes = highest if processes < 0 else min(processes, highest)
+    return f"nofile={files}:{files}", f"nproc={processes}:{processes}"
 
 
 def find_image(engine: Engine, image: str) -> str:

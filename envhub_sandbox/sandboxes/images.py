@@ -18,7 +18,7 @@ from pathlib import Path
 
 from envhub_sandbox.errors import DependencyError, SandboxUnavailableError
 from envhub_sandbox.requirements import Lock
-from envhub_sandbox.sandboxes.engines import Engine, EngineError, environment
+from envhub_sandbox.sandboxes.engines import Engine, EngineError, environment, own_limits
 
 LOCK_LABEL = "dev.envhub.lock"
 _INTERPRETER = "/opt/envhub-worker/bin/python"
@@ -61,6 +61,7 @@ def target_of(engine: Engine, image: str) -> Target:
         said = engine.run(
             *("run", "--rm", "--network", "none", "--read-only", "--cap-drop", "ALL"),
             *("--security-opt", "no-new-privileges", "--pull", "never"),
+            *(word for limit in own_limits(engine) for word in ("--ulimit", limit)),
             *("--entrypoint", _INTERPRETER, image, "-I", "-c", _ASK),
         )
         python, machine = json.loads(said)
