@@ -22,7 +22,8 @@
 snapshots in ``D``, by default below ``$XDG_STATE_HOME``. ``envhub-worker keygen [--out DIR]``
 makes a key pair, ``envhub-worker status`` says who uses a listening server.
 
-``envhub-worker health [--port 5555]`` exits with 0 if a server of this container answers, else 1.
+``envhub-worker health [--port 5555] [--state-dir D]`` exits with 0 if a server of this container
+answers, else 1.
 """
 
 from __future__ import annotations
@@ -67,10 +68,12 @@ def _serve(arguments: argparse.Namespace) -> int:
 
 
 def _health(arguments: argparse.Namespace) -> int:
-    """Say whether a server answers."""
+    """Say whether a server answers: one that listens by its key, any other by its greeting."""
+    from envhub_worker.asking import is_healthy
     from envhub_worker.health import answers
 
-    return 0 if answers("127.0.0.1", arguments.port) else 1
+    healthy = is_healthy(arguments.state_dir)
+    return 0 if healthy or (healthy is None and answers("127.0.0.1", arguments.port)) else 1
 
 
 def _listen(arguments: argparse.Namespace) -> int:
@@ -120,6 +123,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_remote(commands)
     health = commands.add_parser("health", help="whether a server of this container answers")
     health.add_argument("--port", type=int, default=5555)
+    health.add_argument("--state-dir", type=Path, help="as for listen")
     health.set_defaults(run=_health)
     return parser
 

@@ -1,4 +1,4 @@
-"""``envhub-worker status``: ask a running ``listen``, as its operator."""
+"""``envhub-worker status`` and ``health``: ask a running ``listen``, as its operator."""
 
 from __future__ import annotations
 
@@ -51,17 +51,35 @@ def _address(arguments: argparse.Namespace) -> tuple[str, bytes | None, keys.Key
         if not arguments.server_key or not arguments.key:
             raise ValueError("--endpoint needs --server-key and --key")
         return arguments.endpoint, parse_key(arguments.server_key), keys.load(arguments.key)
-    state = state_dir(arguments.state_dir, create=False)
+    noted = _noted(arguments.state_dir)
+    if noted is None:
+        raise UnreachableError("no 'envhub-worker listen' of this user is running here")
+    return noted
+
+
+def _noted(chosen: Path | None) -> tuple[str, bytes | None, keys.KeyPair] | None:
+    """What a server of this user wrote down when it started; None if there is none."""
+    state = state_dir(chosen, create=False)
     try:
         if state is None:
-            raise FileNotFoundError
-        endpoint, public = (state / "endpoint").read_text().split()
+            return None
+        endpoint, public, key_file = (state / "endpoint").read_text().rstrip("\n").split(" ", 2)
     except FileNotFoundError:
-        raise UnreachableError("no 'envhub-worker listen' of this user is running here") from None
+        return None
     if public == "insecure":
         return endpoint, None, keys.generate()
-    own = keys.load(arguments.key or state / "server.key")
-    return reachable(endpoint), parse_key(public), own
+    return reachable(endpoint), parse_key(public), keys.load(Path(key_file))
+
+
+def is_healthy(chosen: Path | None) -> bool | None:
+    """Whether the server of this user answers requests; None if none was started here."""
+    try:
+        noted = _noted(chosen)
+        if noted is not None:
+            _ask(*noted)
+    except (OSError, ValueError, ProtocolError, UnreachableError):
+        return False
+    return None if noted is None else True
 
 
 def _ask(endpoint: str, server_key: bytes | None, pair: keys.KeyPair) -> list[dict[str, Any]]:

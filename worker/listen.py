@@ -105,7 +105,8 @@ def _listen(arguments: argparse.Namespace, state: Path) -> int:
         raise
     server.stop_on(signal.SIGTERM, signal.SIGINT)
     note = state / "endpoint"
-    note.write_text(f"{server.endpoint} {identity.public}\n")
+    key_file = (arguments.key or state / "server.key").absolute()
+    note.write_text(f"{server.endpoint} {identity.public} {key_file}\n")
     print(announcement(server.endpoint, identity), flush=True)
     try:
         server.run()

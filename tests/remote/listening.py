@@ -122,8 +122,7 @@ def listening(
         assert process.poll() is None, server.said()
         assert eventually(lambda: "sandbox=" in server.said())
         server.endpoint = re.search(r"tcp://\S+", server.said())[0]  # type: ignore[index]
-        public = state / "server.pub"
-        server.public = public.read_text().strip() if public.exists() else ""
+        server.public = (state / "endpoint").read_text().split()[1]
         key = state / "client.key"
         server.client_key = key.read_text().strip() if key.exists() else ""
         yield server

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import stat
 import subprocess
 from pathlib import Path
@@ -161,6 +162,18 @@ def test_status_says_what_jails_do(server: Listening, repository: Path) -> None:
         command = [*client, "--key", str(server.state / "client.key")]
         done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
         assert "operator" not in done.stdout
+
+
+def test_health_asks_the_server_and_not_only_its_port(tmp_path: Path) -> None:
+    """0 while it answers requests by key, 1 when it is stopped; refusals are no part of that."""
+    own = keys.save(keys.generate(), tmp_path / "own", "mine")[0]
+    with listening(tmp_path / "server", "--key", str(own)) as server:
+        command = [*WORKER, "health", "--state-dir", str(server.state)]
+        assert subprocess.run(command, timeout=60, check=False).returncode == 0
+        assert "refused" not in server.said()
+        server.process.send_signal(signal.SIGSTOP)
+        assert subprocess.run(command, timeout=60, check=False).returncode == 1
+        server.process.send_signal(signal.SIGCONT)
 
 
 def test_status_without_a_server_says_so(tmp_path: Path) -> None:
