@@ -8,7 +8,7 @@ import resource
 import shutil
 import subprocess
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ class Engine:
         version: The engine's own.
         rootless: Whether it runs as a plain user.
         remapped: Whether it maps the users of containers to others (``userns-remap``).
+        passed_over: Why it is this one, where another one would come first.
     """
 
     kind: str
@@ -42,6 +43,7 @@ class Engine:
     version: str
     rootless: bool
     remapped: bool = False
+    passed_over: str = ""
 
     def run(self, *arguments: str) -> str:
         """What a command prints.
@@ -95,7 +97,8 @@ def find_engine(name: str | None) -> Engine:
     for candidate in (name,) if name else ENGINES:
         # a failure is not remembered: it may be repaired meanwhile
         try:
-            return _engine(candidate, os.environ.get("PATH"), os.environ.get("DOCKER_HOST"))
+            found = _engine(candidate, os.environ.get("PATH"), os.environ.get("DOCKER_HOST"))
+            return replace(found, passed_over=" ".join(problems))
         except SandboxUnavailableError as error:
             problems.append(f"{candidate}: {error}")
     raise SandboxUnavailableError("no container engine can be used. " + " ".join(problems))
@@ -225,4 +228,5 @@ def find_image(engine: Engine, image: str) -> str:
             raise SandboxUnavailableError(explained(engine.kind, text)) from error
     build = f"{engine.kind} build -t {image} ."
     get = f"{engine.kind} pull {image}" if "/" in image else f"{build} (in a checkout of envhub)"
-    raise SandboxUnavailableError(f"{engine.kind} has no image {image!r}; run: {get}")
+    asked = f" It was asked because of {engine.passed_over}" if engine.passed_over else ""
+    raise SandboxUnavailableError(f"{engine.kind} has no image {image!r}; run: {get}.{asked}")

@@ -59,7 +59,8 @@ def target_of(engine: Engine, image: str) -> Target:
     """
     try:
         said = engine.run(
-            *("run", "--rm", "--network", "none", "--read-only", "--cap-drop", "ALL"),
+            *("run", "--rm", "--no-healthcheck", "--network", "none", "--read-only"),
+            *("--cap-drop", "ALL"),
             *("--security-opt", "no-new-privileges", "--pull", "never"),
             *(word for limit in own_limits(engine) for word in ("--ulimit", limit)),
             *("--entrypoint", _INTERPRETER, image, "-I", "-c", _ASK),
