@@ -93,7 +93,7 @@ def find_engine(name: str | None) -> Engine:
     """
     if name is not None and name not in ENGINES:
         raise PolicyError(f"engine is {name!r}; it is one of {', '.join(ENGINES)}, or None")
-    problems = []
+    problems: list[str] = []
     for candidate in (name,) if name else ENGINES:
         # a failure is not remembered: it may be repaired meanwhile
         try:
