@@ -66,6 +66,9 @@ class Builder:
         self._check_manifest(loaded)
         if self._keeps and not loaded.jail.kept:
             loaded.jail.keep(deadline)
+        idle_s = self._repository.timeouts.idle_s
+        if idle_s is not None and idle_s < float("inf"):
+            loaded.jail.expire(idle_s, deadline)
         hosts = self._repository.spread(loaded, len(self._bounds), deadline)
         place = Place(loaded, hosts, next(_numbers), None)
         shards = range(len(hosts))

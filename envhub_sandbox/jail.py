@@ -100,6 +100,11 @@ class RemoteJail:
         expect(reply, m.Done)
         self.kept = True
 
+    def expire(self, idle_s: float, deadline: Deadline) -> None:
+        """From now on it ends once it has been idle for so long."""
+        message = m.ExpireIdle(self.number, max(1, int(idle_s * 1000)))
+        expect(self.client.request(message, deadline=deadline)[0], m.Done)
+
     def replace_hosts(self, dead: Sequence[int], deadline: Deadline) -> list[int]:
         """Fork a host in the place of each that has died; returns the new numbers, in order."""
         self.hosts = [host for host in self.hosts if host not in dead]

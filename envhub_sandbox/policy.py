@@ -32,6 +32,8 @@ class Timeouts:
         step_s: One ``step``.
         call_s: One ``call``, ``get_attr``, ``set_attr`` or ``render``.
         close_s: The environment's own ``close``; afterwards its processes are killed.
+        idle_s: Between two requests; then its processes are ended, and the next ``reset`` starts
+            others (a step says so). None, the default, leaves them alone.
     """
 
     startup_s: float | None = 300.0
@@ -39,6 +41,7 @@ class Timeouts:
     step_s: float | None = 300.0
     call_s: float | None = 300.0
     close_s: float | None = 5.0
+    idle_s: float | None = None
 
     def __post_init__(self) -> None:
         for item in fields(self):

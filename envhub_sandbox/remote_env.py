@@ -281,12 +281,25 @@ class RemoteEnv:
         with self._lock, self.repository.named():
             if self.lifecycle.state is State.PENDING:
                 self.lifecycle.on(Event.INTERRUPT)
+            if self.lifecycle.state is State.READY and self.repository.timeouts.idle_s is not None:
+                self._see_whether_it_expired()
+            if self.lifecycle.state is State.EXPIRED:
+                self._forget()
             if self.lifecycle.state is State.LATE:
                 self._catch_up()
             may_restart = self.repository.policy.restart != "never"
             if self.lifecycle.state is State.DEAD and may_restart:
                 self._restarts.spend("reset")
                 self._forget()
+
+    def _see_whether_it_expired(self) -> None:
+        assert self._loaded is not None
+        try:
+            self._loaded.jail.output("reset", Deadline(_CAUSE_S))
+        except WorkerDiedError as error:
+            if error.reason == "idle":
+                self._moved(Event.EXPIRY)
+        # of any other death the reset that follows hears as of its own
 
     def _catch_up(self) -> None:
         loaded, pending = self._loaded, self._pending
@@ -326,6 +339,8 @@ class RemoteEnv:
                 "use policy={'restart': 'on_reset'} and call reset()",
                 request=operation,
             )
+        if state is State.EXPIRED:
+            raise self._expired(operation, "it was idle for too long")
         if state is State.FOREIGN:
             raise WorkerError(
                 f"cannot {operation}: this environment belongs to another process, and this is a "
@@ -363,6 +378,8 @@ class RemoteEnv:
         except HostsDiedError:
             raise
         except EnvHubError as error:
+            if isinstance(error, WorkerDiedError) and error.reason == "idle":
+                raise self._expired(self._pending[1], error.detail) from None
             if self._revives and isinstance(error, WorkerError):
                 raise self._all_died(error) from error.__cause__
             raise self._dead(error) from error.__cause__
@@ -374,6 +391,12 @@ class RemoteEnv:
         self._pending = None
         self._moved(Event.REPLY)
         return received
+
+    def _expired(self, operation: str, why: str) -> WorkerDiedError:
+        self._moved(Event.EXPIRY)
+        self._pending = None
+        text = f"cannot {operation}: {why}, so its processes were ended; call reset() first"
+        return WorkerDiedError(text, reason="idle", request=operation, detail=why)
 
     def _late(self, operation: str, timeout_s: float | None) -> WorkerTimeoutError:
         assert self._loaded is not None

@@ -7,6 +7,7 @@ on. A host that breaks the rules loses its jail.
 from __future__ import annotations
 
 import itertools
+import os
 import secrets
 import signal
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ from typing import Protocol
 
 from envhub_worker.channel import close_fds
 from envhub_worker.deposits import Deposits
+from envhub_worker.idleness import Idleness
 from envhub_worker.jailspec import JailSpec, confinement_from_wire
 from envhub_worker.link import MAX_PENDING, HostLink
 from envhub_worker.loop import Loop
@@ -100,6 +102,7 @@ class JailEntry:
     opening: list[Opening] = field(default_factory=list)
     closing: list[Asker] = field(default_factory=list)
     kept: bool = False
+    idle: Idleness | None = None
     lost: dict[int, m.Died] = field(default_factory=dict)
     death: m.Died | None = None
     released: bool = False
@@ -246,8 +249,12 @@ class Jails:
             link = entry.links[host]
             fds = self._deposits.take(entry.number, host) if request.operation == ATTACH else []
             link.send(next(self._packet_ids), frames, (pending, index), fds)
+            if entry.idle is not None and fds:
+                entry.idle.watch(host, [os.dup(fd) for fd in fds[:2]])
             close_fds(fds)
             self._follow_writes(link)
+        if entry.idle is not None:
+            entry.idle.begin()
         if pending.dead:
             self._gather(pending)
 
@@ -274,6 +281,21 @@ class Jails:
         if entry is not None:
             entry.kept = True
             self._answers.reply(asker, m.Done())
+
+    def expire(self, asker: Asker, request: m.ExpireIdle) -> None:
+        """End it once it has done nothing for so long."""
+        entry = self._owned(asker, request.jail)
+        if entry is not None:
+            if entry.idle is None:
+                entry.idle = Idleness(request.idle_ms / 1000)
+            self._answers.reply(asker, m.Done())
+
+    def look(self) -> None:
+        """End the jails that have done nothing for longer than they may; about once a second."""
+        for entry in self.open_ones():
+            busy = any(link.pending for link in entry.links.values())
+            if entry.idle is not None and entry.idle.passed(busy):
+                self.end(entry, f"it was idle for more than {entry.idle.limit_s:g} s")
 
     def _pidfd_for(self, request: m.Deposit) -> int | None:
         entry = self._jails.get(request.jail)
@@ -315,6 +337,8 @@ class Jails:
         """Tell the last lines that a jail printed."""
         entry = self._owned(asker, request.jail, request.operation)
         if entry is not None:
+            if entry.idle is not None:
+                entry.idle.begin()  # so that the request that follows finds it alive
             entry.output.read()
             self._answers.reply(asker, m.Output(entry.output.text()))
 
@@ -367,6 +391,8 @@ class Jails:
             self._loop.unwatch(link.fileno())
             return  # its exit says more
         self._follow_writes(link)
+        if entry.idle is not None:
+            entry.idle.begin()
         for packet, (pending, index) in answers:
             pending.replies[index] = packet.frames
             self._gather(pending)
@@ -436,6 +462,8 @@ class Jails:
         entry.jail.kill_host(death.host)  # it may live, and have broken the rules
         entry.pids.pop(death.host, None)
         close_fds(self._deposits.take(entry.number, death.host))
+        if entry.idle is not None:
+            entry.idle.forget(death.host)
         link = entry.links.pop(death.host)
         self._loop.unwatch(link.fileno())
         for pending, index in link.pending.values():
@@ -493,6 +521,8 @@ class Jails:
         self._loop.unwatch(entry.output.fileno())
         self._loop.unwatch(entry.control)
         entry.output.close()
+        if entry.idle is not None:
+            entry.idle.close()
         for pending in _waiting(entry):
             death = m.Died(-1, "killed", None, None, "the jail was closed", "", pending.operation)
             self._answers.reply(pending.asker, death)

@@ -54,7 +54,7 @@ class Server:
         self._loop.watch(self._router, self._serve_clients)
         fd_path = fd_path or runtime_dir / "fds"
         self._jails = Jails(self._loop, self, runtime_dir, readable_roots, limits, fd_path)
-        self._loop.tick(lambda: self._gate.tick(self._sessions, self._jails))
+        self._loop.tick(self._tick)
         if client_pidfd is not None:
             self._loop.watch(client_pidfd, self.stop)
 
@@ -62,6 +62,10 @@ class Server:
     def endpoint(self) -> str:
         """Where it listens, with the port that was found for it."""
         return str(self._router.get_string(zmq.LAST_ENDPOINT))
+
+    def _tick(self) -> None:
+        self._jails.look()
+        self._gate.tick(self._sessions, self._jails)
 
     def stop_on(self, *signals: int) -> None:
         """End the loop at these signals; to be called on the main thread."""
@@ -192,6 +196,7 @@ _HANDLERS: dict[type[m.Message], Callable[[Jails, Asker, Any], None]] = {
     m.OpenJail: Jails.open,
     m.StartHosts: Jails.start_more,
     m.KeepJail: Jails.keep,
+    m.ExpireIdle: Jails.expire,
     m.CloseJail: Jails.close_jail,
     m.ReadOutput: Jails.read_output,
     m.FollowOutput: Jails.follow_output,

@@ -48,6 +48,7 @@ SAMPLES: list[m.Message] = [
     m.Packed("lz4", (-1, 4096)),
     m.GetSessions(),
     m.Sessions(({"client": "a", "session": "b", "heard_s": 0.5, "connections": 1, "jails": ()},)),
+    m.ExpireIdle(3, 60_000),
     m.KeepJail(3),
     m.RelayedPartly((2, 1), (1,)),
     m.Load(4, True, {"task": "pick"}, {"seed": 1}),

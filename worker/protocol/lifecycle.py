@@ -13,6 +13,7 @@ class State(Enum):
     PENDING = "waiting for a reply"
     REVIVING = "bringing back what has died"
     LATE = "waiting for a reply that is late"
+    EXPIRED = "ended, for it was idle"
     DEAD = "dead"
     FOREIGN = "another process's: this is a fork of it"
     CLOSED = "closed"
@@ -30,6 +31,7 @@ class Event(Enum):
     INTERRUPT = "whoever waited was interrupted"
     LOSS = "what died is to be brought back"
     REVIVAL = "it is back"
+    EXPIRY = "its jail was ended for being idle"
     DEATH = "its jail ended"
     FORGET = "its jail was given up"
     FORK = "this process is a fork of the one that made it"
@@ -51,6 +53,11 @@ TABLE: dict[tuple[State, Event], State] = {
     (State.PENDING, Event.DEATH): State.DEAD,
     (State.PENDING, Event.CLOSE): State.CLOSED,
     (State.PENDING, Event.LOSS): State.REVIVING,
+    (State.READY, Event.EXPIRY): State.EXPIRED,
+    (State.PENDING, Event.EXPIRY): State.EXPIRED,
+    (State.EXPIRED, Event.EXPIRY): State.EXPIRED,
+    (State.EXPIRED, Event.FORGET): State.IDLE,
+    (State.EXPIRED, Event.CLOSE): State.CLOSED,
     (State.REVIVING, Event.REVIVAL): State.READY,
     (State.REVIVING, Event.TIMEOUT): State.LATE,
     (State.REVIVING, Event.INTERRUPT): State.LATE,

@@ -372,6 +372,18 @@ class OutputBytes(Message):
     data: bytes
 
 
+@_message(30)
+@dataclass(frozen=True, slots=True)
+class ExpireIdle(Message):
+    """End a jail whose hosts do nothing for so many milliseconds. Reply: ``Done``, or ``Died``.
+
+    Whoever asks anything of it afterwards is told ``Died`` with the reason ``"idle"``.
+    """
+
+    jail: int
+    idle_ms: int
+
+
 # --- client and jail host ----------------------------------------------------------------------
 
 

@@ -62,6 +62,10 @@ class Mortal(gym.Env):
     def last_words(self):
         os._exit(5)
 
+    def rest(self, seconds: float) -> None:
+        """Take a while, asleep."""
+        time.sleep(seconds)
+
     def hello(self) -> str:
         return "hello"
 
