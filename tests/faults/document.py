@@ -34,6 +34,63 @@ In every cell:
 or the answer. Timeouts were 1 second for requests, 5 for starting and 1 for closing. `reset()`
 after a death needs `policy={"restart": "on_reset"}`; after a timeout it needs nothing.
 
+## Deaths that are survived
+
+`policy={"restart": "transparent"}` brings back what has died, in the middle of a step or a reset.
+Only the sub-environments of the process that died come back, in a fresh process of the same jail;
+the others go on, and their rows are their real results. `tests/faults/test_transparent.py` has a
+test for each sentence here.
+
+- **In a step** the rows of the dead have the observation of a fresh reset, reward 0, terminated
+  False and truncated True; the infos have `worker_restarted` for them, with its mask
+  `_worker_restarted`. What they did since the last observation is lost with them, and so is the
+  final observation of their episode: mask these rows where a final observation is learnt from.
+- **Afterwards** they are as after any truncation in their autoreset mode. *NEXT_STEP*: the next
+  action is not looked at, that step resets them (again). *SAME_STEP*: they are in the next episode,
+  of which the observation is the first; it stands in `final_obs` too, and `final_info` is empty.
+  *DISABLED*: a step before their `reset` is refused as Gymnasium refuses it. An environment with a
+  `step` of its own comes back as a whole: it is reset, and its next step is a step.
+- **In a reset** the fresh process is asked for the same reset with the same seeds, once, and the
+  infos have `worker_restarted`. A reset with a mask also brings back those rows of the dead
+  process that the mask does not name: their episodes begin anew.
+- **In a `call`, `get_attr`, `set_attr` or `render`** nothing is repeated, for nobody knows how far
+  it came: it raises `WorkerDiedError`, and so do others until a step (which then reports the rows
+  as above) or a reset has brought them back. A death between two requests is met by the next. What
+  `set_attr` and calls had changed is lost.
+- **Seeds**: whoever was last seeded with `s` comes back with
+  `int(np.random.SeedSequence((abs(s), n)).generate_state(1)[0])` at the environment's `n`-th
+  restart, so that a seeded run with the same deaths is the same run. Whoever was never seeded
+  draws a seed.
+- **Who dies**: an exit, a signal, a crash or the cpu limit takes one process. The memory limit is
+  the jail's: where the kernel does not say whom it ended for it, all processes end and all rows
+  come back. The jail's own end, or the server's, takes all rows, and they come back in another
+  jail. A suite that `make_env` has built at once shares one process: a death there is everybody's,
+  and each environment is told at its own next request.
+- **How long**: the step waits for the others as long as `step_s` says; starting and resetting have
+  `startup_s` and `reset_s` for themselves. A timeout stays a `WorkerTimeoutError`, and `reset()`
+  recovers, also if somebody has died meanwhile.
+- **How often**: `restart_budget` and `restart_backoff_s` count every time that a step or a reset
+  had to bring something back. When they are used up, or when what is coming back dies again or
+  cannot be built, the error says how, and the environment is dead: the next `reset()` starts afresh
+  if the budget allows. A process that breaks the rules of the wire is not brought back.
+- **What stays**: the fresh process has slabs and a stream that the dead one never saw. Its children
+  are ended with it; daemons that have left its session end with the jail, and until then count
+  towards its limits. Shards of one environment are one repository's code in one jail: they are not
+  protected from each other's writes to the batch of results that they share.
+
+Whatever is asked of a timed out, dead or restarted environment, no answer is taken for another's:
+`tests/faults/test_attribution.py` drives it through random sequences of all these, and
+`benchmarks/soak.py` through a million steps beside an oracle.
+
+## Time without work
+
+With `timeouts={"idle_s": 60}` the processes of an environment of which nothing is asked for a
+minute (and up to two seconds more: the server looks once a second) are ended, and their memory is
+given back. That is no death: no policy is asked and no budget spent. The next `reset()` starts
+others; a step or a call before it raises a `WorkerDiedError` with `reason="idle"` that says so.
+Each task of a suite has its own clock, unless `make_env` has built them all at once. Whoever owes
+an answer is not idle.
+
 ## However the client ends
 
 `tests/faults/test_nothing_left.py` ends clients: by return without `close()`, exceptions,
