@@ -33,6 +33,11 @@ SESSION = secrets.token_bytes(16)
 _contexts: dict[int, zmq.Context[zmq.Socket[bytes]]] = {}
 
 
+def far_session() -> bytes:
+    """Our session on other hosts, where a fork of this process is another client."""
+    return SESSION + os.getpid().to_bytes(4, "little")
+
+
 def _context() -> zmq.Context[zmq.Socket[bytes]]:
     """This process's ZeroMQ context: one that came through a fork cannot be used."""
     pid = os.getpid()
@@ -94,7 +99,8 @@ class WorkerClient:
     def hello(self, deadline: Deadline) -> m.Welcome:
         """Agree on a protocol version."""
         self._compression = ""
-        greeting = m.Hello(m.OLDEST_VERSION, m.VERSION, SESSION)
+        session = SESSION if self._far is None else far_session()
+        greeting = m.Hello(m.OLDEST_VERSION, m.VERSION, session)
         reply, _ = self.request(greeting, deadline=deadline)
         welcome = expect(reply, m.Welcome)
         if not m.OLDEST_VERSION <= welcome.version <= m.VERSION:

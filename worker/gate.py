@@ -39,6 +39,8 @@ _HEARTBEAT_MS = 15_000
 _HEARTBEAT_TIMEOUT_MS = 60_000
 _BACKLOG = 64
 _SNDHWM = 32
+_FORGOTTEN_S = 3600.0
+"""Where silent clients keep their jails, those without any are forgotten after so long."""
 ANYBODY = bytes(KEY_BYTES)
 """The key of clients that have none, behind ``--insecure-loopback``."""
 
@@ -238,11 +240,14 @@ class RemoteGate:
             return m.Sessions(tuple(self._sessions_of(key, sessions, jails)))
         return request
 
-    def _refuse_unless_authorized(self, key: bytes) -> None:
+    def _is_known(self, key: bytes) -> bool:
         rules = self._rules
         if rules.keys is None or key in rules.operators:
-            return
-        if rules.authorized.name_of(key) is None:
+            return True
+        return rules.authorized.name_of(key) is not None
+
+    def _refuse_unless_authorized(self, key: bytes) -> None:
+        if not self._is_known(key):
             raise RefusedError("WorkerError", "your key is not authorised any more")
 
     def _check_open(self, key: bytes, request: m.OpenJail, jails: Jails) -> m.OpenJail:
@@ -312,17 +317,25 @@ class RemoteGate:
             self._rules.authorized.refresh()
         except (OSError, ValueError) as error:
             self._log.say("authorised clients", f"kept as they were: {error}")
-        if not self.idle_s:
-            return
-        for session in sessions.idle(self.idle_s):
-            self._end(session, sessions, jails)
+        for session in sessions.all():
+            if not self._is_known(session.key):
+                self._end(session, sessions, jails, "its key is not authorised any more")
+        for session in sessions.idle(self.idle_s or _FORGOTTEN_S):
+            if self.idle_s:
+                why = f"nothing was heard of its client for {self.idle_s} s"
+                self._end(session, sessions, jails, why)
+            elif not jails.open_ones(session.owner):
+                sessions.drop(session)
+        if self.idle_s:
+            self._end_unheld(sessions, jails)
+
+    def _end_unheld(self, sessions: Sessions, jails: Jails) -> None:
         for session in sessions.all():
             for entry in jails.open_ones(session.owner):
                 if sessions.unheld(session, entry.number, self.idle_s):
                     self._reap(entry, jails, "its client gave it up")
 
-    def _end(self, session: Session, sessions: Sessions, jails: Jails) -> None:
-        why = f"nothing was heard of its client for {self.idle_s} s"
+    def _end(self, session: Session, sessions: Sessions, jails: Jails, why: str) -> None:
         for entry in jails.open_ones(session.owner):
             self._reap(entry, jails, why)
         self._uploads.forget(session.owner)

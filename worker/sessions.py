@@ -10,6 +10,9 @@ from dataclasses import dataclass, field
 MAX_CONNECTIONS = 4096
 """Of one session. libzmq does not tell which of them have gone: the longest unused is dropped."""
 
+MAX_HELD = 8192
+"""Jails of one session whose last mention is remembered."""
+
 
 @dataclass
 class Session:
@@ -106,8 +109,9 @@ class Sessions:
     def keep(self, session: Session, jails: tuple[int, ...]) -> None:
         """Write down which jails the client holds."""
         now = self._clock()
-        before = session.held or {}
-        session.held = {**before, **dict.fromkeys(jails, now)}
+        listed = dict.fromkeys(jails, now)
+        before = [item for item in (session.held or {}).items() if item[0] not in listed]
+        session.held = dict([*before, *listed.items()][-MAX_HELD:])
 
     def unheld(self, session: Session, jail: int, idle_s: float) -> bool:
         """Whether a jail has been held by nobody for so long; the first answer starts the time."""

@@ -13,6 +13,8 @@ import pytest
 import zmq
 
 from envhub_sandbox import make_env
+from envhub_sandbox.client import far_session
+from envhub_sandbox.deadline import Deadline
 from envhub_worker import keys
 from envhub_worker.keys import KeyPair
 from envhub_worker.protocol import messages as m
@@ -87,10 +89,8 @@ def peer(server: Listening, pair: KeyPair, *, routing_id: bytes = b"") -> Iterat
 @pytest.fixture
 def mallory(shared: Listening) -> Iterator[Peer]:
     """She has said Hello, under Alice's session: what she claims to be is worth nothing."""
-    from envhub_sandbox.client import SESSION
-
     with peer(shared, MALLORY) as found:
-        assert isinstance(found.ask(m.Hello(1, 2, SESSION)), m.Welcome)
+        assert isinstance(found.ask(m.Hello(1, 2, far_session())), m.Welcome)
         yield found
 
 
@@ -106,16 +106,10 @@ def test_another_clients_jail_is_not_there(alice: Any, mallory: Peer) -> None:
         payload = (b"x",) if isinstance(request, m.Relay) else ()
         assert "there is no jail" in mallory.refused(request, *payload).message
     assert isinstance(mallory.ask(m.CloseJail(jail.number)), m.Done)
-    assert jail.output("", _deadline()) is not None
+    assert jail.output("", Deadline(30)) is not None
     status = mallory.ask(m.GetStatus())
     assert isinstance(status, m.Status)
     assert status.jails == ()
-
-
-def _deadline() -> Any:
-    from envhub_sandbox.deadline import Deadline
-
-    return Deadline(30)
 
 
 def test_only_ones_own_sessions_are_shown(alice: Any, mallory: Peer) -> None:

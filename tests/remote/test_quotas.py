@@ -22,7 +22,7 @@ from envhub_worker.quotas import (
     check_jail,
     check_policy,
 )
-from envhub_worker.sessions import Sessions
+from envhub_worker.sessions import MAX_HELD, Sessions
 from tests.remote.listening import Listening, listening
 from tests.support.processes import eventually
 
@@ -89,6 +89,17 @@ def test_a_session_belongs_to_its_key() -> None:
     assert mine.owner != theirs.owner
     assert sessions.find(b"id", b"a" * 32) is mine
     assert sessions.find(b"id", b"c" * 32) is None
+
+
+def test_what_a_client_says_it_holds_is_bounded() -> None:
+    """It may list what it likes, as often as it likes: the latest are remembered."""
+    sessions = Sessions()
+    session = sessions.connect(b"id", b"", b"name")
+    for start in range(0, 3 * MAX_HELD, 4096):
+        sessions.keep(session, tuple(range(start, start + 4096)))
+    assert session.held is not None
+    assert len(session.held) == MAX_HELD
+    assert 3 * MAX_HELD - 1 in session.held
 
 
 def test_jails_that_nobody_holds_are_found() -> None:

@@ -181,6 +181,7 @@ def test_a_key_that_is_taken_off_the_list_is_out(tmp_path: Path, repository: Pat
             assert [one["client"] for one in server.sessions()] == ["alice"]
             authorized.write_text(f"{key_text(other.public)} bob\n")
             assert eventually(lambda: _is_refused(suites.env))
+            assert eventually(lambda: server.jails() == 0)
         with pytest.raises(SandboxUnavailableError, match="does not know our key"):
             make_env(repository, n_envs=2, sandbox=sandbox)
 
