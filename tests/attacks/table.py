@@ -5,12 +5,12 @@ A run knows one user's columns; those of the other one are taken over from the p
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from tests.attacks.harness import Row
 
-_COLUMNS = (
+COLUMNS = (
     "control, user",
     "control, root",
     "strict, user",
@@ -18,7 +18,7 @@ _COLUMNS = (
     "no-userns, user",
     "no-userns, root",
 )
-_HEAD = """# Attacks
+HEAD = """# Attacks
 
 Written by the attack suite (`ENVHUB_ATTACK_TABLE=docs/attacks.md pytest tests/attacks`, once as a
 plain user and once as root); do not edit by hand. Each attack runs twice in the same test: without
@@ -38,9 +38,11 @@ _START = "| attack |"
 Page = dict[str, dict[str, dict[str, str]]]
 
 
-def update(path: Path, rows: Iterable[Row]) -> None:
+def update(
+    path: Path, rows: Iterable[Row], *, columns: Sequence[str] = COLUMNS, head: str = HEAD
+) -> None:
     """Write ``rows`` into the page at ``path``, over what they know better."""
-    page = _parse(path.read_text()) if path.exists() else {}
+    page = _parse(path.read_text(), columns) if path.exists() else {}
     notes = _notes(path.read_text()) if path.exists() else {}
     for row in rows:
         cells = page.setdefault(row.family, {}).setdefault(row.attack, {})
@@ -50,21 +52,21 @@ def update(path: Path, rows: Iterable[Row]) -> None:
             notes[f"{row.attack}, {row.user}"] = row.detail
         else:
             notes.pop(f"{row.attack}, {row.user}", None)
-    path.write_text(_page(page, notes))
+    path.write_text(_page(page, notes, columns, head))
 
 
 def attacks_on(page: str) -> set[str]:
     """The titles of all attacks on a page."""
-    return {attack for family in _parse(page).values() for attack in family}
+    return {attack for family in _parse(page, COLUMNS).values() for attack in family}
 
 
-def _page(page: Page, notes: dict[str, str]) -> str:
-    parts = [_HEAD]
+def _page(page: Page, notes: dict[str, str], columns: Sequence[str], head: str) -> str:
+    parts = [head]
     for family in sorted(page):
-        parts.append(f"\n## {family}\n\n{_START} {' | '.join(_COLUMNS)} |")
-        parts.append("|---" * (len(_COLUMNS) + 1) + "|")
+        parts.append(f"\n## {family}\n\n{_START} {' | '.join(columns)} |")
+        parts.append("|---" * (len(columns) + 1) + "|")
         for attack in sorted(page[family]):
-            cells = [page[family][attack].get(column, "") for column in _COLUMNS]
+            cells = [page[family][attack].get(column, "") for column in columns]
             parts.append(f"| {attack} | {' | '.join(cells)} |")
     if notes:
         parts.append("\n## Controls that are not possible\n")
@@ -72,7 +74,7 @@ def _page(page: Page, notes: dict[str, str]) -> str:
     return "\n".join(parts) + "\n"
 
 
-def _parse(text: str) -> Page:
+def _parse(text: str, columns: Sequence[str]) -> Page:
     page: Page = {}
     family = ""
     for line in text.splitlines():
@@ -80,7 +82,7 @@ def _parse(text: str) -> Page:
             family = line[3:]
         elif line.startswith("| ") and not line.startswith(_START):
             attack, *cells = (cell.strip() for cell in line.strip("|").split("|"))
-            page.setdefault(family, {})[attack] = dict(zip(_COLUMNS, cells, strict=True))
+            page.setdefault(family, {})[attack] = dict(zip(columns, cells, strict=True))
     return page
 
 

@@ -1,7 +1,8 @@
 """What the tests of containers share: an engine with the image, or a reason to skip.
 
 ``ENVHUB_TEST_IMAGE`` names the image; ``envhub-worker`` by default, which must be built from this
-checkout: ``docker build -t envhub-worker .``
+checkout: ``docker build -t envhub-worker .``. With
+``ENVHUB_CONTAINER_TABLE=docs/attacks-containers.md`` a run as root writes the table of attacks.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -17,10 +19,27 @@ import pytest
 from envhub_sandbox.errors import SandboxUnavailableError
 from envhub_sandbox.sandboxes.docker import DockerSandbox
 from envhub_sandbox.sandboxes.engines import Engine, find_engine, find_image
+from tests.attacks import table
+from tests.attacks.harness import USER, Row
 from tests.compliance.conftest import lane, pytest_generate_tests
-from tests.containers.kit import IMAGE
+from tests.containers.kit import IMAGE, Walls
 
 __all__ = ["lane", "pytest_generate_tests"]
+
+PLACES = ("strict-jail", "bare-jail", "walls")
+_COLUMNS = ("control, root", *(f"{place}, root" for place in PLACES))
+_HEAD = """# Attacks in containers
+
+Written by `tests/containers` (`ENVHUB_CONTAINER_TABLE=docs/attacks-containers.md pytest
+tests/containers`, as root); do not edit by hand. The words are those of [attacks.md](attacks.md):
+the control runs without a container, in the same test, and has to succeed.
+
+- **strict-jail**: in a jail with namespaces, in a container: what `sandbox="docker"` gives.
+- **bare-jail**: in a jail without, in a container: where namespaces cannot be had inside.
+- **walls**: in no jail at all, next to the server, should a jail be broken.
+"""
+_PROPERTY = "container attack"
+_rows: list[Row] = []
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -47,3 +66,25 @@ def open_ground() -> Iterator[Path]:
     folder.chmod(0o777)
     yield folder
     shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(params=PLACES)
+def walls(request: pytest.FixtureRequest, engine: Engine) -> Iterator[Walls]:
+    """Where an attack is tried."""
+    made = Walls(request.param, engine)
+    yield made
+    for row in made.rows:
+        request.node.user_properties.append((_PROPERTY, asdict(row)))
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Collect the rows; with xdist they come from the workers through the reports."""
+    if report.when == "teardown":
+        _rows.extend(Row(**row) for name, row in report.user_properties if name == _PROPERTY)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Write the table, if asked to."""
+    path = os.environ.get("ENVHUB_CONTAINER_TABLE")
+    if path and _rows and USER == "root" and not hasattr(session.config, "workerinput"):
+        table.update(Path(path), _rows, columns=_COLUMNS, head=_HEAD)

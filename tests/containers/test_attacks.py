@@ -30,12 +30,6 @@ PIDS, FORKS = 96, 240
 _SOCKET = Path("/var/run/docker.sock")
 
 
-@pytest.fixture(params=["strict-jail", "bare-jail", "walls"])
-def walls(request: pytest.FixtureRequest, engine: Engine) -> Walls:
-    """Where an attack is tried."""
-    return Walls(request.param, engine)
-
-
 def an_address_of_this_machine() -> str:
     """One that a network of any kind would lead to; the loopback has another meaning inside."""
     found = [
