@@ -1,0 +1,130 @@
+"""``envhub replay`` of what came from a Hub or from somebody: a pin runs, and the user decides."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox import errors, make_env
+from tests.hub.olah_server import OlahServer
+from tests.integration.test_cli_run import envhub
+from tests.support.repositories import write_repository
+from tests.support.samples import sample
+
+_KWARGS = {"moment": "step", "fault": "exit"}
+
+
+def crashed(folder: Path, reference: Any, **options: Any) -> Path:
+    """The bundle of an environment that dies in its third step."""
+    policy = {"crash_folder": str(folder), **options.pop("policy", {})}
+    with make_env(reference, env_kwargs=_KWARGS, policy=policy, **options) as suites:
+        env = next(iter(suites.envs()))
+        env.reset(seed=1)
+        env.step([0])
+        env.step([0])
+        with pytest.raises(errors.WorkerDiedError) as caught:
+            env.step([1])
+    return Path(str(caught.value.bundle))
+
+
+def test_the_pinned_commit_runs_again(
+    olah: OlahServer, hub_cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the branch has become; the Hub is named by the user, or not at all."""
+    code = (sample("faulty") / "env.py").read_text()
+    repository = olah.repository("org/cli-replays", "model")
+    commit = repository.commit({"env.py": code})
+    place = {"endpoint": olah.endpoint, "hub_cache_dir": hub_cache}
+    bundle = crashed(tmp_path / "crashes", "org/cli-replays@main", **place)
+    repository.commit({"env.py": code.replace("os._exit(7)", "os._exit(8)")})
+    refused = envhub("replay", bundle)
+    assert refused.returncode == 2
+    assert "endpoint=" in refused.stderr
+    assert "--grant" in refused.stderr
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    for option in (["--grant"], ["--endpoint", olah.endpoint, "--hub-cache-dir", hub_cache]):
+        done = envhub("replay", bundle, *option)
+        assert done.returncode == 0, done.stderr
+        assert f"org/cli-replays@{commit[:12]}" in done.stdout
+        assert done.stdout.count("exit (exit code 7), at request 4 (step 3)") == 2
+
+
+def test_a_weaker_policy_is_not_granted_by_the_bundle(tmp_path: Path) -> None:
+    """Somebody else's bundle cannot open the network; the user can, or says what to take."""
+    bundle = crashed(tmp_path, sample("faulty"), policy={"network": "loopback"})
+    refused = envhub("replay", bundle)
+    assert refused.returncode == 2
+    assert "network='loopback'" in refused.stderr
+    assert envhub("replay", bundle, "--grant").returncode == 0
+
+
+def test_what_cannot_be_replayed_is_refused(tmp_path: Path) -> None:
+    """Not in this process, not from anywhere, and not with a task that is no more."""
+    bundle = crashed(tmp_path, sample("faulty"))
+    assert envhub("replay", bundle, "--sandbox", "none").returncode == 2
+    assert envhub("replay", tmp_path).returncode == 2
+    file = bundle / "bundle.json"
+    document = json.loads(file.read_text())
+    document["task"]["suite"] = "\x1b[31mother"
+    file.write_text(json.dumps(document))
+    refused = envhub("replay", bundle)
+    assert refused.returncode == 2
+    assert "so nothing can be repeated" in refused.stderr
+    assert "\x1b" not in refused.stderr
+
+
+_FUSE = """
+import os
+import gymnasium as gym
+import numpy as np
+
+class Fuse(gym.Env):
+    observation_space = gym.spaces.Box(0, 100, (1,))
+    action_space = gym.spaces.Discrete(2)
+    def __init__(self, length):
+        self.left = length
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+    def step(self, action):
+        self.left -= 1
+        if not self.left:
+            os._exit(3)
+        return np.zeros(1, np.float32), 0.0, False, False, {}
+
+def make_env(n_envs=1, use_async_envs=False, cfg=None, tasks=("a", "b")):
+    def one():
+        return gym.vector.SyncVectorEnv([lambda: Fuse(cfg.lengths["long"][1])] * n_envs)
+    return {"fuses": {task: one() for task in tasks}}
+"""
+
+
+class Config:
+    """As LeRobot's: the fields are the repository's business."""
+
+    def __init__(self, hub_path: Path) -> None:
+        self.hub_path = str(hub_path)
+        self.lengths = {"long": (1, 5)}
+
+
+def test_a_config_and_a_task_are_found_again(tmp_path: Path) -> None:
+    """``cfg`` is made again out of plain values; of a suite the task that died is repeated."""
+    config = Config(write_repository(tmp_path / "fuse", _FUSE))
+    policy = {"crash_folder": str(tmp_path / "crashes")}
+    with make_env(config, env_kwargs={"tasks": ["x", "y"]}, policy=policy) as suites:
+        env = suites["fuses"]["y"]
+        env.reset(seed=1)
+        with pytest.raises(errors.WorkerDiedError) as caught:
+            _burn(env)
+    done = envhub("replay", str(caught.value.bundle), "--json")
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    assert (document["doubts"], document["replayed"]["steps"]) == ([], 5)
+
+
+def _burn(env: Any) -> None:
+    for _ in range(10):
+        env.step([0])
