@@ -18,12 +18,13 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from envhub_worker import __version__, keys
+from envhub_worker import __version__, container, keys
 from envhub_worker.gate import RemoteGate, Rules
 from envhub_worker.keys import AuthorizedClients, KeyPair
+from envhub_worker.lockdown import landlock, probe
 from envhub_worker.lockdown.scratch import remove_tree
 from envhub_worker.protocol.confinement import GIB, MIB
 from envhub_worker.protocol.keys import key_text
@@ -93,7 +94,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _listen(arguments: argparse.Namespace, state: Path) -> int:
     check_bind(arguments.bind, arguments.insecure_loopback)
-    identity = _identity(arguments, state)
+    strongest = container.profiles(probe.probe()["layers"], landlock.version())
+    identity = replace(_identity(arguments, state), profile=(*strongest, "strict")[0])
     _raise_file_limit()
     runtime_dir = Path(tempfile.mkdtemp(prefix="envhub-"))
     try:
@@ -162,6 +164,7 @@ class Identity:
         client: The one client that was made, if there is no such file.
         client_file: Where its secret lies.
         fresh: Whether that was made just now.
+        profile: The strongest profile that jails can have here.
     """
 
     keys: KeyPair | None
@@ -169,6 +172,7 @@ class Identity:
     client: KeyPair | None = None
     client_file: Path | None = None
     fresh: bool = False
+    profile: str = "strict"
 
     @property
     def public(self) -> str:
@@ -205,11 +209,14 @@ def announcement(endpoint: str, identity: Identity) -> str:
     """What is printed at the start: the endpoint, the public key, and what a client writes."""
     lines = [f"envhub-worker {__version__} listens on {endpoint}"]
     reached = reachable(endpoint)
+    policy = "" if identity.profile == "strict" else f", policy={{'profile': {identity.profile!r}}}"
+    if policy:
+        lines.append(f"jails here can have the profile {identity.profile!r} at most")
     if reached != endpoint:
         lines.append(f"(on all interfaces; from another host write its name for {reached!r})")
     if identity.keys is None:
         lines += ["No keys: every user of this machine can run code here.", ""]
-        client = f"RemoteSandbox({reached!r}, insecure_loopback=True)"
+        client = f"RemoteSandbox({reached!r}, insecure_loopback=True){policy}"
         return "\n".join([*lines, f"sandbox=envhub_sandbox.{client}"])
     lines.append(f"server's public key: {identity.public}")
     lines.append("")
@@ -225,9 +232,9 @@ def announcement(endpoint: str, identity: Identity) -> str:
         secret = f"<what {identity.client_file} holds>"
     lines.append(
         f'  sandbox=envhub_sandbox.RemoteSandbox("{reached}", server_key="{identity.public}", '
-        f'client_key="{secret}")'
+        f'client_key="{secret}"){policy}'
     )
-    lines.append("or, in its environment, and then sandbox=" + f'"{reached}":')
+    lines.append(f'or, in its environment, and then sandbox="{reached}"{policy}:')
     lines.append(f"  ENVHUB_SERVER_KEY={identity.public} ENVHUB_CLIENT_KEY={secret!r}")
     return "\n".join(lines)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import os
 import signal
 import stat
@@ -105,6 +106,16 @@ def test_a_server_says_what_its_client_has_to_write(
         monkeypatch.setenv(name, value.strip("'"))
     with make_env(repository, sandbox=server.endpoint) as suites:
         suites.env.reset(seed=1)
+
+
+def test_the_line_names_the_profile_where_the_default_cannot_be_had() -> None:
+    """In most containers: what is printed must work when it is pasted."""
+    identity = listen.Identity(keys.generate(), None, keys.generate(), Path("x"), True, "no-userns")
+    said = listen.announcement("tcp://0.0.0.0:5555", identity)
+    assert said.count("policy={'profile': 'no-userns'}") == 2
+    assert 'RemoteSandbox("tcp://127.0.0.1:5555"' in said
+    strict = dataclasses.replace(identity, profile="strict")
+    assert "policy=" not in listen.announcement("tcp://127.0.0.1:1", strict)
 
 
 def test_a_second_start_keeps_the_keys_and_does_not_print_the_secret(tmp_path: Path) -> None:
