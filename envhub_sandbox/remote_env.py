@@ -13,15 +13,14 @@ import time
 import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from time import perf_counter_ns
 from typing import Any, TypeVar
 
+from envhub_sandbox import survivors
 from envhub_sandbox.building import Builder, Place
 from envhub_sandbox.deadline import Deadline, StartupDeadline
 from envhub_sandbox.errors import (
     EnvHubError,
-    RemoteProtocolError,
     WorkerDiedError,
     WorkerError,
     WorkerTimeoutError,
@@ -38,6 +37,7 @@ from envhub_sandbox.results import Results, StepResult
 from envhub_sandbox.reviving import SeedBook, marked, resets, truncated
 from envhub_sandbox.sharding import PaceBook
 from envhub_sandbox.stats import LEDGER, Counters, Labels, lane_step_bytes
+from envhub_sandbox.survivors import Requests
 from envhub_worker.protocol import batches, slabs
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
@@ -229,7 +229,7 @@ class RemoteEnv:
             return self._lane.wait(timeout_s)
         except JailGoneError:
             if self._loaded is not None and self._loaded.jail.kept:
-                return self._wait_for_survivors(self._lane, timeout_s)
+                return self._wait_for_survivors(timeout_s)
             raise self._cause_of_death() from None
 
     def _lane_infos(
@@ -256,7 +256,8 @@ class RemoteEnv:
         try:
             [reply] = self._collect(Deadline(timeout_s), timeout_s)
         except HostsDiedError as deaths:
-            raise self._with_all_shards(deaths, [self._hosts.index(host)]) from None
+            asked = [self._hosts.index(host)]
+            raise survivors.among_all(deaths, asked, len(self.bounds)) from None
         check(reply)
         return typed(reply, m.Value).value
 
@@ -380,8 +381,9 @@ class RemoteEnv:
         except EnvHubError as error:
             if isinstance(error, WorkerDiedError) and error.reason == "idle":
                 raise self._expired(self._pending[1], error.detail) from None
-            if self._revives and isinstance(error, WorkerError):
-                raise self._all_died(error) from error.__cause__
+            open_still = self.lifecycle.state is not State.CLOSED
+            if self._revives and open_still and isinstance(error, WorkerError):
+                raise survivors.all_died(error, len(self.bounds)) from error.__cause__
             raise self._dead(error) from error.__cause__
         except BaseException as error:  # Ctrl-C, or whatever else a signal handler raises or does
             if self.lifecycle.state is State.CLOSED and isinstance(error, Exception):
@@ -449,40 +451,12 @@ class RemoteEnv:
 
     # --- deaths that are survived --------------------------------------------------------------
 
-    def _wait_for_survivors(self, lane: FastLane, timeout_s: float | None) -> list[Outcome]:
-        """After a death: what all the others answer; all outcomes if it came after its answer."""
+    def _wait_for_survivors(self, timeout_s: float | None) -> list[Outcome]:
+        assert self._place is not None
+        assert self._lane is not None
         if timeout_s is not None and self.lifecycle.state is State.PENDING:
-            timeout_s = max(0.0, timeout_s - lane.waited_s)
-        living = lane.survivors(Deadline(timeout_s))
-        dead = [index for index in range(len(lane.shards)) if index not in living]
-        if not dead:  # the next step meets it
-            return [shard.outcome() for shard in lane.shards]
-        for index in living:
-            lane.shards[index].outcome()  # wanted or not: later columns are of this schema
-        assert self._loaded is not None
-        jail = self._loaded.jail
-        asked = [(self._hosts[index], m.FetchInfos(self._number)) for index in dead]
-        try:
-            jail.receive(jail.send("step", asked), Deadline(_CAUSE_S))
-        except HostsDiedError as deaths:
-            raise self._with_all_shards(deaths, dead) from None
-        raise RemoteProtocolError("the worker says that a process lives which has died")
-
-    def _with_all_shards(self, deaths: HostsDiedError, asked: list[int]) -> HostsDiedError:
-        """The deaths of those that were asked, as deaths among all shards."""
-        if deaths.jail_gone:
-            return deaths
-        by_shard = {asked[place]: death for place, death in deaths.deaths.items()}
-        return HostsDiedError([None] * len(self.bounds), by_shard)
-
-    def _all_died(self, error: WorkerError) -> EnvHubError:
-        """The jail has ended, and all shards with it."""
-        if self.lifecycle.state is State.CLOSED:
-            return self._dead(error)
-        if not isinstance(error, WorkerDiedError):  # a sibling has given the jail up
-            error = WorkerDiedError(str(error), reason="killed")
-        shards = range(len(self.bounds))
-        return HostsDiedError([None for _ in shards], dict.fromkeys(shards, error), jail_gone=True)
+            timeout_s = max(0.0, timeout_s - self._lane.waited_s)
+        return survivors.wait(self._place, Deadline(timeout_s))
 
     def _survive_request(self, deaths: HostsDiedError) -> list[m.Message]:
         """A reset is done in fresh hosts; anything else is not repeated.
@@ -518,8 +492,11 @@ class RemoteEnv:
         """
         assert self._pending is not None
         try:
-            by_lane = self._lane is not None and self._pending[1] == "step"
-            replies = self._of_lane(deaths) if by_lane else deaths.replies
+            replies = deaths.replies
+            if self._lane is not None and self._pending[1] == "step":
+                assert self._place is not None
+                found = (self.manifest, self.bounds, self.results)
+                replies = survivors.answers_by_lane(self._place, deaths, *found)
             for reply in replies:
                 if reply is not None:
                     check(reply)
@@ -529,31 +506,7 @@ class RemoteEnv:
             raise
         return replies
 
-    def _of_lane(self, deaths: HostsDiedError) -> list[m.Message | None]:
-        lane, loaded = self._lane, self._loaded
-        assert lane is not None
-        assert loaded is not None
-        parts: list[m.Message | None] = [None] * len(self.bounds)
-        space = self.manifest.single_observation_space
-        observations = batches.split(space, lane.observation(), self.bounds)
-        flags = lane.flags()
-        for index, bounds in enumerate(self.bounds):
-            if index in deaths.deaths:
-                continue
-            asked = [(self._hosts[index], m.FetchInfos(self._number))]
-            fetch = partial(loaded.jail.exchange, "step", asked, Deadline(_CAUSE_S))
-            try:
-                info = self.results.lane_info(lane.shards[index], fetch)
-            except WorkerDiedError as error:
-                deaths.deaths[index] = error
-                continue
-            rewards, over, cut = (column[slice(*bounds)] for column in flags)
-            parts[index] = m.StepDone(observations[index], rewards, over, cut, info)
-        return parts
-
-    def _revive(
-        self, deaths: HostsDiedError, requests: Callable[[int], list[m.Message]]
-    ) -> dict[int, m.Message]:
+    def _revive(self, deaths: HostsDiedError, requests: Requests) -> dict[int, m.Message]:
         """Bring dead shards back; returns what their fresh hosts answer to the last request."""
         self._moved(Event.LOSS)
         self._keep_crash(deaths.first)
@@ -579,9 +532,7 @@ class RemoteEnv:
         self._moved(Event.REVIVAL)
         return replies
 
-    def _bring_back(
-        self, deaths: HostsDiedError, requests: Callable[[int], list[m.Message]]
-    ) -> dict[int, m.Message]:
+    def _bring_back(self, deaths: HostsDiedError, requests: Requests) -> dict[int, m.Message]:
         assert self._pending is not None
         if any(death.reason == "protocol" for death in deaths.deaths.values()):
             raise deaths.first  # whoever breaks the rules is given no second chance
@@ -608,20 +559,13 @@ class RemoteEnv:
             assert self._place is not None
             self._settle(self._builder.rebuild(self._place, dead, deadline))
 
-    def _ask_anew(
-        self, dead: list[int], requests: Callable[[int], list[m.Message]]
-    ) -> dict[int, m.Message]:
-        assert self._loaded is not None
-        jail, reset_s = self._loaded.jail, self.repository.timeouts.reset_s
-        deadline = Deadline(reset_s)
-        replies: list[m.Message] = []
+    def _ask_anew(self, dead: list[int], requests: Requests) -> dict[int, m.Message]:
+        assert self._place is not None
+        reset_s = self.repository.timeouts.reset_s
         try:
-            for messages in zip(*[requests(index) for index in dead], strict=True):
-                hosts = [self._hosts[index] for index in dead]
-                replies = jail.exchange("reset", list(zip(hosts, messages, strict=True)), deadline)
+            return survivors.ask_anew(self._place, dead, requests, Deadline(reset_s))
         except WorkerTimeoutError as error:
             raise self._late("reset", reset_s) from error
-        return dict(zip(dead, replies, strict=True))
 
     def _revivals(self, index: int) -> list[m.Message]:
         return [m.Revive(self._number, self._derived(index))]

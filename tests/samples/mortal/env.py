@@ -15,10 +15,11 @@ LIVE, EXIT, KILL, CRASH, RAISE, SLOW, MEMORY = range(7)
 
 def _once(name: str) -> bool:
     """Whether this is the first time that anybody in this jail asks."""
-    mark = Path(tempfile.gettempdir(), name)
-    known = mark.exists()
-    mark.write_text("")
-    return not known
+    try:
+        Path(tempfile.gettempdir(), name).open("x").close()
+    except FileExistsError:
+        return False
+    return True
 
 
 def _end(how: int) -> None:
