@@ -237,6 +237,12 @@ class RepositoryContainer:
     ) -> ContainerServer:
         _check_started(self._engine, answer)
         found = enclosure.parse(answer)
+        if not (folder / "sockets" / "fds").is_socket():
+            raise SandboxUnavailableError(
+                f"{self._engine.kind} started a container that shares no socket with this process: "
+                "an engine in a virtual machine, or a runtime with a kernel of its own. Run the "
+                "worker there, and connect to it with sandbox='tcp://...'"
+            )
         title = f"{self._engine.kind} {self._engine.version}, image {self._options.image}"
         runtime = self._options.runtime or "default"
         title += f" ({self._image[:19]}), runtime {runtime}, {wanted.name}"
