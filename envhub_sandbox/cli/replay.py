@@ -87,6 +87,9 @@ class _Replay:
         self._refuse_wishes(bundle)
         for doubt in bundle.doubts:
             say(f"This cannot be exact: {safe_text(doubt)}.")
+        place = bundle.arguments.get("sandbox")
+        if place != self._sandbox:
+            say(f"It died in sandbox {safe_line(place)}; this is sandbox {self._sandbox}.")
         with Bar(quiet=self._as_json) as bar:
             replayed = self._run(bundle, bar)
         self._print(bundle, replayed)
