@@ -44,6 +44,7 @@ KEPT = 20
 """Bundles in one folder; older ones are removed."""
 _NAME = re.compile(r"\d{8}T\d{6}-[0-9a-f]{8}")
 _BUILDING = ".building-"
+_LOGIN = re.compile(r"://[^/@]*@")
 _ABANDONED_AFTER_S = 3600.0
 _SHOWN_REQUESTS = 8
 
@@ -211,7 +212,9 @@ def _arguments(crash: Crash) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     if isinstance(value, (Policy, Timeouts)):
         return asdict(value)
-    if value is None or isinstance(value, (bool, int, float, str)):
+    if isinstance(value, str):
+        return _LOGIN.sub("://***@", value)
+    if value is None or isinstance(value, (bool, int, float)):
         return value
     return os.fspath(value) if isinstance(value, os.PathLike) else type(value).__name__
 
