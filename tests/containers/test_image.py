@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox import make_env
+from envhub_sandbox import RemoteSandbox, make_env
 from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.sandboxes.docker import DockerSandbox
 from envhub_sandbox.sandboxes.engines import Engine
@@ -48,22 +50,44 @@ def test_no_file_of_the_worker_can_be_changed_by_it(engine: Engine) -> None:
     assert engine.run("run", "--rm", *words).strip() == ""
 
 
+@contextlib.contextmanager
+def served(engine: Engine, *words: str) -> Iterator[RemoteSandbox]:
+    """A container as a server for clients elsewhere; connected to by what it prints."""
+    published = ("--publish", "127.0.0.1::5555")
+    container = engine.run("run", "--rm", "--detach", *published, *words, IMAGE).strip()
+    try:
+        assert eventually(lambda: succeeds(engine, "exec", container, "envhub-worker", "health"))
+        printed = engine.run("logs", container)
+        keys = dict(re.findall(r'(server_key|client_key)="(\w+)"', printed))
+        port = engine.run("port", container, "5555").split()[0].rpartition(":")[2]
+        yield RemoteSandbox(f"tcp://127.0.0.1:{port}", **keys)
+    finally:
+        engine.run("rm", "--force", container)
+
+
 def test_the_image_serves_at_once(engine: Engine) -> None:
-    """As everybody would first try it, and locked down; it says how to connect."""
+    """As everybody would first try it: over TCP, with the keys that it prints."""
+    with (
+        served(engine) as remote,
+        make_env(SAMPLES / "counter", sandbox=remote, policy={"profile": "container"}) as suites,
+    ):
+        suites.env.reset(seed=0)
+        suites.env.step(suites.env.action_space.sample())
+
+
+def test_a_hardened_container_gives_jails_every_layer(engine: Engine) -> None:
+    """With the options and the profile of docs/deployment.md, the default policy can be had."""
     profile = SAMPLES.parent.parent / "examples" / "deployment" / "seccomp.json"
-    hardened = ("--read-only", "--tmpfs", "/tmp", "--cap-drop", "ALL")
+    hardened: tuple[str, ...] = ("--read-only", "--tmpfs", "/tmp", "--cap-drop", "ALL")
     for option in ("no-new-privileges", f"seccomp={profile}", "systempaths=unconfined"):
         hardened += ("--security-opt", option)
-    for words in ((), hardened):
-        container = engine.run("run", "--rm", "--detach", *words, IMAGE).strip()
-        try:
-            check = ("exec", container, "envhub-worker", "health")
-            assert eventually(lambda check=check: succeeds(engine, *check))
-            log = engine.run("logs", container)
-            assert "tcp://" in log
-            assert "key" in log
-        finally:
-            engine.run("rm", "--force", container)
+    with (
+        served(engine, *hardened) as remote,
+        make_env(SAMPLES / "counter", sandbox=remote) as suites,
+    ):
+        suites.env.reset(seed=0)
+        held = {layer["layer"] for layer in suites.env.sandbox_report if layer["enforced"]}
+        assert {"mount-namespace", "pid-namespace", "landlock", "seccomp"} <= held
 
 
 def succeeds(engine: Engine, *arguments: str) -> bool:
