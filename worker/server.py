@@ -14,8 +14,9 @@ from typing import Any
 import zmq
 
 from envhub_worker import __version__
+from envhub_worker.entries import Asker
 from envhub_worker.gate import Gate, LocalGate
-from envhub_worker.jails import Asker, Jails
+from envhub_worker.jails import Jails
 from envhub_worker.lockdown.scratch import remove_tree
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
@@ -105,11 +106,13 @@ class Server:
     def _serve_clients(self) -> None:
         for _ in range(_ROUND):
             try:
-                sender = self._router.recv(zmq.NOBLOCK, copy=False)
+                identity = self._router.recv(zmq.NOBLOCK)
             except zmq.Again:
                 return
-            frames = self._router.recv_multipart(zmq.NOBLOCK) if sender.more else []
-            self._serve(sender.bytes, self._gate.key_of(sender), frames)
+            # not of the frame before: libzmq 4.3.4 knows nothing of who sent the first one
+            header = self._router.recv(zmq.NOBLOCK, copy=False)
+            rest = self._router.recv_multipart(zmq.NOBLOCK) if header.more else []
+            self._serve(identity, self._gate.key_of(header), [header.bytes, *rest])
 
     def _serve(self, identity: bytes, key: bytes, frames: list[Any]) -> None:
         if not frames or len(frames[0]) > self._limits.header_bytes:
