@@ -9,22 +9,30 @@ from __future__ import annotations
 import itertools
 import os
 import secrets
-import signal
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from time import monotonic
-from typing import Protocol
 
 from envhub_worker.channel import close_fds
 from envhub_worker.deposits import Deposits
+from envhub_worker.entries import (
+    Answers,
+    Asker,
+    JailEntry,
+    Opening,
+    Pending,
+    for_operation,
+    owes,
+    signal_name,
+    status_of,
+    waiting,
+)
 from envhub_worker.idleness import Idleness
 from envhub_worker.jailspec import JailSpec, confinement_from_wire
 from envhub_worker.link import MAX_PENDING, HostLink
 from envhub_worker.loop import Loop
 from envhub_worker.output import OutputTail
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec import Buffer
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.limits import WireLimits
@@ -32,7 +40,6 @@ from envhub_worker.spawner import (
     Failed,
     HostExited,
     HostStarted,
-    Jail,
     JailExited,
     Spawner,
     ZygoteDied,
@@ -46,82 +53,6 @@ MAX_JAILS = 256
 """Open jails of one server."""
 MAX_DEAD = 256
 """Jails that were ended and not closed, whose deaths are remembered."""
-
-
-@dataclass(frozen=True)
-class Asker:
-    """Who asked: the reply goes to this identity under this id. Jails belong to its session.
-
-    ``key`` was proved in the handshake; empty where none is needed.
-    """
-
-    identity: bytes
-    request_id: int
-    session: bytes = b""
-    key: bytes = b""
-
-
-@dataclass
-class Opening:
-    """An ``OpenJail`` or ``StartHosts`` whose hosts have not all come up."""
-
-    asker: Asker
-    waiting: set[int]
-    hosts: tuple[int, ...]
-
-
-@dataclass
-class Pending:
-    """A ``Relay`` that hosts still owe answers to."""
-
-    asker: Asker
-    operation: str
-    replies: list[list[Buffer] | None]
-    dead: set[int] = field(default_factory=set)
-    since: float = field(default_factory=monotonic)
-
-    def lost(self, index: int, death: m.Died) -> None:
-        """In the place of a host's answer: how it died."""
-        self.dead.add(index)
-        self.replies[index] = m.pack(_for_operation(death, self.operation), 0)
-
-
-@dataclass
-class JailEntry:
-    """A jail and everything that waits for it."""
-
-    number: int
-    name: str
-    session: bytes
-    jail: Jail
-    spawner: tuple[object, ...]
-    output: OutputTail
-    links: dict[int, HostLink] = field(default_factory=dict)
-    pids: dict[int, int] = field(default_factory=dict)
-    report: tuple[object, ...] = ()
-    opening: list[Opening] = field(default_factory=list)
-    closing: list[Asker] = field(default_factory=list)
-    kept: bool = False
-    idle: Idleness | None = None
-    lost: dict[int, m.Died] = field(default_factory=dict)
-    death: m.Died | None = None
-    released: bool = False
-
-    def __post_init__(self) -> None:
-        # kept, because closing a descriptor makes it forget its number
-        self.control = self.jail.fileno()
-
-
-class Answers(Protocol):
-    """Where replies go."""
-
-    def reply(self, asker: Asker, message: m.Message, payload: Sequence[Buffer] = ()) -> None:
-        """Answer a request."""
-
-    def refuse(
-        self, asker: Asker, error: str, message: str, layer: str = "", fix: str = ""
-    ) -> None:
-        """Answer that it is not done."""
 
 
 class Jails:
@@ -238,7 +169,7 @@ class Jails:
                 asker, "LocalProtocolError", "the parts of Relay do not fit its frames"
             )
             return
-        if any(_owes(entry, host) >= MAX_PENDING for host, _ in targets):
+        if any(owes(entry, host) >= MAX_PENDING for host, _ in targets):
             self._answers.refuse(asker, "WorkerError", f"a host owes {MAX_PENDING} answers already")
             return
         pending = Pending(asker, request.operation, [None] * len(targets))
@@ -317,7 +248,7 @@ class Jails:
             )
             return None
         if entry.death is not None:
-            self._answers.reply(asker, _for_operation(entry.death, operation))
+            self._answers.reply(asker, for_operation(entry.death, operation))
             return None
         return entry
 
@@ -354,7 +285,7 @@ class Jails:
     def status(self, asker: Asker, request: m.GetStatus) -> None:
         """Tell what the asker's jails are doing."""
         mine = [entry for entry in self._jails.values() if entry.session == asker.session]
-        self._answers.reply(asker, m.Status(tuple(_status_of(entry) for entry in mine)))
+        self._answers.reply(asker, m.Status(tuple(status_of(entry) for entry in mine)))
 
     # --- for the gate --------------------------------------------------------------------------
 
@@ -368,7 +299,7 @@ class Jails:
 
     def statuses(self, owner: bytes) -> list[dict[str, object]]:
         """What the jails of a session are doing."""
-        return [_status_of(entry) for entry in self.open_ones(owner)]
+        return [status_of(entry) for entry in self.open_ones(owner)]
 
     def end(self, entry: JailEntry, why: str) -> None:
         """End a jail that nobody closes; its client is told why if it comes back."""
@@ -440,7 +371,7 @@ class Jails:
         self._end(entry, m.Died(-1, "unavailable", None, None, event.reason, "", ""))
 
     def _host_exited(self, entry: JailEntry, event: HostExited) -> None:
-        how = _signal_name(event.signal)
+        how = signal_name(event.signal)
         self._host_died(
             entry, m.Died(event.host_id, event.reason, event.code, how, event.detail, "", "")
         )
@@ -472,7 +403,7 @@ class Jails:
         link.close()
         for opening in [one for one in entry.opening if death.host in one.waiting]:
             entry.opening.remove(opening)
-            self._answers.reply(opening.asker, _for_operation(death, "start"))
+            self._answers.reply(opening.asker, for_operation(death, "start"))
 
     def _end(self, entry: JailEntry, death: m.Died) -> None:
         """Write the jail's death down, tell everybody who waits, and make it true."""
@@ -480,10 +411,10 @@ class Jails:
             return
         entry.output.read()
         entry.death = death = replace(death, tail=entry.output.text())
-        for pending in _waiting(entry):
-            self._answers.reply(pending.asker, _for_operation(death, pending.operation))
+        for pending in waiting(entry):
+            self._answers.reply(pending.asker, for_operation(death, pending.operation))
         for opening in entry.opening:
-            self._answers.reply(opening.asker, _for_operation(death, "start"))
+            self._answers.reply(opening.asker, for_operation(death, "start"))
         entry.opening.clear()
         self._kill(entry)
 
@@ -507,7 +438,7 @@ class Jails:
             del self._jails[entry.number]
         else:
             self._jail_events(entry)  # its hosts' exits say more than its own
-            how = _signal_name(event.signal)
+            how = signal_name(event.signal)
             self._end(entry, m.Died(-1, "exit", event.code, how, "", "", ""))
         self._release(entry)
         for asker in entry.closing:
@@ -523,7 +454,7 @@ class Jails:
         entry.output.close()
         if entry.idle is not None:
             entry.idle.close()
-        for pending in _waiting(entry):
+        for pending in waiting(entry):
             death = m.Died(-1, "killed", None, None, "the jail was closed", "", pending.operation)
             self._answers.reply(pending.asker, death)
 
@@ -538,52 +469,3 @@ class Jails:
 
 
 _ZYGOTE_FIELDS = ("profile", "network", "readable", "gpu")
-
-
-def _waiting(entry: JailEntry) -> list[Pending]:
-    found = {}
-    for link in entry.links.values():
-        for pending, _ in link.pending.values():
-            found[id(pending)] = pending
-        link.pending.clear()
-    return list(found.values())
-
-
-def _owes(entry: JailEntry, host: int) -> int:
-    """How many answers a host owes; one that has died owes none any more."""
-    link = entry.links.get(host)
-    return 0 if link is None else len(link.pending)
-
-
-def _for_operation(death: m.Died, operation: str) -> m.Died:
-    return replace(death, operation=operation)
-
-
-def _signal_name(number: int | None) -> str | None:
-    return None if number is None else signal.Signals(number).name
-
-
-_STATES = {"R": "running", "S": "waiting", "D": "waiting", "T": "stopped", "t": "stopped"}
-
-
-def _state_of(pid: int) -> str:
-    """What the kernel says that a host is doing: of a busy environment nobody else can tell."""
-    try:
-        with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as file:
-            # the command may hold anything, parentheses and blanks included
-            return _STATES.get(file.read().rpartition(")")[2].split()[0], "gone")
-    except (OSError, IndexError):
-        return "gone"
-
-
-def _status_of(entry: JailEntry) -> dict[str, object]:
-    owed = [pending for link in entry.links.values() for pending, _ in link.pending.values()]
-    oldest = min(owed, key=lambda pending: pending.since, default=None)
-    return {
-        "jail": entry.number,
-        "name": entry.name,
-        "pids": tuple(entry.pids.values()),
-        "states": tuple(_state_of(pid) for pid in entry.pids.values()),
-        "busy_s": 0.0 if oldest is None else monotonic() - oldest.since,
-        "operation": "" if oldest is None else oldest.operation,
-    }
