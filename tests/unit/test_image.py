@@ -19,7 +19,7 @@ _IMPORTED_AS = {"pyzmq": "zmq"}
 def project() -> dict[str, Any]:
     """pyproject.toml, read."""
     if sys.version_info < (3, 11):
-        from pip._vendor import tomli as tomllib
+        tomllib = pytest.importorskip("pip._vendor.tomli")
     else:
         import tomllib
     return tomllib.loads((CHECKOUT / "pyproject.toml").read_text())
