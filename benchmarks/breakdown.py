@@ -59,7 +59,7 @@ def _client(env: Any, batches: list[Any], spin_ns: int | None) -> dict[str, floa
         _marking(type(lane).ask, lane, marks),
         _marking(type(lane).wait, lane, marks),
     )
-    lane._spin = _Forced(spin_ns) if spin_ns is not None else SpinChooser(True)
+    lane._step_spin = _Forced(spin_ns) if spin_ns is not None else SpinChooser(True)
     parts: list[tuple[int, int, int, int]] = []
     actions = itertools.cycle(batches)
     until = perf_counter_ns() + _LONGEST_NS

@@ -29,6 +29,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol import slabs
 from envhub_worker.protocol.columns import Column, columns_of
 from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.stream import PacketReader
 
 _RING = (1).to_bytes(8, "little")
 _RECHECK_MS = 2
@@ -77,6 +78,7 @@ class LaneShard:
         self._views: dict[tuple[int, Any], Any] = {}
         self._codes = [-1] * len(layout.actions)
         self._wishes = (0, 0, 0)
+        self._told = False
         self.sequence = 0
 
     def handed_over(self) -> None:
@@ -87,6 +89,9 @@ class LaneShard:
     def ask(self, leaves: Sequence[Any], slot: int, spin_ns: int, cpu: int = 0) -> None:
         """Write a shard's actions and announce them; its observations are to go to ``slot``."""
         asks = self._asks
+        if self._told:
+            asks[slabs.MESSAGE] = 0
+            self._told = False
         for index, leaf in enumerate(leaves):
             found = self._views.get((index, leaf.dtype))
             if found is None:
@@ -98,8 +103,22 @@ class LaneShard:
         wishes = (spin_ns, slot, cpu)
         if wishes != self._wishes:
             self._wish(*wishes)
+        self._announce()
+
+    def tell(self, packet: bytes, slot: int, spin_ns: int = 0, cpu: int = 0) -> None:
+        """Write a message and announce it."""
+        start = self.layout.message
+        self._request[start : start + len(packet)] = packet
+        self._asks[slabs.MESSAGE] = len(packet)
+        self._told = True
+        wishes = (spin_ns, slot, cpu)
+        if wishes != self._wishes:
+            self._wish(*wishes)
+        self._announce()
+
+    def _announce(self) -> None:
         self.sequence += 1
-        asks[slabs.SEQUENCE] = self.sequence
+        self._asks[slabs.SEQUENCE] = self.sequence
         if self._tells[slabs.PARKED]:
             os.write(self._host_bell, _RING)
 
@@ -164,6 +183,21 @@ class LaneShard:
             self._learn(message.value)
         return kind, message
 
+    def answer(self) -> m.Message | None:
+        """The answer to a message; None if it did not fit. Trust: as ``outcome``."""
+        kind, length = self._tells[slabs.OUTCOME], self._tells[slabs.LENGTH]
+        if kind == slabs.FETCH:
+            return None
+        if kind not in (slabs.DONE, slabs.RAISED) or length > slabs.INFO_BYTES:
+            raise RemoteProtocolError("the worker wrote an impossible answer into its slab")
+        if kind == slabs.RAISED:
+            return self.outcome()[1]
+        start = self.layout.answer
+        packets = list(PacketReader().feed(self._reply[start : start + length]))
+        if len(packets) != 1:
+            raise RemoteProtocolError("the worker's answer in its slab is not one message")
+        return m.unpack(packets[0].frames, tensors=to_tensor)[1]
+
     def _learn(self, infos: dict[Any, Any]) -> None:
         start = self.layout.infos
         columns = columns_of(infos) or ()
@@ -215,7 +249,9 @@ class FastLane:
         self._poller.register(process_fd, select.POLLIN)
         for shard in self.shards:
             self._poller.register(shard.bell, select.POLLIN)
-        self._spin = SpinChooser(_ORDERED_STORES and len(CPUS) > 1)
+        may_spin = _ORDERED_STORES and len(CPUS) > 1
+        self._spin = self._step_spin = SpinChooser(may_spin)
+        self._talk_spin = SpinChooser(may_spin)  # messages take another time than steps
         self._asked_ns = 0
         self.elapsed_ns = 0
         # One core is the client's. Shards that find no other sleep until they are asked, then run
@@ -285,6 +321,7 @@ class FastLane:
         """Send a validated batch of actions to every shard."""
         leaves = [actions] if self._flat_actions else slabs.flatten(self._action_space, actions)
         self._asked_ns = perf_counter_ns()
+        self._spin = self._step_spin
         spin_ns = self._spin.budget_ns
         slot = self.observations.choose()
         if len(self.shards) == 1:
@@ -295,6 +332,23 @@ class FastLane:
             rows = [leaf[start:stop] for leaf in leaves]
             shard.ask(rows, slot, spin_ns if index < self._awake else 0, cpus[index])
 
+    def tell(self, packets: Sequence[bytes], *, moves: bool) -> None:
+        """Send each shard a message; if it ``moves``, what it writes must not be held by anyone."""
+        self._asked_ns = perf_counter_ns()
+        self._spin = self._talk_spin
+        slot = self.observations.choose() if moves else self.observations.chosen
+        spin_ns, cpus = self._spin.budget_ns, self._cpus()
+        for index, (shard, packet) in enumerate(zip(self.shards, packets, strict=True)):
+            shard.tell(packet, slot, spin_ns if index < self._awake else 0, cpus[index])
+
+    def _cpus(self) -> list[int]:
+        # one shard alone is left to the kernel
+        return self._cores.of_shards() if len(self.shards) > 1 else [0]
+
+    def answers(self) -> list[m.Message | None]:
+        """What the shards said to a message; None where it did not fit."""
+        return [shard.answer() for shard in self.shards]
+
     def wait(self, timeout_s: float | None) -> list[Outcome]:
         """Every shard's outcome; nothing at all if none says more than its results.
 
@@ -303,6 +357,14 @@ class FastLane:
             JailGoneError: The jail has ended.
             RemoteProtocolError: A shard wrote what the rules forbid.
         """
+        self.wait_for_all(timeout_s)
+        for shard in self.shards:
+            if not shard.has_nothing_to_say():
+                return [shard.outcome() for shard in self.shards]
+        return _NOTHING
+
+    def wait_for_all(self, timeout_s: float | None) -> None:
+        """Until every shard has answered; raises as ``wait`` does."""
         deadline = None
         for shard in self._sleepers:
             deadline = deadline or Deadline(timeout_s)
@@ -317,10 +379,6 @@ class FastLane:
                 self._sleep_for(shard, deadline)
         self.elapsed_ns = perf_counter_ns() - self._asked_ns
         self._spin.measured(self.elapsed_ns)
-        for shard in self.shards:
-            if not shard.has_nothing_to_say():
-                return [shard.outcome() for shard in self.shards]
-        return _NOTHING
 
     def _sleep_for(self, shard: LaneShard, deadline: Deadline) -> None:
         shard.park(1)

@@ -110,16 +110,20 @@ class RemoteJail:
         self.hosts = [host for host in self.hosts if host not in dead]
         return self.start_hosts(len(dead), deadline)
 
+    def pack(self, message: m.Message) -> list[Buffer]:
+        """The frames of a message to a host."""
+        # the only way in for the caller's own objects; nothing is ever unpickled here
+        return m.pack(message, 0, pickler=cloudpickle.dumps, limits=self._limits)
+
     def send(self, operation: str, requests: Sequence[tuple[int, m.Message]]) -> int:
         """Send one message to each of some hosts, in one request; returns its id."""
-        payload: list[Buffer] = []
-        parts = []
-        for host, message in requests:
-            # the only way in for the caller's own objects; nothing is ever unpickled here
-            frames = m.pack(message, 0, pickler=cloudpickle.dumps, limits=self._limits)
-            parts.append((host, len(frames)))
-            payload += frames
-        return self.client.send(m.Relay(self.number, operation, tuple(parts)), payload)
+        return self.relay(operation, [(host, self.pack(message)) for host, message in requests])
+
+    def relay(self, operation: str, requests: Sequence[tuple[int, list[Buffer]]]) -> int:
+        """``send`` for messages that are packed."""
+        parts = tuple((host, len(frames)) for host, frames in requests)
+        payload = [frame for _, frames in requests for frame in frames]
+        return self.client.send(m.Relay(self.number, operation, parts), payload)
 
     def receive(self, request_id: int, deadline: Deadline) -> list[m.Message]:
         """The hosts' replies, in the order of the request.

@@ -39,6 +39,7 @@ class ObservationSlab:
     Attributes:
         fd: Its descriptor, for the hosts.
         layout: Where everything lies.
+        chosen: The slot of the last batch.
     """
 
     def __init__(self, space: gym.Space[Any], layout: slabs.ObservationLayout) -> None:
@@ -57,25 +58,25 @@ class ObservationSlab:
         self._single = self._copies[0] if flat else None
         # counted just as choose() does: a loop's variable would be one more
         self._unheld = [sys.getrefcount(self._slots[index]) for index in range(len(self._slots))]
-        self._chosen = _SPARE
+        self.chosen = _SPARE
         self._rewards, self._flags = slabs.results(self._memory, layout)
 
     def choose(self) -> int:
         """The slot for the next batch: the lowest that nobody holds, so that few stay hot."""
-        self._chosen = _SPARE
+        self.chosen = _SPARE
         for index in range(1, len(self._slots)):
             if sys.getrefcount(self._slots[index]) == self._unheld[index]:
-                self._chosen = index
+                self.chosen = index
                 break
-        return self._chosen
+        return self.chosen
 
     def take(self) -> Any:
         """The batch in the chosen slot, in the structure of the space."""
-        if self._chosen == _SPARE:
+        if self.chosen == _SPARE:
             if self._single is not None:
                 return self._single()
             return self._assemble([copy() for copy in self._copies])
-        slot = self._slots[self._chosen]
+        slot = self._slots[self.chosen]
         return self._assemble([_borrowed(slot, leaf) for leaf in self.layout.leaves])
 
     def results(self) -> tuple[Any, Any, Any]:

@@ -46,6 +46,11 @@ class Results:
         observation = self._observation([reply.observation for reply in replies])
         return observation, self._infos([reply.info for reply in replies])
 
+    def reset_done(self, observation: Any, reply: m.Message) -> m.ResetDone:
+        """A shard's reply to a reset by the fast lane."""
+        check(reply)
+        return m.ResetDone(observation, self._info(typed(reply, m.Value).value))
+
     def lane_infos(self, parts: list[Any]) -> dict[Any, Any]:
         """The infos that came by the fast lane."""
         return self._infos([self._info(part) for part in parts])

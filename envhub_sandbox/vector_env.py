@@ -99,10 +99,11 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             declared.check_mask(mask, self.num_envs)
         seeds = self._seeds(seed)
         self._remote.recover()
+        sliced = self._manifest.shardable and seeds is not None
 
-        def message(number: int, bounds: Bounds) -> m.Message:
+        def message(number: int, bounds: Bounds) -> m.Message:  # kept: it must not hold us
             start, stop = bounds
-            some = seeds[start:stop] if self._manifest.shardable and seeds is not None else seeds
+            some = seeds[start:stop] if sliced else seeds
             return m.Reset(number, some, options, None if mask is None else mask[start:stop])
 
         self._submit("reset", message)

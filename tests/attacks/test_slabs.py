@@ -20,7 +20,9 @@ from gymnasium import spaces
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_sandbox.fast_lane import LaneShard
 from envhub_sandbox.observations import ObservationSlab
+from envhub_worker.protocol import messages as m
 from envhub_worker.protocol import slabs
+from envhub_worker.protocol.stream import pack_packet
 
 WAIT_S = 60
 
@@ -143,6 +145,66 @@ def test_an_impossible_header_is_refused(shard: LaneShard, outcome: int, length:
     attack(shard, f"os.pwrite(reply, {words}, {slabs.OUTCOME * 8})")
     with pytest.raises(RemoteProtocolError):
         shard.outcome()
+
+
+@pytest.mark.parametrize(
+    ("outcome", "length"),
+    [
+        (99, 0),
+        (slabs.COLUMNS, 0),
+        (slabs.DONE, 0),
+        (slabs.DONE, slabs.INFO_BYTES + 1),
+        (slabs.DONE, 2**64 - 1),
+    ],
+)
+def test_an_impossible_answer_is_refused(shard: LaneShard, outcome: int, length: int) -> None:
+    """A message has one answer, of a length that fits its area."""
+    shard.tell(b"".join(pack_packet(0, m.pack(m.Render(1), 0))), 0)
+    words = f"struct.pack('QQ', {outcome}, {length})"
+    attack(shard, f"os.pwrite(reply, {words}, {slabs.OUTCOME * 8})")
+    with pytest.raises(RemoteProtocolError):
+        shard.answer()
+
+
+def _packets(*frames: bytes) -> str:
+    return repr(b"".join(b"".join(pack_packet(0, [frame])) for frame in frames))
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        repr(bytes(64)),
+        repr(b"\xff" * 64),
+        _packets(b"\x80\x04."),
+        _packets(*[bytes(m.pack(m.Value(1), 0)[0])] * 2),
+        repr(b"\x01\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0" + b"\xff" * 7 + b"\x0f"),
+    ],
+    ids=["zeros", "ones", "pickle", "two", "endless"],
+)
+def test_garbage_for_an_answer_is_refused(shard: LaneShard, answer: str) -> None:
+    """It is cut into frames and decoded by the same suspicious code as a message's reply."""
+    shard.tell(b"".join(pack_packet(0, m.pack(m.Render(1), 0))), 0)
+    attack(
+        shard,
+        f"answer = {answer}\n"
+        f"os.pwrite(reply, answer, {shard.layout.answer})\n"
+        f"os.pwrite(reply, struct.pack('QQ', {slabs.DONE}, len(answer)), {slabs.OUTCOME * 8})",
+    )
+    with pytest.raises(RemoteProtocolError):
+        shard.answer()
+
+
+def test_an_honest_answer_is_read(shard: LaneShard) -> None:
+    """The control of the two above."""
+    answer = _packets(bytes(m.pack(m.Value((1, "two")), 0)[0]))
+    shard.tell(b"".join(pack_packet(0, m.pack(m.Render(1), 0))), 0)
+    attack(
+        shard,
+        f"answer = {answer}\n"
+        f"os.pwrite(reply, answer, {shard.layout.answer})\n"
+        f"os.pwrite(reply, struct.pack('QQ', {slabs.DONE}, len(answer)), {slabs.OUTCOME * 8})",
+    )
+    assert shard.answer() == m.Value((1, "two"))
 
 
 @pytest.mark.parametrize("bytes_", ["b'\\x80\\x04.'", "os.urandom(64)", "b'\\xff' * 64"])

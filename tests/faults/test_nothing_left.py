@@ -224,6 +224,7 @@ def test_proxy_that_nobody_holds_ends_its_processes(folder: Path) -> None:
         keeper = made()
         for _ in range(3):
             suites = made()
+            suites.env.reset(seed=1)
             suites.env.me = suites.env  # a cycle
             del suites
         gc.collect()

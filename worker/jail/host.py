@@ -10,6 +10,7 @@ import os
 import select
 import socket
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import cloudpickle  # type: ignore[import-untyped]
@@ -85,13 +86,21 @@ class Host:
         self.lane: Lane | None = None
         self.descriptors: list[int] = []
 
-    def answer(self, packet: Packet) -> list[Any]:
+    def answer(self, packet: Packet, *, by_lane: bool = False) -> list[Any]:
         """The reply's frames; whatever the repository raises becomes ``Raised``."""
         # the caller's own arguments may be pickled: this is the only place that unpickles
         request_id, request = m.unpack(packet.frames, unpickler=cloudpickle.loads)
         self._stage = type(request).__name__.lower()
+        if self.lane is not None and not by_lane:
+            if isinstance(request, m.FetchInfos) and self.lane.unsent:
+                return self.lane.unsent
+            if isinstance(request, m.Reset) and request.env == self.lane.number:
+                self.lane.leave_slot()
         try:
-            return m.pack(_HANDLERS[type(request)](self, request), request_id)
+            reply = _HANDLERS[type(request)](self, request)
+            if by_lane and isinstance(reply, m.ResetDone):
+                reply = m.Value(reply.info)  # the observation lies in the slab already
+            return m.pack(reply, request_id)
         except ResultError as error:
             return m.pack(raised(error, "return"), request_id)
         except BaseException as error:
@@ -159,7 +168,7 @@ class Host:
         env = self._envs[request.env]
         if not isinstance(env, SubEnvs) or env.reward_shape:
             return m.Value(False)
-        self.lane = Lane(env, request, self.descriptors)
+        self.lane = Lane(env, request, self.descriptors, partial(self.answer, by_lane=True))
         return m.Value(True)
 
     def fetch_infos(self, request: m.FetchInfos) -> m.Message:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import mmap
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from time import perf_counter_ns
 from typing import Any
@@ -20,6 +21,7 @@ from envhub_worker.jail.infos import InfoWriter, Pairs, join
 from envhub_worker.jail.subenvs import SubEnvs
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol import slabs
+from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
 
 _RING = (1).to_bytes(8, "little")
 _MEASURE = 31
@@ -34,9 +36,23 @@ class Lane:
         attach: Which rows of the batch they are, and how many slots there are.
         fds: Request slab, reply slab, observation slab, our doorbell, the client's. Owned from
             now on.
+        answer: Gives the frames of the answer to a message.
+
+    Attributes:
+        number: The environment's.
+        unsent: The frames of the last answer, if it did not fit.
     """
 
-    def __init__(self, env: SubEnvs, attach: m.Attach, fds: list[int]) -> None:
+    def __init__(
+        self,
+        env: SubEnvs,
+        attach: m.Attach,
+        fds: list[int],
+        answer: Callable[[Packet], list[Any]],
+    ) -> None:
+        self.number = attach.env
+        self.unsent: list[Any] = []
+        self._answer = answer
         layout = slabs.layout_of(env.single_action_space, env.num_envs)
         observed = slabs.observation_layout(
             env.single_observation_space, attach.count, attach.slots
@@ -104,7 +120,7 @@ class Lane:
         if sequence == self._served:
             return False
         told = self._told
-        if sequence & _MEASURE:
+        if sequence & _MEASURE or self._asked[slabs.MESSAGE]:
             told[slabs.OUTCOME], told[slabs.LENGTH] = self._run()
         else:
             self._run_measured()
@@ -125,6 +141,8 @@ class Lane:
             if changes != self._changes:
                 self._changes = changes
                 self._change()
+            if self._asked[slabs.MESSAGE]:
+                return self._run_message(self._asked[slabs.MESSAGE])
             # copied, because an environment may keep its action and the client writes the next one
             actions = self._assemble([view.copy() for view in self._views])
             pairs = self._pairs = self._env.run_step(actions)
@@ -132,10 +150,29 @@ class Lane:
         except BaseException as error:
             return slabs.RAISED, self._writer.put(_raised_frame(error))
 
+    def _run_message(self, length: int) -> tuple[int, int]:
+        start = self._layout.message
+        [packet] = PacketReader().feed(bytes(self._request[start : start + length]))
+        frames = self._answer(packet)
+        data = b"".join(pack_packet(packet.request_id, frames))
+        if len(data) > slabs.INFO_BYTES:
+            self.unsent = frames
+            return slabs.FETCH, 0
+        self.unsent = []
+        start = self._layout.answer
+        self._reply[start : start + len(data)] = data
+        return slabs.DONE, len(data)
+
+    def leave_slot(self) -> None:
+        """Somebody may hold the batch that lies in the slot: write the next one elsewhere."""
+        self._env.batch.choose(0, carry=True)
+        self._changes = -1
+
     def _change(self) -> None:
         asked = self._asked
         self._spin_ns = asked[slabs.SPIN]
-        self._env.batch.choose(asked[slabs.SLOT])
+        # a message that moves is a reset: of some of the sub-environments, perhaps
+        self._env.batch.choose(asked[slabs.SLOT], carry=bool(asked[slabs.MESSAGE]))
         if asked[slabs.CPU] != self._cpu:
             self._keep_to(asked[slabs.CPU])
         codes = asked[slabs.DTYPES : slabs.DTYPES + len(self._layout.actions)].tolist()

@@ -62,8 +62,11 @@ class Batch:
         flat = isinstance(self._space, _ARRAYS)
         return [leaves[0][index, ...] for index in range(self._count)] if flat else []
 
-    def choose(self, slot: int) -> None:
-        """Write the next observations into another slot."""
+    def choose(self, slot: int, *, carry: bool = False) -> None:
+        """Write the next observations into another slot; ``carry`` takes the last ones along."""
+        if carry and slot != self._slot:
+            for ours, theirs in zip(self._slots[slot][0], self._slots[self._slot][0], strict=True):
+                ours[...] = theirs
         self._slot = slot
         _, self.store, self.rows = self._slots[slot]
 

@@ -9,11 +9,11 @@ length that it has not computed or bounded itself.
 
 ::
 
-    request       header | one area per action leaf
-    reply         header | infos, encoded
+    request       header | one area per action leaf | a message, encoded
+    reply         header | infos, encoded | the answer to a message, encoded
     observations  slot 0: one area per leaf | slot 1 ... | rewards, terminations, truncations
 
-Only ``step`` goes this way; everything else is a message.
+``step`` goes this way, and messages that are small, both ways.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ from gymnasium import spaces
 LINE = 64
 """Bytes of a cache line: words that two cores poll must not share one."""
 INFO_BYTES = 64 * 1024
-"""Room for a step's infos, or for what it raised; larger infos are fetched with a message."""
+"""Room for a step's infos, or for what it raised, or for a message or its answer. What is larger
+goes through the server."""
 MAX_SLAB_BYTES = 1 << 31
 """Above this the frames lane serves: a slab is pinned memory."""
 
@@ -55,6 +56,8 @@ CPU = 18
 """Request: one more than the number of the core that the shard should keep to; 0 for any."""
 CHANGES = 19
 """Request: grows with every change of ``SPIN``, ``SLOT``, ``CPU`` and the dtypes."""
+MESSAGE = 20
+"""Request: bytes of the encoded message; 0 for a step."""
 DTYPES = 24
 """Request: the dtype code of each action leaf, one word each, up to ``MAX_LEAVES``."""
 MAX_LEAVES = 64
@@ -105,15 +108,19 @@ class Layout:
     Attributes:
         count: Sub-environments of the shard.
         actions: Leaves of the action space, in the request slab.
+        message: Offset of a message, in the request slab.
         request_bytes: Size of the request slab.
-        infos: Offset of the encoded infos.
+        infos: Offset of the encoded infos, in the reply slab.
+        answer: Offset of the answer to a message, in the reply slab.
         reply_bytes: Size of the reply slab.
     """
 
     count: int
     actions: tuple[Leaf, ...]
+    message: int
     request_bytes: int
     infos: int
+    answer: int
     reply_bytes: int
 
 
@@ -143,10 +150,12 @@ def layout_of(action: gym.Space[Any], count: int) -> Layout | None:
     leaves = list(_leaves(action))
     if None in leaves or len(leaves) > MAX_LEAVES:
         return None
-    actions, request_bytes = _placed(leaves, count, HEADER_BYTES, _ACTION_ITEM_BYTES)
+    actions, message = _placed(leaves, count, HEADER_BYTES, _ACTION_ITEM_BYTES)
+    request_bytes = message + INFO_BYTES
     if request_bytes > MAX_SLAB_BYTES:
         return None
-    return Layout(count, actions, request_bytes, HEADER_BYTES, HEADER_BYTES + INFO_BYTES)
+    infos, answer = HEADER_BYTES, HEADER_BYTES + INFO_BYTES
+    return Layout(count, actions, message, request_bytes, infos, answer, answer + INFO_BYTES)
 
 
 def observation_layout(space: gym.Space[Any], count: int, slots: int) -> ObservationLayout | None:
