@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 import zmq
 
+from envhub_worker.doorman import MAX_CONNECTIONS, Doorman
 from envhub_worker.entries import Asker, JailEntry
 from envhub_worker.jails import Jails
 from envhub_worker.jailspec import confinement_from_wire
@@ -135,6 +136,7 @@ class Rules:
         quotas: What one key may take.
         permissions: What a policy may ask for.
         idle_s: How long the jails of a client that says nothing live on.
+        max_connections: Of everybody together, strangers included.
     """
 
     keys: KeyPair | None
@@ -143,6 +145,7 @@ class Rules:
     quotas: Quotas
     permissions: Permissions
     idle_s: int
+    max_connections: int = MAX_CONNECTIONS
 
 
 class RemoteGate:
@@ -157,6 +160,7 @@ class RemoteGate:
         self._log = log
         self._in_flight = InFlight()
         self._closers: list[Callable[[], None]] = []
+        self._doorman: Doorman | None = None
 
     # --- the socket ----------------------------------------------------------------------------
 
@@ -167,6 +171,8 @@ class RemoteGate:
         router.setsockopt(zmq.HEARTBEAT_TIMEOUT, _HEARTBEAT_TIMEOUT_MS)
         router.setsockopt(zmq.BACKLOG, _BACKLOG)
         router.setsockopt(zmq.SNDHWM, _SNDHWM)
+        self._doorman = Doorman(router, loop, self._log, self._rules.max_connections)
+        self._closers.append(self._doorman.close)
         keys = self._rules.keys
         if keys is None:
             return
@@ -176,29 +182,12 @@ class RemoteGate:
         router.setsockopt(zmq.CURVE_SERVER, 1)
         router.setsockopt(zmq.CURVE_SECRETKEY, keys.secret)
         router.setsockopt(zmq.ZAP_DOMAIN, DOMAIN)
-        self._watch_handshakes(router, loop)
 
     def _admits(self, key: bytes, address: str) -> bool:
         if self._rules.authorized.name_of(key) is not None or key in self._rules.operators:
             return True
         self._log.say("refused", f"{address} has the key {key_text(key)}, which is not authorised")
         return False
-
-    def _watch_handshakes(self, router: zmq.Socket[bytes], loop: Loop) -> None:
-        failed = zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
-        monitor = router.get_monitor_socket(failed)
-        # in this order: a context does not end while the monitor's other end is open
-        self._closers += [router.disable_monitor, monitor.close]
-
-        def drain() -> None:
-            while True:
-                try:
-                    monitor.recv_multipart(zmq.NOBLOCK)
-                except zmq.Again:
-                    return
-                self._log.say("refused", "a handshake failed: no key, another server's, or noise")
-
-        loop.watch(monitor, drain)
 
     def key_of(self, frame: zmq.Frame) -> bytes:
         """The key that was proved in the handshake, never what the peer claims to be."""
@@ -314,6 +303,8 @@ class RemoteGate:
     def tick(self, sessions: Sessions, jails: Jails) -> None:
         """End the jails of clients that are not heard from, and what clients no longer hold."""
         self._log.tick()
+        if self._doorman is not None:
+            self._doorman.tick()
         try:
             self._rules.authorized.refresh()
         except (OSError, ValueError) as error:

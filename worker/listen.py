@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from envhub_worker import __version__, container, keys
+from envhub_worker.doorman import MAX_CONNECTIONS
 from envhub_worker.gate import RemoteGate, Rules
 from envhub_worker.keys import AuthorizedClients, KeyPair
 from envhub_worker.lockdown import landlock, probe
@@ -47,6 +48,9 @@ class UsageError(Exception):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``listen``."""
     quotas = Quotas()
+    parser.add_argument(
+        "--max-connections", type=_count, default=MAX_CONNECTIONS, help="of everybody together"
+    )
     parser.add_argument("--bind", default=DEFAULT_BIND, metavar="tcp://HOST:PORT")
     parser.add_argument("--key", type=Path, help="the server's secret key (see keygen)")
     parser.add_argument("--authorized-clients", type=Path, metavar="FILE")
@@ -269,6 +273,7 @@ def _gate(arguments: argparse.Namespace, state: Path, identity: Identity) -> Rem
             gpu=arguments.allow_gpu,
         ),
         idle_s=max(0, arguments.idle_s),
+        max_connections=arguments.max_connections,
     )
     return RemoteGate(rules, Uploads(state / "store", quotas), Log())
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 import zmq
 
@@ -151,6 +152,34 @@ def test_slow_strangers_are_shown_the_door(server: Listening, good: Any) -> None
     finally:
         for connection in connections:
             connection.close()
+
+
+def test_too_many_connections_stay_outside(tmp_path: Path, repository: Path) -> None:
+    """Who is in goes on, descriptors are left for jails, and afterwards the door is open again."""
+    with (
+        listening(tmp_path / "server", "--max-connections", "40") as server,
+        make_env(repository, sandbox=server.sandbox()) as suites,
+        contextlib.ExitStack() as crowd,
+    ):
+        suites.env.reset(seed=1)
+        for _ in range(400):
+            stranger = crowd.enter_context(socket.socket())
+            stranger.setblocking(False)
+            stranger.connect_ex(("127.0.0.1", server.port))
+        assert eventually(lambda: "no more for the moment" in server.said())
+        assert suites.env.step(np.array([0]))[0].tolist() == [[1.0]]
+        assert psutil.Process(server.process.pid).num_fds() < 300
+        crowd.close()
+        assert eventually(lambda: _gets_in(server, repository))
+
+
+def _gets_in(server: Listening, repository: Path) -> bool:
+    try:
+        with make_env(repository, n_envs=2, sandbox=server.sandbox()) as suites:
+            suites.env.reset(seed=1)
+    except SandboxUnavailableError:
+        return False
+    return True
 
 
 def test_without_keys_it_listens_on_loopback_only(tmp_path: Path, repository: Path) -> None:

@@ -48,7 +48,13 @@ WITHOUT_IO = {"asyncio", "multiprocessing", "os", "select", "socket", "subproces
 ZEROMQ = {
     *("envhub_sandbox.client", "envhub_sandbox.far", "envhub_worker.loop", "envhub_worker.server"),
     # sockets, keys and handshakes of clients on other hosts
-    *("envhub_worker.gate", "envhub_worker.keys", "envhub_worker.zap", "envhub_worker.asking"),
+    *(
+        "envhub_worker.gate",
+        "envhub_worker.keys",
+        "envhub_worker.zap",
+        "envhub_worker.asking",
+        "envhub_worker.doorman",
+    ),
 }
 # who runs code by a name that is not written in its source, and whose code that is
 IMPORTERS = {
