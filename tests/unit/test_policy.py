@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -147,3 +148,28 @@ def test_confinement_says_what_the_policy_says() -> None:
     made = policy.confinement()
     assert (made.profile, made.network, made.readable) == ("no-userns", "loopback", ("/data",))
     assert (made.gpu, made.limits) == (True, limits)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"output": ""},
+        {"output": 5},
+        {"output": None},
+        {"crash_history": -1},
+        {"crash_history": 1.5},
+        {"crash_history": True},
+        {"crash_folder": b"crashes"},
+        {"crash_folder": ""},
+    ],
+)
+def test_where_output_and_bundles_go_is_checked(values: dict[str, Any]) -> None:
+    """Before anything runs; the text names the field."""
+    with pytest.raises(PolicyError, match=next(iter(values))):
+        Policy(**values)
+
+
+def test_paths_may_be_path_objects() -> None:
+    """They become text, as everything in a policy that crosses to another process."""
+    policy = Policy(output=Path("a/b.log"), crash_folder=Path("c"))  # type: ignore[arg-type]
+    assert (policy.output, policy.crash_folder) == ("a/b.log", "c")
