@@ -81,7 +81,8 @@ def image(name: str) -> dict[str, Any]:
     """Bytes of the image, and of what lies on its base."""
     engine = find_engine(None)
     size = int(engine.run("image", "inspect", "--format", "{{.Size}}", name))
-    layers = engine.run("history", "--human=false", "--format", "{{.Size}} {{.CreatedBy}}", name)
+    words = ("history", "--no-trunc", "--human=false", "--format", "{{.Size}} {{.CreatedBy}}")
+    layers = engine.run(*words, name)
     own = [int(line.split()[0]) for line in layers.splitlines() if "envhub-worker" in line]
     return {"engine": f"{engine.kind} {engine.version}", "bytes": size, "own_bytes": sum(own)}
 
