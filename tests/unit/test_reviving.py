@@ -1,0 +1,141 @@
+"""What is made of deaths: who the server says has died, seeds for the fresh, rows of the dead."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from envhub_sandbox.client import WorkerClient
+from envhub_sandbox.deadline import Deadline
+from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
+from envhub_sandbox.jail import HostsDiedError, RemoteJail
+from envhub_sandbox.reviving import SeedBook, derived_seed, resets, truncated
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.limits import DEFAULT_LIMITS
+
+DIED = m.Died(2, "exit", 3, None, "", "last words", "step")
+
+
+class Told:
+    """A connection on which the server has said one thing."""
+
+    def __init__(self, reply: m.Message, *parts: m.Message) -> None:
+        self.reply = reply
+        self.payload: list[Buffer] = [frame for part in parts for frame in m.pack(part, 0)]
+
+    def send(self, message: m.Message, payload: Any = ()) -> int:
+        """Whatever it is."""
+        return 1
+
+    def receive(self, request_id: int, deadline: Deadline) -> tuple[m.Message, list[Buffer]]:
+        """What was said."""
+        return self.reply, self.payload
+
+
+def jail(reply: m.Message, *parts: m.Message, kept: bool = True) -> RemoteJail:
+    """A jail of two hosts whose server says this."""
+    client = cast("WorkerClient", Told(reply, *parts))
+    made = RemoteJail(client, 1, [1, 2], [], DEFAULT_LIMITS)
+    made.kept = kept
+    return made
+
+
+def test_deaths_come_with_the_answers_of_the_others() -> None:
+    """Each in its place: what lived has answered, and of the dead one knows how."""
+    said = jail(m.RelayedPartly((1, 1), (1,)), m.Value(7), DIED)
+    with pytest.raises(HostsDiedError) as caught:
+        said.receive(1, Deadline(1))
+    assert caught.value.replies == [m.Value(7), None]
+    assert list(caught.value.deaths) == [1]
+    assert (caught.value.first.exit_code, caught.value.first.log_tail) == (3, "last words")
+    with pytest.raises(WorkerDiedError, match="exit code 3") as told:
+        said.exchange("step", [(1, m.Render(1)), (2, m.Render(1))], Deadline(1))
+    assert type(told.value) is WorkerDiedError
+
+
+def test_a_hosts_word_is_no_death() -> None:
+    """A ``Died`` in the place of a living host is an answer, and an illegal one."""
+    with pytest.raises(HostsDiedError) as caught:
+        jail(m.RelayedPartly((1, 1), (1,)), DIED, DIED).receive(1, Deadline(1))
+    assert list(caught.value.deaths) == [1]
+    with pytest.raises(RemoteProtocolError, match="a host sent Died"):
+        jail(m.Relayed((1, 1)), m.Value(7), DIED).exchange("step", [], Deadline(1))
+
+
+@pytest.mark.parametrize(
+    ("reply", "parts"),
+    [
+        (m.RelayedPartly((1, 1), ()), (m.Value(7), DIED)),
+        (m.RelayedPartly((1, 1), (2,)), (m.Value(7), DIED)),
+        (m.RelayedPartly((1, 1), (-1,)), (m.Value(7), DIED)),
+        (m.RelayedPartly((1, 1), (0,)), (m.Value(7), DIED)),
+        (m.RelayedPartly((1, 2), (1,)), (m.Value(7), DIED)),
+        (m.RelayedPartly((2, 0), (1,)), (m.Value(7), DIED)),
+    ],
+)
+def test_deaths_that_do_not_add_up_are_refused(
+    reply: m.RelayedPartly, parts: tuple[m.Message, ...]
+) -> None:
+    """Nobody dead, nobody asked, no ``Died``, frames too many or too few."""
+    with pytest.raises(RemoteProtocolError):
+        jail(reply, *parts).receive(1, Deadline(1))
+
+
+def test_a_jail_that_is_not_kept_has_no_partial_answers() -> None:
+    """What was not asked for is not taken."""
+    with pytest.raises(RemoteProtocolError, match="RelayedPartly"):
+        jail(m.RelayedPartly((1, 1), (1,)), m.Value(7), DIED, kept=False).receive(1, Deadline(1))
+
+
+def test_derived_seeds_are_documented_and_all_different() -> None:
+    """As ``docs/faults.md`` says; neither siblings nor restarts share one."""
+    assert derived_seed(5, 1) == int(np.random.SeedSequence((5, 1)).generate_state(1)[0])
+    assert derived_seed(None, 1) is None
+    assert len({derived_seed(seed, n) for seed in range(20) for n in range(20)}) == 400
+
+
+def test_the_last_seed_counts() -> None:
+    """A reset without one, or of others only, leaves it; so does a None among seeds."""
+    book = SeedBook(3, each=True)
+    assert book.derived((0, 3), 1) == [None, None, None]
+    book.remember(m.Reset(1, [1, 2, 3], None, None))
+    book.remember(m.Reset(1, None, None, None))
+    book.remember(m.Reset(1, [7, None, 9], None, None))
+    book.remember(m.Reset(1, [8, 8, 8], None, np.array([False, True, False])))
+    assert book.derived((0, 3), 4) == [derived_seed(seed, 4) for seed in (7, 8, 9)]
+    assert book.derived((1, 2), 4) == [derived_seed(8, 4)]
+
+
+@pytest.mark.parametrize(("seeds", "expected"), [(5, derived_seed(5, 1)), ([5], None)])
+def test_environments_that_seed_themselves_get_what_they_were_given(
+    seeds: Any, expected: Any
+) -> None:
+    """A number or a list, as it was."""
+    book = SeedBook(1, each=False)
+    assert book.derived((0, 1), 1) is None
+    book.remember(m.Reset(1, seeds, None, None))
+    assert book.derived((0, 1), 1) == (expected or [derived_seed(5, 1)])
+
+
+def test_resets_of_the_fresh_are_those_of_the_dead() -> None:
+    """With the caller's seeds, and derived ones where he gave none; before a mask, all of them."""
+    plain = m.Reset(1, [5, None], {"a": 1}, None)
+    assert resets(plain, [8, 9]) == [m.Reset(1, [5, 9], {"a": 1}, None)]
+    assert resets(m.Reset(1, None, None, None), [8, 9]) == [m.Reset(1, [8, 9], None, None)]
+    mask = np.array([True, False])
+    first, second = resets(m.Reset(1, None, {"a": 1}, mask), [8, 9])
+    assert first == m.Reset(1, [8, 9], None, None)
+    assert cast("m.Reset", second).mask is mask
+
+
+def test_rows_of_the_dead_are_truncated_whatever_the_fresh_say() -> None:
+    """Its flags and rewards are not its own to choose."""
+    yes = np.ones(2, np.bool_)
+    said = m.StepDone(np.zeros((2, 1)), np.full((2, 3), 9.0), yes, ~yes, {"worker_restarted": ~yes})
+    row = truncated(said, 2)
+    assert row.rewards.tolist() == [[0.0] * 3] * 2  # type: ignore[attr-defined]
+    assert (row.terminations.tolist(), row.truncations.tolist()) == ([False] * 2, [True] * 2)  # type: ignore[attr-defined]
+    assert row.info["worker_restarted"].tolist() == [True, True]  # type: ignore[attr-defined]
