@@ -21,7 +21,7 @@ from envhub_worker.protocol.lifecycle import State
 from tests.support.processes import eventually
 from tests.support.samples import reference, sample
 
-LIVE, EXIT, KILL, CRASH, RAISE, SLOW, MEMORY = range(7)
+LIVE, EXIT, KILL, CRASH, RAISE, SLOW, MEMORY, SPIN = range(8)
 ALL_LIVE = [LIVE] * 4
 LAST_DIES = [LIVE, LIVE, LIVE, EXIT]
 DEAD = slice(2, 4)
@@ -332,6 +332,17 @@ def test_memory_of_all_takes_all_rows(lane: str) -> None:
         assert np.array_equal(truncated, info["worker_restarted"])
         env.step(ALL_LIVE)  # it meets those who had answered before their end came
         assert not env.step(ALL_LIVE)[3].any()
+
+
+def test_the_cpu_limit_takes_one_process() -> None:
+    """It is each process's own, and the fresh one has it from the start."""
+    with made(policy={"limits": {"cpu_s": 2}}) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        observation, _, _, truncated, info = env.step([LIVE, LIVE, LIVE, SPIN])
+        assert truncated.tolist() == [False, False, True, True]
+        assert observation[:, 1].tolist() == [1, 1, 0, 0]
+        assert restarted(info)
 
 
 @lanes

@@ -10,7 +10,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 
-LIVE, EXIT, KILL, CRASH, RAISE, SLOW, MEMORY = range(7)
+LIVE, EXIT, KILL, CRASH, RAISE, SLOW, MEMORY, SPIN = range(8)
 
 
 def _once(name: str) -> bool:
@@ -29,6 +29,8 @@ def _end(how: int) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
     if how == CRASH:
         ctypes.string_at(0)
+    while how == SPIN:
+        pass
     while how == MEMORY:
         MORE.append(b"x" * (16 << 20))
 
@@ -40,7 +42,7 @@ class Mortal(gym.Env):
     """Observation: ``[drawn at the reset, steps since, drawn at the step]``."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
-    action_space = gym.spaces.Discrete(7)
+    action_space = gym.spaces.Discrete(8)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
