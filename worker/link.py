@@ -16,7 +16,6 @@ from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
 MAX_PENDING = 16
 """Requests that one host may owe: a client waits for its answer before it asks again, but a
 late one after a timeout may still be under way."""
-_CHUNK = 1 << 20
 _MAX_IOVECS = 512
 
 
@@ -89,7 +88,7 @@ class HostLink:
             RemoteProtocolError: The host sent what nobody asked for. Trust: it is hostile.
         """
         try:
-            data = self.sock.recv(_CHUNK)
+            data = self.sock.recv(self._reader.chunk)
         except BlockingIOError:
             return []
         except OSError:

@@ -28,7 +28,6 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest import encode_env, encode_manifest
 from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
 
-_CHUNK = 1 << 20
 _MAX_FDS = 8
 _RECHECK_MS = 2
 
@@ -58,7 +57,7 @@ def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
 
 def _serve(stream: socket.socket, reader: PacketReader, host: Host) -> bool:
     """Answer what has come; False at the end of the stream."""
-    data, host.descriptors, _, _ = socket.recv_fds(stream, _CHUNK, _MAX_FDS)
+    data, host.descriptors, _, _ = socket.recv_fds(stream, reader.chunk, _MAX_FDS)
     for packet in reader.feed(data):
         _send(stream, packet.request_id, host.answer(packet))
     return bool(data)

@@ -28,6 +28,10 @@ class Packet:
     frames: list[Buffer]
 
 
+_SMALL_CHUNK = 1 << 16
+_LARGE_CHUNK = 1 << 20
+
+
 def pack_packet(request_id: int, frames: Sequence[Buffer]) -> list[Buffer]:
     """The buffers to write, in order; large frames are not copied."""
     lengths = [memoryview(frame).nbytes for frame in frames]
@@ -44,6 +48,12 @@ class PacketReader:
         self._head: tuple[int, tuple[int, ...]] | None = None
         self._body: memoryview | None = None
         self._filled = 0
+
+    @property
+    def chunk(self) -> int:
+        """How many bytes to ask for next: memory for many is dear, and most packets are small."""
+        missing = 0 if self._body is None else self._body.nbytes - self._filled
+        return min(max(missing, _SMALL_CHUNK), _LARGE_CHUNK)
 
     def feed(self, data: Buffer) -> Iterator[Packet]:
         """Take the next bytes; yields the packets that they complete.
