@@ -1,0 +1,48 @@
+"""Deaths and idleness on another host: as here."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import WorkerDiedError
+from tests.remote.listening import Listening
+from tests.support.processes import eventually
+from tests.support.samples import sample
+
+LIVE, EXIT = 0, 1
+
+
+def test_what_dies_over_there_comes_back(server: Listening) -> None:
+    """The rows of the dead are fresh and truncated; the others' results have crossed."""
+    policy = {"restart": "transparent", "crash_history": 0}
+    with make_env(
+        sample("mortal"),
+        n_envs=2,
+        use_async_envs=True,
+        num_workers=2,
+        policy=policy,
+        sandbox=server.sandbox(),
+    ) as suites:
+        env = suites.env
+        env.reset(seed=1)
+        observation, _, _, truncated, info = env.step([LIVE, EXIT])
+        assert observation[:, 1].tolist() == [1, 0]
+        assert truncated.tolist() == [False, True]
+        assert np.array_equal(info["worker_restarted"], truncated)
+        env.step([LIVE, LIVE])
+        assert env.step([LIVE, LIVE])[0][:, 1].tolist() == [3, 1]
+    assert eventually(lambda: server.jails() == 0)
+
+
+def test_idle_jails_end_over_there(server: Listening) -> None:
+    """Their memory is another's; a reset has another jail."""
+    with make_env(sample("mortal"), timeouts={"idle_s": 0.5}, sandbox=server.sandbox()) as suites:
+        env = suites.env
+        env.reset(seed=1)
+        assert eventually(lambda: server.jails() == 0)
+        with pytest.raises(WorkerDiedError, match="idle"):
+            env.step([LIVE])
+        env.reset(seed=1)
+        assert env.step([LIVE])[0][:, 1].tolist() == [1]
