@@ -1,13 +1,17 @@
 """``envhub doctor``: what this host can enforce, found out by doing it.
 
 Each profile is tried with a jail of its own, set up exactly as for a repository, self-test
-included: nothing is concluded from versions or settings.
+included: nothing is concluded from versions or settings. A jail stops at the first layer that is
+missing, so the layers are also tried one by one, to name all of them at once.
 """
 
 from __future__ import annotations
 
+import json as json_format
 import os
 import platform
+import subprocess
+import sys
 import tempfile
 import time
 from dataclasses import asdict, dataclass
@@ -42,6 +46,9 @@ class Idle(gym.Env):
 def make_env(n_envs=1, use_async_envs=False):
     return gym.vector.SyncVectorEnv([Idle] * n_envs)
 '''
+
+
+_PROBE_S = 60.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,10 +98,14 @@ def doctor(
             for name in PROFILES:
                 bar.begin(f"trying {name}")
                 findings.append(examine(folder, name))
+            bar.begin("trying each layer")
+            probed = probe()
         if json:
-            print_json({"host": host(), "profiles": [asdict(finding) for finding in findings]})
+            profiles = [asdict(finding) for finding in findings]
+            print_json({"host": host(), "profiles": profiles, **probed})
         else:
             _print(findings)
+            _print_missing(probed)
         decisive = next(finding for finding in findings if finding.profile == profile)
         raise typer.Exit(decisive.code)
 
@@ -107,6 +118,19 @@ def host() -> dict[str, Any]:
         "root": os.geteuid() == 0,
         "python": f"{platform.python_implementation()} {platform.python_version()}",
     }
+
+
+def probe() -> dict[str, Any]:
+    """What came of each layer by itself: ``layers``, and an ``apparmor_profile`` or None."""
+    from envhub_sandbox.sandboxes.process import BOOTSTRAP
+
+    command = [sys.executable, "-I", str(BOOTSTRAP), "probe"]
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=_PROBE_S, check=True, cwd="/")
+        found = json_format.loads(done.stdout)
+    except (OSError, subprocess.SubprocessError, ValueError):
+        return {"layers": [], "apparmor_profile": None}  # what the profiles say still stands
+    return {name: found[name] for name in ("layers", "apparmor_profile")}
 
 
 def examine(folder: str, profile: str) -> Finding:
@@ -172,3 +196,19 @@ def _print(findings: list[Finding]) -> None:
             mark = "  holds" if layer.get("enforced") else "  none"
             grid.add_row(mark, safe_line(layer.get("layer")), safe_line(layer.get("detail"), 300))
         out.print(grid)
+
+
+def _print_missing(probed: dict[str, Any]) -> None:
+    out = console()
+    missing = [layer for layer in probed["layers"] if not layer["available"]]
+    if missing:
+        out.print()
+        out.print("Layers that are missing here, each tried by itself:", style="bold")
+    for layer in missing:
+        out.print(f"  {safe_line(layer['layer'])}: {safe_line(layer['detail'])}", soft_wrap=True)
+        for line in safe_text(layer["fix"]).splitlines():
+            out.print(f"    {line}", soft_wrap=True)
+    if probed["apparmor_profile"]:
+        out.print()
+        out.print("An AppArmor profile that permits user namespaces to this interpreter:")
+        out.print(safe_text(probed["apparmor_profile"]), soft_wrap=True, markup=False)

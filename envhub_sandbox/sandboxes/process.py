@@ -23,7 +23,7 @@ import envhub_worker.protocol
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.sandboxes.base import WorkerServer
 
-_BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
+BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
 _STARTUP_S = 60.0
 _STOP_S = 5.0
 _KEPT_VARIABLES = ("PATH", "LANG", "LC_ALL", "LC_CTYPE", "TZ", "TMPDIR")
@@ -140,7 +140,7 @@ def _start(store: Path) -> ProcessServer:
 def _execute(folder: Path, store: Path, endpoint: str, ready: int) -> subprocess.Popen[bytes]:
     ourselves = os.pidfd_open(os.getpid())
     arguments = [
-        *(sys.executable, "-I", str(_BOOTSTRAP), "worker", "serve"),
+        *(sys.executable, "-I", str(BOOTSTRAP), "worker", "serve"),
         *("--endpoint", endpoint, "--runtime-dir", str(folder)),
         *("--readable-root", str(store)),
         *("--ready-fd", str(ready), "--client-pidfd", str(ourselves)),

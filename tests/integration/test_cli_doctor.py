@@ -9,6 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from envhub_sandbox import api
+from envhub_sandbox.cli import doctor as doctor_command
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.policy import PROFILES
@@ -28,6 +29,31 @@ def test_the_strict_profile_is_tried_for_real() -> None:
     assert strict["first_step_s"] > 0
     assert {"seccomp", "landlock", "pid-namespace"} <= {one["layer"] for one in strict["layers"]}
     assert all(layer["enforced"] for layer in strict["layers"])
+
+
+def test_each_layer_is_tried_by_itself() -> None:
+    """So that all that are missing can be named, where a jail stops at the first."""
+    done = RUNNER.invoke(app, ["doctor", "--json"])
+    layers = {layer["layer"]: layer for layer in json.loads(done.stdout)["layers"]}
+    assert {"user-namespace", "mount-namespace", "landlock", "seccomp"} <= set(layers)
+    assert layers["seccomp"]["available"]
+
+
+def test_all_missing_layers_are_named_with_their_fixes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two are missing: both are told, and the profile for AppArmor is printed as it is."""
+    layers = [
+        {"layer": "user-namespace", "available": False, "detail": "denied", "fix": "sysctl -w x=1"},
+        {"layer": "landlock", "available": False, "detail": "none\x1b[2J", "fix": "Linux 5.13"},
+        {"layer": "seccomp", "available": True, "detail": "", "fix": ""},
+    ]
+    probed = {"layers": layers, "apparmor_profile": "profile x [/usr/bin/python3] { userns, }"}
+    monkeypatch.setattr(doctor_command, "probe", lambda: probed)
+    fail_with(monkeypatch, {})
+    printed = RUNNER.invoke(app, ["doctor"]).stdout
+    assert "  user-namespace: denied\n    sysctl -w x=1\n" in printed
+    assert "  landlock: none\\x1b[2J\n    Linux 5.13\n" in printed
+    assert "  seccomp" not in printed
+    assert "profile x [/usr/bin/python3] { userns, }" in printed
 
 
 def fail_with(monkeypatch: pytest.MonkeyPatch, errors: dict[str, Exception]) -> None:
