@@ -298,9 +298,10 @@ class Host:
         """No longer tell it. A fork of its owner does nothing."""
         if os.getpid() == self.owner:
             self._stop.set()
+            os.close(self._stops)  # wakes the thread, should it wait for an answer
             self._thread.join(_STOP_S)
-            os.close(self._stops)
-            os.close(self.stopped)
+            if not self._thread.is_alive():
+                os.close(self.stopped)
 
 
 class Hosts:

@@ -101,7 +101,8 @@ def test_a_server_says_what_its_client_has_to_write(
     sandbox: Any = eval(expression, {"RemoteSandbox": RemoteSandbox})
     assert sandbox == server.sandbox()
     assert server.client_key not in repr(sandbox)
-    words = dict(word.split("=") for word in said.splitlines()[-1].split() if "KEY=" in word)
+    words = dict(word.split("=") for word in said.split() if word.startswith("ENVHUB_"))
+    assert set(words) == {"ENVHUB_SERVER_KEY", "ENVHUB_CLIENT_KEY"}
     for name, value in words.items():
         monkeypatch.setenv(name, value.strip("'"))
     with make_env(repository, sandbox=server.endpoint) as suites:
