@@ -336,6 +336,63 @@ def test_an_engine_on_another_machine_is_refused(
         engines.find_engine("docker")
 
 
+def engine_that_says(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, version: str, facts: dict[str, Any]
+) -> Engine:
+    """What is made of a program called docker."""
+    program = folder / "docker"
+    program.write_text(
+        f"#!/bin/sh\n[ $1 = --version ] && echo '{version}' || echo '{json.dumps(facts)}'\n"
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(folder))
+    monkeypatch.delenv("DOCKER_HOST", raising=False)
+    return engines.find_engine("docker")
+
+
+@pytest.mark.parametrize(
+    ("options", "rootless", "remapped"),
+    [
+        (["name=seccomp,profile=default"], False, False),
+        (["name=seccomp,profile=default", "name=rootless"], True, False),
+        (["name=userns"], False, True),
+    ],
+)
+def test_an_engine_says_whose_users_it_has(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    options: list[str],
+    rootless: bool,
+    remapped: bool,
+) -> None:
+    """Rootless docker is refused; one that maps users is told not to."""
+    facts = {"ServerVersion": "28.0", "SecurityOptions": options}
+    engine = engine_that_says(tmp_path, monkeypatch, "Docker version 28", facts)
+    assert (engine.kind, engine.version) == ("docker", "28.0")
+    assert (engine.rootless, engine.remapped) == (rootless, remapped)
+    if rootless:
+        with pytest.raises(SandboxUnavailableError, match="podman"):
+            DockerSandbox(engine="docker").for_repository(tmp_path, Policy(), "")
+
+
+def test_podman_under_dockers_name_is_podman(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Some systems have a program of that name; it takes podman's options."""
+    facts = {"host": {"security": {"rootless": True}}, "version": {"Version": "5.1"}}
+    engine = engine_that_says(tmp_path, monkeypatch, "podman version 5.1", facts)
+    assert (engine.kind, engine.version, engine.rootless) == ("podman", "5.1", True)
+
+
+def test_an_engine_without_a_server_is_not_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Docker's program answers without one too, and says what is wrong."""
+    facts = {"ServerErrors": ["Cannot connect to the Docker daemon at unix:///x"]}
+    with pytest.raises(SandboxUnavailableError, match="systemctl start docker"):
+        engine_that_says(tmp_path, monkeypatch, "Docker version 28", facts)
+
+
 def test_secrets_do_not_go_to_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its program gets what it needs of our environment, and no more."""
     monkeypatch.setenv("HF_TOKEN", "secret")
