@@ -55,13 +55,13 @@ def test_an_image_of_something_else_is_no_worker(
 @pytest.mark.parametrize(
     ("flag", "layer"),
     [
-        ("--read-only", "container-files"),
-        ("no-new-privileges", "container-privileges"),
-        ("--cap-drop", "container-capabilities"),
-        ("--network", "container-network"),
-        ("--memory", "container-memory"),
-        ("--pids-limit", "container-pids"),
-        ("--cpus", "container-cpus"),
+        ("--read-only", "files"),
+        ("no-new-privileges", "privileges"),
+        ("--cap-drop", "capabilities"),
+        ("--network", "network"),
+        ("--memory", "memory"),
+        ("--pids-limit", "pids"),
+        ("--cpus", "cpus"),
     ],
 )
 def test_a_wall_that_is_missing_is_noticed(
@@ -83,7 +83,7 @@ def test_a_wall_that_is_missing_is_noticed(
         return dropped
 
     monkeypatch.setattr(docker_module.containers, "run_arguments", without)
-    with pytest.raises(SandboxUnavailableError, match=layer):
+    with pytest.raises(SandboxUnavailableError, match=f"container-{layer} does not hold"):
         make_env(sample("counter"), sandbox=docker).env.reset()
     assert nothing_left(engine)
 

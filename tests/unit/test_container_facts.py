@@ -27,6 +27,7 @@ def layers(*names: str) -> list[dict[str, object]]:
         (("landlock", "seccomp"), 2, "container"),
         (("seccomp",), 0, "container"),
     ],
+    ids=["all", "no mounts", "no namespaces", "an old Landlock", "a filter only"],
 )
 def test_the_strongest_profile_is_the_one_whose_layers_are_there(
     there: tuple[str, ...], abi: int, expected: str
