@@ -131,7 +131,7 @@ class WorkerDiedError(WorkerError):
         exit_code: The exit code, or None when a signal ended it.
         signal: The name of the signal (``"SIGKILL"``), or None.
         reason: ``"exit"``, ``"signal"``, ``"out-of-memory"``, ``"cpu-limit"``, ``"disk-limit"``,
-            ``"protocol"``, ``"zygote"``, ``"server"`` or ``"killed"``.
+            ``"protocol"``, ``"zygote"``, ``"server"``, ``"killed"`` or ``"idle"``.
         log_tail: The last lines of its output, control characters escaped.
         request: The operation that it was serving (``"step"``), or None.
         detail: The numbers, where a limit was the reason.
