@@ -13,10 +13,11 @@ import time
 import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from time import perf_counter_ns
 from typing import Any, TypeVar
 
-from envhub_sandbox import survivors
+from envhub_sandbox import lane_requests, survivors
 from envhub_sandbox.building import Builder, Place
 from envhub_sandbox.deadline import Deadline, StartupDeadline
 from envhub_sandbox.errors import (
@@ -38,12 +39,11 @@ from envhub_sandbox.reviving import SeedBook, marked, resets, truncated
 from envhub_sandbox.sharding import PaceBook
 from envhub_sandbox.stats import LEDGER, Counters, Labels, lane_step_bytes
 from envhub_sandbox.survivors import Requests
-from envhub_worker.protocol import batches, slabs
+from envhub_worker.protocol import batches
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec import Buffer
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from envhub_worker.protocol.manifest import EnvManifest
-from envhub_worker.protocol.stream import pack_packet
 
 _GRACE_S = 2.0
 """How long ``reset`` waits for a late reply before it gives the jail up and starts another."""
@@ -60,11 +60,6 @@ _CAUSE_POLL_S = 0.01
 _LANE = 0
 """In place of a request's id, for what went by the fast lane; requests count from 1."""
 _BY_LANE = (_LANE, "step")
-_FRAME_BYTES = 8
-_ROOM = slabs.INFO_BYTES - 64
-"""For the frames of a message, less what is put around them."""
-_BULKY = frozenset({"render"})
-"""What hardly ever fits the lane."""
 
 
 class RemoteEnv:
@@ -229,7 +224,9 @@ class RemoteEnv:
         self.counters.stepped(lane.elapsed_ns)
         infos: dict[Any, Any] = {}
         if outcomes:
-            infos = self.results.lane_infos(self._lane_infos(lane, outcomes, timeout_s))
+            assert self._place is not None
+            fetch = partial(self._fetch_infos, timeout_s=timeout_s)
+            infos = self.results.lane_infos(lane_requests.infos(self._place, outcomes, fetch))
         return (lane.observation(), *lane.flags(), infos)
 
     def _wait_on_lane(self, timeout_s: float | None) -> list[Outcome]:
@@ -240,25 +237,6 @@ class RemoteEnv:
             if self._loaded is not None and self._loaded.jail.kept:
                 return self._wait_for_survivors(timeout_s)
             raise self._cause_of_death() from None
-
-    def _lane_infos(
-        self,
-        lane: FastLane,
-        outcomes: list[Outcome],
-        timeout_s: float | None,
-    ) -> list[Any]:
-        infos: list[Any] = []
-        for (kind, message), shard, host in zip(outcomes, lane.shards, self._hosts, strict=True):
-            if kind == slabs.COLUMNS:
-                infos.append(shard.columns())
-            elif kind == slabs.FETCH:
-                infos.append(self._fetch_infos(host, timeout_s))
-            elif message is None:
-                infos.append({})
-            else:
-                check(message)
-                infos.append(typed(message, m.Value).value)
-        return infos
 
     def _fetch_infos(self, host: int, timeout_s: float | None) -> Any:
         self._send("step", [(host, m.FetchInfos(self._number))])
@@ -369,55 +347,35 @@ class RemoteEnv:
         self._asked_ns = perf_counter_ns()
         jail = self._loaded.jail
         packed = [(host, jail.pack(message)) for host, message in requests]
-        if self._fits_lane(operation, packed):
-            self._tell(operation, [frames for _, frames in packed])
+        messages = [frames for _, frames in packed]
+        # what may have to be repeated in a fresh host goes by the server, who knows the dead
+        if self._lane and not self._revives and lane_requests.takes(operation, messages):
+            self._tell(operation, messages)
             return
         request_id = jail.relay(operation, packed)
         self.counters.requests += 1
         self._pending = (request_id, operation)
         self.lifecycle.on(Event.SUBMIT)
 
-    def _fits_lane(self, operation: str, packed: list[tuple[int, list[Buffer]]]) -> bool:
-        """Whether a request can go straight to the hosts; what may be repeated cannot."""
-        if self._lane is None or self._revives or operation in _BULKY:
-            return False
-        return operation != "step" and all(_size(frames) < _ROOM for _, frames in packed)
-
     def _tell(self, operation: str, messages: list[list[Buffer]]) -> None:
-        assert self._lane is not None
-        packets = [b"".join(pack_packet(0, frames)) for frames in messages]
+        assert self._place is not None
         self._pending = (_LANE, operation)  # first, as for a step
         self.lifecycle.on(Event.SUBMIT)
-        self._lane.tell(packets, moves=operation == "reset")
+        lane_requests.tell(self._place, operation, messages)
         self.counters.requests += 1
 
     def _receive_by_lane(self, timeout_s: float | None) -> list[m.Message]:
-        lane, loaded, pending = self._lane, self._loaded, self._pending
-        assert lane is not None
-        assert loaded is not None
+        place, pending = self._place, self._pending
+        assert place is not None
         assert pending is not None
         try:
-            lane.wait_for_all(timeout_s)
+            replies = lane_requests.answers(place, pending[1], timeout_s)
         except JailGoneError:
             raise self._cause_of_death() from None
-        replies: list[m.Message] = []
-        for host, answer in zip(self._hosts, lane.answers(), strict=True):
-            if answer is None:
-                fetch = [(host, m.FetchInfos(self._number))]
-                [answer] = loaded.jail.receive(
-                    loaded.jail.send(pending[1], fetch), Deadline(timeout_s)
-                )
-            replies.append(answer)
-        return self._with_observations(lane, replies) if pending[1] == "reset" else replies
-
-    def _with_observations(self, lane: FastLane, replies: list[m.Message]) -> list[m.Message]:
-        """Replies to a reset as they would have come through the server."""
-        space = self.manifest.single_observation_space
-        parts = batches.split(space, lane.observation(), self.bounds)
-        return [
-            reply if isinstance(reply, m.Raised) else self.results.reset_done(part, reply)
-            for part, reply in zip(parts, replies, strict=True)
-        ]
+        if pending[1] != "reset":
+            return replies
+        found = (self.manifest, self.bounds, self.results)
+        return lane_requests.with_observations(place, replies, *found)
 
     def _collect(self, deadline: Deadline, timeout_s: float | None) -> list[m.Message]:
         loaded, pending = self._loaded, self._pending
@@ -789,10 +747,6 @@ def _abandon_all() -> None:
 
 
 os.register_at_fork(after_in_child=_abandon_all)
-
-
-def _size(frames: list[Buffer]) -> int:
-    return sum(memoryview(frame).nbytes + _FRAME_BYTES for frame in frames)
 
 
 def _nothing() -> None:
