@@ -209,6 +209,9 @@ with tempfile.TemporaryDirectory() as folder:
     with open(path) as file:
         fcntl.flock(file, fcntl.LOCK_EX)
     os.mkfifo(path.with_name("e"))
+    path.with_name("f").touch()
+    path.with_name("f").touch()
+    os.utime(path, (1, 2))
     names = sorted(os.listdir(folder))
 with tempfile.NamedTemporaryFile() as file:
     file.write(b"x")
@@ -216,7 +219,7 @@ pathlib.Path("cwd-file").write_text("here")
 shutil.copytree("assets", "copy", dirs_exist_ok=True)
 result = [names, (home / ".cache/deep/file").read_text(), pathlib.Path("copy/a.txt").read_text()]
 """
-    assert outcome(cell, source) == [["a", "b", "c", "d", "e"], "cached", "asset"]
+    assert outcome(cell, source) == [["a", "b", "c", "d", "e", "f"], "cached", "asset"]
 
 
 def test_working_directory_takes_files_beside_the_snapshots(strict: Cell) -> None:

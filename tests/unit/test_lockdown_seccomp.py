@@ -58,6 +58,16 @@ def test_program_is_the_golden_one(machine: str, namespaced: bool, network: str)
 
 
 @machines
+def test_times_are_pretended_but_for_a_touch(machine: str) -> None:
+    """A touch that succeeds means that the file is there, and this one may not be."""
+    filtered = Filter(machine, namespaced=False)
+    path, times = 0x7F00_0000_0010, 0x7F00_0000_0020
+    assert filtered("utimensat", 3, path, times, 0) == PRETEND
+    assert filtered("utimensat", 3, 0, 0, 0) == PRETEND
+    assert filtered("utimensat", 3, path, 0, 0) == EPERM
+
+
+@machines
 @pytest.mark.parametrize(("namespaced", "network"), VARIANTS)
 def test_every_number_gets_the_verdict_of_the_table(
     machine: str, namespaced: bool, network: str
