@@ -108,7 +108,10 @@ def _package_of(root: Path, path: PurePosixPath) -> tuple[Path, list[str]]:
 def _make_importable(root: Path, folder: Path, scratch: str, package_path: Path) -> None:
     stub = Path(scratch) / "import" / PACKAGE
     stub.mkdir(parents=True, exist_ok=True)
-    (stub / "__init__.py").write_text(f"__path__ = [{os.fspath(package_path)!r}]\n")
+    # the hosts of a jail share the folder: none may import another's half-written file
+    draft = stub / f"{os.getpid()}.draft"
+    draft.write_text(f"__path__ = [{os.fspath(package_path)!r}]\n")
+    draft.replace(stub / "__init__.py")
     source = root / "src"
     wanted = [folder, root, *([source] if source.is_dir() else []), stub.parent]
     fresh = dict.fromkeys(os.fspath(item) for item in wanted)
