@@ -77,10 +77,12 @@ class AuthorizedClients:
     Args:
         path: The file, or None.
         known: Keys that may come in without it.
+        most: How many may be on it; None for any number.
     """
 
-    def __init__(self, path: Path | None, known: dict[bytes, str]) -> None:
+    def __init__(self, path: Path | None, known: dict[bytes, str], most: int | None = None) -> None:
         self._path = path
+        self._most = most
         self._known = known
         self._stamp: tuple[int, int] | None = None
         self._names = dict(known)
@@ -91,13 +93,20 @@ class AuthorizedClients:
 
         Raises:
             OSError: It cannot be read.
-            ValueError: A line of it is none; the text says which.
+            ValueError: A line of it is none, or there are too many; the text says which.
         """
         if self._path is None:
             return
         found = self._path.stat()
         if (found.st_mtime_ns, found.st_size) != self._stamp:
-            self._names = {**_parse(_read(self._path), self._path), **self._known}
+            names = {**_parse(_read(self._path), self._path), **self._known}
+            if self._most is not None and len(names) > self._most:
+                raise ValueError(
+                    f"{self._path}: {len(names)} clients, and without Landlock a jail of the "
+                    "profile 'container' could read the files of all of them: leave one on the "
+                    "list (one server for each), or use --weakest-profile no-userns or strict"
+                )
+            self._names = names
             self._stamp = (found.st_mtime_ns, found.st_size)
 
     def name_of(self, key: bytes) -> str | None:

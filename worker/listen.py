@@ -82,8 +82,12 @@ def _count(text: str) -> int:
 
 
 def _weakest_profile() -> str:
-    """In a container the container is the outer layer, and the others are often not to be had."""
-    return "container" if any(map(os.path.exists, _CONTAINER_MARKS)) else "strict"
+    """In a container the container is the outer layer, and the others are often not to be had.
+
+    But a jail of that profile is our user: without Landlock it would read our keys and all stores.
+    """
+    contained = any(map(os.path.exists, _CONTAINER_MARKS)) and landlock.version() >= 1
+    return "container" if contained else "strict"
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -100,6 +104,7 @@ def _listen(arguments: argparse.Namespace, state: Path) -> int:
     check_bind(arguments.bind, arguments.insecure_loopback)
     strongest = container.profiles(probe.probe()["layers"], landlock.version())
     identity = replace(_identity(arguments, state), profile=(*strongest, "strict")[0])
+    sys.stderr.write(unusable(identity.profile, arguments.weakest_profile))
     _raise_file_limit()
     runtime_dir = Path(tempfile.mkdtemp(prefix="envhub-"))
     try:
@@ -243,6 +248,16 @@ def announcement(endpoint: str, identity: Identity) -> str:
     return "\n".join(lines)
 
 
+def unusable(strongest: str, weakest: str) -> str:
+    """A warning, or nothing: where no jail can have what is permitted at least."""
+    if PROFILES.index(strongest) <= PROFILES.index(weakest):
+        return ""
+    return (
+        f"envhub-worker listen: no jail can be opened here: the strongest profile to be had is "
+        f"{strongest!r}, and --weakest-profile permits nothing weaker than {weakest!r}\n"
+    )
+
+
 def reachable(endpoint: str) -> str:
     """An endpoint that a client on this machine can connect to."""
     host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
@@ -264,7 +279,7 @@ def _gate(arguments: argparse.Namespace, state: Path, identity: Identity) -> Rem
     )
     rules = Rules(
         keys=identity.keys,
-        authorized=AuthorizedClients(identity.authorized, known),
+        authorized=AuthorizedClients(identity.authorized, known, _most_clients(arguments)),
         operators=operators,
         quotas=quotas,
         permissions=Permissions(
@@ -276,6 +291,12 @@ def _gate(arguments: argparse.Namespace, state: Path, identity: Identity) -> Rem
         max_connections=arguments.max_connections,
     )
     return RemoteGate(rules, Uploads(state / "store", quotas), Log())
+
+
+def _most_clients(arguments: argparse.Namespace) -> int | None:
+    """One, where nothing keeps a jail from the other clients' files."""
+    shared = arguments.weakest_profile == "container" and landlock.version() < 1
+    return 1 if shared else None
 
 
 # --- the state folder --------------------------------------------------------------------------

@@ -75,6 +75,46 @@ def test_the_list_of_clients_knows_names_and_comments(tmp_path: Path) -> None:
     assert clients.name_of(one.public) is not None
 
 
+@pytest.mark.parametrize(("abi", "default"), [(0, "strict"), (1, "container")])
+def test_a_container_without_landlock_permits_no_weak_profile_by_itself(
+    monkeypatch: pytest.MonkeyPatch, abi: int, default: str
+) -> None:
+    """A jail of the profile ``container`` is the server's user: it would read every store."""
+    monkeypatch.setattr("envhub_worker.listen._CONTAINER_MARKS", ("/",))
+    monkeypatch.setattr("envhub_worker.lockdown.landlock.version", lambda: abi)
+    parser = argparse.ArgumentParser()
+    listen.add_arguments(parser)
+    assert parser.parse_args([]).weakest_profile == default
+    assert ("no jail can be opened" in listen.unusable("container", default)) is (abi == 0)
+
+
+def test_without_landlock_a_weak_profile_is_for_one_client(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the start, and when the list grows later; with Landlock it may be as long as it likes."""
+    one, other = key_text(keys.generate().public), key_text(keys.generate().public)
+    path = tmp_path / "clients"
+    path.write_text(f"{one}\n{other}\n")
+    parser = argparse.ArgumentParser()
+    listen.add_arguments(parser)
+    options = parser.parse_args(
+        ["--weakest-profile", "container", "--authorized-clients", str(path)]
+    )
+    identity = listen.Identity(keys.generate(), path)
+    monkeypatch.setattr("envhub_worker.lockdown.landlock.version", lambda: 0)
+    with pytest.raises(ValueError, match="without Landlock"):
+        listen._gate(options, tmp_path, identity)
+    path.write_text(f"{one}\n")
+    listen._gate(options, tmp_path, identity)
+    few = AuthorizedClients(path, {}, 1)
+    path.write_text(f"{one}\n{other}\n")
+    with pytest.raises(ValueError, match="2 clients"):
+        few.refresh()
+    assert few.name_of(parse_key(other)) is None
+    monkeypatch.setattr("envhub_worker.lockdown.landlock.version", lambda: 1)
+    listen._gate(options, tmp_path, identity)
+
+
 @pytest.mark.parametrize(
     "bind", ["tcp://", "5555", "ipc:///tmp/x", "udp://127.0.0.1:1", "tcp://127.0.0.1:http"]
 )
