@@ -182,6 +182,8 @@ class RemoteGate:
         router.setsockopt(zmq.CURVE_SERVER, 1)
         router.setsockopt(zmq.CURVE_SECRETKEY, keys.secret)
         router.setsockopt(zmq.ZAP_DOMAIN, DOMAIN)
+        # without it libzmq lets everybody in whom no handler was there to ask about
+        router.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
 
     def _admits(self, key: bytes, address: str) -> bool:
         if self._rules.authorized.name_of(key) is not None or key in self._rules.operators:
@@ -201,7 +203,8 @@ class RemoteGate:
     # --- requests ------------------------------------------------------------------------------
 
     def greet(self, sessions: Sessions, key: bytes, name: bytes) -> None:
-        """Refuse more sessions than the quota."""
+        """Refuse who has proved no key, and more sessions than the quota."""
+        self._refuse_unless_authorized(key)
         mine = sessions.of_key(key)
         if len(name) > 64:
             raise RefusedError("LocalProtocolError", "the name of a session is too long")
@@ -215,7 +218,7 @@ class RemoteGate:
         self, asker: Asker, request: m.Message, size: int, sessions: Sessions, jails: Jails
     ) -> m.Message:
         """Hold a request against keys and quotas."""
-        key = _key_of(asker)
+        key = asker.key
         self._refuse_unless_authorized(key)
         if isinstance(request, m.KeepAlive):
             self._keep(asker, request, sessions)
@@ -224,8 +227,7 @@ class RemoteGate:
         elif isinstance(request, m.StartHosts):
             check_jail(_uses(jails, key), Use(0, request.hosts), self._rules.quotas)
         elif isinstance(request, m.Relay):
-            request_of = (asker.identity, asker.request_id)
-            self._in_flight.add(key, request_of, size, self._rules.quotas.inflight_bytes)
+            self._in_flight.add(key, asker, size, self._rules.quotas.inflight_bytes)
         elif isinstance(request, m.GetSessions):
             return m.Sessions(tuple(self._sessions_of(key, sessions, jails)))
         return request
@@ -257,7 +259,7 @@ class RemoteGate:
         )
 
     def _keep(self, asker: Asker, request: m.KeepAlive, sessions: Sessions) -> None:
-        session = sessions.find(asker.identity, _key_of(asker))
+        session = sessions.find(asker.identity, asker.key)
         if session is not None and all(type(jail) is int for jail in request.jails[:4096]):
             sessions.keep(session, request.jails[:4096])
 
@@ -265,7 +267,7 @@ class RemoteGate:
         self, asker: Asker, request: m.Message, payload: Sequence[bytes], jails: Jails
     ) -> m.Message | None:
         """Take snapshots; say who is here."""
-        key = _key_of(asker)
+        key = asker.key
         if isinstance(request, m.OfferSnapshot):
             in_use = {entry.jail.spec.snapshot for entry in jails.open_ones()}
             return self._uploads.offer(asker.session, key, request, in_use)
@@ -280,7 +282,7 @@ class RemoteGate:
 
     def answered(self, asker: Asker) -> None:
         """Its bytes are no longer in flight."""
-        self._in_flight.answered((asker.identity, asker.request_id))
+        self._in_flight.answered(asker)
 
     def _sessions_of(self, key: bytes, sessions: Sessions, jails: Jails) -> list[dict[str, Any]]:
         rules = self._rules
@@ -341,10 +343,6 @@ class RemoteGate:
         """Close the sockets of the handshakes."""
         for close in self._closers:
             close()
-
-
-def _key_of(asker: Asker) -> bytes:
-    return asker.session[:KEY_BYTES]
 
 
 def _uses(jails: Jails, key: bytes) -> list[Use]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
+from envhub_worker.entries import Asker
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import GIB, MIB, Confinement
 
@@ -122,30 +123,35 @@ class InFlight:
     """Bytes that clients have sent and nobody has answered yet."""
 
     _of: dict[bytes, int] = field(default_factory=dict)
-    _requests: dict[tuple[bytes, int], tuple[bytes, int]] = field(default_factory=dict)
+    _requests: dict[tuple[bytes, int], tuple[Asker, bytes, int]] = field(default_factory=dict)
 
-    def add(self, key: bytes, request: tuple[bytes, int], size: int, quota: int) -> None:
+    def add(self, key: bytes, asker: Asker, size: int, quota: int) -> None:
         """Count a request until it is answered.
 
         Raises:
-            RefusedError: Over the quota.
+            RefusedError: Over the quota, or its id is that of one that is not answered yet.
         """
         taken = self._of.get(key, 0)
+        if (asker.identity, asker.request_id) in self._requests:
+            raise RefusedError("LocalProtocolError", "a request with this id is not answered yet")
         if taken + size > quota:
             raise RefusedError(
                 "WorkerError",
                 f"{taken} bytes of your key's requests are not answered yet, and {size} more are "
                 f"over the server's quota of {quota}; wait for replies",
             )
-        self.answered(request)
-        self._of[key] = self._of.get(key, 0) + size
-        self._requests[request] = key, size
+        self._of[key] = taken + size
+        self._requests[asker.identity, asker.request_id] = asker, key, size
 
-    def answered(self, request: tuple[bytes, int]) -> None:
-        """A request was answered."""
-        key, size = self._requests.pop(request, (b"", 0))
-        left = self._of.get(key, 0) - size
+    def answered(self, asker: Asker) -> None:
+        """A request was answered: this very one, not another under the same id."""
+        place = (asker.identity, asker.request_id)
+        counted, key, size = self._requests.get(place, (None, b"", 0))
+        if counted is not asker:
+            return
+        del self._requests[place]
+        left = self._of[key] - size
         if left > 0:
             self._of[key] = left
         else:
-            self._of.pop(key, None)
+            self._of.pop(key)

@@ -11,6 +11,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, WorkerError
+from envhub_worker.entries import Asker
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.quotas import (
@@ -72,13 +73,28 @@ def test_the_sums_of_a_key_are_bounded() -> None:
 def test_bytes_in_flight_are_bounded_until_they_are_answered() -> None:
     """Of one key; another's are its own."""
     flying = InFlight()
-    flying.add(b"a", (b"one", 1), 60, 100)
-    flying.add(b"b", (b"two", 1), 60, 100)
+    first = Asker(b"one", 1)
+    flying.add(b"a", first, 60, 100)
+    flying.add(b"b", Asker(b"two", 1), 60, 100)
     with pytest.raises(RefusedError, match="not answered yet"):
-        flying.add(b"a", (b"one", 2), 60, 100)
-    flying.answered((b"one", 1))
-    flying.answered((b"one", 1))
-    flying.add(b"a", (b"one", 3), 60, 100)
+        flying.add(b"a", Asker(b"one", 2), 60, 100)
+    flying.answered(first)
+    flying.answered(first)
+    flying.add(b"a", Asker(b"one", 3), 60, 100)
+
+
+def test_an_id_that_is_used_again_hides_no_bytes() -> None:
+    """Neither the second request nor the answer to it makes the first one forgotten."""
+    flying = InFlight()
+    first, again = Asker(b"one", 1), Asker(b"one", 1)
+    flying.add(b"a", first, 60, 100)
+    with pytest.raises(RefusedError, match="with this id"):
+        flying.add(b"a", again, 1, 100)
+    flying.answered(again)
+    with pytest.raises(RefusedError, match="60 bytes"):
+        flying.add(b"a", Asker(b"one", 2), 60, 100)
+    flying.answered(first)
+    flying.add(b"a", again, 100, 100)
 
 
 def test_a_session_belongs_to_its_key() -> None:

@@ -16,8 +16,16 @@ import zmq
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerError
 from envhub_worker import keys
+from envhub_worker.entries import Asker
+from envhub_worker.gate import RemoteGate, Rules
+from envhub_worker.keys import AuthorizedClients
+from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import key_text
+from envhub_worker.quotas import Permissions, Quotas, RefusedError
+from envhub_worker.refusals import Log
+from envhub_worker.sessions import Sessions
+from envhub_worker.uploads import Uploads
 from tests.remote.listening import Listening, listening
 from tests.remote.relay import relay
 from tests.support.processes import eventually
@@ -90,6 +98,51 @@ def _greets(context: zmq.Context[Any], server: Listening, *, with_keys: bool) ->
         peer.connect(server.endpoint)
         peer.send_multipart(m.pack(m.Hello(1, 2, b"stranger"), 1))
         return bool(peer.poll(10_000 if with_keys else 1_000))
+
+
+def _gate(folder: Path) -> RemoteGate:
+    """One with keys and nobody on its list."""
+    rules = Rules(
+        keys=keys.generate(),
+        authorized=AuthorizedClients(None, {}),
+        operators=frozenset(),
+        quotas=Quotas(),
+        permissions=Permissions(),
+        idle_s=0,
+    )
+    return RemoteGate(rules, Uploads(folder, Quotas()), Log())
+
+
+def test_nobody_comes_in_while_nobody_can_be_asked(tmp_path: Path) -> None:
+    """Without its handler libzmq refuses whoever has a key of his own; the control answers."""
+    for enforced in (True, False):
+        gate, pair = _gate(tmp_path), keys.generate()
+        with zmq.Context() as context:
+            router, peer = context.socket(zmq.ROUTER), context.socket(zmq.DEALER)
+            gate.secure(router, Loop())
+            gate.close()
+            if not enforced:
+                router.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 0)
+            port = router.bind_to_random_port("tcp://127.0.0.1")
+            peer.setsockopt(zmq.LINGER, 0)
+            peer.setsockopt(zmq.CURVE_SERVERKEY, gate._rules.keys.public)  # type: ignore[union-attr]
+            peer.setsockopt(zmq.CURVE_SECRETKEY, pair.secret)
+            peer.setsockopt(zmq.CURVE_PUBLICKEY, pair.public)
+            peer.connect(f"tcp://127.0.0.1:{port}")
+            peer.send(b"hello")
+            assert bool(router.poll(500 if enforced else 10_000)) is not enforced
+            peer.close()
+            router.close(0)
+
+
+def test_a_message_without_a_proved_key_is_refused(tmp_path: Path) -> None:
+    """Where keys are needed an empty one is nobody's: neither a session nor a request."""
+    gate, sessions = _gate(tmp_path), Sessions()
+    with pytest.raises(RefusedError, match="not authorised"):
+        gate.greet(sessions, b"", b"name")
+    asker = Asker(b"id", 1, b"x" * 40, b"")
+    with pytest.raises(RefusedError, match="not authorised"):
+        gate.check(asker, m.GetSessions(), 0, sessions, None)  # type: ignore[arg-type]
 
 
 def test_captured_bytes_are_worth_nothing(server: Listening, repository: Path, good: Any) -> None:
