@@ -292,7 +292,9 @@ class RemoteEnv:
 
     def _catch_up(self) -> None:
         loaded, pending = self._loaded, self._pending
-        assert loaded is not None
+        if loaded is None:  # an earlier attempt was interrupted when it had given the jail up
+            self._forget()
+            return
         deadline = Deadline(_GRACE_S)
         try:
             if pending is None:  # interrupted on the way out: nobody knows what was sent
@@ -664,11 +666,19 @@ class RemoteEnv:
     def _leave(self) -> None:
         self._let_server_go()
         self._release_server = self.repository.hold()
-        loaded, self._loaded, self._place = self._loaded, None, None
-        if loaded is not None:
-            self._jails.end(loaded)
-            self._jails.give_back(loaded)
-        self._close_lane()
+        try:
+            if self._loaded is not None:
+                self._jails.end(self._loaded)
+        finally:
+            self._give_back()
+
+    def _give_back(self) -> None:
+        loaded, self._loaded = self._loaded, None
+        try:
+            if loaded is not None:
+                self._jails.give_back(loaded)
+        finally:
+            self._close_lane()
 
     def close(self) -> None:
         """Close the environment and end its processes, in bounded time, from any thread."""
