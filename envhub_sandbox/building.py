@@ -54,6 +54,7 @@ class Builder:
         self._bounds = bounds
         # hosts of a jail that several environments share die with it, for all of them
         own = not isinstance(jails, SharedJail)
+        self._own = own
         self._keeps = own and jails.repository.policy.restart == "transparent"
 
     def build(self, loaded: LoadedJail, deadline: Deadline) -> Place:
@@ -114,6 +115,8 @@ class Builder:
         server, manifest = place.loaded.server, self._manifest
         if server.fd_path is None or not manifest.shardable or self._repository.lane == "frames":
             return None
+        if not self._own:
+            return None  # a host has one lane, and these environments share theirs
         copy = self._repository.copy
         lane = FastLane.for_spaces(manifest, self._bounds, server.process_fd, copy=copy)
         if lane is None:

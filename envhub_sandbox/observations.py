@@ -70,6 +70,10 @@ class ObservationSlab:
                 break
         return self.chosen
 
+    def leave(self) -> None:
+        """The next batch comes another way: the hosts leave the slot that somebody may hold."""
+        self.chosen = _SPARE
+
     def take(self) -> Any:
         """The batch in the chosen slot, in the structure of the space."""
         if self.chosen == _SPARE:

@@ -13,12 +13,19 @@ from numbers import Real
 from typing import Any, TypeVar
 
 from envhub_sandbox.errors import PolicyError
-from envhub_worker.protocol.confinement import Confinement, Limits
+from envhub_worker.protocol.confinement import NETWORKS, PROFILES, Confinement, Limits
 
-__all__ = ["Limits", "Policy", "Timeouts", "limits_from", "policy_from", "timeouts_from"]
+__all__ = [
+    "NETWORKS",
+    "PROFILES",
+    "Limits",
+    "Policy",
+    "Timeouts",
+    "limits_from",
+    "policy_from",
+    "timeouts_from",
+]
 
-PROFILES = ("strict", "no-userns", "container")
-NETWORKS = ("none", "loopback", "host")
 RESTARTS = ("never", "on_reset", "transparent")
 
 

@@ -355,6 +355,8 @@ class RemoteEnv:
             self._tell(operation, messages)
             return
         request_id = jail.relay(operation, packed)
+        if self._lane and operation == "reset":
+            self._lane.observations.leave()
         self.counters.requests += 1
         self._pending = (request_id, operation)
         self.lifecycle.on(Event.SUBMIT)

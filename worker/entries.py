@@ -114,8 +114,13 @@ def for_operation(death: m.Died, operation: str) -> m.Died:
 
 
 def signal_name(number: int | None) -> str | None:
-    """``"SIGKILL"`` for 9."""
-    return None if number is None else signal.Signals(number).name
+    """``"SIGKILL"`` for 9. Trust: a jail may choose one that has no name, such as 40."""
+    if number is None:
+        return None
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
 
 
 _STATES = {"R": "running", "S": "waiting", "D": "waiting", "T": "stopped", "t": "stopped"}

@@ -20,6 +20,7 @@ from envhub_worker.jailspec import confinement_from_wire
 from envhub_worker.keys import AuthorizedClients, KeyPair
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.keys import KEY_BYTES, key_text
 from envhub_worker.quotas import (
     InFlight,
@@ -245,14 +246,17 @@ class RemoteGate:
     def _check_open(self, key: bytes, request: m.OpenJail, jails: Jails) -> m.OpenJail:
         try:
             confinement = confinement_from_wire(request.confinement)
-            memory = int(confinement.limits.memory_bytes)
-        except (KeyError, TypeError, ValueError) as error:
+        except ProtocolError as error:
             raise RefusedError("LocalProtocolError", f"no confinement: {error}") from None
         check_policy(request, confinement, self._rules.permissions)
         wrong = wrong_with_path(request.entry)
         if wrong:
             raise RefusedError("PolicyError", f"the entry file {wrong}")
-        check_jail(_uses(jails, key), Use(max(1, memory), request.hosts), self._rules.quotas)
+        check_jail(
+            _uses(jails, key),
+            Use(confinement.limits.memory_bytes, request.hosts),
+            self._rules.quotas,
+        )
         tree = self._uploads.tree(key, request.snapshot)
         return m.OpenJail(
             request.name[:512], "", tree, request.entry, request.confinement, request.hosts

@@ -9,7 +9,8 @@ from __future__ import annotations
 import itertools
 import os
 import secrets
-from collections.abc import Sequence
+import traceback
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,7 +53,9 @@ ATTACH = "attach"
 MAX_JAILS = 256
 """Open jails of one server."""
 MAX_DEAD = 256
-"""Jails that were ended and not closed, whose deaths are remembered."""
+"""Jails that have ended and are not closed, whose deaths are remembered."""
+MAX_LOST = 4096
+"""Hosts of a kept jail that may die: their deaths are remembered."""
 
 
 class Jails:
@@ -122,8 +125,8 @@ class Jails:
             output=OutputTail(jail.output, confinement.limits.output_bytes),
         )
         self._jails[entry.number] = entry
-        self._loop.watch(entry.control, lambda: self._jail_events(entry))
-        self._loop.watch(jail.output, lambda: self._read_output(entry))
+        self._watch(entry, entry.control, lambda: self._jail_events(entry))
+        self._watch(entry, jail.output, lambda: self._read_output(entry))
         self._start_hosts(asker, entry, request.hosts)
 
     def start_more(self, asker: Asker, request: m.StartHosts) -> None:
@@ -134,6 +137,9 @@ class Jails:
         if not 1 <= request.hosts <= MAX_HOSTS - len(entry.links):
             self._answers.refuse(asker, "WorkerError", f"a jail has at most {MAX_HOSTS} hosts")
             return
+        if len(entry.lost) > MAX_LOST:
+            self._answers.refuse(asker, "WorkerError", f"{len(entry.lost)} of its hosts have died")
+            return
         self._start_hosts(asker, entry, request.hosts)
 
     def _start_hosts(self, asker: Asker, entry: JailEntry, count: int) -> None:
@@ -143,8 +149,21 @@ class Jails:
     def _start_host(self, entry: JailEntry) -> int:
         host, sock = entry.jail.start_host()
         link = entry.links[host] = HostLink(sock, self._limits)
-        self._loop.watch(link.fileno(), lambda: self._host_ready(entry, host))
+        self._watch(entry, link.fileno(), lambda: self._host_ready(entry, host))
         return host
+
+    def _watch(self, entry: JailEntry, fd: int, callback: Callable[[], None]) -> None:
+        """Whatever goes wrong with a jail is its own end, and not the server's."""
+
+        def guarded() -> None:
+            try:
+                callback()
+            except Exception as error:
+                traceback.print_exc()
+                what = f"an error of the worker server: {type(error).__name__}: {error}"
+                self._end(entry, m.Died(-1, "killed", None, None, what, "", ""))
+
+        self._loop.watch(fd, guarded)
 
     def _spawner(self, key: tuple[object, ...], confinement: Confinement) -> Spawner:
         spawner = self._spawners.get(key)
@@ -179,10 +198,12 @@ class Jails:
                 continue
             link = entry.links[host]
             fds = self._deposits.take(entry.number, host) if request.operation == ATTACH else []
-            link.send(next(self._packet_ids), frames, (pending, index), fds)
-            if entry.idle is not None and fds:
-                entry.idle.watch(host, [os.dup(fd) for fd in fds[:2]])
-            close_fds(fds)
+            try:
+                link.send(next(self._packet_ids), frames, (pending, index), fds)
+                if entry.idle is not None and fds:
+                    entry.idle.watch(host, [os.dup(fd) for fd in fds[:2]])
+            finally:
+                close_fds(fds)
             self._follow_writes(link)
         if entry.idle is not None:
             entry.idle.begin()
@@ -192,12 +213,16 @@ class Jails:
     def _relay_targets(
         self, entry: JailEntry, request: m.Relay, payload: list[bytes]
     ) -> list[tuple[int, list[bytes]]] | None:
-        targets = []
+        targets: list[tuple[int, list[bytes]]] = []
+        asked: set[int] = set()
         start = 0
         for part in request.parts:
             if type(part) is not tuple or len(part) != 2:
                 return None
             host, count = part
+            if type(host) is not int or host in asked:
+                return None
+            asked.add(host)
             if host not in entry.links and host not in entry.lost:
                 return None
             if type(count) is not int or not 1 <= count <= len(payload) - start:
@@ -304,6 +329,9 @@ class Jails:
     def end(self, entry: JailEntry, why: str) -> None:
         """End a jail that nobody closes; its client is told why if it comes back."""
         self._end(entry, m.Died(-1, "idle", None, None, why, "", ""))
+
+    def _forget_some(self) -> None:
+        """The oldest dead, where there are many: their clients do not come back for them."""
         dead = [number for number, one in self._jails.items() if one.released]
         for number in dead[:-MAX_DEAD]:
             del self._jails[number]
@@ -338,13 +366,16 @@ class Jails:
             self._answers.reply(pending.asker, answer, payload)
 
     def _read_output(self, entry: JailEntry) -> None:
-        fd = entry.output.fileno()
         entry.output.read()
-        if entry.output.fileno() < 0:
-            self._loop.unwatch(fd)
+        if entry.output.ended:
+            self._loop.unwatch(entry.output.fileno())
+            entry.output.close()
 
     def _jail_events(self, entry: JailEntry) -> None:
-        for event in entry.jail.poll():
+        events = entry.jail.poll()
+        if entry.jail.fileno() < 0:
+            self._unwatch_control(entry)
+        for event in events:
             if isinstance(event, HostStarted):
                 self._host_started(entry, event)
             elif isinstance(event, Failed):
@@ -420,8 +451,13 @@ class Jails:
 
     def _kill(self, entry: JailEntry) -> None:
         self._deposits.drop(entry.number)
-        self._loop.unwatch(entry.control)
+        self._unwatch_control(entry)
         entry.jail.kill()
+
+    def _unwatch_control(self, entry: JailEntry) -> None:
+        """Once: after that the number may be another's."""
+        self._loop.unwatch(entry.control)
+        entry.control = -1
 
     def _spawner_events(self, key: tuple[object, ...]) -> None:
         for event in self._spawners[key].poll():
@@ -450,19 +486,20 @@ class Jails:
             self._loop.unwatch(link.fileno())
             link.close()
         self._loop.unwatch(entry.output.fileno())
-        self._loop.unwatch(entry.control)
         entry.output.close()
+        self._unwatch_control(entry)
         if entry.idle is not None:
             entry.idle.close()
         for pending in waiting(entry):
             death = m.Died(-1, "killed", None, None, "the jail was closed", "", pending.operation)
             self._answers.reply(pending.asker, death)
+        self._forget_some()
 
     def _zygote_died(self, key: tuple[object, ...], event: ZygoteDied) -> None:
         spawner = self._spawners.pop(key)
         self._loop.unwatch(spawner.fileno())
         for entry in list(self._jails.values()):
-            if entry.spawner == key:
+            if entry.spawner == key and not entry.released:
                 self._end(entry, m.Died(-1, "zygote", event.code, None, event.log, "", ""))
                 self._release(entry)
         spawner.close()

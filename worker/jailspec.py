@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from envhub_worker.protocol.confinement import Confinement, Limits
+from envhub_worker.protocol.confinement import NETWORKS, PROFILES, Confinement, Limits
+from envhub_worker.protocol.errors import RemoteProtocolError
+
+_MAX_LIMIT = 1 << 62
+_MAX_OUTPUT_BYTES = 64 << 20
+"""The server itself keeps what a jail prints."""
+_MAX_ENVIRONMENT_BYTES = 64 << 10
+"""All granted variables together: they travel in one packet between our own processes."""
+_MAX_READABLE = 64
+_LIFTABLE = frozenset({"cpu_s", "file_bytes"})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +45,46 @@ class JailSpec:
 
 
 def confinement_from_wire(data: dict[str, Any]) -> Confinement:
-    """A ``Confinement`` from its ``dataclasses.asdict`` form, lists for tuples permitted."""
-    return Confinement(
-        **{**data, "readable": tuple(data["readable"]), "limits": Limits(**data["limits"])}
+    """A ``Confinement`` from its ``dataclasses.asdict`` form, lists for tuples permitted.
+
+    Trust: a client on another host may have written it.
+
+    Raises:
+        RemoteProtocolError: A name, type or number that there cannot be.
+    """
+    if set(data) != {item.name for item in fields(Confinement)}:
+        raise RemoteProtocolError("a confinement has other fields")
+    made = Confinement(
+        **{**data, "readable": tuple(_texts(data["readable"])), "limits": _limits(data["limits"])}
     )
+    known = made.profile in PROFILES and made.network in NETWORKS and type(made.gpu) is bool
+    if not known or len(made.readable) > _MAX_READABLE or not _may_be_granted(made.environment):
+        raise RemoteProtocolError("a confinement that there cannot be")
+    return made
+
+
+def _texts(value: Any) -> Any:
+    if type(value) not in (list, tuple) or not all(type(item) is str for item in value):
+        raise RemoteProtocolError("readable paths are a list of strings")
+    return value
+
+
+def _limits(data: Any) -> Limits:
+    names = {item.name for item in fields(Limits)}
+    if not isinstance(data, Mapping) or not set(data) <= names:
+        raise RemoteProtocolError("limits have other fields")
+    for name, value in data.items():
+        highest = _MAX_OUTPUT_BYTES if name == "output_bytes" else _MAX_LIMIT
+        lifted = value is None and name in _LIFTABLE
+        if not lifted and not (type(value) is int and 1 <= value <= highest):
+            raise RemoteProtocolError(f"the limit {name} is a whole number from 1 to {highest}")
+    return Limits(**data)
+
+
+def _may_be_granted(environment: Any) -> bool:
+    if type(environment) is not dict:
+        return False
+    texts = [*environment, *environment.values()]
+    if not all(type(text) is str and "\0" not in text for text in texts):
+        return False
+    return sum(map(len, texts)) <= _MAX_ENVIRONMENT_BYTES

@@ -30,7 +30,7 @@ class HostLink:
 
     def __post_init__(self) -> None:
         self.sock.setblocking(False)
-        self._reader = PacketReader(self.limits)
+        self._reader = PacketReader(self.limits, self._check_owed)
 
     def fileno(self) -> int:
         """The stream's descriptor."""
@@ -61,7 +61,11 @@ class HostLink:
         if self._unsent:
             raise RuntimeError("the host is still being sent another request")
         data = b"".join(map(bytes, pack_packet(request_id, frames)))
-        if socket.send_fds(self.sock, [data], fds) != len(data):
+        try:
+            sent = socket.send_fds(self.sock, [data], fds)
+        except OSError:
+            return  # it is gone: its exit answers
+        if sent != len(data):
             raise RuntimeError("the host does not read its stream")
 
     def flush(self) -> None:
@@ -105,12 +109,13 @@ class HostLink:
             raise
         return answers
 
-    def _owner(self, packet: Packet) -> Any:
+    def _check_owed(self, request_id: int) -> None:
+        """Before there is memory for what nobody asked for."""
         expected = next(iter(self.pending), None)
-        if packet.request_id != expected:
-            raise RemoteProtocolError(
-                f"the host answered request {packet.request_id}, it owes {expected}"
-            )
+        if request_id != expected:
+            raise RemoteProtocolError(f"the host answered request {request_id}, it owes {expected}")
+
+    def _owner(self, packet: Packet) -> Any:
         return self.pending.pop(packet.request_id)
 
     def close(self) -> None:

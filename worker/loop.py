@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import traceback
 from collections.abc import Callable
 from time import monotonic
 from typing import Any
@@ -11,6 +12,8 @@ from typing import Any
 import zmq
 
 _POLL_MS = 1000
+_MAX_FAILURES = 100
+"""Callbacks that fail one after the other."""
 
 
 class Loop:
@@ -21,6 +24,7 @@ class Loop:
         self._callbacks: dict[Any, Callable[[], None]] = {}
         self._stopped = False
         self._tick: Callable[[], None] | None = None
+        self._failures = 0
 
     def tick(self, callback: Callable[[], None]) -> None:
         """Call back about once a second, from now on."""
@@ -59,7 +63,19 @@ class Loop:
             for ready, _ in self._poller.poll(_POLL_MS):
                 callback = self._callbacks.get(ready)
                 if callback is not None:
-                    callback()
+                    self._call(callback)
             if self._tick is not None and monotonic() - ticked >= _POLL_MS / 1000:
                 ticked = monotonic()
-                self._tick()
+                self._call(self._tick)
+
+    def _call(self, callback: Callable[[], None]) -> None:
+        """One client's misfortune is not everybody's; what fails again and again is the end."""
+        try:
+            callback()
+        except Exception:
+            self._failures += 1
+            if self._failures >= _MAX_FAILURES:
+                raise
+            traceback.print_exc()
+        else:
+            self._failures = 0

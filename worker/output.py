@@ -12,28 +12,32 @@ MAX_BYTES = 1 << 20
 
 
 class OutputTail:
-    """The last ``limit`` bytes of a pipe that a jail writes to. Owns the descriptor."""
+    """The last ``limit`` bytes of a pipe that a jail writes to. Owns the descriptor.
+
+    Attributes:
+        ended: Nothing more will come.
+    """
 
     def __init__(self, fd: int, limit: int) -> None:
+        self.ended = False
         self._fd = fd
         self._limit = limit
         self._kept = bytearray()
         self._total = 0
 
     def fileno(self) -> int:
-        """The descriptor, or -1 when the pipe has ended."""
+        """The descriptor, or -1 once it is closed."""
         return self._fd
 
     def read(self) -> None:
         """Take what is there. One read a call, so that a flood cannot hold up the server."""
-        if self._fd < 0:
+        if self._fd < 0 or self.ended:
             return
         try:
             data = os.read(self._fd, _CHUNK)
         except BlockingIOError:
             return
-        if not data:
-            self.close()
+        self.ended = not data  # closed by whoever watches it: its number is soon another's
         self._kept += data
         self._total += len(data)
         if len(self._kept) > 2 * self._limit:

@@ -6,6 +6,7 @@ business of its gate.
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -50,6 +51,9 @@ class Server:
         self._gate: Gate = gate or LocalGate()
         self._sessions = Sessions()
         self._loop = Loop()
+        # ROUTER's own routing ids come from rand(), which libzmq does not seed: who can tell the
+        # next one can claim it, and that ends the process
+        ctypes.CDLL(None).srand(int.from_bytes(os.urandom(4), "little"))
         self._context = zmq.Context()
         self._router = self._listen(endpoint)
         self._loop.watch(self._router, self._serve_clients)

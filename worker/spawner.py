@@ -231,9 +231,13 @@ class Spawner:
         spec = replace(spec, snapshot=os.path.realpath(spec.snapshot))
         folder = None if self._scratches is None else self._scratches / f"jail-{self._count}"
         jail = Jail(spec, self, folder, self._user)
-        jail._describe(self._make_group(spec))
+        try:
+            jail._describe(self._make_group(spec))
+            self._channel.send({"op": "spawn", "id": self._count}, jail._theirs)
+        except BaseException:
+            jail._give_up()
+            raise
         self._jails[self._count] = jail
-        self._channel.send({"op": "spawn", "id": self._count}, jail._theirs)
         jail._close_theirs()
         return jail
 
@@ -309,6 +313,13 @@ class Jail:
 
     def _close_theirs(self) -> None:
         close_fds(self._theirs)
+
+    def _give_up(self) -> None:
+        """Nobody has heard of it."""
+        os.close(self.output)
+        self._close_theirs()
+        self._channel.close()
+        self._release()
 
     def _attach(self, pidfd: int) -> None:
         self._pidfd = pidfd

@@ -130,7 +130,7 @@ def test_only_ones_own_sessions_are_shown(alice: Any, mallory: Peer) -> None:
         ({"confinement": {}}, "no confinement"),
         ({"confinement": asdict(Confinement(readable=("/",)))}, "readable"),
         ({"confinement": asdict(Confinement(network="host"))}, "--allow-network"),
-        ({"confinement": asdict(Confinement(profile="nothing"))}, "--weakest-profile"),
+        ({"confinement": asdict(Confinement(profile="nothing"))}, "no confinement"),
         ({"hosts": 10_000}, "hosts"),
     ],
 )

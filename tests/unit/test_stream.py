@@ -165,3 +165,18 @@ def test_arbitrary_bytes_raise_nothing_but_protocol_errors(chunks: list[bytes]) 
         read(chunks)
     except RemoteProtocolError:
         return
+
+
+def test_what_must_not_come_is_refused_before_there_is_memory_for_it() -> None:
+    """Its header is enough; the frames need not follow."""
+
+    def check(request_id: int) -> None:
+        if request_id != 1:
+            raise RemoteProtocolError("nobody asked")
+
+    reader = PacketReader(check=check)
+    [packet] = reader.feed(b"".join(pack_packet(1, [b"asked"])))
+    assert packet.request_id == 1
+    header = pack_packet(2, [bytes(1 << 20)])[0]
+    with pytest.raises(RemoteProtocolError, match="nobody asked"):
+        list(reader.feed(header))

@@ -96,6 +96,6 @@ def test_a_follower_gets_every_byte_that_is_kept(
     assert tail.since(len(printed) + 5) == (len(printed), b"")
     os.close(writes)
     tail.read()
-    assert tail.fileno() == -1
+    assert tail.ended
     tail.read()  # after its end: nothing happens
     tail.close()

@@ -87,8 +87,11 @@ class Host:
 
     def answer(self, packet: Packet, *, by_lane: bool = False) -> list[Any]:
         """The reply's frames; whatever the repository raises becomes ``Raised``."""
-        # the caller's own arguments may be pickled: this is the only place that unpickles
-        request_id, request = m.unpack(packet.frames, unpickler=cloudpickle.loads)
+        try:
+            # the caller's own arguments may be pickled: this is the only place that unpickles
+            request_id, request = m.unpack(packet.frames, unpickler=cloudpickle.loads)
+        except Exception as error:  # of a class that is not to be had here, for instance
+            return m.pack(raised(error, "arguments"), 0)
         self._stage = type(request).__name__.lower()
         if self.lane is not None and not by_lane:
             if isinstance(request, m.FetchInfos) and self.lane.unsent:

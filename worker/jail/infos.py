@@ -97,6 +97,7 @@ class InfoWriter:
     def put(self, frame: Any) -> int:
         """Write encoded bytes; returns their number."""
         size = memoryview(frame).nbytes
+        self._fresh = True
         self._reply[self._start : self._start + size] = frame
         return size
 

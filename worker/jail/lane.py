@@ -143,6 +143,7 @@ class Lane:
                 self._change()
             if self._asked[slabs.MESSAGE]:
                 return self._run_message(self._asked[slabs.MESSAGE])
+            self.unsent = []  # what is fetched after this step are its infos
             # copied, because an environment may keep its action and the client writes the next one
             actions = self._assemble([view.copy() for view in self._views])
             pairs = self._pairs = self._env.run_step(actions)

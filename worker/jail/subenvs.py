@@ -45,6 +45,7 @@ class Batch:
         self.rows: list[Any] = []
         self._slots: list[tuple[list[Any], Store, list[Any]]] = []
         self._slot = 0
+        self._left: int | None = None
         layout = slabs.observation_layout(space, count, 1)
         if layout is None:
             self.store: Store = self._members.__setitem__
@@ -64,11 +65,23 @@ class Batch:
 
     def choose(self, slot: int, *, carry: bool = False) -> None:
         """Write the next observations into another slot; ``carry`` takes the last ones along."""
-        if carry and slot != self._slot:
-            for ours, theirs in zip(self._slots[slot][0], self._slots[self._slot][0], strict=True):
-                ours[...] = theirs
+        if slot != self._slot:
+            self._left = self._slot
         self._slot = slot
+        if carry:
+            self.carry(0)
         _, self.store, self.rows = self._slots[slot]
+
+    def carry(self, start: int) -> None:
+        """Take the rows from ``start`` on along from the slot that was left, if one was."""
+        left, self._left = self._left, None
+        if left is not None:
+            for ours, theirs in zip(self._slots[self._slot][0], self._slots[left][0], strict=True):
+                ours[start:] = theirs[start:]
+
+    def stay(self) -> None:
+        """All rows have been written: what was left is of no concern any more."""
+        self._left = None
 
     def observation(self) -> Any:
         """The batched observation; views of the arrays that the next step writes."""
@@ -149,32 +162,38 @@ class SubEnvs(SyncVectorEnv):
         done = [False] * count
         infos: Pairs = []
         each = zip(self._each(actions), self.envs, self._done, strict=True)
-        for index, (action, env, over) in enumerate(each):
-            if over:
-                observation, info = env.reset()
-                rewards[index] = 0.0
-                terminations[index] = truncations[index] = False
-            else:
-                observation, reward, terminated, truncated, info = env.step(action)
-                rewards[index] = reward
-                terminations[index] = terminated
-                truncations[index] = truncated
-                if terminated or truncated:
-                    if same_step:
-                        infos.append((index, {"final_obs": observation, "final_info": info}))
-                        observation, info = env.reset()
-                    else:
-                        done[index] = True
-            if (
-                type(observation) is array
-                and observation.dtype is dtype
-                and observation.shape == shape
-            ):
-                rows[index][...] = observation
-            else:
-                store(index, observation)
-            if info:
-                infos.append((index, info))
+        index = 0
+        try:
+            for index, (action, env, over) in enumerate(each):
+                if over:
+                    observation, info = env.reset()
+                    rewards[index] = 0.0
+                    terminations[index] = truncations[index] = False
+                else:
+                    observation, reward, terminated, truncated, info = env.step(action)
+                    rewards[index] = reward
+                    terminations[index] = terminated
+                    truncations[index] = truncated
+                    if terminated or truncated:
+                        if same_step:
+                            infos.append((index, {"final_obs": observation, "final_info": info}))
+                            observation, info = env.reset()
+                        else:
+                            done[index] = True
+                if (
+                    type(observation) is array
+                    and observation.dtype is dtype
+                    and observation.shape == shape
+                ):
+                    rows[index][...] = observation
+                else:
+                    store(index, observation)
+                if info:
+                    infos.append((index, info))
+        except BaseException:
+            batch.carry(index)  # who was not asked any more has his last observation still
+            raise
+        batch.stay()
         self._done = done
         return infos
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 
 MIB = 1024 * 1024
 GIB = 1024 * MIB
+PROFILES = ("strict", "no-userns", "container")
+NETWORKS = ("none", "loopback", "host")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ then the frames. The reader checks every number before it allocates: the peer is
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,10 +40,18 @@ def pack_packet(request_id: int, frames: Sequence[Buffer]) -> list[Buffer]:
 
 
 class PacketReader:
-    """Cuts a byte stream into packets."""
+    """Cuts a byte stream into packets.
 
-    def __init__(self, limits: WireLimits = DEFAULT_LIMITS) -> None:
+    Args:
+        limits: Bounds on a packet.
+        check: Refuses the id of one that must not come, before anything is allocated for it.
+    """
+
+    def __init__(
+        self, limits: WireLimits = DEFAULT_LIMITS, check: Callable[[int], None] | None = None
+    ) -> None:
         self._limits = limits
+        self._check = check
         self._pending = bytearray()
         self._head: tuple[int, tuple[int, ...]] | None = None
         self._body: memoryview | None = None
@@ -88,6 +96,8 @@ class PacketReader:
 
     def _begin_body(self) -> None:
         count, _, request_id = _PREFIX.unpack_from(self._pending)
+        if self._check is not None:
+            self._check(request_id)
         lengths = struct.unpack_from(f"<{count}Q", self._pending, _PREFIX.size)
         self._check_lengths(lengths)
         self._head = request_id, lengths

@@ -1,0 +1,146 @@
+"""Requests that go straight to the hosts, and answers too large for that: nothing is mixed up."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import RemoteEnvError
+from envhub_worker.protocol import slabs
+from tests.support.compare import assert_same
+
+REPOSITORY = '''
+import gymnasium as gym
+import numpy as np
+
+LARGE = 2 * 65536
+
+
+class Talker(gym.Env):
+    """Counts what it is asked, says so in its infos, and some of these are large."""
+
+    observation_space = gym.spaces.Box(0, 1e6, (2,), np.float32)
+    action_space = gym.spaces.Discrete(4)
+
+    def __init__(self):
+        self.asked = 0
+        self.small = "small"
+
+    def seen(self):
+        return np.full(2, self.asked, np.float32)
+
+    def said(self, what, large):
+        return {"what": (what, self.asked, "x" * (LARGE if large else 1))}
+
+    def reset(self, *, seed=None, options=None):
+        self.asked += 1
+        return self.seen(), self.said("reset", (options or {}).get("large", False))
+
+    def step(self, action):
+        self.asked += 1
+        if action == 2:
+            raise ValueError("no")
+        return self.seen(), 0.0, False, False, self.said("step", action == 1)
+
+    def tell(self, large, ignored=None):
+        self.asked += 1
+        return self.said("call", large)["what"]
+
+    def signal(self):
+        import os
+
+        os.kill(os.getpid(), 40)
+
+
+def make_env(n_envs=1, use_async_envs=False):
+    cls = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv
+    return cls([Talker] * n_envs)
+'''
+
+
+assert slabs.INFO_BYTES == 65536, "what is large has changed"
+
+
+@pytest.fixture(scope="module")
+def talker(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The repository."""
+    folder = tmp_path_factory.mktemp("talker")
+    (folder / "env.py").write_text(REPOSITORY)
+    return folder
+
+
+def conversation(folder: Path, lane: str, num_workers: int) -> list[Any]:
+    """Large and small answers of every kind, one after the other."""
+    with make_env(folder, 4, use_async_envs=True, lane=lane, num_workers=num_workers) as suites:
+        env = suites.env
+        heard: list[Any] = []
+        for large in (True, False, True):
+            heard.append(env.reset(options={"large": large}))
+            for action in (1, 0, 1, 1):
+                heard += [env.step([action] * 4), env.call("tell", large), env.get_attr("small")]
+                heard.append(env.step([1, 0, 0, 1]))
+        return heard
+
+
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_large_and_small_answers_are_not_mixed_up(talker: Path, num_workers: int) -> None:
+    """Whatever did not fit the lane is fetched for the request that it belongs to."""
+    by_lane = conversation(talker, "auto", num_workers)
+    assert_same(conversation(talker, "frames", num_workers), by_lane)
+
+
+def test_a_reset_by_the_server_leaves_lent_batches_alone(talker: Path) -> None:
+    """Its options do not fit the lane, so it goes another way than what follows it."""
+    with make_env(talker, 4, copy=False) as suites:
+        env = suites.env
+        env.reset()
+        held = env.step([0] * 4)[0]
+        before = held.copy()
+        env.reset(options={"padding": "x" * 2 * slabs.INFO_BYTES})
+        env.get_attr("small")
+        env.step([0] * 4)
+        np.testing.assert_array_equal(held, before)
+
+
+@pytest.mark.parametrize("copy", [True, False])
+def test_a_masked_reset_after_a_failed_step_shows_the_last_observations(
+    talker: Path, copy: bool
+) -> None:
+    """Of those that the failed step did not reach, too."""
+    with make_env(talker, 2, copy=copy) as suites:
+        env = suites.env
+        held = [env.reset()[0]]
+        held += [env.step([0, 0])[0] for _ in range(3)]
+        with pytest.raises(RemoteEnvError, match="no"):
+            env.step([2, 0])
+        observation, _ = env.reset(options={"reset_mask": np.array([True, False])})
+        assert observation[1].tolist() == [4, 4]
+
+
+class Unknown:
+    """Of a module that is not to be had in a jail."""
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+def test_an_argument_that_cannot_be_read_there_is_told(talker: Path, lane: str) -> None:
+    """The environment goes on."""
+    with make_env(talker, lane=lane) as suites:
+        env = suites.env
+        env.reset()
+        with pytest.raises(RemoteEnvError, match="tests"):
+            env.call("tell", False, ignored=Unknown())
+        assert env.get_attr("small") == ("small",)
+
+
+def test_a_signal_without_a_name_is_told(talker: Path) -> None:
+    """And ends nothing but its jail."""
+    with make_env(talker) as suites, make_env(talker) as others:
+        suites.env.reset()
+        others.env.reset()
+        with pytest.raises(Exception, match="signal 40"):
+            suites.env.call("signal")
+        others.env.step([0])

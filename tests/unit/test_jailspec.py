@@ -1,0 +1,65 @@
+"""What a client may write into a confinement: it comes from another host, perhaps."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import pytest
+
+from envhub_worker.jailspec import confinement_from_wire
+from envhub_worker.protocol.confinement import Confinement, Limits
+from envhub_worker.protocol.errors import RemoteProtocolError
+
+
+def wire(**changes: Any) -> dict[str, Any]:
+    """An ordinary confinement as it travels, but for this."""
+    return {**asdict(Confinement()), **changes}
+
+
+def test_an_ordinary_one_is_what_it_was() -> None:
+    """With lists for tuples, as JSON has them, and limits lifted that may be."""
+    made = Confinement(
+        readable=("/data",), environment={"A": "b"}, limits=Limits(cpu_s=None, file_bytes=5)
+    )
+    assert confinement_from_wire({**asdict(made), "readable": ["/data"]}) == made
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"profile": "none"},
+        {"network": "anything"},
+        {"network": ["host"]},
+        {"gpu": 1},
+        {"readable": "/etc"},
+        {"readable": [b"/etc"]},
+        {"readable": ["/a"] * 65},
+        {"environment": {"A": b"b"}},
+        {"environment": {"A": "b" * (64 << 10)}},
+        {"environment": {"A": "b\0c"}},
+        {"environment": ["A"]},
+        {"limits": None},
+        {"limits": {"unknown": 1}},
+        {"surplus": 1},
+    ],
+    ids=lambda changes: next(iter(changes)),
+)
+def test_what_there_cannot_be_is_refused(changes: dict[str, Any]) -> None:
+    """Before a zygote is started for it, or a number is added up."""
+    with pytest.raises(RemoteProtocolError):
+        confinement_from_wire(wire(**changes))
+
+
+@pytest.mark.parametrize("name", list(asdict(Limits())))
+@pytest.mark.parametrize("value", [0, -(10**15), True, 1.5, "1", 1 << 63])
+def test_a_limit_is_a_number_above_zero(name: str, value: object) -> None:
+    """A negative one would make room for others in a sum, and a text would end the server."""
+    with pytest.raises(RemoteProtocolError):
+        confinement_from_wire(wire(limits={**asdict(Limits()), name: value}))
+
+
+def test_what_is_kept_of_the_output_is_bounded() -> None:
+    """It lies in the server's own memory."""
+    with pytest.raises(RemoteProtocolError, match="output_bytes"):
+        confinement_from_wire(wire(limits={"output_bytes": 1 << 30}))
