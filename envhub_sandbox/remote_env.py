@@ -696,14 +696,20 @@ class RemoteEnv:
             state, loaded = self.lifecycle.state, self._loaded
             self._moved(Event.CLOSE)
             self._note_pace()
-            if loaded is not None:
-                if state is State.READY:
-                    self._close_politely(loaded)
-                self._jails.give_back(loaded)
-            self._close_lane()
-            self._let_server_go()
+            if loaded is not None and state is State.READY:
+                self._close_politely(loaded)
         finally:
-            self._lock.release()
+            try:
+                self._let_go()
+            finally:
+                self._lock.release()
+
+    def _let_go(self) -> None:
+        """Give back whatever is left of it."""
+        try:
+            self._give_back()
+        finally:
+            self._let_server_go()
 
     def abandon(self) -> None:
         """In a fork of the process that made it: touch nothing, and refuse from now on."""
@@ -725,10 +731,7 @@ class RemoteEnv:
         if self._lock.acquire(timeout=_INTERRUPT_S):
             try:
                 self._moved(Event.CLOSE)  # the other may have moved at the same moment
-                if self._loaded is not None:  # it may have moved elsewhere, too
-                    self._jails.give_back(self._loaded)
-                self._close_lane()
-                self._let_server_go()
+                self._let_go()  # of what is there now: it may have moved elsewhere, too
             finally:
                 self._lock.release()
 

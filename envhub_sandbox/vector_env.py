@@ -243,8 +243,6 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
     def close(self, **kwargs: Any) -> None:
         """Close the sub-environments and end their processes, in bounded time. Idempotent."""
-        if self.closed:
-            return
         self.closed = True
         self._remote.close()
 

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import make_env, remote_env
+from envhub_sandbox.remote_env import RemoteEnv
 from envhub_worker.protocol.lifecycle import State
 from tests.support.samples import sample
 
@@ -26,6 +27,19 @@ def made(lane: str = "auto", **options: Any) -> Any:
 def interrupted(*arguments: Any, **options: Any) -> Any:
     """In place of whatever takes so long that somebody loses patience."""
     raise KeyboardInterrupt
+
+
+def released(remote: RemoteEnv) -> list[bool]:
+    """Have the environment hold its server; what is returned says when it has let it go."""
+    found: list[bool] = []
+    give_back = remote.repository.hold()
+
+    def release() -> None:
+        give_back()
+        found.append(True)
+
+    remote._release_server = release
+    return found
 
 
 @lanes
@@ -48,3 +62,23 @@ def test_a_second_ctrl_c_in_recovery_leaves_a_usable_environment(
         env.reset()
         assert remote._loaded is not first
         assert env.render() is not None
+
+
+@lanes
+@pytest.mark.parametrize("owner", ["jail", "book"])
+def test_ctrl_c_in_close_leaves_nothing(
+    lane: str, owner: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the repository's ``close`` is waited for, or the pace noted; it can be repeated."""
+    suites = made(lane)
+    env, remote = suites.env, suites.env._remote
+    loaded, release = remote._loaded, released(remote)
+    if owner == "jail":
+        monkeypatch.setattr(loaded.jail, "receive", interrupted)
+    else:
+        monkeypatch.setattr(remote, "_note_pace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        env.close()
+    assert loaded.closed
+    assert (remote._lane, release) == (None, [True])
+    suites.close()
