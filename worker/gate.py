@@ -291,6 +291,7 @@ class RemoteGate:
     def _sessions_of(self, key: bytes, sessions: Sessions, jails: Jails) -> list[dict[str, Any]]:
         rules = self._rules
         seen = sessions.all() if key in rules.operators else sessions.of_key(key)
+        used = {key: self._uploads.used_bytes(key) for key in {one.key for one in seen}}
         return [
             {
                 "client": rules.authorized.name_of(one.key) or "operator",
@@ -298,7 +299,7 @@ class RemoteGate:
                 "session": one.name.hex()[:8],
                 "heard_s": sessions.age_s(one),
                 "connections": len(one.connections),
-                "upload_bytes": self._uploads.used_bytes(one.key),
+                "upload_bytes": used[one.key],
                 "jails": tuple(jails.statuses(one.owner)),
             }
             for one in seen
@@ -323,6 +324,7 @@ class RemoteGate:
                 why = f"nothing was heard of its client for {self.idle_s} s"
                 self._end(session, sessions, jails, why)
             elif not jails.open_ones(session.owner):
+                self._uploads.forget(session.owner)
                 sessions.drop(session)
         if self.idle_s:
             self._end_unheld(sessions, jails)

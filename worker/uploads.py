@@ -11,12 +11,9 @@ its files. A snapshot is named by the digest of its listing, so the same listing
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
-import shutil
-import tempfile
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,25 +22,21 @@ from typing import Any
 from envhub_worker.lockdown.scratch import remove_tree
 from envhub_worker.protocol import messages as m
 from envhub_worker.quotas import Quotas, RefusedError
+from envhub_worker.stores import Listed, Store, blob_charge, tree_charge
 
 MAX_PIECE_BYTES = 8 << 20
 """One ``PutBlob``: the server writes and hashes it while everybody else waits."""
 MAX_PARTIAL = 64
 """Files of one client under way at once."""
+MAX_TREES = 1000
+"""Snapshots of one key, those that it is bringing included."""
+MAX_STEPS = 200_000
+"""Names in all paths of one snapshot."""
 PREFIX = "sha256:"
 _SHA256_BYTES = 32
 _MAX_DEPTH = 64
 _MAX_PATH_BYTES = 4096
 _MAX_NAME_BYTES = 255
-
-
-@dataclass(frozen=True)
-class Listed:
-    """One file of an offered snapshot."""
-
-    path: str
-    size: int
-    sha256: bytes
 
 
 @dataclass
@@ -54,6 +47,23 @@ class Partial:
     size: int
     written: int = 0
     running: Any = field(default_factory=hashlib.sha256)
+
+
+@dataclass
+class Offer:
+    """What a session is about to bring.
+
+    Attributes:
+        store: Where to.
+        needed: The hashes of all its files: they stay until its tree is laid out.
+        missing: Of these, the ones that are not here yet, with their sizes.
+        reserved: What it may still be charged.
+    """
+
+    store: Store
+    needed: Collection[bytes]
+    missing: dict[bytes, int]
+    reserved: int
 
 
 class Uploads:
@@ -67,11 +77,13 @@ class Uploads:
     def __init__(self, folder: Path, quotas: Quotas) -> None:
         self.folder = folder
         self._quotas = quotas
-        self._expected: dict[bytes, dict[bytes, int]] = {}
+        self._offers: dict[bytes, Offer] = {}
         self._partial: dict[tuple[bytes, bytes], Partial] = {}
         folder.mkdir(parents=True, exist_ok=True)
         for left in [*folder.glob("*/parts"), *folder.glob("*/trees/.building-*")]:
             remove_tree(str(left))
+        # counted now: later everybody would wait for it
+        self._stores = {home.name: Store(home) for home in folder.iterdir() if home.is_dir()}
 
     def offer(
         self, owner: bytes, key: bytes, request: m.OfferSnapshot, in_use: Collection[str]
@@ -89,20 +101,36 @@ class Uploads:
         """
         files = checked_listing(request.files, self._quotas)
         digest = digest_of(files)
-        home = self._home(key)
-        tree = home / "trees" / digest
-        if tree.is_dir():
-            os.utime(tree)
+        store = self._store(key)
+        self.forget(owner)  # it begins again
+        if store.tree(digest).is_dir():
+            os.utime(store.tree(digest))
             return m.Wanted(PREFIX + digest, ())
         sizes = {file.sha256: file.size for file in files}
-        missing = {sha: size for sha, size in sizes.items() if not (_blob(home, sha)).exists()}
-        if missing:
-            self._make_room(home, sum(sizes.values()), set(sizes), in_use)
-            self._expected[owner] = missing
-            return m.Wanted(PREFIX + digest, tuple(missing))
-        self._expected.pop(owner, None)
-        _lay_out(home, tree, files)
-        return m.Wanted(PREFIX + digest, ())
+        missing = {sha: size for sha, size in sizes.items() if not store.blob(sha).exists()}
+        reserved = tree_charge(file.path for file in files)
+        reserved += sum(map(blob_charge, missing.values()))
+        self._offers[owner] = Offer(store, sizes.keys(), missing, reserved)
+        try:
+            self._make_room(store, in_use)
+            if not missing:
+                self._lay_out(owner, digest, files, in_use)
+        except BaseException:
+            self.forget(owner)
+            raise
+        return m.Wanted(PREFIX + digest, tuple(missing))
+
+    def _lay_out(
+        self, owner: bytes, digest: str, files: list[Listed], in_use: Collection[str]
+    ) -> None:
+        offer = self._offers[owner]
+
+        def copying(size: int) -> None:
+            offer.reserved += size
+            self._make_room(offer.store, in_use)
+
+        offer.store.lay_out(digest, files, copying)
+        self.forget(owner)
 
     def put(self, owner: bytes, key: bytes, request: m.PutBlob, data: bytes) -> None:
         """Take a piece of a wanted file; the last one makes it a blob.
@@ -110,13 +138,13 @@ class Uploads:
         Raises:
             RefusedError: Nobody wanted it, it is out of order, or it is not what its hash says.
         """
-        size = self._expected.get(owner, {}).get(request.sha256)
-        home = self._home(key)
-        if size is None:
-            if _blob(home, request.sha256).exists():
+        offer = self._offers.get(owner)
+        size = None if offer is None else offer.missing.get(request.sha256)
+        if offer is None or size is None:
+            if self._store(key).blob(request.sha256).exists():
                 return  # another process of the same client was faster
             raise RefusedError("LocalProtocolError", "this file was not asked for")
-        partial = self._begin(owner, home, request, size)
+        partial = self._begin(owner, offer.store.home, request, size)
         if request.offset != partial.written or len(data) > MAX_PIECE_BYTES:
             self._give_up(owner, request.sha256)
             raise RefusedError("LocalProtocolError", "a piece is out of order, or too large")
@@ -128,7 +156,7 @@ class Uploads:
         partial.running.update(data)
         partial.written += len(data)
         if partial.written == size:
-            self._finish(owner, home, request.sha256)
+            self._finish(owner, offer, request.sha256)
 
     def _begin(self, owner: bytes, home: Path, request: m.PutBlob, size: int) -> Partial:
         place = (owner, request.sha256)
@@ -143,15 +171,13 @@ class Uploads:
             partial.path.write_bytes(b"")
         return partial
 
-    def _finish(self, owner: bytes, home: Path, sha256: bytes) -> None:
+    def _finish(self, owner: bytes, offer: Offer, sha256: bytes) -> None:
         partial = self._partial.pop((owner, sha256))
         if partial.running.digest() != sha256:
             partial.path.unlink()
             raise RefusedError("SnapshotIntegrityError", "a file arrived with another hash")
-        partial.path.chmod(0o444)
-        (home / "blobs").mkdir(exist_ok=True)
-        os.rename(partial.path, _blob(home, sha256))
-        self._expected[owner].pop(sha256, None)
+        offer.store.take(partial.path, sha256, partial.size)
+        offer.reserved -= blob_charge(offer.missing.pop(sha256))
 
     def _give_up(self, owner: bytes, sha256: bytes) -> None:
         partial = self._partial.pop((owner, sha256), None)
@@ -160,7 +186,7 @@ class Uploads:
 
     def forget(self, owner: bytes) -> None:
         """A client has gone: what it had begun is removed."""
-        self._expected.pop(owner, None)
+        self._offers.pop(owner, None)
         for known, sha256 in [place for place in self._partial if place[0] == owner]:
             self._give_up(known, sha256)
 
@@ -171,56 +197,49 @@ class Uploads:
             RefusedError: It is not here; a path is none.
         """
         digest = snapshot.removeprefix(PREFIX)
-        tree = self._home(key) / "trees" / digest
+        tree = self._store(key).tree(digest)
         if not snapshot.startswith(PREFIX) or not _is_digest(digest) or not tree.is_dir():
             raise RefusedError("WorkerError", "this server has no such snapshot; offer it first")
         return str(tree)
 
     def used_bytes(self, key: bytes) -> int:
-        """What a client's files take."""
-        return _size_of(self._home(key))
+        """What a client's files are charged, and what it has offered to bring."""
+        return self._charged(self._store(key))
 
-    def _home(self, key: bytes) -> Path:
-        return self.folder / (key.hex()[:32] or "local")
+    def _store(self, key: bytes) -> Store:
+        name = key.hex()[:32] or "local"
+        if name not in self._stores:
+            self._stores[name] = Store(self.folder / name)
+        return self._stores[name]
 
-    def _make_room(
-        self, home: Path, more: int, needed: Collection[bytes], in_use: Collection[str]
-    ) -> None:
-        """Remove the longest unused snapshots until the offered one fits, whole."""
-        quota = self._quotas.upload_bytes
-        trees = [tree for tree in (home / "trees").glob("[0-9a-f]*") if str(tree) not in in_use]
-        trees.sort(key=lambda tree: tree.stat().st_mtime)
-        keep = {sha.hex() for sha in needed}
-        if _size_of(home, leave=keep) + more > quota:
-            _remove_unlinked(home, keep)
-        while _size_of(home, leave=keep) + more > quota and trees:
-            remove_tree(str(trees.pop(0)))
-            _remove_unlinked(home, keep)
-        if _size_of(home, leave=keep) + more > quota:
+    def _offered(self, store: Store) -> list[Offer]:
+        return [offer for offer in self._offers.values() if offer.store is store]
+
+    def _charged(self, store: Store) -> int:
+        return store.held + sum(offer.reserved for offer in self._offered(store))
+
+    def _make_room(self, store: Store, in_use: Collection[str]) -> None:
+        """Remove the longest unused snapshots until all that is offered fits, whole."""
+        if self._fits(store):
+            return
+        keep = {sha256 for offer in self._offered(store) for sha256 in offer.needed}
+        store.remove_unlinked(keep)
+        for digest in store.unused(in_use):
+            if self._fits(store):
+                return
+            store.remove(digest)
+            store.remove_unlinked(keep)
+        if not self._fits(store):
             raise RefusedError(
                 "WorkerError",
-                f"your key's snapshots would take more than the server's quota of {quota} bytes "
-                "(--max-upload), and open environments use the others",
+                f"your key's snapshots would take more than the server's quota of "
+                f"{self._quotas.upload_bytes} bytes (--max-upload), or be more than {MAX_TREES}; "
+                "open environments use the others, or other processes of yours bring them",
             )
 
-
-def _blob(home: Path, sha256: bytes) -> Path:
-    return home / "blobs" / sha256.hex()
-
-
-def _size_of(home: Path, leave: Collection[str] = ()) -> int:
-    total = 0
-    for folder in ("blobs", "parts"):
-        with contextlib.suppress(FileNotFoundError), os.scandir(home / folder) as items:
-            total += sum(item.stat().st_size for item in items if item.name not in leave)
-    return total
-
-
-def _remove_unlinked(home: Path, keep: Collection[str]) -> None:
-    with contextlib.suppress(FileNotFoundError), os.scandir(home / "blobs") as items:
-        for item in items:
-            if item.stat().st_nlink == 1 and item.name not in keep:
-                os.unlink(item.path)
+    def _fits(self, store: Store) -> bool:
+        trees = store.trees + len(self._offered(store))
+        return trees <= MAX_TREES and self._charged(store) <= self._quotas.upload_bytes
 
 
 def checked_listing(files: tuple[object, ...], quotas: Quotas) -> list[Listed]:
@@ -244,6 +263,11 @@ def checked_listing(files: tuple[object, ...], quotas: Quotas) -> list[Listed]:
             "WorkerError",
             f"a snapshot of {total} bytes is over the server's quota of {quotas.upload_bytes} "
             "(--max-upload)",
+        )
+    steps = sum(file.path.count("/") + 1 for file in listed)
+    if steps > MAX_STEPS:
+        raise RefusedError(
+            "WorkerError", f"the paths of a snapshot have {steps} steps, over {MAX_STEPS}"
         )
     _check_tree([file.path for file in listed])
     return listed
@@ -301,31 +325,3 @@ def digest_of(files: list[Listed]) -> str:
 
 def _is_digest(text: str) -> bool:
     return len(text) == 2 * _SHA256_BYTES and all(c in "0123456789abcdef" for c in text)
-
-
-def _lay_out(home: Path, tree: Path, files: list[Listed]) -> None:
-    """Build the tree beside its place and rename it: what bears a digest is complete."""
-    (home / "trees").mkdir(exist_ok=True)
-    building = Path(tempfile.mkdtemp(prefix=".building-", dir=home / "trees"))
-    try:
-        for file in files:
-            if _blob(home, file.sha256).stat().st_size != file.size:
-                raise RefusedError("LocalProtocolError", f"{file.path!r} has another size")
-            _place(_blob(home, file.sha256), building / file.path)
-        for folder, _, _ in os.walk(building, topdown=False):
-            if folder != str(building):
-                os.chmod(folder, 0o555)
-        os.rename(building, tree)
-        os.chmod(tree, 0o555)  # not before: a folder that cannot be written cannot be moved
-    finally:
-        if building.exists():
-            remove_tree(str(building))
-
-
-def _place(blob: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(blob, target)
-    except OSError:  # more links than the file system allows, or none at all
-        shutil.copyfile(blob, target)
-        target.chmod(0o444)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 from pathlib import Path
@@ -15,11 +16,13 @@ from envhub_sandbox.client import WorkerClient
 from envhub_sandbox.deadline import Deadline
 from envhub_worker.protocol import messages as m
 from envhub_worker.quotas import Quotas, RefusedError
+from envhub_worker.stores import BLOCK_BYTES
 from envhub_worker.uploads import PREFIX, Uploads
 from tests.remote.listening import Listening, counting
 
 ALICE, BOB = b"a" * 32, b"b" * 32
 OWNER = ALICE + b"session"
+SIX = 6 * BLOCK_BYTES
 
 
 def offer(*files: tuple[str, bytes]) -> m.OfferSnapshot:
@@ -50,8 +53,13 @@ def bring(uploads: Uploads, *files: tuple[str, bytes], key: bytes = ALICE) -> st
 
 @pytest.fixture
 def uploads(tmp_path: Path) -> Uploads:
-    """A store for a hundred bytes of each client."""
-    return Uploads(tmp_path / "store", Quotas(upload_bytes=100, upload_files=5))
+    """A store for ten blocks of each client."""
+    return Uploads(tmp_path / "store", Quotas(upload_bytes=10 * BLOCK_BYTES, upload_files=5))
+
+
+def brought(uploads: Uploads) -> int:
+    """Bytes on disk, whole files and halves."""
+    return sum(path.stat().st_size for path in uploads.folder.rglob("*") if path.is_file())
 
 
 def test_a_snapshot_is_a_real_read_only_tree(uploads: Uploads) -> None:
@@ -88,7 +96,7 @@ def test_a_path_that_could_leave_the_tree_is_refused(uploads: Uploads, path: str
         (("a", b""), ("a", b"x")),
         (("a", b""), ("a/b", b"x")),
         tuple((str(number), b"") for number in range(6)),
-        (("a", b"x" * 101),),
+        (("a", b"x" * (10 * BLOCK_BYTES + 1)),),
     ],
     ids=["none", "twice", "file and folder", "too many", "too large"],
 )
@@ -116,7 +124,7 @@ def test_bytes_with_another_hash_are_refused(uploads: Uploads) -> None:
     with pytest.raises(RefusedError, match="another hash"):
         put(uploads, b"forged", told=b"honest")
     assert uploads.offer(OWNER, ALICE, asked, ()).hashes
-    assert uploads.used_bytes(ALICE) == 0
+    assert brought(uploads) == 0
 
 
 def test_what_was_not_asked_for_is_refused(uploads: Uploads) -> None:
@@ -149,22 +157,102 @@ def test_a_snapshot_is_no_path(uploads: Uploads, name: str) -> None:
 
 def test_the_longest_unused_make_room_and_those_in_use_stay(uploads: Uploads) -> None:
     """A quota is of what lies there; what a jail runs is never removed under it."""
-    first = uploads.tree(ALICE, bring(uploads, ("env.py", b"1" * 60)))
+    first = uploads.tree(ALICE, bring(uploads, ("env.py", b"1" * SIX)))
     os.utime(first, (1, 1))
     with pytest.raises(RefusedError, match="--max-upload"):
-        uploads.offer(OWNER, ALICE, offer(("env.py", b"2" * 60)), {first})
-    bring(uploads, ("env.py", b"2" * 60))
+        uploads.offer(OWNER, ALICE, offer(("env.py", b"2" * SIX)), {first})
+    bring(uploads, ("env.py", b"2" * SIX))
     assert not Path(first).exists()
-    assert uploads.used_bytes(ALICE) == 60
+    assert uploads.used_bytes(ALICE) == SIX + BLOCK_BYTES
 
 
 def test_what_a_client_had_begun_goes_with_it(uploads: Uploads) -> None:
     """Half a file is nobody's."""
     uploads.offer(OWNER, ALICE, offer(("a", b"12345678")), ())
     uploads.put(OWNER, ALICE, m.PutBlob(hashlib.sha256(b"12345678").digest(), 0), b"1234")
-    assert uploads.used_bytes(ALICE) == 4
+    assert brought(uploads) == 4
+    assert uploads.used_bytes(ALICE) == 2 * BLOCK_BYTES
     uploads.forget(OWNER)
-    assert uploads.used_bytes(ALICE) == 0
+    assert brought(uploads) == uploads.used_bytes(ALICE) == 0
+
+
+def test_an_upload_that_begins_again_is_not_refused_for_its_own_bytes(uploads: Uploads) -> None:
+    """What it had brought of its files does not count twice."""
+    data = b"1" * SIX
+    for _ in range(3):
+        uploads.offer(OWNER, ALICE, offer(("a", data)), ())
+        uploads.put(OWNER, ALICE, m.PutBlob(hashlib.sha256(data).digest(), 0), data[:-1])
+        assert uploads.used_bytes(ALICE) == SIX + BLOCK_BYTES
+    bring(uploads, ("a", data))
+    assert uploads.used_bytes(ALICE) == SIX + BLOCK_BYTES
+
+
+def test_what_another_session_still_expects_is_not_removed(uploads: Uploads) -> None:
+    """Its files lie there unlinked until its snapshot is whole; room is made of others."""
+    other = ALICE + b"other"
+    old = uploads.tree(ALICE, bring(uploads, ("old", b"0" * BLOCK_BYTES)))
+    wanted = uploads.offer(other, ALICE, offer(("one", b"1"), ("two", b"2")), ())
+    uploads.put(other, ALICE, m.PutBlob(hashlib.sha256(b"1").digest(), 0), b"1")
+    uploads.offer(OWNER, ALICE, offer(("env.py", b"3" * (SIX - BLOCK_BYTES))), ())
+    assert not Path(old).exists()
+    uploads.put(other, ALICE, m.PutBlob(hashlib.sha256(b"2").digest(), 0), b"2")
+    whole = uploads.offer(other, ALICE, offer(("one", b"1"), ("two", b"2")), ())
+    assert (whole.snapshot, whole.hashes) == (wanted.snapshot, ())
+
+
+def test_many_sessions_of_a_key_share_its_quota(uploads: Uploads) -> None:
+    """What each may still bring is reserved, until it goes."""
+    uploads.offer(ALICE + b"1", ALICE, offer(("a", b"1" * SIX)), ())
+    uploads.offer(BOB + b"1", BOB, offer(("a", b"1" * SIX)), ())
+    with pytest.raises(RefusedError, match="--max-upload"):
+        uploads.offer(ALICE + b"2", ALICE, offer(("a", b"2" * SIX)), ())
+    uploads.forget(ALICE + b"1")
+    uploads.offer(ALICE + b"2", ALICE, offer(("a", b"2" * SIX)), ())
+
+
+def test_small_files_and_folders_are_charged_what_they_take(uploads: Uploads) -> None:
+    """A block each; also when the store is found again."""
+    name = bring(uploads, ("a/b/c", b"1"), ("a/b/d", b"1"), ("a/e", b""))
+    assert uploads.used_bytes(ALICE) == (2 + 5) * BLOCK_BYTES
+    assert Uploads(uploads.folder, Quotas()).used_bytes(ALICE) == (2 + 5) * BLOCK_BYTES
+    with pytest.raises(RefusedError, match="--max-upload"):
+        uploads.offer(
+            OWNER, ALICE, offer(("/".join("abcdefghij"), b"1")), {uploads.tree(ALICE, name)}
+        )
+
+
+def test_copies_are_charged(uploads: Uploads, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file system may have no more links: then the same file over and over is no bargain."""
+    files = [(name, b"1" * 2 * BLOCK_BYTES) for name in "abcd"]
+    monkeypatch.setattr("os.link", _no_links)
+    with pytest.raises(RefusedError, match="--max-upload"):
+        bring(uploads, *files)
+    assert brought(uploads) == 2 * BLOCK_BYTES
+    bring(uploads, *files[:2])
+    assert uploads.used_bytes(ALICE) == (2 + 2 + 2 * 2) * BLOCK_BYTES
+    assert Uploads(uploads.folder, Quotas()).used_bytes(ALICE) == uploads.used_bytes(ALICE)
+
+
+def _no_links(*_: object) -> None:
+    raise OSError(errno.EMLINK, "too many links")
+
+
+def test_snapshots_and_their_folders_are_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The longest unused go; paths of too many steps are refused before any is made."""
+    monkeypatch.setattr("envhub_worker.uploads.MAX_TREES", 2)
+    uploads = Uploads(tmp_path / "store", Quotas())
+    first, second = (uploads.tree(ALICE, bring(uploads, (name, b""))) for name in "ab")
+    with pytest.raises(RefusedError, match="more than 2"):
+        uploads.offer(OWNER, ALICE, offer(("c", b"")), {first, second})
+    os.utime(first, (1, 1))
+    bring(uploads, ("c", b""))
+    assert (Path(first).exists(), Path(second).exists()) == (False, True)
+    deep = "/".join(["x"] * 60)
+    files = tuple((f"{number}/{deep}", 0, bytes(32)) for number in range(4000))
+    with pytest.raises(RefusedError, match="steps"):
+        uploads.offer(OWNER, ALICE, m.OfferSnapshot(files), ())
 
 
 def test_a_restart_keeps_snapshots_and_drops_halves(uploads: Uploads) -> None:
