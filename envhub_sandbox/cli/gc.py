@@ -25,7 +25,8 @@ def gc(
     """Remove containers, runtime folders and control groups whose client is gone.
 
     Usually there are none: they end with the client. Never touched are those of a client that
-    still runs, of another user, or of anything but envhub.
+    still runs, of another machine's clients while they run, or of anything but envhub; nor those
+    of another user, but root removes every user's containers and control groups.
     """
     with reported(debug=debug):
         from envhub_sandbox.sandboxes import leftovers

@@ -37,6 +37,12 @@ def has_ended(identity: str) -> bool | None:
         return None
 
 
+def is_of_this_boot(identity: str) -> bool:
+    """Whether the process was one of this machine since it started."""
+    parts = identity.split(":")
+    return len(parts) == 4 and parts[2] == _boot()
+
+
 def _start_time(pid: int) -> str:
     return _fields(pid)[19]
 

@@ -2,7 +2,8 @@
 
 Only what can be told to be ours, and to be nobody's any more. A container names its client in a
 label, a folder in a file or by a socket that nobody serves, a control group by a pid; what does not
-is left alone. So is what belongs to another user, whose processes we may not even see.
+is left alone. So is what belongs to another user, whose processes we may not even see; root sees
+all, and removes every user's containers and control groups.
 """
 
 from __future__ import annotations
@@ -17,14 +18,16 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from envhub_sandbox.errors import SandboxUnavailableError
 from envhub_sandbox.sandboxes.containers import CLIENT_LABEL, USER_LABEL
 from envhub_sandbox.sandboxes.engines import ENGINES, Engine, EngineError, find_engine
-from envhub_sandbox.sandboxes.identity import has_ended
+from envhub_sandbox.sandboxes.identity import has_ended, is_of_this_boot
 
 _CGROUPS = Path("/sys/fs/cgroup")
 _CONNECT_S = 2.0
+_ENDED = frozenset({"exited", "stopped", "dead"})
 _GROUP = re.compile(r"envhub-(\d+)-\w[\w-]*")
 _SERVER_FOLDER = re.compile(r"envhub-[a-z0-9_]{8}")
 _CONTAINER_FOLDER = re.compile(r"envhub-docker-[a-z0-9_]{8}")
@@ -77,7 +80,10 @@ def _engines() -> Iterator[Engine]:
 
 
 def stale_containers(engine: Engine) -> Iterator[Leftover]:
-    """Containers of ours whose client has ended, running or not."""
+    """Containers of ours whose client has ended, running or not.
+
+    One that runs for a client of another machine, or before this one started, is left alone.
+    """
     listed = engine.run(
         "ps", "--all", "--no-trunc", "--filter", f"label={CLIENT_LABEL}", "--format", "{{.ID}}"
     )
@@ -85,8 +91,15 @@ def stale_containers(engine: Engine) -> Iterator[Leftover]:
         with contextlib.suppress(EngineError, ValueError):  # it may have gone meanwhile
             said = json.loads(engine.run("inspect", container))[0]
             labels = said["Config"]["Labels"]
-            if _is_mine(labels.get(USER_LABEL)) and has_ended(labels.get(CLIENT_LABEL, "")):
+            if _is_mine(labels.get(USER_LABEL)) and _is_deserted_container(said):
                 yield Leftover("container", said["Name"].lstrip("/"), engine)
+
+
+def _is_deserted_container(said: dict[str, Any]) -> bool:
+    client = said["Config"]["Labels"].get(CLIENT_LABEL, "")
+    # an engine may be another machine's: its clients run there, or on a third one
+    judged = is_of_this_boot(client) or said["State"]["Status"] in _ENDED
+    return judged and has_ended(client) is True
 
 
 def _is_mine(user: str | None) -> bool:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from envhub_sandbox.sandboxes import leftovers
+from envhub_sandbox.sandboxes.containers import CLIENT_LABEL, USER_LABEL
 from envhub_sandbox.sandboxes.identity import identity_of
 
 
@@ -98,3 +101,35 @@ def test_control_groups_of_ended_servers_are_left_behind(tmp_path: Path, dead: s
     assert groups[0].remove()
     assert not Path(groups[0].name).exists()
     assert (tmp_path / f"envhub-{os.getpid()}-zygote-1" / "jail-1").exists()
+
+
+class OneContainer:
+    """An engine with one container of our user's."""
+
+    def __init__(self, client: str, status: str) -> None:
+        labels = {CLIENT_LABEL: client, USER_LABEL: str(os.geteuid())}
+        self.said = {"Name": "/it", "Config": {"Labels": labels}, "State": {"Status": status}}
+
+    def run(self, command: str, *_: str) -> str:
+        """What ``ps`` and ``inspect`` print."""
+        return "id" if command == "ps" else json.dumps([self.said])
+
+
+@pytest.mark.parametrize(
+    ("boot", "status", "stale"),
+    [
+        ("", "running", True),
+        ("", "exited", True),
+        ("another", "running", False),
+        ("another", "created", False),
+        ("another", "paused", False),
+        ("another", "exited", True),
+    ],
+)
+def test_what_runs_for_a_client_of_another_machine_is_left_alone(
+    dead: str, boot: str, status: str, stale: bool
+) -> None:
+    """An engine may be reached from many machines: whether their processes live nobody knows."""
+    pid, start, ours, namespace = dead.split(":")
+    engine: Any = OneContainer(":".join([pid, start, boot or ours, namespace]), status)
+    assert [one.name for one in leftovers.stale_containers(engine)] == ["it"] * stale
