@@ -7,6 +7,7 @@ are in stay, and whoever knocks again later is let in.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import socket
@@ -65,18 +66,28 @@ class Doorman:
             self._log.say("refused", "a handshake failed: no key, another server's, or noise")
 
     def _shut(self) -> None:
-        self._shut_door = _listener(str(self._router.get_string(zmq.LAST_ENDPOINT)))
-        if self._shut_door is None:
+        """Without descriptors or permission it stays open, and the next one tries again."""
+        door = None
+        try:
+            door = _listener(str(self._router.get_string(zmq.LAST_ENDPOINT)))
+            if door is None:
+                return
+            program = ctypes.create_string_buffer(_DROP)
+            filters = struct.pack("@HP", 1, ctypes.addressof(program))
+            door.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, filters)
+        except OSError as error:
+            if door is not None:
+                door.close()
+            self._log.say("refused", f"there are {self._open} connections, and no end: {error}")
             return
-        program = ctypes.create_string_buffer(_DROP)
-        filters = struct.pack("@HP", 1, ctypes.addressof(program))
-        self._shut_door.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, filters)
+        self._shut_door = door
         self._log.say("refused", f"there are {self._open} connections: no more for the moment")
 
     def tick(self) -> None:
         """Let others in once there is room."""
         if self._shut_door is not None and self._open < self._limit:
-            self._shut_door.setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)
+            with contextlib.suppress(OSError):  # there is no filter any more
+                self._shut_door.setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)
             self._shut_door.close()
             self._shut_door = None
 
@@ -94,20 +105,18 @@ def _listener(endpoint: str) -> socket.socket | None:
     port = int(endpoint.rpartition(":")[2])
     for name in os.listdir("/proc/self/fd"):
         fd = int(name)
-        try:
-            if not stat.S_ISSOCK(os.fstat(fd).st_mode):
-                continue
-            found = socket.socket(fileno=os.dup(fd))
-        except OSError:
-            continue
-        if _listens_on(found, port):
-            return found
-        found.close()
+        with contextlib.suppress(OSError):  # it is closed by now, or there are too many
+            if stat.S_ISSOCK(os.fstat(fd).st_mode) and _listens_on(fd, port):
+                return socket.socket(fileno=os.dup(fd))
     return None
 
 
-def _listens_on(found: socket.socket, port: int) -> bool:
-    if found.family not in (socket.AF_INET, socket.AF_INET6):
-        return False
-    accepts = found.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
-    return bool(accepts) and found.getsockname()[1] == port
+def _listens_on(fd: int, port: int) -> bool:
+    found = socket.socket(fileno=fd)
+    try:
+        if found.family not in (socket.AF_INET, socket.AF_INET6):
+            return False
+        accepts = found.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
+        return bool(accepts) and found.getsockname()[1] == port
+    finally:
+        found.detach()  # it is libzmq's

@@ -134,6 +134,12 @@ def _raise_file_limit() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
+def most_connections(wanted: int) -> int:
+    """Half of our descriptors at most: the other half is for jails."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return wanted if soft == resource.RLIM_INFINITY else max(1, min(wanted, soft // 2))
+
+
 # --- where it listens ------------------------------------------------------------------------
 
 
@@ -288,7 +294,7 @@ def _gate(arguments: argparse.Namespace, state: Path, identity: Identity) -> Rem
             gpu=arguments.allow_gpu,
         ),
         idle_s=max(0, arguments.idle_s),
-        max_connections=arguments.max_connections,
+        max_connections=most_connections(arguments.max_connections),
     )
     return RemoteGate(rules, Uploads(state / "store", quotas), Log())
 

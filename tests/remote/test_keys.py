@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import os
 import signal
@@ -247,6 +248,18 @@ def test_a_log_cannot_be_filled_by_strangers() -> None:
     now[0] = 61
     log.tick()
     assert lines[-1].endswith(f"and {1000 - LINES} more in a minute")
+
+
+def test_a_log_that_nobody_reads_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its stream is closed, or a pipe whose reader has gone."""
+    read, write = os.pipe()
+    os.close(read)
+    broken = open(write, "w", buffering=1)  # noqa: SIM115
+    monkeypatch.setattr("sys.stderr", broken)
+    Log().say("refused", "to a pipe without a reader")
+    with contextlib.suppress(BrokenPipeError):
+        broken.close()
+    Log().say("refused", "to a closed stream")
 
 
 def test_a_state_folder_of_somebody_else_is_not_used(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import resource
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +17,8 @@ import zmq
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerError
-from envhub_worker import keys
+from envhub_worker import keys, listen
+from envhub_worker.doorman import Doorman
 from envhub_worker.entries import Asker
 from envhub_worker.gate import RemoteGate, Rules
 from envhub_worker.keys import AuthorizedClients
@@ -233,6 +236,38 @@ def _gets_in(server: Listening, repository: Path) -> bool:
     except SandboxUnavailableError:
         return False
     return True
+
+
+def test_a_door_that_cannot_be_shut_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a descriptor left the server goes on, says so, and tries again."""
+    said = list[str]()
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as router:
+        doorman = Doorman(router, Loop(), Log(said.append), 1)
+        router.bind("tcp://127.0.0.1:*")
+        for broken in ("os.listdir", "os.dup"):
+            with monkeypatch.context() as patch:
+                patch.setattr(broken, _no_descriptors)
+                doorman._happened(zmq.EVENT_ACCEPTED)
+            assert doorman._shut_door is None
+        assert "and no end" in said[0]
+        doorman._happened(zmq.EVENT_ACCEPTED)
+        assert doorman._shut_door is not None
+        for _ in range(3):
+            doorman._happened(zmq.EVENT_DISCONNECTED)
+        doorman.tick()
+        assert doorman._shut_door is None
+        doorman.close()
+
+
+def _no_descriptors(*_: object) -> None:
+    raise OSError(errno.EMFILE, "Too many open files")
+
+
+def test_connections_leave_half_of_the_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever was asked for: jails need the others."""
+    for limit, most in ((100, 50), (1, 1), (resource.RLIM_INFINITY, 1024), (65_536, 1024)):
+        monkeypatch.setattr("resource.getrlimit", lambda _, soft=limit: (soft, soft))
+        assert listen.most_connections(1024) == most
 
 
 def test_without_keys_it_listens_on_loopback_only(tmp_path: Path, repository: Path) -> None:
