@@ -218,8 +218,13 @@ def find_image(engine: Engine, image: str) -> str:
     """The id of an image, so that what was looked at is what runs.
 
     Raises:
+        PolicyError: That is no name of an image: the engine would read it as something else.
         SandboxUnavailableError: The engine does not have it.
     """
+    if not image.isprintable() or not image or image.startswith("-") or " " in image:
+        raise PolicyError(
+            f"{image!r} is no name of an image: it is empty, begins with '-', or holds blanks"
+        )
     try:
         return engine.run("image", "inspect", "--format", "{{.Id}}", image).strip()
     except EngineError as error:

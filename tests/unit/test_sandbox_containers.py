@@ -278,6 +278,22 @@ def test_the_profile_for_ones_own_containers_is_the_same() -> None:
     }
 
 
+@pytest.mark.parametrize(
+    "image", ["", "-it", "--format=x", "a b", "a\nRUN evil", "a\t", "a\u2028b", " envhub-worker"]
+)
+def test_what_is_no_name_of_an_image_reaches_no_engine(
+    image: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would be an option, or a line of a recipe; a name is asked for as it stands."""
+    asked = list[str]()
+    monkeypatch.setattr(Engine, "run", lambda _, *words: asked.extend(words) or "sha256:1\n")
+    with pytest.raises(PolicyError, match="no name of an image"):
+        engines.find_image(DOCKER, image)
+    assert asked == []
+    assert engines.find_image(DOCKER, "reg.example:5000/a/b_c@sha256:0") == "sha256:1"
+    assert asked[-1] == "reg.example:5000/a/b_c@sha256:0"
+
+
 def test_a_process_is_known_by_more_than_its_pid() -> None:
     """Its start, the boot and the namespace; what cannot be told is not said to have ended."""
     me = identity.identity_of(os.getpid())
