@@ -177,10 +177,11 @@ def test_what_a_client_had_begun_goes_with_it(uploads: Uploads) -> None:
 
 
 def test_an_upload_that_begins_again_is_not_refused_for_its_own_bytes(uploads: Uploads) -> None:
-    """What it had brought of its files does not count twice."""
-    data = b"1" * SIX
-    for _ in range(3):
+    """What it had brought of its files is gone from the disk, and does not count twice."""
+    for content in (b"1", b"1", b"2"):
+        data = content * SIX
         uploads.offer(OWNER, ALICE, offer(("a", data)), ())
+        assert brought(uploads) == 0
         uploads.put(OWNER, ALICE, m.PutBlob(hashlib.sha256(data).digest(), 0), data[:-1])
         assert uploads.used_bytes(ALICE) == SIX + BLOCK_BYTES
     bring(uploads, ("a", data))
