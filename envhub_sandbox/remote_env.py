@@ -11,7 +11,7 @@ import os
 import threading
 import time
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from time import perf_counter_ns
@@ -25,7 +25,6 @@ from envhub_sandbox.errors import (
     WorkerDiedError,
     WorkerError,
     WorkerTimeoutError,
-    name_source,
 )
 from envhub_sandbox.fast_lane import FastLane, JailGoneError, Outcome
 from envhub_sandbox.history import History
@@ -87,6 +86,8 @@ class RemoteEnv:
         self.lifecycle = Lifecycle()
         self._jails = jails
         self._lock = threading.RLock()  # a signal handler may close what its own thread waits for
+        self._ending = threading.RLock()  # nothing is given back that another thread is ending
+        self._owner = os.getpid()
         self._builder = Builder(jails, manifest, self.bounds)
         self._revives = jails.repository.policy.restart == "transparent"
         self._seeds = SeedBook(manifest.num_envs, manifest.shardable)
@@ -127,7 +128,7 @@ class RemoteEnv:
             LocalProtocolError: It cannot be sent; nothing was.
             WorkerError: The environment is not in a state to take it.
         """
-        with self._lock, self.repository.named():
+        with self._turn(operation):
             self._refuse_unless_usable(operation)
             if self.lifecycle.state is State.IDLE:
                 self._start()
@@ -149,7 +150,7 @@ class RemoteEnv:
             WorkerDiedError: The environment is then DEAD; with ``restart="transparent"`` READY.
             RemoteEnvError: The repository's code raised; the environment is still usable.
         """
-        with self._lock, self.repository.named():
+        with self._turn("a request"):
             try:
                 replies = self._collect(Deadline(timeout_s), timeout_s)
             except HostsDiedError as deaths:
@@ -165,24 +166,52 @@ class RemoteEnv:
         self.submit(operation, message_for)
         return self.collect(timeout_s)
 
+    @contextlib.contextmanager
+    def _turn(self, operation: str) -> Iterator[None]:
+        """Hold the lock. A ``close`` that has come when it is left, did not wait for it."""
+        with self._lock, self.repository.named():
+            try:
+                yield
+            except BaseException as error:
+                self._after_close(operation, error)
+                raise
+            if self.lifecycle.state is State.CLOSED:
+                self._let_go()
+
+    def _after_close(self, operation: str, error: BaseException) -> None:
+        """What failed because of a ``close`` in its midst says so, and gives back what is left.
+
+        Raises:
+            WorkerDiedError: It was closed, and the error does not say so.
+        """
+        if self.lifecycle.state is not State.CLOSED:
+            return
+        self._let_go()
+        if isinstance(error, Exception) and not isinstance(error, WorkerDiedError):
+            raise self._closed(operation) from error
+
     # --- steps ---------------------------------------------------------------------------------
 
     def submit_step(self, actions: Any) -> None:
         """Send a validated batch of actions, by the fast lane where there is one."""
         with self._lock:
             if self.lifecycle.state is not State.READY:
-                with self.repository.named():
+                with self._turn("step"):
                     self._refuse_unless_usable("step")
                     self._start()
             if self._lane is None:
-                with self.repository.named():
+                with self._turn("step"):
                     self._send("step", self._step_requests(actions))
                 self.history.step(actions)
                 return
-            # first: an interrupt from here on leaves a reply that may come
-            self._pending = _BY_LANE
-            self.lifecycle.on(Event.SUBMIT)
-            self._lane.ask(actions)
+            try:
+                # first: an interrupt from here on leaves a reply that may come
+                self._pending = _BY_LANE
+                self.lifecycle.on(Event.SUBMIT)
+                self._lane.ask(actions)
+            except BaseException:
+                with self._turn("step"):
+                    raise
             self.counters.lane_steps += 1
             self.history.step(actions)  # while the jail is at it
 
@@ -207,15 +236,11 @@ class RemoteEnv:
                     check(reply)
                 return self.results.step([typed(reply, m.StepDone) for reply in replies])
             except HostsDiedError as deaths:
-                with self.repository.named():
+                with self._turn("step"):
                     return self._survive_step(deaths)
-            except EnvHubError as error:
-                name_source(error, self.repository.label)
-                raise
-            except Exception as error:
-                if self.lifecycle.state is State.CLOSED:  # by a signal handler, in our midst
-                    raise self._closed("step") from error
-                raise
+            except BaseException:
+                with self._turn("step"):
+                    raise
 
     def _collect_by_lane(self, timeout_s: float | None) -> StepResult:
         lane = self._lane
@@ -267,7 +292,7 @@ class RemoteEnv:
         A reply that nobody waits for any more, because of Ctrl-C, counts as late. After a death
         a fresh jail is started only if the policy says ``restart="on_reset"``.
         """
-        with self._lock, self.repository.named():
+        with self._turn("reset"):
             if self.lifecycle.state is State.PENDING:
                 self.lifecycle.on(Event.INTERRUPT)
             if self.lifecycle.state is State.READY and self.repository.timeouts.idle_s is not None:
@@ -613,7 +638,7 @@ class RemoteEnv:
 
     def adopt(self, loaded: LoadedJail) -> None:
         """Use a jail that is already loaded, instead of opening one later."""
-        with self._lock:
+        with self._turn("make_env"):
             self._build(loaded, Deadline(self.repository.timeouts.startup_s))
 
     def _start(self) -> None:
@@ -644,14 +669,12 @@ class RemoteEnv:
     def _move_into(self, loaded: LoadedJail, deadline: Deadline) -> None:
         try:
             place = self._builder.build(loaded, deadline)
-            if self.lifecycle.state is State.CLOSED:
-                if place.lane is not None:
-                    place.lane.close()
-                raise self._closed("make_env")
         except BaseException:
             self._jails.give_back(loaded)
             raise
         self._settle(place)
+        if self.lifecycle.state is State.CLOSED:  # only now: who closes from here on sees the jail
+            raise self._closed("make_env")
 
     def _settle(self, place: Place) -> None:
         self._place, self._loaded, self._lane = place, place.loaded, place.lane
@@ -663,7 +686,7 @@ class RemoteEnv:
         WORKER.info("%s: the jail is given up for a fresh one", self.repository.label)
         self._leave()
         self._pending = None
-        self.lifecycle.on(Event.FORGET)
+        self._moved(Event.FORGET)
 
     def _leave(self) -> None:
         self._let_server_go()
@@ -675,12 +698,13 @@ class RemoteEnv:
             self._give_back()
 
     def _give_back(self) -> None:
-        loaded, self._loaded = self._loaded, None
-        try:
-            if loaded is not None:
-                self._jails.give_back(loaded)
-        finally:
-            self._close_lane()
+        with self._ending:
+            loaded, self._loaded = self._loaded, None
+            try:
+                if loaded is not None:
+                    self._jails.give_back(loaded)
+            finally:
+                self._close_lane()
 
     def close(self) -> None:
         """Close the environment and end its processes, in bounded time, from any thread."""
@@ -695,6 +719,7 @@ class RemoteEnv:
         try:
             state, loaded = self.lifecycle.state, self._loaded
             self._moved(Event.CLOSE)
+            self._restarts.give_up()
             self._note_pace()
             if loaded is not None and state is State.READY:
                 self._close_politely(loaded)
@@ -705,7 +730,9 @@ class RemoteEnv:
                 self._lock.release()
 
     def _let_go(self) -> None:
-        """Give back whatever is left of it."""
+        """Give back whatever is left of it. A fork of its owner gives back nothing."""
+        if os.getpid() != self._owner:
+            return
         try:
             self._give_back()
         finally:
@@ -714,6 +741,7 @@ class RemoteEnv:
     def abandon(self) -> None:
         """In a fork of the process that made it: touch nothing, and refuse from now on."""
         self._lock = threading.RLock()  # whichever thread held it is not here
+        self._ending = threading.RLock()
         if self.lifecycle.state is not State.CLOSED:
             self.lifecycle.on(Event.FORK)
         self._pending, self._release_server = None, _nothing
@@ -721,13 +749,15 @@ class RemoteEnv:
 
     def _interrupt(self) -> None:
         """Another thread waits for a reply: end the jail under it, then clean up after it."""
-        loaded, startup = self._loaded, self._startup
-        self._moved(Event.CLOSE)
-        if startup is not None:
-            startup.give_up()
-        if loaded is None:
-            return
-        self._jails.end(loaded)
+        with self._ending:
+            self._moved(Event.CLOSE)
+            self._restarts.give_up()
+            loaded, startup = self._loaded, self._startup
+            if startup is not None:
+                startup.give_up()
+            if loaded is None:
+                return  # whoever brings one sees that it is closed
+            self._jails.end(loaded)
         if self._lock.acquire(timeout=_INTERRUPT_S):
             try:
                 self._moved(Event.CLOSE)  # the other may have moved at the same moment

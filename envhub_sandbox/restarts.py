@@ -9,6 +9,7 @@ from envhub_sandbox.policy import Policy
 
 _CALM_S = 60.0
 _LONGEST_S = 30.0
+_LOOK_AGAIN_S = 0.1
 
 
 class Restarts:
@@ -22,7 +23,13 @@ class Restarts:
         self._policy = policy
         self._last = -_CALM_S
         self._in_a_row = 0
+        self._given_up = False
         self.count = 0
+
+    def give_up(self) -> None:
+        """Nobody needs another one: end a wait in another thread, soon."""
+        # no Event: a signal handler in the midst of its wait could not set it
+        self._given_up = True
 
     def spend(self, operation: str) -> None:
         """Count one more, and wait if the last one was a moment ago.
@@ -31,7 +38,7 @@ class Restarts:
             operation: What needs it.
 
         Raises:
-            WorkerDiedError: There are none left.
+            WorkerDiedError: There are none left, or somebody has given up.
         """
         budget = self._policy.restart_budget
         if self.count >= budget:
@@ -42,9 +49,17 @@ class Restarts:
             )
         calm = time.monotonic() - self._last >= _CALM_S
         self._in_a_row = 0 if calm else self._in_a_row + 1
-        time.sleep(backoff_s(self._policy.restart_backoff_s, self._in_a_row))
+        self._wait(backoff_s(self._policy.restart_backoff_s, self._in_a_row), operation)
         self._last = time.monotonic()
         self.count += 1
+
+    def _wait(self, wait_s: float, operation: str) -> None:
+        until = time.monotonic() + wait_s
+        while not self._given_up and (left := until - time.monotonic()) > 0:
+            time.sleep(min(left, _LOOK_AGAIN_S))
+        if self._given_up:
+            text = f"the environment was closed during {operation}"
+            raise WorkerDiedError(text, reason="killed", request=operation)
 
 
 def backoff_s(first_s: float, in_a_row: int) -> float:

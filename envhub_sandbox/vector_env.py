@@ -98,7 +98,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         if mask is not None:
             declared.check_mask(mask, self.num_envs)
         seeds = self._seeds(seed)
-        self._remote.recover()
+        self._recover()
         sliced = self._manifest.shardable and seeds is not None
 
         def message(number: int, bounds: Bounds) -> m.Message:  # kept: it must not hold us
@@ -279,10 +279,21 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
     # --- inside --------------------------------------------------------------------------------
 
+    def _recover(self) -> None:
+        try:
+            self._remote.recover()
+        except WorkerDiedError:
+            self._raise_if_closed()  # close() in another thread ended the wait
+            raise
+
     def _own(self, operation: str, kind: Callable[..., m.Message], *fields: Any) -> list[m.Message]:
-        return self._remote.request(
-            operation, lambda number, _: kind(number, *fields), self._timeouts.call_s
-        )
+        try:
+            return self._remote.request(
+                operation, lambda number, _: kind(number, *fields), self._timeouts.call_s
+            )
+        except WorkerDiedError:
+            self._raise_if_closed()
+            raise
 
     def _ask(self, operation: str, message: Callable[[int, Bounds], m.Message]) -> list[m.Value]:
         self._refuse_if_busy(operation)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+import threading
+from collections.abc import Callable
+from typing import Any, cast
 
 import pytest
+from gymnasium.error import ClosedEnvironmentError
 
-from envhub_sandbox import make_env, remote_env
+from envhub_sandbox import errors, make_env, remote_env, restarts
 from envhub_sandbox.remote_env import RemoteEnv
 from envhub_worker.protocol.lifecycle import State
 from tests.support.samples import sample
@@ -82,3 +85,120 @@ def test_ctrl_c_in_close_leaves_nothing(
     assert loaded.closed
     assert (remote._lane, release) == (None, [True])
     suites.close()
+
+
+class Inside:
+    """A place in the client that another thread has come to, and stays in until it may go on."""
+
+    def __init__(self, then: Callable[..., Any]) -> None:
+        self._there, self._go_on, self._then = threading.Event(), threading.Event(), then
+
+    def __call__(self, *arguments: Any, **options: Any) -> Any:
+        """Say that we are there, and wait."""
+        self._there.set()
+        assert self._go_on.wait(60)
+        return self._then(*arguments, **options)
+
+    def wait(self) -> None:
+        """Until somebody is there."""
+        assert self._there.wait(60)
+
+    def leave(self) -> None:
+        """Let him go on."""
+        self._go_on.set()
+
+
+def told(operation: Callable[[], object]) -> tuple[threading.Thread, list[BaseException]]:
+    """Run an operation in another thread; what it raises."""
+    raised: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            operation()
+        except BaseException as error:
+            raised.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    return thread, raised
+
+
+@pytest.mark.parametrize("restart", ["on_reset", "transparent"])
+def test_close_ends_the_wait_before_a_restart(
+    restart: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However long a backoff is; nothing is left of the environment."""
+    waiting = Inside(lambda *_: 3600.0)
+    waiting.leave()
+    policy = {"restart": restart, "crash_history": 0}
+    with made(policy=policy, fails={"moment": "step", "fault": "kill"}) as suites:
+        env, remote = suites.env, suites.env._remote
+        if restart == "on_reset":
+            with pytest.raises(errors.WorkerDiedError):
+                env.step([0, 1])
+        monkeypatch.setattr(restarts, "backoff_s", waiting)
+        loaded = remote._loaded
+        thread, raised = told(env.reset if restart == "on_reset" else lambda: env.step([0, 1]))
+        waiting.wait()
+        env.close()
+        thread.join(60)
+        assert [type(one) for one in raised] == [ClosedEnvironmentError]
+        assert loaded.closed
+        assert remote.stats()["restarts"] == 0
+
+
+def test_who_outlasts_a_close_gives_everything_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``close`` does not wait for ever for a thread that holds the environment."""
+    monkeypatch.setattr(remote_env, "_INTERRUPT_S", 0.0)
+    policy = {"restart": "on_reset", "crash_history": 0}
+    with made(policy=policy, fails={"moment": "step", "fault": "kill"}) as suites:
+        env, remote = suites.env, suites.env._remote
+        with pytest.raises(errors.WorkerDiedError):
+            env.step([0, 1])
+        found: list[list[bool]] = []
+
+        def hold() -> Callable[[], None]:
+            monkeypatch.undo()
+            found.append(released(remote))
+            return cast("Callable[[], None]", remote._release_server)
+
+        forgetting = Inside(hold)
+        monkeypatch.setattr(remote.repository, "hold", forgetting)
+        thread, raised = told(env.reset)
+        forgetting.wait()
+        env.close()
+        forgetting.leave()
+        thread.join(60)
+        assert [type(one) for one in raised] == [ClosedEnvironmentError]
+        assert found == [[True]]
+        assert remote._loaded is None
+
+
+@pytest.mark.parametrize("moment", ["built", "started"])
+def test_a_jail_that_comes_up_after_close_is_given_back(
+    moment: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever closes does not wait for it: whoever opened it gives it back."""
+    monkeypatch.setattr(remote_env, "_INTERRUPT_S", 0.0)
+    with make_env(sample("faulty"), env_kwargs={"tasks": 2}) as suites:
+        suites["suite"][0].reset()
+        env = suites["suite"][1]
+        remote = env._remote
+        assert remote.lifecycle.state is State.IDLE
+        places: list[Any] = []
+        monkeypatch.setattr(
+            remote, "_settle", lambda at, do=remote._settle: places.append(at) or do(at)
+        )
+        owner, name = (
+            (remote._builder, "build") if moment == "built" else (remote.history, "started")
+        )
+        coming = Inside(getattr(owner, name))
+        monkeypatch.setattr(owner, name, coming)
+        thread, raised = told(env.reset)
+        coming.wait()
+        env.close()
+        coming.leave()
+        thread.join(60)
+        assert [type(one) for one in raised] == [ClosedEnvironmentError]
+        assert all(place.loaded.closed for place in places)
+        assert remote._lane is None
