@@ -6,12 +6,13 @@ import threading
 from collections.abc import Callable
 from typing import Any, cast
 
+import numpy as np
 import pytest
 from gymnasium.error import ClosedEnvironmentError
 
 from envhub_sandbox import errors, make_env, remote_env, restarts
 from envhub_sandbox.remote_env import RemoteEnv
-from envhub_worker.protocol.lifecycle import State
+from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from tests.support.samples import sample
 
 pytestmark = pytest.mark.usefixtures("neighbour")
@@ -202,3 +203,51 @@ def test_a_jail_that_comes_up_after_close_is_given_back(
         assert [type(one) for one in raised] == [ClosedEnvironmentError]
         assert all(place.loaded.closed for place in places)
         assert remote._lane is None
+
+
+class Closing(Lifecycle):
+    """Closes the environment at a move, in the same thread, as a signal handler does."""
+
+    def __init__(self, env: Any, event: Event, *, before: bool) -> None:
+        self.state = env._remote.lifecycle.state
+        self._env, self._event, self._before = env, event, before
+
+    def on(self, event: Event) -> State:
+        """Move, and close right before or right after it."""
+        if event is self._event and self._before:
+            self._env.close()
+        state = super().on(event)
+        if event is self._event:
+            self._env.close()
+        return state
+
+
+def recover(env: Any) -> None:
+    """Reset after a step that nobody waits for any more."""
+    env._remote.submit_step(np.zeros(2, np.int64))
+    env.reset()
+
+
+OPERATIONS: dict[str, tuple[Event, Callable[[Any], object]]] = {
+    "step": (Event.SUBMIT, lambda env: env.step([0, 0])),
+    "reset": (Event.SUBMIT, lambda env: env.reset()),
+    "render": (Event.SUBMIT, lambda env: env.render()),
+    "interrupted": (Event.INTERRUPT, recover),
+    "late": (Event.REPLY, recover),
+}
+
+
+@lanes
+@pytest.mark.parametrize("before", [True, False], ids=["before", "after"])
+@pytest.mark.parametrize("operation", OPERATIONS)
+def test_closed_in_the_midst_says_closed(lane: str, before: bool, operation: str) -> None:
+    """A signal handler that closes while a request is on its way out, or looked after."""
+    event, ask = OPERATIONS[operation]
+    with made(lane) as suites:
+        env, remote = suites.env, suites.env._remote
+        loaded = remote._loaded
+        remote.lifecycle = Closing(env, event, before=before)
+        with pytest.raises(ClosedEnvironmentError):
+            ask(env)
+        assert loaded.closed
+        assert (remote._loaded, remote._lane) == (None, None)
