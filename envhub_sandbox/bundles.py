@@ -215,7 +215,10 @@ def _array(folder: Path, name: str) -> Any:
     if name not in dtypes:
         raise BundleError(f"{printable(name, 100)!r} is no file of actions")
     _check_file(folder / name)
-    array = np.lib.format.open_memmap(folder / name, mode="r")
+    try:
+        array = np.lib.format.open_memmap(folder / name, mode="r")
+    except Exception as error:  # numpy reads the header with Python's own tokenizer and parser
+        raise BundleError(f"{name} is no file of actions: {error}") from error
     if array.dtype != dtypes[name] or not array.ndim:
         raise BundleError(f"{name} does not hold what it says")
     return np.array(array)

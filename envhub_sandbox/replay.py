@@ -16,6 +16,9 @@ from envhub_sandbox.errors import (
 )
 from envhub_worker.protocol import messages as m
 
+_UNFIT = (ActionError, TypeError, ValueError)
+"""What another environment than it was raises before it is asked."""
+
 
 class Verdict(str, Enum):
     """How a replay ended."""
@@ -61,7 +64,11 @@ def replay(
     if env is None:
         return Replayed(verdict=Verdict.SURVIVED, requests=0, steps=0)
     for message in bundle.before:
-        ended = _ask(env, message)
+        try:
+            ended = _ask(env, message)
+        except _UNFIT as error:
+            note = f"what had been set before does not fit this environment: {error}"
+            return Replayed(verdict=Verdict.DIFFERENT, requests=0, steps=0, note=note)
         if ended is not None:
             return _ended(ended, bundle, 0, 0)
     return _repeat(env, bundle, tick)
@@ -73,7 +80,7 @@ def _repeat(env: Any, bundle: Bundle, tick: Callable[[int], None]) -> Replayed:
         steps += isinstance(message, m.Step)
         try:
             ended = _ask(env, message)
-        except (ActionError, TypeError, ValueError) as error:  # another environment than it was
+        except _UNFIT as error:
             note = f"request {done} does not fit this environment: {error}"
             return Replayed(verdict=Verdict.DIFFERENT, requests=done, steps=steps, note=note)
         if ended is not None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import pickle
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from gymnasium import spaces
 from envhub_sandbox import bundles, crashes
 from envhub_sandbox.bundles import load_bundle, replayed_arguments, wishes
 from envhub_sandbox.cli.console import safe_line
-from envhub_sandbox.errors import BundleError, WorkerDiedError
+from envhub_sandbox.errors import ActionError, BundleError, WorkerDiedError
 from envhub_sandbox.history import History
 from envhub_sandbox.policy import Limits, Policy, Timeouts
 from envhub_sandbox.replay import Verdict, replay
@@ -143,6 +145,27 @@ def test_a_hostile_file_is_refused(tmp_path: Path, harm: Callable[[Path], None])
     folder = bundle(tmp_path)
     harm(folder)
     with pytest.raises(BundleError):
+        load_bundle(folder)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "{'descr': '<i8', 'fortran_order': False, 'shape': (",
+        f"{{'descr': '<i8', 'fortran_order': False, 'shape': ({10**30}, 2), }}\n",
+        "{'descr': '<i8', 'fortran_order': False, 'shape': (True, -2), }\n",
+        "{'descr': '<i8', 'fortran_order': False, 'shape': (3, 2), 5: 5, }\n",
+        "{[]: 1}\n",
+        "-" * 9_000 + "1",
+    ],
+    ids=["torn", "overflow", "type", "keys", "unhashable", "nested"],
+)
+def test_a_hostile_header_is_refused(tmp_path: Path, header: str) -> None:
+    """Whatever numpy makes of it, the user is told that the bundle is broken."""
+    folder = bundle(tmp_path)
+    size = struct.pack("<H", len(header))
+    (folder / "actions-int64.npy").write_bytes(b"\x93NUMPY\x01\x00" + size + header.encode())
+    with pytest.raises(BundleError, match="no file of actions"):
         load_bundle(folder)
 
 
@@ -286,3 +309,18 @@ def test_a_request_that_does_not_fit_is_said(tmp_path: Path) -> None:
     found = replay(lambda: env, load_bundle(bundle(tmp_path)))
     assert found.verdict is Verdict.DIFFERENT
     assert "request 2 does not fit" in found.note
+
+
+def test_what_was_set_before_and_does_not_fit_is_said(tmp_path: Path) -> None:
+    """It is an answer, not a traceback."""
+    folder = bundle(tmp_path)
+    setting = crashes._packet(m.pack(m.SetAttr(0, "size", (1,)), 0))
+    (folder / "requests.bin").write_bytes(setting + (folder / "requests.bin").read_bytes())
+    edit(folder, "history", "before", value=[{"operation": "set_attr"}])
+    env: Any = Recorder()
+    for error in (ValueError("one value each"), TypeError("no"), ActionError("no")):
+        env.set_attr = Mock(side_effect=error)
+        found = replay(lambda: env, load_bundle(folder))
+        assert found.verdict is Verdict.DIFFERENT
+        assert f"does not fit this environment: {error}" in found.note
+    assert env.asked == []
