@@ -120,9 +120,13 @@ class PaceBook:
         assert self._path is not None
         with contextlib.suppress(OSError):
             fd, temporary = tempfile.mkstemp(dir=self._path.parent)
-            with os.fdopen(fd, "w") as file:
-                json.dump(entries, file)
-            os.replace(temporary, self._path)
+            try:
+                with os.fdopen(fd, "w") as file:
+                    json.dump(entries, file)
+                os.replace(temporary, self._path)
+            except BaseException:
+                os.unlink(temporary)
+                raise
 
 
 def _name(env: EnvManifest) -> str:
