@@ -6,12 +6,12 @@ Functions over a place; whoever calls them knows what state the environment is i
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from envhub_sandbox.building import Place
 from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.fast_lane import Outcome
-from envhub_sandbox.jail import check, typed
 from envhub_sandbox.results import Results
 from envhub_worker.protocol import batches, slabs
 from envhub_worker.protocol import messages as m
@@ -81,23 +81,19 @@ def with_observations(
     ]
 
 
-def infos(place: Place, outcomes: Sequence[Outcome], fetch: Callable[[int], Any]) -> list[Any]:
-    """A step's infos, shard by shard; ``fetch`` gets the host whose infos did not fit.
+def infos(
+    place: Place,
+    outcomes: Sequence[Outcome],
+    results: Results,
+    fetch: Callable[[int], m.Message],
+) -> list[dict[Any, Any]]:
+    """A step's infos, shard by shard; ``fetch`` asks the host whose infos did not fit.
 
     Raises:
         RemoteEnvError: The environment raised.
     """
     assert place.lane is not None
-    found: list[Any] = []
     shards = zip(outcomes, place.lane.shards, place.hosts, strict=True)
-    for (kind, message), shard, host in shards:
-        if kind == slabs.COLUMNS:
-            found.append(shard.columns())
-        elif kind == slabs.FETCH:
-            found.append(fetch(host))
-        elif message is None:
-            found.append({})
-        else:
-            check(message)
-            found.append(typed(message, m.Value).value)
-    return found
+    return [
+        results.lane_info(outcome, shard, partial(fetch, host)) for outcome, shard, host in shards
+    ]

@@ -251,7 +251,8 @@ class RemoteEnv:
         if outcomes:
             assert self._place is not None
             fetch = partial(self._fetch_infos, timeout_s=timeout_s)
-            infos = self.results.lane_infos(lane_requests.infos(self._place, outcomes, fetch))
+            parts = lane_requests.infos(self._place, outcomes, self.results, fetch)
+            infos = self.results.lane_infos(parts)
         return (lane.observation(), *lane.flags(), infos)
 
     def _wait_on_lane(self, timeout_s: float | None) -> list[Outcome]:
@@ -263,15 +264,14 @@ class RemoteEnv:
                 return self._wait_for_survivors(timeout_s)
             raise self._cause_of_death() from None
 
-    def _fetch_infos(self, host: int, timeout_s: float | None) -> Any:
+    def _fetch_infos(self, host: int, timeout_s: float | None) -> m.Message:
         self._send("step", [(host, m.FetchInfos(self._number))])
         try:
             [reply] = self._collect(Deadline(timeout_s), timeout_s)
         except HostsDiedError as deaths:
             asked = [self._hosts.index(host)]
             raise survivors.among_all(deaths, asked, len(self.bounds)) from None
-        check(reply)
-        return typed(reply, m.Value).value
+        return reply
 
     def _cause_of_death(self) -> Exception:
         """Why the jail has ended: the server knows, at the latest when it has reaped it."""

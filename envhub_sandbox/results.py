@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from envhub_sandbox.errors import RemoteProtocolError
-from envhub_sandbox.fast_lane import LaneShard
+from envhub_sandbox.fast_lane import LaneShard, Outcome
 from envhub_sandbox.jail import check, typed
 from envhub_worker.protocol import batches, slabs
 from envhub_worker.protocol import messages as m
@@ -52,16 +52,22 @@ class Results:
         return m.ResetDone(observation, self._info(typed(reply, m.Value).value))
 
     def lane_infos(self, parts: list[Any]) -> dict[Any, Any]:
-        """The infos that came by the fast lane."""
-        return self._infos([self._info(part) for part in parts])
+        """The infos that came by the fast lane, as ``lane_info`` gives each shard's."""
+        return self._infos(parts)
 
-    def lane_info(self, shard: LaneShard, fetch: Callable[[], list[m.Message]]) -> Any:
-        """A shard's infos of a step by the fast lane; ``fetch`` asks for what did not fit."""
-        kind, message = shard.outcome()
+    def lane_info(
+        self, outcome: Outcome, shard: LaneShard, fetch: Callable[[], m.Message]
+    ) -> dict[Any, Any]:
+        """A shard's infos of a step by the fast lane; ``fetch`` asks for what did not fit.
+
+        Raises:
+            RemoteEnvError: The environment raised.
+        """
+        kind, message = outcome
         if kind == slabs.COLUMNS:
             return shard.columns()
         if kind == slabs.FETCH:
-            [message] = fetch()
+            message = fetch()
         if message is None:
             return {}
         check(message)

@@ -76,22 +76,27 @@ def answers_by_lane(
     Raises:
         RemoteEnvError: One of them raised.
     """
-    lane, jail = place.lane, place.loaded.jail
+    lane = place.lane
     assert lane is not None
     parts: list[m.Message | None] = [None] * len(bounds)
     observations = batches.split(manifest.single_observation_space, lane.observation(), bounds)
     flags = lane.flags()
     for index in [index for index in range(len(bounds)) if index not in deaths.deaths]:
-        asked = [(place.hosts[index], m.FetchInfos(place.number))]
-        fetch = partial(jail.exchange, "step", asked, Deadline(_CAUSE_S))
+        shard, fetch = lane.shards[index], partial(_fetch_infos, place, place.hosts[index])
         try:
-            info = results.lane_info(lane.shards[index], fetch)
+            info = results.lane_info(shard.outcome(), shard, fetch)
         except WorkerDiedError as error:
             deaths.deaths[index] = error
             continue
         rewards, over, cut = (column[slice(*bounds[index])] for column in flags)
         parts[index] = m.StepDone(observations[index], rewards, over, cut, info)
     return parts
+
+
+def _fetch_infos(place: Place, host: int) -> m.Message:
+    asked = [(host, m.FetchInfos(place.number))]
+    [reply] = place.loaded.jail.exchange("step", asked, Deadline(_CAUSE_S))
+    return reply
 
 
 def ask_anew(
