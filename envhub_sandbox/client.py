@@ -24,7 +24,7 @@ from envhub_sandbox.far import Far, Link
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol import packing
 from envhub_worker.protocol.codec import Buffer
-from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimits
 from envhub_worker.protocol.text import printable
 
 _FAR_VERSION = 2
@@ -148,8 +148,9 @@ class WorkerClient:
             self._sent[request_id] = self._link.next_number(), frames
             if self._compression:
                 travelling = packing.pack_frames(frames, self._compression)
-        self._socket.send_multipart(travelling, copy=False)
-        self.sent_bytes += sum(memoryview(frame).nbytes for frame in travelling)
+        size = sum(map(len, travelling))
+        self._socket.send_multipart(travelling, copy=size < LARGE_BYTES)
+        self.sent_bytes += size
 
     def receive(self, request_id: int, deadline: Deadline) -> tuple[m.Message, list[Buffer]]:
         """The reply to a request, with its payload. Replies to others are dropped and counted.
@@ -163,7 +164,7 @@ class WorkerClient:
         self.check_process()
         while True:
             self._wait(request_id, deadline)
-            frames: list[Buffer] = list(self._socket.recv_multipart(zmq.NOBLOCK))
+            frames = self._take()
             self.received_bytes += sum(map(len, frames))
             if self._link is not None:
                 frames = packing.unpack_frames(frames, self._limits)
@@ -178,6 +179,14 @@ class WorkerClient:
                 _, unanswered = self._sent.pop(request_id)
                 self.hello(deadline)
                 self._send(request_id, unanswered)
+
+    def _take(self) -> list[Buffer]:
+        """The message that is there. What is large stays in ZeroMQ's memory until it is decoded."""
+        frames: list[Buffer] = [self._socket.recv(zmq.NOBLOCK)]
+        while self._socket.getsockopt(zmq.RCVMORE):
+            frame = self._socket.recv(zmq.NOBLOCK, copy=False)
+            frames.append(frame.bytes if len(frame) < LARGE_BYTES else frame.buffer)
+        return frames
 
     def _must_say_hello(self, request_id: int, reply: m.Message) -> bool:
         """Whether we came back over a new connection: nothing was done, so it can be asked anew."""

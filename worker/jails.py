@@ -263,7 +263,9 @@ class Jails:
         return pidfd if pidfd >= 0 else None
 
     def _follow_writes(self, link: HostLink) -> None:
-        self._loop.watch_writes(link.fileno(), link.wants_write)
+        if link.wants_write != link.watched:
+            link.watched = link.wants_write
+            self._loop.watch_writes(link.fileno(), link.watched)
 
     def _owned(self, asker: Asker, number: int, operation: str = "") -> JailEntry | None:
         entry = self._jails.get(number)

@@ -21,11 +21,17 @@ _MAX_IOVECS = 512
 
 @dataclass
 class HostLink:
-    """One host's stream. ``pending`` maps the request ids that it owes, oldest first."""
+    """One host's stream.
+
+    Attributes:
+        pending: By the ids of the requests that it owes an answer to, oldest first.
+        watched: Whether somebody waits until it can be written to.
+    """
 
     sock: socket.socket
     limits: WireLimits
     pending: collections.OrderedDict[int, Any] = field(default_factory=collections.OrderedDict)
+    watched: bool = False
     _unsent: collections.deque[memoryview] = field(default_factory=collections.deque)
 
     def __post_init__(self) -> None:
@@ -50,10 +56,8 @@ class HostLink:
             self.pending[request_id] = owner
             return
         self.pending[request_id] = owner
-        for buffer in pack_packet(request_id, frames):
-            view = memoryview(buffer).cast("B")
-            if view.nbytes:
-                self._unsent.append(view)
+        buffers = pack_packet(request_id, frames)
+        self._unsent += [memoryview(buffer).cast("B") for buffer in buffers if buffer]
         self.flush()
 
     def _send_fds(self, request_id: int, frames: Sequence[Buffer], fds: Sequence[int]) -> None:

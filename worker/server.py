@@ -24,7 +24,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol import packing
 from envhub_worker.protocol.codec import Buffer
 from envhub_worker.protocol.errors import ProtocolError
-from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimits
 from envhub_worker.quotas import RefusedError
 from envhub_worker.sessions import Sessions
 
@@ -109,14 +109,10 @@ class Server:
 
     def _serve_clients(self) -> None:
         for _ in range(_ROUND):
-            try:
-                identity = self._router.recv(zmq.NOBLOCK)
-            except zmq.Again:
+            # not by an exception where there is nothing: that is how every round would end
+            if not int(self._router.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
                 return
-            # not of the frame before: libzmq 4.3.4 knows nothing of who sent the first one
-            header = self._router.recv(zmq.NOBLOCK, copy=False)
-            rest = self._router.recv_multipart(zmq.NOBLOCK) if header.more else []
-            self._serve(identity, self._gate.key_of(header), [header.bytes, *rest])
+            self._serve(*self._gate.receive(self._router))
 
     def _serve(self, identity: bytes, key: bytes, frames: list[Any]) -> None:
         if not frames or len(frames[0]) > self._limits.header_bytes:
@@ -168,7 +164,8 @@ class Server:
         compression = self._sessions.compression(asker.identity, asker.key)
         if compression:
             frames = packing.pack_frames(frames, compression)
-        self._router.send_multipart([asker.identity, *frames], zmq.NOBLOCK, copy=False)
+        copy = sum(map(len, payload)) < LARGE_BYTES
+        self._router.send_multipart([asker.identity, *frames], zmq.NOBLOCK, copy=copy)
 
     def refuse(
         self, asker: Asker, error: str, message: str, layer: str = "", fix: str = ""

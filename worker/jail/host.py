@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import select
 import socket
+from array import array
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -28,7 +29,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest import encode_env, encode_manifest
 from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
 
-_MAX_FDS = 8
+_ANCILLARY_BYTES = socket.CMSG_SPACE(8 * array("i").itemsize)
 _RECHECK_MS = 2
 
 
@@ -57,7 +58,8 @@ def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
 
 def _serve(stream: socket.socket, reader: PacketReader, host: Host) -> bool:
     """Answer what has come; False at the end of the stream."""
-    data, host.descriptors, _, _ = socket.recv_fds(stream, reader.chunk, _MAX_FDS)
+    data, ancillary, _, _ = stream.recvmsg(reader.chunk, _ANCILLARY_BYTES)
+    host.descriptors = [fd for part in ancillary for fd in array("i", part[2])]
     for packet in reader.feed(data):
         _send(stream, packet.request_id, host.answer(packet))
     return bool(data)

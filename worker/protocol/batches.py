@@ -104,6 +104,8 @@ def join_infos(parts: Sequence[dict[Any, Any]], sizes: Sequence[int]) -> dict[An
             be one: one shard has numbers where another has text.
     """
     joined: dict[Any, Any] = {}
+    if not any(parts):
+        return joined
     starts = np.cumsum([0, *sizes]).tolist()
     for part, start, size in zip(parts, starts, sizes, strict=False):
         try:

@@ -55,7 +55,7 @@ def encode(
     except Exception as error:
         # Objects' own code runs here (__array__, iteration): anything can come out of it.
         raise LocalProtocolError(explain(value, error, limits, pickler)) from error
-    _check_outgoing(frames, limits)
+    check_outgoing(frames, limits)
     return frames
 
 
@@ -85,7 +85,19 @@ def decode(
         MessageTooLargeError: Over one of ``limits``.
         RemoteProtocolError: Malformed in any other way.
     """
-    document, tail, buffers = _split(frames, limits)
+    return decode_parts(*split(frames, limits), limits, unpickler, tensors, copy)
+
+
+def decode_parts(
+    document: bytes,
+    tail: Buffer,
+    buffers: list[Buffer],
+    limits: WireLimits,
+    unpickler: Unpickler | None,
+    tensors: TensorMaker | None,
+    copy: bool = True,
+) -> object:
+    """``decode`` for frames that ``split`` has taken apart."""
     structure.check(document, limits)
     reader = ArrayReader(tail, buffers, limits, copy)
     decoder = Decoder(reader, limits, unpickler, tensors)
@@ -94,15 +106,21 @@ def decode(
     return value
 
 
-def _check_outgoing(frames: Sequence[Buffer], limits: WireLimits) -> None:
+def check_outgoing(frames: Sequence[Buffer], limits: WireLimits) -> None:
+    """Raises ``LocalProtocolError`` for frames that the receiver will not accept."""
     try:
         _check_sizes(frames, limits)
     except MessageTooLargeError as error:
         raise LocalProtocolError(f"The message is too large to be sent: {error}") from None
 
 
-def _split(frames: Sequence[Buffer], limits: WireLimits) -> tuple[bytes, Buffer, list[Buffer]]:
-    """Checks the frames' sizes; returns document, tail of the header, and the other frames."""
+def split(frames: Sequence[Buffer], limits: WireLimits) -> tuple[bytes, Buffer, list[Buffer]]:
+    """Checks the frames' sizes; returns document, tail of the header, and the other frames.
+
+    Raises:
+        MessageTooLargeError: Over one of ``limits``.
+        RemoteProtocolError: There is no header, or not all of it.
+    """
     flat = [frame if type(frame) is bytes else memoryview(frame).cast("B") for frame in frames]
     _check_sizes(flat, limits)
     header, *buffers = flat
@@ -111,13 +129,15 @@ def _split(frames: Sequence[Buffer], limits: WireLimits) -> tuple[bytes, Buffer,
     end = DOCUMENT_BYTES.size + DOCUMENT_BYTES.unpack_from(header)[0]
     if end > len(header):
         raise RemoteProtocolError("The header is shorter than it says.")
-    return bytes(header[DOCUMENT_BYTES.size : end]), memoryview(header)[end:], buffers
+    return bytes(header[DOCUMENT_BYTES.size : end]), header[end:], buffers
 
 
 def _check_sizes(frames: Sequence[Buffer], limits: WireLimits) -> None:
     """Raises ``MessageTooLargeError`` for too much. Frames must consist of single bytes."""
     if not frames:
         raise RemoteProtocolError("A message has no frame.")
+    if len(frames) == 1 and len(frames[0]) <= min(limits.header_bytes, limits.message_bytes):
+        return
     sizes = list(map(len, frames))
     for name, size, cap in (
         ("frames", len(sizes), limits.frames),

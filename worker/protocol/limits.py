@@ -40,3 +40,5 @@ class WireLimits:
 
 
 DEFAULT_LIMITS = WireLimits()
+LARGE_BYTES = 64 * KIB
+"""Below this a copy costs less than to keep the owner of the bytes until they are gone."""

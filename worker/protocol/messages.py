@@ -16,7 +16,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, TypeVar
 
-from envhub_worker.protocol.codec import Buffer, decode, encode
+from envhub_worker.protocol import recurring
+from envhub_worker.protocol.codec import Buffer, decode_parts, encode, split
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 
@@ -604,6 +605,9 @@ class Raised(Message):
 
 # --- packing -----------------------------------------------------------------------------------
 
+_OUTGOING: recurring.Forms[Any, recurring.Outgoing] = recurring.Forms()
+_INCOMING: recurring.Forms[bytes, recurring.Incoming[Message]] = recurring.Forms()
+
 
 def pack(
     message: Message,
@@ -617,9 +621,18 @@ def pack(
     Raises:
         LocalProtocolError: A field holds what the wire cannot carry; nothing was sent.
     """
-    values = [getattr(message, name) for name, _ in _CHECKS[type(message)]]
-    value = [message.kind, request_id, *values]
-    return encode(value, pickler=pickler, limits=limits)
+    cls = type(message)
+    values = [getattr(message, name) for name, _ in _CHECKS[cls]]
+    found = recurring.outline(values)
+    if found is None:
+        return encode([cls.kind, request_id, *values], pickler=pickler, limits=limits)
+    outline, arrays = found
+    form = _OUTGOING.get((cls, outline))
+    if form is not None and form.limits is limits:
+        return form.frames(request_id, arrays)
+    frames = encode([cls.kind, request_id, *values], pickler=pickler, limits=limits)
+    _OUTGOING.met((cls, outline), lambda: recurring.Outgoing(frames[0], limits))
+    return frames
 
 
 def unpack(
@@ -634,7 +647,28 @@ def unpack(
     Raises:
         RemoteProtocolError: The peer broke the rules.
     """
-    value = decode(frames, limits=limits, unpickler=unpickler, tensors=tensors)
+    document, tail, buffers = split(frames, limits)
+    plain = recurring.without_id(document)
+    if plain is None:
+        return _decode(document, tail, buffers, limits, unpickler, tensors)
+    key, packed_id = plain
+    form = _INCOMING.get(key)
+    if form is not None and form.limits is limits:
+        return recurring.read_id(packed_id), form.message(tail, buffers)
+    request_id, message = _decode(document, tail, buffers, limits, unpickler, tensors)
+    _INCOMING.met(key, lambda: recurring.Incoming(document, type(message), limits))
+    return request_id, message
+
+
+def _decode(
+    document: bytes,
+    tail: Buffer,
+    buffers: list[Buffer],
+    limits: WireLimits,
+    unpickler: Callable[[bytes], object] | None,
+    tensors: Callable[[Any, str], object] | None,
+) -> tuple[int, Message]:
+    value = decode_parts(document, tail, buffers, limits, unpickler, tensors)
     if type(value) is not list or len(value) < 2:
         raise RemoteProtocolError("a message is a list that starts with its kind and its id")
     kind, request_id, *rest = value

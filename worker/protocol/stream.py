@@ -71,9 +71,36 @@ class PacketReader:
         """
         rest = memoryview(data)
         while rest.nbytes or self._body_is_complete():
+            if self._body is None and not self._pending:
+                size, whole = self._whole(rest)
+                if whole is not None:
+                    yield whole
+                    rest = rest[size:]
+                    continue
             rest = self._fill_body(rest) if self._body is not None else self._fill_head(rest)
             if self._body_is_complete():
                 yield self._take()
+
+    def _whole(self, data: memoryview) -> tuple[int, Packet | None]:
+        """The packet that the data begins with and its size, if all of it is there: no copy."""
+        if data.nbytes < _PREFIX.size:
+            return 0, None
+        count, reserved, request_id = _PREFIX.unpack_from(data)
+        self._check_prefix(count, reserved, request_id)
+        end = _PREFIX.size + 8 * count
+        if data.nbytes < end:
+            return 0, None
+        lengths = struct.unpack_from(f"<{count}Q", data, _PREFIX.size)
+        if data.nbytes < end + sum(lengths):
+            return 0, None
+        if self._check is not None:
+            self._check(request_id)
+        self._check_lengths(lengths)
+        frames: list[Buffer] = []
+        for length in lengths:
+            frames.append(data[end : end + length])
+            end += length
+        return end, Packet(request_id, frames)
 
     def _body_is_complete(self) -> bool:
         return self._body is not None and self._filled == self._body.nbytes
@@ -90,9 +117,12 @@ class PacketReader:
         if len(self._pending) < _PREFIX.size:
             return _PREFIX.size
         count, reserved, request_id = _PREFIX.unpack_from(self._pending)
+        self._check_prefix(count, reserved, request_id)
+        return _PREFIX.size + 8 * int(count)
+
+    def _check_prefix(self, count: int, reserved: int, request_id: int) -> None:
         if count == 0 or count > self._limits.frames or reserved or request_id >= _MAX_ID:
             raise RemoteProtocolError(f"a packet of {count} frames is outside 1..the limit")
-        return _PREFIX.size + 8 * int(count)
 
     def _begin_body(self) -> None:
         count, _, request_id = _PREFIX.unpack_from(self._pending)

@@ -1,0 +1,214 @@
+"""Messages that recur are packed and unpacked by their form: nobody may notice."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import cloudpickle
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol import recurring
+from envhub_worker.protocol.codec import decode, encode
+from envhub_worker.protocol.errors import (
+    LocalProtocolError,
+    MessageTooLargeError,
+    ProtocolError,
+    RemoteProtocolError,
+)
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+
+_DTYPES = ("bool", "int8", "uint16", "int64", "float16", "float32", ">f8", "complex64")
+_LEAVES = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-(2**70), 2**70),
+    st.text(max_size=5),
+    st.binary(max_size=5),
+    st.floats(),
+    st.builds(
+        lambda shape, dtype: np.arange(np.prod(shape, dtype=int)).reshape(shape).astype(dtype),
+        st.lists(st.integers(0, 3), max_size=3).map(tuple),
+        st.sampled_from(_DTYPES),
+    ),
+)
+_VALUES = st.recursive(
+    _LEAVES,
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=3),
+        st.lists(inner, max_size=3).map(tuple),
+        st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    ),
+    max_leaves=8,
+)
+
+
+@pytest.fixture(autouse=True)
+def no_forms(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever other tests have sent."""
+    monkeypatch.setattr(m, "_OUTGOING", recurring.Forms())
+    monkeypatch.setattr(m, "_INCOMING", recurring.Forms())
+
+
+def alike(one: Any, other: Any) -> bool:
+    """Equal, and of the same types all the way down."""
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, np.ndarray):
+        same = one.dtype == other.dtype and one.shape == other.shape
+        return same and one.tobytes() == other.tobytes() and one.flags.writeable
+    if isinstance(one, (list, tuple)):
+        return len(one) == len(other) and all(map(alike, one, other))
+    if isinstance(one, dict):
+        return list(one) == list(other) and all(alike(one[key], other[key]) for key in one)
+    return repr(one) == repr(other)
+
+
+def changed(value: Any) -> Any:
+    """The same with other numbers in its arrays."""
+    if isinstance(value, np.ndarray):
+        return np.logical_not(value) if value.dtype == bool else value + 1
+    if isinstance(value, (list, tuple)):
+        return type(value)(map(changed, value))
+    if isinstance(value, dict):
+        return {key: changed(item) for key, item in value.items()}
+    return value
+
+
+@given(_VALUES, st.lists(st.integers(0, 2**63 - 1), min_size=4, max_size=4))
+def test_what_comes_again_is_packed_and_unpacked_as_the_first_time(
+    value: Any, ids: list[int]
+) -> None:
+    """The codec itself decides what is right, for anything that it takes."""
+    for number, one in zip(ids, (value, value, value, changed(value)), strict=True):
+        frames = m.pack(m.Value(one), number)
+        assert [bytes(f) for f in frames] == [bytes(f) for f in encode([48, number, one])]
+        found, message = m.unpack(frames)
+        assert found == number
+        assert isinstance(message, m.Value)
+        assert alike(message.value, decode(encode(one)))
+
+
+@pytest.mark.parametrize(("one", "other"), [(1, True), (0, False), (0.0, -0.0), ("a", b"a")])
+def test_what_is_equal_and_not_the_same_is_kept_apart(one: Any, other: Any) -> None:
+    """True is 1, and is not."""
+    for value in (one, one, one, other, other, other):
+        _, message = m.unpack(m.pack(m.Value((value, np.zeros(2))), 1))
+        assert isinstance(message, m.Value)
+        assert alike(message.value, (value, np.zeros(2)))
+
+
+def test_arrays_of_a_recurring_message_are_the_receivers_own() -> None:
+    """What one receiver writes, no other sees."""
+    frames = m.pack(m.Value({"a": np.zeros(3)}), 1)
+    values = [m.unpack(frames)[1].value for _ in range(4)]  # type: ignore[attr-defined]
+    for number, value in enumerate(values):
+        value["a"][:] = number
+        value["more"] = number
+    assert [value["a"].tolist() for value in values] == [[float(n)] * 3 for n in range(4)]
+
+
+def _known(value: object) -> bytes:
+    """The header of a message whose form both sides know."""
+    for _ in range(3):
+        frames = m.pack(m.Value(value), 1)
+        m.unpack(frames)
+    assert list(m._INCOMING._forms.values()) != [None]
+    [header] = frames
+    return bytes(header)
+
+
+@pytest.mark.parametrize("change", [lambda raw: raw[:-1], lambda raw: raw + b"x"])
+def test_the_bytes_of_a_known_message_are_counted(change: Any) -> None:
+    """Too few, too many, or a frame that nothing describes."""
+    header = _known(np.arange(4.0))
+    with pytest.raises(RemoteProtocolError):
+        m.unpack([change(header)])
+    with pytest.raises(RemoteProtocolError):
+        m.unpack([header, b"more"])
+
+
+def test_the_bytes_of_a_known_message_are_looked_at() -> None:
+    """A boolean of 2 would reach outside of an array."""
+    header = _known(np.zeros(4, bool))
+    with pytest.raises(RemoteProtocolError, match="boolean"):
+        m.unpack([header[:-1] + b"\2"])
+
+
+def test_the_limits_of_a_known_message_hold() -> None:
+    """A form is for the limits under which it was made, and no others."""
+    header = _known(np.arange(4.0))
+    with pytest.raises(MessageTooLargeError):
+        m.unpack([header], limits=WireLimits(header_bytes=20))
+    with pytest.raises(MessageTooLargeError):
+        m.unpack([header], limits=WireLimits(depth=0))
+    with pytest.raises(LocalProtocolError):
+        m.pack(m.Value(np.arange(4.0)), 1, limits=WireLimits(header_bytes=20))
+
+
+def test_large_arrays_of_a_known_message_have_frames() -> None:
+    """Their sizes are checked as ever."""
+    limits = WireLimits(frame_bytes=200_000)
+    for size in (50_000, 50_000, 50_000, 200_000, 200_000, 200_000):
+        value = np.full(size, size % 7, np.uint8)
+        frames = m.pack(m.Value(value), 1, limits=limits)
+        assert len(frames) == 2
+        _, message = m.unpack(frames, limits=limits)
+        assert alike(message, m.Value(value)) or np.array_equal(message.value, value)  # type: ignore[attr-defined]
+    with pytest.raises(RemoteProtocolError):
+        m.unpack([frames[0], bytes(199_999)], limits=limits)
+    for _ in range(3):
+        with pytest.raises(LocalProtocolError):
+            m.pack(m.Value(np.zeros(200_001, np.uint8)), 1, limits=limits)
+
+
+def test_pickled_objects_and_tensors_never_have_a_form() -> None:
+    """What they become depends on who reads them."""
+    frames = m.pack(m.Value(_Own()), 1, pickler=cloudpickle.dumps)
+    for _ in range(3):
+        _, message = m.unpack(frames, unpickler=cloudpickle.loads)
+        assert type(message.value).__name__ == "_Own"  # type: ignore[attr-defined]
+    for _ in range(3):
+        with pytest.raises(ProtocolError):
+            m.unpack(frames)
+    torch = pytest.importorskip("torch")
+    frames = m.pack(m.Value(torch.zeros(2)), 1)
+    for _ in range(3):
+        assert type(m.unpack(frames)[1].value) is np.ndarray  # type: ignore[attr-defined]
+    made = m.unpack(frames, tensors=lambda array, name: (name, array))[1]
+    assert made.value[0] == "float32"  # type: ignore[attr-defined]
+
+
+class _Own:
+    """Something that only a pickler can send."""
+
+
+def test_a_peer_that_never_repeats_itself_fills_nothing() -> None:
+    """Forms are bounded."""
+    for number in range(2000):
+        m.unpack(m.pack(m.Value(f"{number}"), 1))
+    assert len(m._INCOMING._forms) <= 256
+    assert len(m._OUTGOING._forms) <= 256
+    assert set(m._INCOMING._forms.values()) == {None}
+
+
+@given(st.integers(0, 2**64 - 1), st.binary(min_size=1, max_size=40))
+def test_an_id_is_read_as_msgpack_reads_it(number: int, rest: bytes) -> None:
+    """Whatever follows it, and whatever its size."""
+    packed = msgpack.packb(number)
+    cut = recurring.without_id(b"\x93\x30" + packed + rest)
+    assert cut == (b"\x93\x30" + rest, packed)
+    assert recurring.read_id(packed) == number
+
+
+def test_an_id_that_is_cut_off_is_refused() -> None:
+    """No form is taken for it."""
+    _known(None)
+    document = b"\x93\x30\xcd\x01"
+    with pytest.raises(RemoteProtocolError):
+        m.unpack([struct.pack("<I", len(document)) + document], limits=DEFAULT_LIMITS)
