@@ -158,18 +158,18 @@ def test_other_snapshots_of_the_store_are_out_of_reach(cell: Cell) -> None:
     assert denied(cell.run(source), "PermissionError", "FileNotFoundError")
 
 
-def test_link_in_a_snapshot_leads_nowhere(outside: Path) -> None:
+@pytest.mark.parametrize("profile", ["strict", "no-userns"])
+def test_link_in_a_snapshot_leads_nowhere(outside: Path, profile: str) -> None:
     """A symbolic link to a file outside shows nothing."""
     (outside / "secret").write_text("s3cret")
-    for profile in ("strict", "no-userns"):
-        with open_folder() as folder, spawner_in(folder, Confinement(profile=profile)) as spawner:
-            snapshot = make_snapshot(folder, str(outside / "secret"))
-            cell = new_cell(spawner, snapshot, Confinement(profile=profile))
-            cell.start()
-            source = f"result = open({snapshot!r} + '/link').read()"
-            assert unconfined(source) == {"result": "s3cret"}
-            assert denied(cell.run(source), "PermissionError", "FileNotFoundError")
-            assert denied(cell.run("result = open('link').read()"))
+    with open_folder() as folder, spawner_in(folder, Confinement(profile=profile)) as spawner:
+        snapshot = make_snapshot(folder, str(outside / "secret"))
+        cell = new_cell(spawner, snapshot, Confinement(profile=profile))
+        cell.start()
+        source = f"result = open({snapshot!r} + '/link').read()"
+        assert unconfined(source) == {"result": "s3cret"}
+        assert denied(cell.run(source), "PermissionError", "FileNotFoundError")
+        assert denied(cell.run("result = open('link').read()"))
 
 
 def test_another_jails_scratch_is_out_of_reach(cells: dict[str, Cell]) -> None:
