@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gymnasium.error import ClosedEnvironmentError
 
-from envhub_sandbox import errors, make_env, remote_env, restarts
+from envhub_sandbox import errors, make_env, remote_env, restarts, tenant
 from envhub_sandbox.remote_env import RemoteEnv
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from tests.support.samples import sample
@@ -150,7 +150,7 @@ def test_close_ends_the_wait_before_a_restart(
 
 def test_who_outlasts_a_close_gives_everything_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """``close`` does not wait for ever for a thread that holds the environment."""
-    monkeypatch.setattr(remote_env, "_INTERRUPT_S", 0.0)
+    monkeypatch.setattr(tenant, "_INTERRUPT_S", 0.0)
     policy = {"restart": "on_reset", "crash_history": 0}
     with made(policy=policy, fails={"moment": "step", "fault": "kill"}) as suites:
         env, remote = suites.env, suites.env._remote
@@ -180,7 +180,7 @@ def test_a_jail_that_comes_up_after_close_is_given_back(
     moment: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whoever closes does not wait for it: whoever opened it gives it back."""
-    monkeypatch.setattr(remote_env, "_INTERRUPT_S", 0.0)
+    monkeypatch.setattr(tenant, "_INTERRUPT_S", 0.0)
     with make_env(sample("faulty"), env_kwargs={"tasks": 2}) as suites:
         suites["suite"][0].reset()
         env = suites["suite"][1]
