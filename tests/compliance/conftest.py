@@ -6,10 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from envhub_sandbox import make_env
 from tests.compliance.pair import Pair
-from tests.compliance.vector_env import Case, VectorEnvCompliance
-from tests.support.samples import reference, sample
+from tests.compliance.vector_env import Case, paired
 
 
 @pytest.fixture(scope="session", params=["auto", "frames"])
@@ -21,19 +19,8 @@ def lane(request: pytest.FixtureRequest) -> str:
 @pytest.fixture(scope="class")
 def pair(request: pytest.FixtureRequest, case: Case, lane: str) -> Iterator[Pair]:
     """The reference and the sandboxed environment of a case; its tests share them."""
-    suite: type[VectorEnvCompliance] = request.cls
-    expected = reference(suite.sample, case.n_envs, **case.env_kwargs)
-    suites = make_env(
-        sample(suite.sample),
-        n_envs=case.n_envs,
-        use_async_envs=case.use_async_envs,
-        env_kwargs=case.env_kwargs,
-        num_workers=case.num_workers,
-        lane=lane,
-    )
-    with suites:
-        yield Pair(expected, suites.env)
-    expected.close()
+    with paired(request.cls.sample, case, lane=lane) as both:
+        yield both
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

@@ -6,6 +6,7 @@ on each of them. ``SyncVectorEnv`` in this process is the oracle, for ``use_asyn
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Iterator
 from copy import deepcopy
@@ -17,9 +18,10 @@ import pytest
 from gymnasium.error import AlreadyPendingCallError, NoAsyncCallError
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from envhub_sandbox import SandboxVectorEnv
+from envhub_sandbox import SandboxVectorEnv, make_env
 from tests.compliance.pair import Pair
 from tests.support.compare import assert_same, assert_same_space
+from tests.support.samples import reference, sample
 
 MODES = ("NextStep", "SameStep", "Disabled")
 
@@ -52,6 +54,29 @@ def cases(
         Case(n, is_async, {"autoreset_mode": mode}, async_workers if is_async else None)
         for n, is_async, mode in itertools.product(n_envs, use_async_envs, modes)
     ]
+
+
+@contextlib.contextmanager
+def paired(name: str, case: Case, **options: Any) -> Iterator[Pair]:
+    """A sample's reference and its sandboxed environment, which live as long as the context.
+
+    Args:
+        name: Of the repository under ``tests/samples``.
+        case: How both are built.
+        options: What else ``make_env`` takes: the place, the lane.
+    """
+    expected = reference(name, case.n_envs, **case.env_kwargs)
+    suites = make_env(
+        sample(name),
+        n_envs=case.n_envs,
+        use_async_envs=case.use_async_envs,
+        env_kwargs=case.env_kwargs,
+        num_workers=case.num_workers,
+        **options,
+    )
+    with suites:
+        yield Pair(expected, suites.env)
+    expected.close()
 
 
 class VectorEnvCompliance:

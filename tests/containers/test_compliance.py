@@ -6,11 +6,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from envhub_sandbox import make_env
 from envhub_sandbox.sandboxes.docker import DockerSandbox
 from tests.compliance.pair import Pair
-from tests.compliance.vector_env import Case, VectorEnvCompliance, cases
-from tests.support.samples import reference, sample
+from tests.compliance.vector_env import Case, VectorEnvCompliance, cases, paired
 
 
 @pytest.fixture(scope="class")
@@ -18,20 +16,8 @@ def pair(
     request: pytest.FixtureRequest, case: Case, lane: str, docker: DockerSandbox
 ) -> Iterator[Pair]:
     """The reference and the environment in a container; the tests of a case share them."""
-    suite: type[VectorEnvCompliance] = request.cls
-    expected = reference(suite.sample, case.n_envs, **case.env_kwargs)
-    suites = make_env(
-        sample(suite.sample),
-        n_envs=case.n_envs,
-        use_async_envs=case.use_async_envs,
-        env_kwargs=case.env_kwargs,
-        num_workers=case.num_workers,
-        lane=lane,
-        sandbox=docker,
-    )
-    with suites:
-        yield Pair(expected, suites.env)
-    expected.close()
+    with paired(request.cls.sample, case, lane=lane, sandbox=docker) as both:
+        yield both
 
 
 class TestCounter(VectorEnvCompliance):

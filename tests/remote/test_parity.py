@@ -6,30 +6,17 @@ from collections.abc import Iterator
 
 import pytest
 
-from envhub_sandbox import make_env
 from tests.compliance.conftest import pytest_generate_tests as pytest_generate_tests
 from tests.compliance.pair import Pair
-from tests.compliance.vector_env import Case, VectorEnvCompliance, cases
+from tests.compliance.vector_env import Case, VectorEnvCompliance, cases, paired
 from tests.remote.listening import Listening
-from tests.support.samples import reference, sample
 
 
 @pytest.fixture(scope="class")
 def pair(request: pytest.FixtureRequest, case: Case, server: Listening) -> Iterator[Pair]:
     """The reference here and the environment over there; a class's tests share them."""
-    suite: type[VectorEnvCompliance] = request.cls
-    expected = reference(suite.sample, case.n_envs, **case.env_kwargs)
-    suites = make_env(
-        sample(suite.sample),
-        n_envs=case.n_envs,
-        use_async_envs=case.use_async_envs,
-        env_kwargs=case.env_kwargs,
-        num_workers=case.num_workers,
-        sandbox=server.sandbox(),
-    )
-    with suites:
-        yield Pair(expected, suites.env)
-    expected.close()
+    with paired(request.cls.sample, case, sandbox=server.sandbox()) as both:
+        yield both
 
 
 class TestCounter(VectorEnvCompliance):
