@@ -9,7 +9,6 @@ down as it does on a host. What holds is read from inside before anything runs; 
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import json
 import os
@@ -19,8 +18,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import threading
-import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,6 +37,7 @@ from envhub_sandbox.sandboxes.engines import (
     own_limits,
 )
 from envhub_sandbox.sandboxes.identity import identity_of
+from envhub_sandbox.sandboxes.sharing import Sharing
 
 _KEEPER = Path(__file__).with_name("keeper.py")
 _STARTUP_S = 120.0
@@ -156,6 +154,11 @@ class ContainerServer:
         """The socket that takes descriptors."""
         return f"{self.folder}/sockets/fds"
 
+    @property
+    def runs(self) -> bool:
+        """Whether it has not ended."""
+        return self.process.poll() is None
+
     def stop(self) -> None:
         """End the container, in bounded time. A fork of its owner does nothing."""
         if os.getpid() != self.owner:
@@ -176,41 +179,16 @@ class RepositoryContainer:
         self.interpreter = f"{image} in {engine.kind}"
         self._options, self._engine, self._image = options, engine, image
         self._snapshot, self._policy = snapshot, policy
-        # reentrant: the garbage collector may close an environment in the middle of acquire()
-        self._lock = threading.RLock()
-        self._servers: dict[int, ContainerServer] = {}
-        _sandboxes.add(self)
-
-    def forked(self) -> None:
-        """In a fork: whichever thread held the lock is not here."""
-        self._lock = threading.RLock()
+        self._servers: Sharing[ContainerServer] = Sharing()
 
     def acquire(self, store: Path) -> ContainerServer:
         """The repository's container, started if there is none."""
-        with self._lock:
-            server = self._servers.get(os.getpid())
-            if server is not None:
-                server.users += 1  # at once: nobody may end it from here on
-                if server.process.poll() is None:
-                    return server
-                self.release(server)
-            server = self._servers[os.getpid()] = self._start()
-            server.users += 1
-            _running.append(server)
-            return server
+        return self._servers.acquire(None, self._start)
 
     def release(self, server: WorkerServer) -> None:
         """Give it back; the last one who does ends the container."""
         assert isinstance(server, ContainerServer)
-        with self._lock:
-            server.users -= 1
-            if server.users > 0:
-                return
-            if self._servers.get(server.owner) is server:
-                del self._servers[server.owner]
-        with contextlib.suppress(ValueError):
-            _running.remove(server)
-        server.stop()
+        self._servers.release(server)
 
     def _start(self) -> ContainerServer:
         folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
@@ -355,22 +333,3 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     except subprocess.TimeoutExpired:
         process.kill()  # its pipe closes, and the container ends
         process.wait()
-
-
-_running: list[ContainerServer] = []
-_sandboxes: weakref.WeakSet[RepositoryContainer] = weakref.WeakSet()
-
-
-def _stop_all() -> None:
-    """End all containers of this process, as at its exit."""
-    while _running:
-        _running.pop().stop()
-
-
-def _forked() -> None:
-    for sandbox in list(_sandboxes):
-        sandbox.forked()
-
-
-atexit.register(_stop_all)
-os.register_at_fork(after_in_child=_forked)

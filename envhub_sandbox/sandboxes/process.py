@@ -7,7 +7,6 @@ whatever ended it: it holds a pidfd of us.
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import os
 import select
@@ -15,13 +14,14 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import threading
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import envhub_worker.protocol
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.sandboxes.base import WorkerServer
+from envhub_sandbox.sandboxes.sharing import Sharing
 
 BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
 _STARTUP_S = 60.0
@@ -45,6 +45,11 @@ class ProcessServer:
         """The socket that takes descriptors."""
         return str(self.folder / "fds")
 
+    @property
+    def runs(self) -> bool:
+        """Whether it has not ended."""
+        return self.process.poll() is None
+
     def stop(self) -> None:
         """End it and everything below it, in bounded time. A fork of its owner does nothing."""
         if os.getpid() != self.owner:
@@ -66,9 +71,7 @@ class ProcessSandbox:
     name = "process"
 
     def __init__(self) -> None:
-        # reentrant: the garbage collector may close an environment in the middle of acquire()
-        self._lock = threading.RLock()
-        self._servers: dict[tuple[int, Path], ProcessServer] = {}
+        self._servers: Sharing[ProcessServer] = Sharing()
 
     def acquire(self, store: Path) -> ProcessServer:
         """The server for this process, started if there is none."""
@@ -77,40 +80,12 @@ class ProcessSandbox:
                 f"sandbox='process' needs Linux, and this is {sys.platform}: nothing here can "
                 "confine a process. Run the worker in a container or on a Linux host."
             )
-        with self._lock:
-            server = self._servers.get((os.getpid(), store))
-            if server is not None:
-                server.users += 1  # at once: nobody may end it from here on
-                if server.process.poll() is None:
-                    return server
-                self.release(server)
-            server = self._servers[os.getpid(), store] = _start(store)
-            server.users += 1
-            return server
+        return self._servers.acquire(store, partial(_start, store))
 
     def release(self, server: WorkerServer) -> None:
         """Give a server back; the last one who does ends it."""
         assert isinstance(server, ProcessServer)
-        with self._lock:
-            server.users -= 1
-            if server.users > 0:
-                return
-            for key, known in list(self._servers.items()):
-                if known is server:
-                    del self._servers[key]
-        server.stop()
-
-    def forked(self) -> None:
-        """In a fork: whichever thread held the lock is not here."""
-        self._lock = threading.RLock()
-
-    def stop_all(self) -> None:
-        """End all servers of this process, as at its exit."""
-        with self._lock:
-            mine = [key for key in self._servers if key[0] == os.getpid()]
-            servers = [self._servers.pop(key) for key in mine]
-        for server in servers:
-            server.stop()
+        self._servers.release(server)
 
 
 def _start(store: Path) -> ProcessServer:
@@ -171,5 +146,3 @@ def _wait_until_ready(ready: int, server: ProcessServer) -> None:
 
 
 PROCESS = ProcessSandbox()
-atexit.register(PROCESS.stop_all)
-os.register_at_fork(after_in_child=PROCESS.forked)

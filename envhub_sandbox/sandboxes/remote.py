@@ -7,13 +7,13 @@ has gone loses its jails.
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import ipaddress
 import os
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -25,6 +25,7 @@ from envhub_sandbox.errors import EnvHubError, PolicyError, SandboxUnavailableEr
 from envhub_sandbox.far import Far
 from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes.base import WorkerServer
+from envhub_sandbox.sandboxes.sharing import Sharing
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import parse_key
 
@@ -212,7 +213,8 @@ class RemoteRepository:
 
     def acquire(self, store: Path) -> RemoteServer:
         """The server; nothing is sent before a jail is opened."""
-        host = HOSTS.acquire(self._endpoint, self._far)
+        where = (self._endpoint, self._far)
+        host = HOSTS.acquire(where, partial(Host, *where))
         return RemoteServer(host, self, self._policy.profile)
 
     def release(self, server: WorkerServer) -> None:
@@ -294,6 +296,11 @@ class Host:
         if client is not None:
             client.close()
 
+    @property
+    def runs(self) -> bool:
+        """Nobody here knows; whoever asks it something hears."""
+        return True
+
     def stop(self) -> None:
         """No longer tell it. A fork of its owner does nothing."""
         if os.getpid() == self.owner:
@@ -304,45 +311,5 @@ class Host:
                 os.close(self.stopped)
 
 
-class Hosts:
-    """The servers that this process uses, each once. Thread-safe."""
-
-    def __init__(self) -> None:
-        # reentrant: the garbage collector may close an environment in the middle of acquire()
-        self._lock = threading.RLock()
-        self._hosts: dict[tuple[int, str, Far], Host] = {}
-
-    def acquire(self, endpoint: str, far: Far) -> Host:
-        """The server at an endpoint under these keys."""
-        key = (os.getpid(), endpoint, far)
-        with self._lock:
-            host = self._hosts.get(key)
-            if host is None:
-                host = self._hosts[key] = Host(endpoint, far)
-            host.users += 1
-            return host
-
-    def release(self, host: Host) -> None:
-        """Give it back; the last one who does ends its thread."""
-        with self._lock:
-            host.users -= 1
-            if host.users > 0:
-                return
-            self._hosts.pop((host.owner, host.endpoint, host.far), None)
-        host.stop()
-
-    def forked(self) -> None:
-        """In a fork: whichever thread held the lock is not here."""
-        self._lock = threading.RLock()
-
-    def stop_all(self) -> None:
-        """End all threads, as at this process's exit."""
-        with self._lock:
-            hosts, self._hosts = list(self._hosts.values()), {}
-        for host in hosts:
-            host.stop()
-
-
-HOSTS = Hosts()
-atexit.register(HOSTS.stop_all)
-os.register_at_fork(after_in_child=HOSTS.forked)
+HOSTS: Sharing[Host] = Sharing()
+"""The servers that this process uses, each once for an endpoint and its keys."""

@@ -245,11 +245,9 @@ def test_dead_server_is_told_and_replaced(folder: Path) -> None:
     client = start(
         folder,
         """
-        from envhub_sandbox.sandboxes.process import PROCESS
         for lane in ("auto", "frames"):
             suites = made(lane=lane, policy={"restart": "on_reset"})
-            [server] = PROCESS._servers.values()
-            server.process.kill()
+            suites.env._remote._loaded.server.process.kill()
             try:
                 while True:  # the jail may live a moment longer
                     suites.env.step([0, 0])

@@ -1,0 +1,96 @@
+"""What the environments of this process share: started for the first of them, ended by the last."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import os
+import threading
+import weakref
+from collections.abc import Callable, Hashable
+from typing import Any, Generic, Protocol, TypeVar
+
+
+class Shared(Protocol):
+    """A worker server, or what stands for one that is elsewhere.
+
+    Attributes:
+        users: How many use it; counted here, and 0 at first.
+        runs: Whether it is still there.
+    """
+
+    users: int
+
+    @property
+    def runs(self) -> bool: ...  # noqa: D102
+
+    def stop(self) -> None:
+        """End it, in bounded time. A fork of its owner does nothing."""
+
+
+S = TypeVar("S", bound=Shared)
+
+
+class Sharing(Generic[S]):
+    """Counts who uses what. Thread-safe; a fork starts its own."""
+
+    def __init__(self) -> None:
+        # reentrant: the garbage collector may close an environment in the middle of acquire()
+        self._lock = threading.RLock()
+        self._shared: dict[tuple[int, Hashable], S] = {}
+        _all.add(self)
+
+    def acquire(self, key: Hashable, start: Callable[[], S]) -> S:
+        """The one with this key, started if there is none, or none that runs."""
+        mine = os.getpid(), key
+        with self._lock:
+            shared = self._shared.get(mine)
+            if shared is not None:
+                shared.users += 1  # at once: nobody may end it from here on
+                if shared.runs:
+                    return shared
+                self.release(shared)
+            shared = self._shared[mine] = start()
+            shared.users += 1
+            return shared
+
+    def release(self, shared: S) -> None:
+        """Give it back; the last one who does ends it."""
+        with self._lock:
+            shared.users -= 1
+            if shared.users > 0:
+                return
+            for key, known in list(self._shared.items()):
+                if known is shared:
+                    del self._shared[key]
+        shared.stop()
+
+    def stop_all(self) -> None:
+        """End all that this process has started, as at its exit."""
+        with self._lock:
+            mine = [key for key in self._shared if key[0] == os.getpid()]
+            ended = [self._shared.pop(key) for key in mine]
+        for shared in ended:
+            shared.stop()
+
+    def forked(self) -> None:
+        """In a fork: whichever thread held the lock is not here."""
+        self._lock = threading.RLock()
+
+
+_all: weakref.WeakSet[Sharing[Any]] = weakref.WeakSet()
+
+
+def _stop_all() -> None:
+    with contextlib.ExitStack() as stack:  # whatever interrupts one of them, the others follow
+        for sharing in list(_all):
+            stack.callback(sharing.stop_all)
+
+
+def _forked() -> None:
+    for sharing in list(_all):
+        sharing.forked()
+
+
+atexit.register(_stop_all)
+os.register_at_fork(after_in_child=_forked)
