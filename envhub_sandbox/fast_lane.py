@@ -12,6 +12,7 @@ import os
 import platform
 import select
 import socket
+from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from time import perf_counter_ns
@@ -21,7 +22,7 @@ from envhub_sandbox.cores import CPUS, Cores
 from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import RemoteProtocolError, WorkerTimeoutError
 from envhub_sandbox.observations import RING, ObservationSlab
-from envhub_sandbox.sharding import Pace, awake_shards
+from envhub_sandbox.sharding import ASK_NS, Cost, Pace, Sample, awake_shards, pace_of
 from envhub_sandbox.slab import SEAL_FUTURE_WRITE, slab
 from envhub_sandbox.spinning import SpinChooser
 from envhub_sandbox.tensors import to_tensor
@@ -36,6 +37,9 @@ _RECHECK_MS = 2
 _CONNECT_S = 5.0
 _PACE_STEPS = 256
 """Steps after which what they took is worth remembering."""
+_SAMPLE_EVERY = 64
+"""Steps between two samples; the hosts measure every 32nd."""
+_SAMPLES = 64
 # elsewhere a core may see the sequence word before the data it announces: sleep, do not poll
 _ORDERED_STORES = platform.machine() in ("x86_64", "AMD64")
 
@@ -254,6 +258,8 @@ class FastLane:
         self._talk_spin = SpinChooser(may_spin)  # messages take another time than steps
         self._asked_ns = 0
         self.elapsed_ns = 0
+        self._slept_ns = 0
+        self._samples: deque[Sample] = deque(maxlen=_SAMPLES)
         # One core is the client's. Shards that find no other sleep until they are asked, then run
         # on the client's while it sleeps: so it waits for those first, and for the others awake.
         self._awake = awake_shards(len(self.shards))
@@ -327,6 +333,8 @@ class FastLane:
         if len(self.shards) == 1:
             self.shards[0].ask(leaves, slot, spin_ns)
             return
+        if not self.shards[0].sequence % _SAMPLE_EVERY:
+            self._sample()
         cpus = self._cores.of_shards()
         for index, (shard, (start, stop)) in enumerate(zip(self.shards, self._bounds, strict=True)):
             rows = [leaf[start:stop] for leaf in leaves]
@@ -370,7 +378,9 @@ class FastLane:
             deadline = deadline or Deadline(timeout_s)
             self._sleep_for(shard, deadline)
         budget_ns = self._spin.budget_ns
-        until_ns = perf_counter_ns() + budget_ns
+        now_ns = perf_counter_ns()
+        self._slept_ns = now_ns - self._asked_ns
+        until_ns = now_ns + budget_ns
         for shard in self._wakers:
             if not budget_ns or not shard.answered_until(until_ns):
                 if budget_ns:
@@ -404,14 +414,23 @@ class FastLane:
                 return True
         return False
 
-    def pace(self, step_s: float) -> Pace | None:
-        """What the steps took, given their median; None after too few of them."""
+    def _sample(self) -> None:
+        """Take note of the last step, which every shard has measured."""
         busy = [shard.busy_ns for shard in self.shards]
-        if self.shards[0].sequence < _PACE_STEPS or not all(busy):
+        asleep, awake = busy[self._awake :], busy[: self._awake]
+        if asleep and awake and all(busy):
+            sample = Sample(self._slept_ns, self.elapsed_ns, max(asleep), max(awake))
+            self._samples.append(sample)
+
+    def pace(self) -> Pace | None:
+        """What the steps took; None after too few of them."""
+        if self.shards[0].sequence < _PACE_STEPS:
             return None
-        step_ns = sum(busy) / self.observations.layout.count
-        asleep = busy[self._awake :]
-        return Pace(step_ns, max(1.0, step_s * 1e9 - max(asleep)) if asleep else None)
+        sizes = [stop - start for start, stop in self._bounds]
+        if self._samples:
+            return pace_of(self._samples, max(sizes[self._awake :]), max(sizes[: self._awake]))
+        busy = sum(shard.busy_ns for shard in self.shards)
+        return Pace(Cost(ASK_NS, busy / sum(sizes)), None) if busy else None
 
     def observation(self) -> Any:
         """The batched observation: arrays that no later step changes."""

@@ -13,18 +13,37 @@ import contextlib
 import json
 import os
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 
 from envhub_sandbox.cores import CPUS
 from envhub_worker.protocol.batches import even_bounds
 from envhub_worker.protocol.manifest import EnvManifest
 
+ASK_NS = 10_000.0
+"""What it costs to ask a shard that waits awake, before it has been measured."""
 _WAKE_UP_NS = 15_000.0
-"""What a sleeping shard costs, before it has been measured."""
+"""How much more it costs to ask one that sleeps, before that has been measured."""
 _FORGETTING = 0.7
 """Per use without a sleeping shard: a busy machine must not be remembered for ever."""
 _WORST_NS = 1e12
+_NOTICED_NS = 2_000
+"""A wait that is shorter is none: the answer was there already."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a step of a shard took, from the client's call on.
+
+    Attributes:
+        fixed_ns: Until it has begun, and until its end is known.
+        step_ns: For each of its sub-environments.
+    """
+
+    fixed_ns: float
+    step_ns: float
 
 
 @dataclass(frozen=True)
@@ -32,12 +51,40 @@ class Pace:
     """What an environment took.
 
     Attributes:
-        step_ns: One sub-environment's step.
-        wake_ns: A step's wait for a sleeping shard beyond that shard's work; None without one.
+        awake: A shard that waits awake, on a core of its own.
+        asleep: One that sleeps, and runs on a core that somebody else needs too; None without one.
     """
 
-    step_ns: float
-    wake_ns: float | None
+    awake: Cost
+    asleep: Cost | None
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One step over several shards, in nanoseconds.
+
+    Attributes:
+        slept: From the client's call until all shards that sleep were known to have answered.
+        elapsed: Until all were.
+        asleep, awake: What the longest shard of each kind took itself.
+    """
+
+    slept: int
+    elapsed: int
+    asleep: int
+    awake: int
+
+
+def pace_of(samples: Sequence[Sample], asleep: int, awake: int) -> Pace:
+    """What typical steps took shards of these sizes: the largest of each kind."""
+    sleeping = median(one.slept - one.asleep for one in samples)
+    # only where it was waited for after the others can be told when an awake one's end was known
+    waited = [one.elapsed - one.awake for one in samples if one.elapsed - one.slept > _NOTICED_NS]
+    waking = median(waited) if 2 * len(waited) > len(samples) else sleeping - _WAKE_UP_NS
+    return Pace(
+        Cost(max(1.0, waking), median(one.awake for one in samples) / awake),
+        Cost(max(1.0, sleeping), median(one.asleep for one in samples) / asleep),
+    )
 
 
 def awake_shards(shards: int) -> int:
@@ -69,9 +116,12 @@ def _weighted(
     count: int, shards: int, awake: int, pace: Pace, *, may_drop: bool
 ) -> list[tuple[int, int]]:
     """All shards done at the same time: those that sleep have ``fewer`` sub-environments."""
-    fewer = (pace.wake_ns or _WAKE_UP_NS) / pace.step_ns
+    quick = pace.awake
+    slow = pace.asleep or Cost(quick.fixed_ns + _WAKE_UP_NS, quick.step_ns)
     sleepers = shards - awake
-    small = round((count - awake * fewer) / shards)
+    head_start = awake * (slow.fixed_ns - quick.fixed_ns)
+    each = awake * slow.step_ns + sleepers * quick.step_ns
+    small = round((count * quick.step_ns - head_start) / each)
     if small < 1 and may_drop:
         return even_bounds(count, awake)
     small = min(max(1, small), (count - awake) // sleepers)
@@ -94,20 +144,27 @@ class PaceBook:
     def of(self, env: EnvManifest) -> Pace | None:
         """What an environment took the last time; None where nobody knows."""
         entry = self._read().get(_name(env))
-        if not (isinstance(entry, list) and len(entry) == 2 and all(map(_is_sane, entry))):
+        if not (isinstance(entry, list) and len(entry) == 4 and all(map(_is_sane, entry))):
             return None
-        return Pace(*map(float, entry))
+        awake_fixed, awake_step, asleep_fixed, asleep_step = map(float, entry)
+        return Pace(Cost(awake_fixed, awake_step), Cost(asleep_fixed, asleep_step))
 
     def note(self, env: EnvManifest, pace: Pace) -> None:
         """Remember it. A cache that cannot be written is no error."""
-        if self._path is None or not _is_sane(pace.step_ns):
+        if self._path is None:
             return
+        awake, asleep = pace.awake, pace.asleep or self._forgotten(env, pace.awake)
+        entry = [awake.fixed_ns, awake.step_ns, asleep.fixed_ns, asleep.step_ns]
+        if all(map(_is_sane, entry)):
+            self._write({**self._read(), _name(env): entry})
+
+    def _forgotten(self, env: EnvManifest, awake: Cost) -> Cost:
+        """What a sleeping shard takes, as far as is known from earlier uses."""
         known = self.of(env)
-        wake_ns = pace.wake_ns
-        if wake_ns is None or not _is_sane(wake_ns):
-            before = known.wake_ns if known is not None and known.wake_ns else _WAKE_UP_NS
-            wake_ns = max(before * _FORGETTING, _WAKE_UP_NS)
-        self._write({**self._read(), _name(env): [pace.step_ns, wake_ns]})
+        least = awake.fixed_ns + _WAKE_UP_NS
+        if known is None or known.asleep is None:
+            return Cost(least, awake.step_ns)
+        return Cost(max(least, known.asleep.fixed_ns * _FORGETTING), awake.step_ns)
 
     def _read(self) -> dict[str, object]:
         try:

@@ -94,10 +94,6 @@ class Counters:
             "step_seconds": self._total_ns / 1e9,
         }
 
-    def median_step_s(self) -> float:
-        """The median of the last steps, in seconds; 0 before there is one."""
-        return self._percentiles().get("p50", 0.0)
-
     def latencies_s(self) -> Any:
         """The last step latencies, float64 ``(at most KEPT,)``, in no order."""
         return np.array(self._latencies[: min(self._steps, KEPT)], np.float64) / 1e9

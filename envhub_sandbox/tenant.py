@@ -239,7 +239,7 @@ class Tenant:
             loaded.jail.receive(loaded.jail.send("close", requests), deadline)
 
     def _note_pace(self) -> None:
-        pace = self._lane and self._lane.pace(self.counters.median_step_s())
+        pace = self._lane and self._lane.pace()
         if pace:
             self._paces.note(self.manifest, pace)
 

@@ -14,11 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_sandbox import sharding
-from envhub_sandbox.sharding import Pace, PaceBook, bounds_for
+from envhub_sandbox.sharding import Cost, Pace, PaceBook, Sample, bounds_for, pace_of
 from envhub_worker.protocol.manifest import EnvManifest
 
-SHORT = Pace(step_ns=3_000, wake_ns=15_000)
-LONG = Pace(step_ns=2e6, wake_ns=15_000)
+SHORT = Pace(Cost(10_000, 3_000), Cost(25_000, 3_000))
+LONG = Pace(Cost(10_000, 2e6), Cost(25_000, 2e6))
 
 
 @pytest.fixture(autouse=True)
@@ -64,6 +64,28 @@ def test_a_shard_that_sleeps_gets_less_of_short_steps() -> None:
     assert sizes(environment(16), None, SHORT) == [10, 6]
 
 
+def test_a_shard_whose_steps_are_slower_gets_less() -> None:
+    """It shares a core, whose caches are somebody else's in between."""
+    pace = Pace(Cost(10_000, 8_000), Cost(25_000, 14_000))
+    assert sizes(environment(16), None, pace) == [11, 5]
+
+
+def test_what_a_shard_costs_is_told_from_what_was_waited_for() -> None:
+    """Who was waited for last tells when it had begun; the others only when they were done."""
+    slow = [Sample(slept=100, elapsed=100, asleep=60, awake=50) for _ in range(3)]
+    slow = [replace(one, slept=100_000, elapsed=100_500, asleep=60_000) for one in slow]
+    assert pace_of(slow, asleep=6, awake=10) == Pace(Cost(25_000, 5), Cost(40_000, 10_000))
+    late = [Sample(slept=80_000, elapsed=120_000, asleep=50_000, awake=100_000) for _ in range(3)]
+    assert pace_of(late, asleep=5, awake=10) == Pace(Cost(20_000, 10_000), Cost(30_000, 10_000))
+
+
+def test_one_hiccup_changes_no_pace() -> None:
+    """The median step decides."""
+    usual = Sample(slept=80_000, elapsed=120_000, asleep=50_000, awake=100_000)
+    hiccup = Sample(slept=4_000_000, elapsed=4_100_000, asleep=60_000, awake=3_900_000)
+    assert pace_of([hiccup, usual, usual], 5, 10) == pace_of([usual], 5, 10)
+
+
 def test_long_steps_are_shared_out_evenly() -> None:
     """A wake-up is nothing beside them."""
     assert sizes(environment(16), None, LONG) == [8, 8]
@@ -87,17 +109,20 @@ def test_what_may_share_state_stays_together(pace: Pace | None) -> None:
     assert sizes(environment(16, shardable=False), 4, pace) == [16]
 
 
+_COSTS = st.builds(Cost, *[st.floats(1, 1e12, exclude_max=True)] * 2)
+
+
 @given(
     count=st.integers(1, 200),
     workers=st.none() | st.integers(1, 20),
-    step_ns=st.floats(1, 1e12, exclude_max=True),
-    wake_ns=st.none() | st.floats(1, 1e12, exclude_max=True),
+    awake=_COSTS,
+    asleep=st.none() | _COSTS,
 )
 def test_every_sub_environment_has_one_shard(
-    count: int, workers: int | None, step_ns: float, wake_ns: float | None
+    count: int, workers: int | None, awake: Cost, asleep: Cost | None
 ) -> None:
     """Slices are adjacent, none is empty, and together they are all."""
-    bounds = bounds_for(environment(count), workers, Pace(step_ns, wake_ns))
+    bounds = bounds_for(environment(count), workers, Pace(awake, asleep))
     assert [start for start, _ in bounds] == [0, *(stop for _, stop in bounds[:-1])]
     assert bounds[-1][1] == count
     assert all(start < stop for start, stop in bounds)
@@ -117,15 +142,18 @@ def test_a_use_without_a_sleeping_shard_forgets_a_little(tmp_path: Path) -> None
     """A machine that was busy once is not taken for a busy one for ever."""
     book = PaceBook(tmp_path / "entry.pace")
     env = environment(2)
-    book.note(env, Pace(3_000, 1e6))
+    book.note(env, Pace(SHORT.awake, Cost(1e6, 9_000)))
     for _ in range(30):
-        book.note(env, Pace(3_000, None))
+        book.note(env, Pace(SHORT.awake, None))
     assert book.of(env) == SHORT
+
+
+_SPOILT = ([3_000, 15_000], [1, 1, 0, -1], [1, math.nan, 1, 1], [1, True, 1, 1], 7)
 
 
 @pytest.mark.parametrize(
     "text",
-    ["", "[]", *(json.dumps({'["suite", "0"]': pair}) for pair in ([0, -1], [math.nan, 1]))],
+    ["", "[]", *(json.dumps({'["suite", "0"]': pace}) for pace in _SPOILT)],
 )
 def test_an_unreadable_book_is_empty(tmp_path: Path, text: str) -> None:
     """A cache that somebody spoilt costs speed and nothing else."""
