@@ -6,11 +6,9 @@ table; run it as root and as a plain user for all of them.
 
 from __future__ import annotations
 
-import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -18,11 +16,10 @@ import pytest
 from envhub_sandbox import snapshot_store
 from envhub_sandbox.sandboxes.process import PROCESS
 from tests.attacks import table
-from tests.attacks.harness import Arena, Row
+from tests.attacks.harness import Arena
 
 PROFILES = ("strict", "no-userns")
-_PROPERTY = "attack"
-_rows: list[Row] = []
+_TABLE = table.Collected("attack", "ENVHUB_ATTACK_TABLE")
 
 
 @pytest.fixture(scope="package")
@@ -58,18 +55,14 @@ def arena(request: pytest.FixtureRequest) -> Iterator[Arena]:
     """Where a test attacks, once for each profile."""
     made = Arena(request.param, request.node.module.FAMILY)
     yield made
-    for row in made.rows:
-        request.node.user_properties.append((_PROPERTY, asdict(row)))
+    _TABLE.found(request.node, made.rows)
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    """Collect the rows; with xdist they come from the workers through the reports."""
-    if report.when == "teardown":
-        _rows.extend(Row(**row) for name, row in report.user_properties if name == _PROPERTY)
+    """Collect the rows."""
+    _TABLE.read(report)
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """Write the table, if asked to."""
-    path = os.environ.get("ENVHUB_ATTACK_TABLE")
-    if path and _rows and not hasattr(session.config, "workerinput"):
-        table.update(Path(path), _rows)
+    _TABLE.write(session)

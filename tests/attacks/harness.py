@@ -172,10 +172,13 @@ class Arena:
         **options: Any,
     ) -> Iterator[Any]:
         """The hostile repository's environment, in a jail of its own."""
-        wanted = {"profile": self.profile, **(policy or {})}
-        options = {"policy": wanted, "limits": limits, "timeouts": TIMEOUTS, **options}
+        options = {"limits": limits, "timeouts": TIMEOUTS, **self.place(policy or {}), **options}
         with make_env(str(HOSTILE), **options) as suites:
             yield suites.env
+
+    def place(self, policy: Mapping[str, Any]) -> dict[str, Any]:
+        """Where the jail is, as ``make_env`` takes it."""
+        return {"policy": {"profile": self.profile, **policy}}
 
 
 def call(env: Any, run: Run, payload: str, arguments: Mapping[str, Any]) -> None:

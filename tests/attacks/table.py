@@ -5,8 +5,12 @@ A run knows one user's columns; those of the other one are taken over from the p
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from pathlib import Path
+
+import pytest
 
 from tests.attacks.harness import Row
 
@@ -36,6 +40,42 @@ what the repository returned. `docs/threat-model.md` explains what is not stoppe
 _START = "| attack |"
 
 Page = dict[str, dict[str, dict[str, str]]]
+
+
+class Collected:
+    """The rows of one table, from the tests that find them to the page.
+
+    With xdist they come from its workers, in the reports of the tests.
+
+    Args:
+        name: Tells these rows from those of other tables in a report.
+        variable: Of the environment; it names the page, if one is to be written.
+        columns: Of the page.
+        head: What stands above the tables.
+    """
+
+    def __init__(
+        self, name: str, variable: str, columns: Sequence[str] = COLUMNS, head: str = HEAD
+    ) -> None:
+        self._name, self._variable = name, variable
+        self._columns, self._head = columns, head
+        self._rows: list[Row] = []
+
+    def found(self, test: pytest.Item, rows: Iterable[Row]) -> None:
+        """Have a test's report carry what it has found."""
+        test.user_properties += [(self._name, asdict(row)) for row in rows]
+
+    def read(self, report: pytest.TestReport) -> None:
+        """Take the rows out of a report."""
+        if report.when == "teardown":
+            found = [row for name, row in report.user_properties if name == self._name]
+            self._rows += [Row(**row) for row in found]  # type: ignore[arg-type]
+
+    def write(self, session: pytest.Session) -> None:
+        """Write the page, if asked to."""
+        path = os.environ.get(self._variable)
+        if path and self._rows and not hasattr(session.config, "workerinput"):
+            update(Path(path), self._rows, columns=self._columns, head=self._head)
 
 
 def update(

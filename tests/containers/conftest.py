@@ -11,7 +11,6 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,7 @@ from envhub_sandbox.errors import SandboxUnavailableError
 from envhub_sandbox.sandboxes.docker import DockerSandbox
 from envhub_sandbox.sandboxes.engines import Engine, find_engine, find_image
 from tests.attacks import table
-from tests.attacks.harness import USER, Row
+from tests.attacks.harness import USER
 from tests.compliance.conftest import lane, pytest_generate_tests
 from tests.containers.kit import IMAGE, Walls
 
@@ -38,8 +37,7 @@ the control runs without a container, in the same test, and has to succeed.
 - **bare-jail**: in a jail without, in a container: where namespaces cannot be had inside.
 - **walls**: in no jail at all, next to the server, should a jail be broken.
 """
-_PROPERTY = "container attack"
-_rows: list[Row] = []
+_TABLE = table.Collected("container attack", "ENVHUB_CONTAINER_TABLE", _COLUMNS, _HEAD)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -73,18 +71,15 @@ def walls(request: pytest.FixtureRequest, engine: Engine) -> Iterator[Walls]:
     """Where an attack is tried."""
     made = Walls(request.param, engine)
     yield made
-    for row in made.rows:
-        request.node.user_properties.append((_PROPERTY, asdict(row)))
+    _TABLE.found(request.node, made.rows)
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    """Collect the rows; with xdist they come from the workers through the reports."""
-    if report.when == "teardown":
-        _rows.extend(Row(**row) for name, row in report.user_properties if name == _PROPERTY)
+    """Collect the rows."""
+    _TABLE.read(report)
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Write the table, if asked to."""
-    path = os.environ.get("ENVHUB_CONTAINER_TABLE")
-    if path and _rows and USER == "root" and not hasattr(session.config, "workerinput"):
-        table.update(Path(path), _rows, columns=_COLUMNS, head=_HEAD)
+    """Write the table, if asked to; it has columns for root only."""
+    if USER == "root":
+        _TABLE.write(session)

@@ -12,12 +12,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox import make_env
 from envhub_sandbox.sandboxes.containers import CLIENT_LABEL, SNAPSHOT
 from envhub_sandbox.sandboxes.docker import DockerSandbox
 from envhub_sandbox.sandboxes.engines import Engine
 from envhub_sandbox.sandboxes.identity import identity_of
-from tests.attacks.harness import HOSTILE, TIMEOUTS, Arena, Run, answered, new_alias
+from tests.attacks.harness import Arena, Run, answered, new_alias
 from tests.support.processes import eventually
 
 _PYTHON = "/opt/envhub-worker/bin/python"
@@ -113,18 +112,8 @@ class Walls(Arena):
         with answered(process, run):
             yield
 
-    @contextlib.contextmanager
-    def environment(
-        self,
-        policy: Mapping[str, Any] | None = None,
-        limits: Mapping[str, Any] | None = None,
-        **options: Any,
-    ) -> Iterator[Any]:
-        """The hostile repository's environment, in a container of its own."""
+    def place(self, policy: Mapping[str, Any]) -> dict[str, Any]:
+        """In a container of its own."""
         profile = "container" if self.profile == "bare-jail" else "strict"
         sandbox = DockerSandbox(image=IMAGE, engine=self.engine.kind, **self.options)
-        wanted = {"profile": profile, **(policy or {})}
-        with make_env(
-            str(HOSTILE), policy=wanted, limits=limits, timeouts=TIMEOUTS, sandbox=sandbox
-        ) as suites:
-            yield suites.env
+        return {"policy": {"profile": profile, **policy}, "sandbox": sandbox}
