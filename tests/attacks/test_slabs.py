@@ -170,6 +170,17 @@ def _packets(*frames: bytes) -> str:
     return repr(b"".join(b"".join(pack_packet(0, [frame])) for frame in frames))
 
 
+def answers(shard: LaneShard, answer: str) -> None:
+    """Tell the jail something; it answers with these bytes, a Python literal."""
+    shard.tell(b"".join(pack_packet(0, m.pack(m.Render(1), 0))), 0)
+    attack(
+        shard,
+        f"answer = {answer}\n"
+        f"os.pwrite(reply, answer, {shard.layout.answer})\n"
+        f"os.pwrite(reply, struct.pack('QQ', {slabs.DONE}, len(answer)), {slabs.OUTCOME * 8})",
+    )
+
+
 @pytest.mark.parametrize(
     "answer",
     [
@@ -183,13 +194,7 @@ def _packets(*frames: bytes) -> str:
 )
 def test_garbage_for_an_answer_is_refused(shard: LaneShard, answer: str) -> None:
     """It is cut into frames and decoded by the same suspicious code as a message's reply."""
-    shard.tell(b"".join(pack_packet(0, m.pack(m.Render(1), 0))), 0)
-    attack(
-        shard,
-        f"answer = {answer}\n"
-        f"os.pwrite(reply, answer, {shard.layout.answer})\n"
-        f"os.pwrite(reply, struct.pack('QQ', {slabs.DONE}, len(answer)), {slabs.OUTCOME * 8})",
-    )
+    answers(shard, answer)
     with pytest.raises(RemoteProtocolError):
         shard.answer()
 
@@ -197,13 +202,7 @@ def test_garbage_for_an_answer_is_refused(shard: LaneShard, answer: str) -> None
 def test_an_honest_answer_is_read(shard: LaneShard) -> None:
     """The control of the two above."""
     answer = _packets(bytes(m.pack(m.Value((1, "two")), 0)[0]))
-    shard.tell(b"".join(pack_packet(0, m.pack(m.Render(1), 0))), 0)
-    attack(
-        shard,
-        f"answer = {answer}\n"
-        f"os.pwrite(reply, answer, {shard.layout.answer})\n"
-        f"os.pwrite(reply, struct.pack('QQ', {slabs.DONE}, len(answer)), {slabs.OUTCOME * 8})",
-    )
+    answers(shard, answer)
     assert shard.answer() == m.Value((1, "two"))
 
 

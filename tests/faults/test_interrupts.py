@@ -124,6 +124,16 @@ def told(operation: Callable[[], object]) -> tuple[threading.Thread, list[BaseEx
     return thread, raised
 
 
+def close_during_reset(env: Any, inside: Inside) -> None:
+    """Close while another thread resets and has come to a place; it is told so."""
+    thread, raised = told(env.reset)
+    inside.wait()
+    env.close()
+    inside.leave()
+    thread.join(60)
+    assert [type(one) for one in raised] == [ClosedEnvironmentError]
+
+
 @pytest.mark.parametrize("restart", ["on_reset", "transparent"])
 def test_close_ends_the_wait_before_a_restart(
     restart: str, monkeypatch: pytest.MonkeyPatch
@@ -165,12 +175,7 @@ def test_who_outlasts_a_close_gives_everything_back(monkeypatch: pytest.MonkeyPa
 
         forgetting = Inside(hold)
         monkeypatch.setattr(remote.repository, "hold", forgetting)
-        thread, raised = told(env.reset)
-        forgetting.wait()
-        env.close()
-        forgetting.leave()
-        thread.join(60)
-        assert [type(one) for one in raised] == [ClosedEnvironmentError]
+        close_during_reset(env, forgetting)
         assert found == [[True]]
         assert remote._loaded is None
 
@@ -195,12 +200,7 @@ def test_a_jail_that_comes_up_after_close_is_given_back(
         )
         coming = Inside(getattr(owner, name))
         monkeypatch.setattr(owner, name, coming)
-        thread, raised = told(env.reset)
-        coming.wait()
-        env.close()
-        coming.leave()
-        thread.join(60)
-        assert [type(one) for one in raised] == [ClosedEnvironmentError]
+        close_during_reset(env, coming)
         assert all(place.loaded.closed for place in places)
         assert remote._lane is None
 
