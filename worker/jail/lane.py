@@ -88,6 +88,7 @@ class Lane:
         batch.rewards = rewards[start:stop]
         batch.terminations = bools[:count][start:stop]
         batch.truncations = bools[count:][start:stop]
+        bools[:count][start:stop] = bools[count:][start:stop] = False  # another may have died here
         bases = [slot * observed.slot_bytes for slot in range(observed.slots)]
         rows = [[self._rows(leaf, base, start) for leaf in observed.leaves] for base in bases]
         batch.write_to(rows)

@@ -31,8 +31,8 @@ class Batch:
         rewards: float64 ``(count, *reward_shape)``.
         terminations, truncations: bool ``(count,)``.
         store: Writes a sub-environment's observation into its row.
-        rows: Where each observation goes as it is, if its dtype and shape are the rows'; empty
-            where the space is no array.
+        rows: Where each observation goes as it is, if its dtype and shape are the row's; None
+            each where the space is no array.
     """
 
     def __init__(self, space: gym.Space[Any], count: int, reward_shape: tuple[int, ...]) -> None:
@@ -42,7 +42,7 @@ class Batch:
         self.rewards = np.zeros((count, *reward_shape))
         self.terminations = np.zeros(count, np.bool_)
         self.truncations = np.zeros(count, np.bool_)
-        self.rows: list[Any] = []
+        self.rows: list[Any] = [None] * count
         self._slots: list[tuple[list[Any], Store, list[Any]]] = []
         self._slot = 0
         self._left: int | None = None
@@ -60,8 +60,9 @@ class Batch:
         self.choose(0)
 
     def _rows_of(self, leaves: list[Any]) -> list[Any]:
-        flat = isinstance(self._space, _ARRAYS)
-        return [leaves[0][index, ...] for index in range(self._count)] if flat else []
+        if not isinstance(self._space, _ARRAYS):
+            return [None] * self._count
+        return [leaves[0][index, ...] for index in range(self._count)]
 
     def choose(self, slot: int, *, carry: bool = False) -> None:
         """Write the next observations into another slot; ``carry`` takes the last ones along."""
@@ -107,6 +108,7 @@ class SubEnvs(SyncVectorEnv):
         self.reward_shape = () if sync else _reward_shape(self.envs[0])
         self.batch = Batch(self.single_observation_space, self.num_envs, self.reward_shape)
         self._done = [False] * self.num_envs
+        self._flagged: list[int] = []  # whose flags are not both False
         self._mode = autoreset_mode
         self._plain_actions = isinstance(self.single_action_space, _ARRAYS)
 
@@ -139,6 +141,7 @@ class SubEnvs(SyncVectorEnv):
         infos = self.run_reset(seeds, None, None)
         self.batch.rewards[...] = 0.0
         self.batch.truncations[...] = True
+        self._flagged = list(range(self.num_envs))
         if self._mode == "SameStep":
             fresh = iterate(self.observation_space, self.batch.observation())
             finals = [(i, {"final_obs": row, "final_info": {}}) for i, row in enumerate(fresh)]
@@ -156,25 +159,28 @@ class SubEnvs(SyncVectorEnv):
             raise AssertionError(f"self._autoreset_envs={np.array(self._done)!r}")
         batch, same_step, count = self.batch, self._mode == "SameStep", self.num_envs
         store, rows, rewards = batch.store, batch.rows, batch.rewards
-        dtype, shape = (rows[0].dtype, rows[0].shape) if rows else (None, None)
+        dtype, shape = (None, None) if rows[0] is None else (rows[0].dtype, rows[0].shape)
         array = np.ndarray
         terminations, truncations = batch.terminations, batch.truncations
+        for index in self._flagged:
+            terminations[index] = truncations[index] = False
+        flagged = self._flagged = []
         done = [False] * count
         infos: Pairs = []
-        each = zip(self._each(actions), self.envs, self._done, strict=True)
         index = 0
+        each = zip(range(count), self._each(actions), self.envs, self._done, rows, strict=True)
         try:
-            for index, (action, env, over) in enumerate(each):
+            for index, action, env, over, row in each:
                 if over:
                     observation, info = env.reset()
                     rewards[index] = 0.0
-                    terminations[index] = truncations[index] = False
                 else:
                     observation, reward, terminated, truncated, info = env.step(action)
                     rewards[index] = reward
-                    terminations[index] = terminated
-                    truncations[index] = truncated
                     if terminated or truncated:
+                        flagged.append(index)
+                        terminations[index] = terminated
+                        truncations[index] = truncated
                         if same_step:
                             infos.append((index, {"final_obs": observation, "final_info": info}))
                             observation, info = env.reset()
@@ -185,7 +191,7 @@ class SubEnvs(SyncVectorEnv):
                     and observation.dtype is dtype
                     and observation.shape == shape
                 ):
-                    rows[index][...] = observation
+                    row[...] = observation
                 else:
                     store(index, observation)
                 if info:
