@@ -30,7 +30,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol import slabs
 from envhub_worker.protocol.columns import Column, columns_of
 from envhub_worker.protocol.manifest import EnvManifest
-from envhub_worker.protocol.stream import PacketReader
+from envhub_worker.protocol.stream import read_packet
 
 _RING = (1).to_bytes(8, "little")
 _RECHECK_MS = 2
@@ -197,10 +197,8 @@ class LaneShard:
         if kind == slabs.RAISED:
             return self.outcome()[1]
         start = self.layout.answer
-        packets = list(PacketReader().feed(self._reply[start : start + length]))
-        if len(packets) != 1:
-            raise RemoteProtocolError("the worker's answer in its slab is not one message")
-        return m.unpack(packets[0].frames, tensors=to_tensor)[1]
+        packet = read_packet(self._reply[start : start + length])
+        return m.unpack(packet.frames, tensors=to_tensor)[1]
 
     def _learn(self, infos: dict[Any, Any]) -> None:
         start = self.layout.infos

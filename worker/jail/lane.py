@@ -21,7 +21,7 @@ from envhub_worker.jail.infos import InfoWriter, Pairs, join
 from envhub_worker.jail.subenvs import SubEnvs
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol import slabs
-from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
+from envhub_worker.protocol.stream import Packet, pack_packet, read_packet
 
 _RING = (1).to_bytes(8, "little")
 _MEASURE = 31
@@ -154,7 +154,7 @@ class Lane:
 
     def _run_message(self, length: int) -> tuple[int, int]:
         start = self._layout.message
-        [packet] = PacketReader().feed(bytes(self._request[start : start + length]))
+        packet = read_packet(self._request[start : start + length])
         frames = self._answer(packet)
         data = b"".join(pack_packet(packet.request_id, frames))
         if len(data) > slabs.INFO_BYTES:

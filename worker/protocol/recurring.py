@@ -8,6 +8,7 @@ few and small: a peer that sends nothing twice gains nothing and costs nothing.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
@@ -24,6 +25,7 @@ _MAX_FORMS = 256
 _MAX_ITEMS = 32
 _MAX_TEXT = 256
 _CONSTANTS = frozenset({int, bool, str, bytes, type(None)})
+_BITS = struct.Struct("<d")
 _TEXTS = frozenset({str, bytes})
 _NUMBERS = frozenset("biufc")
 _ID = 2
@@ -214,6 +216,8 @@ def _outlined(value: Any, arrays: list[Array]) -> Any:
             raise _IrregularError
         arrays.append(value)
         return value.dtype, value.shape
+    if kind is float:
+        return kind, _BITS.pack(value)  # 0.0 is -0.0, and nan is not nan
     if kind in _CONSTANTS:
         if kind in _TEXTS and len(value) > _MAX_TEXT:
             raise _IrregularError

@@ -39,6 +39,61 @@ def pack_packet(request_id: int, frames: Sequence[Buffer]) -> list[Buffer]:
     return [head + struct.pack(f"<{len(lengths)}Q", *lengths), *frames]
 
 
+def read_packet(data: Buffer, limits: WireLimits = DEFAULT_LIMITS) -> Packet:
+    """The one packet that the data is; its frames lie in the data.
+
+    Raises:
+        RemoteProtocolError: It is something else, or more, or less.
+    """
+    view = memoryview(data)
+    size, packet = _whole(view, limits, None)
+    if packet is None or size != view.nbytes:
+        raise RemoteProtocolError("this is not one packet")
+    return packet
+
+
+def _whole(
+    data: memoryview, limits: WireLimits, check: Callable[[int], None] | None
+) -> tuple[int, Packet | None]:
+    """The packet that the data begins with and its size, if all of it is there: no copy."""
+    if data.nbytes < _PREFIX.size:
+        return 0, None
+    count, reserved, request_id = _PREFIX.unpack_from(data)
+    _check_prefix(count, reserved, request_id, limits)
+    end = _PREFIX.size + 8 * count
+    if data.nbytes < end:
+        return 0, None
+    lengths = struct.unpack_from(f"<{count}Q", data, _PREFIX.size)
+    if data.nbytes < end + sum(lengths):
+        return 0, None
+    if check is not None:
+        check(request_id)
+    _check_lengths(lengths, limits)
+    frames: list[Buffer] = []
+    for length in lengths:
+        frames.append(data[end : end + length])
+        end += length
+    return end, Packet(request_id, frames)
+
+
+def _check_prefix(count: int, reserved: int, request_id: int, limits: WireLimits) -> None:
+    if count == 0 or count > limits.frames or reserved or request_id >= _MAX_ID:
+        raise RemoteProtocolError(f"a packet of {count} frames is outside 1..the limit")
+
+
+def _check_lengths(lengths: tuple[int, ...], limits: WireLimits) -> None:
+    if lengths[0] > limits.header_bytes:
+        raise MessageTooLargeError(
+            f"a header of {lengths[0]} bytes is over the limit of {limits.header_bytes}"
+        )
+    largest = max(lengths)
+    if largest > limits.frame_bytes or sum(lengths) > limits.message_bytes:
+        raise MessageTooLargeError(
+            f"a message of {sum(lengths)} bytes (largest frame {largest}) is over the limit of "
+            f"{limits.message_bytes} (a frame: {limits.frame_bytes})"
+        )
+
+
 class PacketReader:
     """Cuts a byte stream into packets.
 
@@ -72,7 +127,7 @@ class PacketReader:
         rest = memoryview(data)
         while rest.nbytes or self._body_is_complete():
             if self._body is None and not self._pending:
-                size, whole = self._whole(rest)
+                size, whole = _whole(rest, self._limits, self._check)
                 if whole is not None:
                     yield whole
                     rest = rest[size:]
@@ -80,27 +135,6 @@ class PacketReader:
             rest = self._fill_body(rest) if self._body is not None else self._fill_head(rest)
             if self._body_is_complete():
                 yield self._take()
-
-    def _whole(self, data: memoryview) -> tuple[int, Packet | None]:
-        """The packet that the data begins with and its size, if all of it is there: no copy."""
-        if data.nbytes < _PREFIX.size:
-            return 0, None
-        count, reserved, request_id = _PREFIX.unpack_from(data)
-        self._check_prefix(count, reserved, request_id)
-        end = _PREFIX.size + 8 * count
-        if data.nbytes < end:
-            return 0, None
-        lengths = struct.unpack_from(f"<{count}Q", data, _PREFIX.size)
-        if data.nbytes < end + sum(lengths):
-            return 0, None
-        if self._check is not None:
-            self._check(request_id)
-        self._check_lengths(lengths)
-        frames: list[Buffer] = []
-        for length in lengths:
-            frames.append(data[end : end + length])
-            end += length
-        return end, Packet(request_id, frames)
 
     def _body_is_complete(self) -> bool:
         return self._body is not None and self._filled == self._body.nbytes
@@ -117,37 +151,20 @@ class PacketReader:
         if len(self._pending) < _PREFIX.size:
             return _PREFIX.size
         count, reserved, request_id = _PREFIX.unpack_from(self._pending)
-        self._check_prefix(count, reserved, request_id)
+        _check_prefix(count, reserved, request_id, self._limits)
         return _PREFIX.size + 8 * int(count)
-
-    def _check_prefix(self, count: int, reserved: int, request_id: int) -> None:
-        if count == 0 or count > self._limits.frames or reserved or request_id >= _MAX_ID:
-            raise RemoteProtocolError(f"a packet of {count} frames is outside 1..the limit")
 
     def _begin_body(self) -> None:
         count, _, request_id = _PREFIX.unpack_from(self._pending)
         if self._check is not None:
             self._check(request_id)
         lengths = struct.unpack_from(f"<{count}Q", self._pending, _PREFIX.size)
-        self._check_lengths(lengths)
+        _check_lengths(lengths, self._limits)
         self._head = request_id, lengths
         self._pending.clear()
         # numpy maps large blocks lazily: a length that is declared and never sent costs no memory
         self._body = np.empty(sum(lengths), np.uint8).data
         self._filled = 0
-
-    def _check_lengths(self, lengths: tuple[int, ...]) -> None:
-        limits = self._limits
-        if lengths[0] > limits.header_bytes:
-            raise MessageTooLargeError(
-                f"a header of {lengths[0]} bytes is over the limit of {limits.header_bytes}"
-            )
-        largest = max(lengths)
-        if largest > limits.frame_bytes or sum(lengths) > limits.message_bytes:
-            raise MessageTooLargeError(
-                f"a message of {sum(lengths)} bytes (largest frame {largest}) is over the limit of "
-                f"{limits.message_bytes} (a frame: {limits.frame_bytes})"
-            )
 
     def _fill_body(self, data: memoryview) -> memoryview:
         assert self._body is not None
