@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import gc
+import os
 import re
+import socket
+from collections.abc import Callable
 from pathlib import Path
 
 import psutil
@@ -23,6 +27,30 @@ def descendants_mb() -> dict[str, float]:
         found["processes"] += 1
     found["total"] = round(sum(found.values()) - found["processes"], 2)
     return found
+
+
+def growth_mb(work: Callable[[], object]) -> float:
+    """Megabytes by which a fork of this process grows, and parts from it, when it does ``work``."""
+    gc.collect()
+    gc.freeze()
+    ours, theirs = socket.socketpair()
+    child = os.fork()
+    if not child:
+        try:
+            theirs.send(b"forked")
+            theirs.recv(1)
+            kept = work()  # noqa: F841
+            theirs.send(b"done")
+            theirs.recv(1)
+        finally:
+            os._exit(0)
+    sizes = []
+    for _ in range(2):
+        ours.recv(16)
+        sizes.append(_pss_mb(os.getpid()) + _pss_mb(child))
+        ours.send(b".")
+    os.waitpid(child, 0)
+    return round(sizes[1] - sizes[0], 2)
 
 
 def _kind(process: psutil.Process) -> str:

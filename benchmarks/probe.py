@@ -103,6 +103,25 @@ def memory(reference: str, count: str, num_workers: str) -> dict[str, Any]:
         return descendants_mb()
 
 
+def own_memory(workload: str) -> dict[str, float]:
+    """What one sub-environment takes by itself where Gymnasium is there already, in MB."""
+    import gymnasium.vector
+    import gymnasium.wrappers  # noqa: F401
+
+    from benchmarks.memory import growth_mb
+    from benchmarks.workloads import makers
+
+    def run() -> object:
+        [make] = makers(workload, 1)
+        env = make()
+        env.reset(seed=0)
+        for _ in range(20):
+            env.step(env.action_space.sample())
+        return env
+
+    return {"total": growth_mb(run)}
+
+
 def async_vector_env(context: str, count: str) -> dict[str, float]:
     """How long Gymnasium's processes take to start, until the first reset."""
     import gymnasium
@@ -119,7 +138,7 @@ def async_vector_env(context: str, count: str) -> dict[str, float]:
 
 PROBES: dict[str, Callable[..., dict[str, Any]]] = {
     probe.__name__: probe
-    for probe in (imports, first_step, make_again, workers, memory, async_vector_env)
+    for probe in (imports, first_step, make_again, workers, memory, own_memory, async_vector_env)
 }
 
 

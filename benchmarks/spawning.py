@@ -118,10 +118,12 @@ def _workers(found: dict[str, Any]) -> dict[str, Any]:
 def _memory(probes: Probes, reference: str) -> dict[str, Any]:
     one = probes.run("memory", reference, _SHARDS, 1)
     several = probes.run("memory", reference, _SHARDS, _SHARDS)
+    own = probes.run("own_memory", "cartpole")
     result: dict[str, Any] = {"one worker": one, f"{_SHARDS} workers": several}
-    if "failed" not in one and "failed" not in several:
+    if not any("failed" in found for found in (one, several, own)):
         further = (several["total"] - one["total"]) / (_SHARDS - 1)
         result["each further worker"] = round(further, 2)
+        result["of it the environment's own"] = own["total"]
     return result
 
 
