@@ -90,15 +90,17 @@ def keep(folder: Path, crash: Crash) -> Path:
     except BaseException:
         shutil.rmtree(building, ignore_errors=True)
         raise
-    _remove_oldest(folder)
+    _remove_oldest(folder, home.name)
     return home
 
 
-def _remove_oldest(folder: Path) -> None:
+def _remove_oldest(folder: Path, newest: str) -> None:
+    """Keep the newest, which its name alone does not tell from others of the same second."""
     names = os.listdir(folder)
-    bundles = sorted(name for name in names if _NAME.fullmatch(name))
+    bundles = sorted(name for name in names if _NAME.fullmatch(name) and name != newest)
     abandoned = [name for name in names if name.startswith(_BUILDING) and _is_old(folder / name)]
-    for name in [*bundles[:-KEPT], *abandoned]:
+    surplus = bundles[: max(0, len(bundles) - KEPT + 1)]
+    for name in [*surplus, *abandoned]:
         shutil.rmtree(folder / name, ignore_errors=True)
 
 

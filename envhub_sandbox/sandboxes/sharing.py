@@ -55,8 +55,10 @@ class Sharing(Generic[S]):
             return shared
 
     def release(self, shared: S) -> None:
-        """Give it back; the last one who does ends it."""
+        """Give it back; the last one who does ends it, unless it has been ended."""
         with self._lock:
+            if not shared.users:
+                return
             shared.users -= 1
             if shared.users > 0:
                 return
@@ -70,6 +72,8 @@ class Sharing(Generic[S]):
         with self._lock:
             mine = [key for key in self._shared if key[0] == os.getpid()]
             ended = [self._shared.pop(key) for key in mine]
+            for shared in ended:
+                shared.users = 0
         for shared in ended:
             shared.stop()
 

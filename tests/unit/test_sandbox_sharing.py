@@ -73,6 +73,8 @@ def test_all_are_ended_at_exit() -> None:
     servers = [sharing.acquire(key, Server) for key in (1, 2)]
     sharing.stop_all()
     assert [server.ends for server in servers] == [["stopped"]] * 2
+    sharing.release(servers[0])  # its descriptors may be somebody else's by now
+    assert servers[0].ends == ["stopped"]
     assert sharing.acquire(1, Server) is not servers[0]
 
 
