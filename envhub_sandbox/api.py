@@ -45,6 +45,7 @@ def make_env(
     num_workers: int | None = None,
     lane: str = "auto",
     copy: bool = True,
+    validate: bool = False,
     server_key: str | None = None,
 ) -> EnvSuites:
     """Make the vector environments of a repository, without its code entering this process.
@@ -72,6 +73,8 @@ def make_env(
         lane: ``"auto"`` steps over shared memory where that is possible, ``"frames"`` never does.
         copy: False lends observations instead of copying them, as in Gymnasium; still no later
             step changes an array that somebody holds, but the worker could.
+        validate: Hold every action and observation against its space, value by value: for tests,
+            at the cost of speed. Shapes and dtypes are checked in any case.
         server_key: For ``sandbox="tcp://..."``: that server's public key.
 
     Returns:
@@ -94,6 +97,8 @@ def make_env(
         raise ValueError("`n_envs` must be at least 1")
     if sandbox is None and not trust_remote_code:
         raise inprocess.refusal(reference)
+    if sandbox is None and validate:
+        raise PolicyError("validate=True is for environments in a sandbox; here there is none")
     chosen_policy = policy_from(policy, limits_from(limits))
     chosen_timeouts = timeouts_from(timeouts)
     place = None if sandbox is None else _sandbox(sandbox, server_key)
@@ -134,10 +139,19 @@ def make_env(
             "num_workers": num_workers,
             "lane": lane,
             "copy": copy,
+            "validate": validate,
             "server_key": server_key,
         },
     )
-    return _Maker(repository, num_workers).make()
+    return _Maker(repository, num_workers, _face(validate)).make()
+
+
+def _face(validate: bool) -> type[SandboxVectorEnv]:
+    if not validate:
+        return SandboxVectorEnv
+    from envhub_sandbox.validation import ValidatedVectorEnv
+
+    return ValidatedVectorEnv
 
 
 _LANES = ("auto", "frames")
@@ -146,7 +160,10 @@ _LANES = ("auto", "frames")
 class _Maker:
     """Makes the proxies, from the remembered manifest or from a first jail."""
 
-    def __init__(self, repository: Repository, num_workers: int | None) -> None:
+    def __init__(
+        self, repository: Repository, num_workers: int | None, face: type[SandboxVectorEnv]
+    ) -> None:
+        self._face = face
         self._repository = repository
         self._num_workers = num_workers
         load = repository.arguments.message()
@@ -176,7 +193,7 @@ class _Maker:
         envs: dict[str, dict[Any, Any]] = {}
         for remote in remotes:
             env = remote.manifest
-            envs.setdefault(env.suite, {})[env.task] = SandboxVectorEnv(remote)
+            envs.setdefault(env.suite, {})[env.task] = self._face(remote)
         return EnvSuites(
             envs,
             lambda: provenance_of(repository.snapshot, manifest, repository.report),

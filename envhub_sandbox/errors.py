@@ -11,6 +11,7 @@
       PolicyError (ValueError)
       BundleError (ValueError)
       ActionError (ValueError)
+      ObservationError (ValueError)
       SandboxUnavailableError
       DependencyError
       LoadError
@@ -102,6 +103,20 @@ class BundleError(EnvHubError, ValueError):
 
 class ActionError(EnvHubError, ValueError):
     """Actions of a wrong shape, dtype or structure. Nothing was sent; the env is still usable."""
+
+
+class ObservationError(EnvHubError, ValueError):
+    """With ``validate=True``: an observation is outside of its space. The env is still usable.
+
+    Attributes:
+        index: The sub-environment's.
+        observation: What it gave.
+    """
+
+    def __init__(self, message: str, *, index: int = 0, observation: object = None) -> None:
+        super().__init__(message)
+        self.index = index
+        self.observation = observation
 
 
 class SandboxUnavailableError(EnvHubError):

@@ -125,6 +125,17 @@ class Tenant:
         with self._turn("make_env"):
             self._build(loaded, Deadline(self.repository.timeouts.startup_s))
 
+    def prewarm(self) -> None:
+        """Start its processes in a thread of their own, unless they are there."""
+        if self.lifecycle.state is State.IDLE:
+            threading.Thread(target=self._prewarm, name="envhub-prewarm", daemon=True).start()
+
+    def _prewarm(self) -> None:
+        # whatever goes wrong: the first request meets it again, and somebody hears of it there
+        with contextlib.suppress(Exception), self._turn("make_env"):
+            if self.lifecycle.state is State.IDLE:
+                self._start()
+
     def _start(self) -> None:
         deadline = self._startup = StartupDeadline(self.repository.timeouts.startup_s)
         try:

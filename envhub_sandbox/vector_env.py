@@ -61,6 +61,17 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         # a proxy that nobody holds any more must not keep processes alive
         weakref.finalize(self, remote.close).atexit = False
 
+    def prewarm(self) -> None:
+        """Start its processes now, in the background; returns at once.
+
+        The first ``reset`` then waits only for what is left of that. Without it they start when
+        they are first needed, so that a suite of many tasks costs nothing before it is used: an
+        evaluation can prewarm the next task while it plays one. What fails is raised by the
+        first request.
+        """
+        self._raise_if_closed()
+        self._remote.prewarm()
+
     # --- reset and step ------------------------------------------------------------------------
 
     def reset(

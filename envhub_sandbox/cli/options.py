@@ -73,6 +73,14 @@ NumWorkers = Annotated[
         rich_help_panel=_CODE,
     ),
 ]
+Validate = Annotated[
+    bool,
+    typer.Option(
+        "--validate",
+        help="Hold every action and observation against its space, value by value.",
+        rich_help_panel=_CODE,
+    ),
+]
 SandboxName = Annotated[
     str,
     typer.Option(
@@ -195,6 +203,7 @@ class MakeOptions:
     endpoint: str | None
     hub_cache_dir: str | None
     output: str | None = None
+    validate: bool = False
 
     @property
     def in_process(self) -> bool:
@@ -227,6 +236,7 @@ class MakeOptions:
             "endpoint": self.endpoint,
             "python": self.python,
             "num_workers": self.num_workers,
+            "validate": self.validate,
         }
 
     @contextlib.contextmanager

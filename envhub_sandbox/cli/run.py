@@ -64,6 +64,7 @@ def run(
     env_kwargs: opt.EnvKwargs = None,
     python: opt.Python = None,
     num_workers: opt.NumWorkers = None,
+    validate: opt.Validate = False,
     sandbox: opt.SandboxName = "process",
     trust: opt.Trust = False,
     profile: opt.Profile = None,
@@ -111,6 +112,7 @@ def run(
             endpoint=endpoint,
             hub_cache_dir=hub_cache_dir,
             output=logs.output_policy(worker_output),
+            validate=validate,
         )
         play = Play(episodes=episodes, policy=policy.value, seed=seed, steps=steps, video=video)
         _Run(make, play, suite, task, as_json=json).execute()
