@@ -102,6 +102,7 @@ def test_options_become_arguments_of_make_env(monkeypatch: pytest.MonkeyPatch) -
         *("--n-envs", "3", "--async", "--env-kwargs", "size=8", "--num-workers", "2"),
         *("--python", "/usr/bin/python3", "--token", "hf_x", "--endpoint", "http://h"),
         *("--hub-cache-dir", "/cache", "--memory", "1G", "--timeout", "9", "--profile", "strict"),
+        "--validate",
     )
     assert seen == {
         "cfg": "org/repo",
@@ -117,6 +118,7 @@ def test_options_become_arguments_of_make_env(monkeypatch: pytest.MonkeyPatch) -
         "endpoint": "http://h",
         "python": "/usr/bin/python3",
         "num_workers": 2,
+        "validate": True,
     }
 
 
