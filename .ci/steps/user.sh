@@ -10,9 +10,9 @@ permit_what_this_machine_lacks
 export ENVHUB_TEST_DIR=$CI_WORK/user PYTHON=/usr/bin/python3
 export ENVHUB_TEST_RUNNER="bash $CI_STEPS/../as-user.sh"
 # One process: some limits count what a user runs, and two would count each other's.
-# What downloads, what trains, what comes out of shared memory and what the client is told does not
-# depend on who runs it, and has been run.
+# What downloads, what trains, how loading fails, what comes out of shared memory and what the client
+# is told does not depend on who runs it, and has been run.
 with_summary user ./test -n 1 tests/integration tests/attacks tests/unit/test_spawner.py \
-  --ignore-glob='*/test_hub_*' --ignore-glob='*/test_dropin_*' \
+  --ignore-glob='*/test_hub_*' --ignore-glob='*/test_dropin_*' --ignore-glob='*/test_loading*' \
   --ignore-glob='*/test_borrowed*' --ignore-glob='*/test_lane_*' --ignore-glob='*/test_validation*' \
   --ignore-glob='*/test_client_lies*' --ignore-glob='*/test_decoder_*' --ignore-glob='*/test_slabs*'
