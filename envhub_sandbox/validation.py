@@ -6,7 +6,8 @@ because many environments leave their own bounds and train all the same.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -35,19 +36,9 @@ class ValidatedVectorEnv(SandboxVectorEnv):
 
     def __init__(self, remote: RemoteEnv) -> None:
         super().__init__(remote)
-        self._read_unchecked = self._read_actions
-        self._read_actions = self._read_and_check
-
-    def _read_and_check(self, actions: Any) -> Any:
-        batch = self._read_unchecked(actions)
-        space = self.single_action_space
-        for index, action in enumerate(_members(self.action_space, batch)):
-            if not holds(space, action):
-                raise ActionError(
-                    f"the action of sub-environment {index} is outside of its space: "
-                    f"{_shown(action)} is not in {space}"
-                )
-        return batch
+        spaces_of_actions = self.single_action_space, self.action_space
+        # not a method of ours: who holds himself is not closed when nobody else holds him
+        self._read_actions = partial(_read_and_check, self._read_actions, *spaces_of_actions)
 
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
         """As ``SandboxVectorEnv.reset_wait``, checked."""
@@ -113,6 +104,19 @@ def holds(space: gym.Space[Any], member: Any) -> bool:
         return bool(space.contains(member))
     except (AttributeError, TypeError, ValueError):
         return False  # it is nothing of the kind
+
+
+def _read_and_check(
+    read: Callable[[Any], Any], single: gym.Space[Any], batched: gym.Space[Any], actions: Any
+) -> Any:
+    batch = read(actions)
+    for index, action in enumerate(_members(batched, batch)):
+        if not holds(single, action):
+            raise ActionError(
+                f"the action of sub-environment {index} is outside of its space: "
+                f"{_shown(action)} is not in {single}"
+            )
+    return batch
 
 
 def _members(space: gym.Space[Any], batch: Any) -> Iterable[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import ActionError, ObservationError, PolicyError
 from envhub_sandbox.validation import holds
+from envhub_worker.protocol.lifecycle import State
 from envhub_worker.protocol.spaces import OpaqueSpace
 from tests.support.repositories import write_repository
 from tests.support.samples import sample
@@ -117,6 +119,21 @@ def test_what_keeps_to_its_spaces_passes(name: str) -> None:
                 except gym.error.CustomSpaceError:
                     break
                 env.step(actions)
+
+
+def test_who_drops_it_has_closed_it() -> None:
+    """At once, and not when the garbage collector comes by."""
+    gc.disable()
+    try:
+        suites = make_env(sample("pendulum"), 2, validate=True)
+        env = suites.env
+        env.reset(seed=0)
+        remote = env._remote
+        suites.clear()
+        del suites, env
+        assert remote.lifecycle.state is State.CLOSED
+    finally:
+        gc.enable()
 
 
 def test_holds_counts_numbers_as_what_they_are_worth() -> None:
