@@ -95,12 +95,11 @@ def keep(folder: Path, crash: Crash) -> Path:
 
 
 def _remove_oldest(folder: Path, newest: str) -> None:
-    """Keep the newest, which its name alone does not tell from others of the same second."""
     names = os.listdir(folder)
-    bundles = sorted(name for name in names if _NAME.fullmatch(name) and name != newest)
+    # its name alone does not tell the newest from others of the same second
+    bundles = sorted(filter(_NAME.fullmatch, names), key=lambda name: (name == newest, name))
     abandoned = [name for name in names if name.startswith(_BUILDING) and _is_old(folder / name)]
-    surplus = bundles[: max(0, len(bundles) - KEPT + 1)]
-    for name in [*surplus, *abandoned]:
+    for name in [*bundles[:-KEPT], *abandoned]:
         shutil.rmtree(folder / name, ignore_errors=True)
 
 

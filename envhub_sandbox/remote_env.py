@@ -148,7 +148,7 @@ class RemoteEnv(Mortal):
             assert self._place is not None
             fetch = partial(self._fetch_infos, timeout_s=timeout_s)
             parts = lane_requests.infos(self._place, outcomes, self.results, fetch)
-            infos = self.results.lane_infos(parts)
+            infos = self.results.infos(parts)
         return (lane.observation(), *lane.flags(), infos)
 
     def _wait_on_lane(self, timeout_s: float | None) -> list[Outcome]:

@@ -38,22 +38,27 @@ class Results:
             self._per_env("rewards", [reply.rewards for reply in replies]),
             self._per_env("terminations", [reply.terminations for reply in replies]),
             self._per_env("truncations", [reply.truncations for reply in replies]),
-            self._infos([reply.info for reply in replies]),
+            self.infos([reply.info for reply in replies]),
         )
 
     def reset(self, replies: list[m.ResetDone]) -> tuple[Any, dict[Any, Any]]:
         """What ``VectorEnv.reset`` returns."""
         observation = self._observation([reply.observation for reply in replies])
-        return observation, self._infos([reply.info for reply in replies])
+        return observation, self.infos([reply.info for reply in replies])
 
     def reset_done(self, observation: Any, reply: m.Message) -> m.ResetDone:
         """A shard's reply to a reset by the fast lane."""
         check(reply)
         return m.ResetDone(observation, self._info(typed(reply, m.Value).value))
 
-    def lane_infos(self, parts: list[Any]) -> dict[Any, Any]:
-        """The infos that came by the fast lane, as ``lane_info`` gives each shard's."""
-        return self._infos(parts)
+    def infos(self, parts: list[dict[Any, Any]]) -> dict[Any, Any]:
+        """One mapping of the shards' infos."""
+        infos = parts[0] if len(parts) == 1 else self._joined_infos(parts)
+        final = infos.get("final_obs") if self._restores else None
+        if final is not None:
+            for index, member in enumerate(final):
+                final[index] = batches.restore(self._space, member)
+        return infos
 
     def lane_info(
         self, outcome: Outcome, shard: LaneShard, fetch: Callable[[], m.Message]
@@ -100,14 +105,6 @@ class Results:
             if not (_numeric(part) and (not self._declared or name == "rewards" or _flags(part))):
                 raise RemoteProtocolError(f"the worker sent {name} of a wrong dtype or shape")
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-    def _infos(self, parts: list[dict[Any, Any]]) -> dict[Any, Any]:
-        infos = parts[0] if len(parts) == 1 else self._joined_infos(parts)
-        final = infos.get("final_obs") if self._restores else None
-        if final is not None:
-            for index, member in enumerate(final):
-                final[index] = batches.restore(self._space, member)
-        return infos
 
     def _joined_infos(self, parts: list[dict[Any, Any]]) -> dict[Any, Any]:
         try:
