@@ -56,29 +56,49 @@ def _whole(
     data: memoryview, limits: WireLimits, check: Callable[[int], None] | None
 ) -> tuple[int, Packet | None]:
     """The packet that the data begins with and its size, if all of it is there: no copy."""
-    if data.nbytes < _PREFIX.size:
-        return 0, None
-    count, reserved, request_id = _PREFIX.unpack_from(data)
-    _check_prefix(count, reserved, request_id, limits)
-    end = _PREFIX.size + 8 * count
+    end = _head_bytes(data, limits)
     if data.nbytes < end:
         return 0, None
-    lengths = struct.unpack_from(f"<{count}Q", data, _PREFIX.size)
-    if data.nbytes < end + sum(lengths):
+    request_id, lengths = _read_head(data, end, limits, check)
+    size = end + sum(lengths)
+    if data.nbytes < size:
         return 0, None
-    if check is not None:
-        check(request_id)
-    _check_lengths(lengths, limits)
+    return size, Packet(request_id, _cut(data[end:], lengths))
+
+
+def _cut(body: memoryview, lengths: tuple[int, ...]) -> list[Buffer]:
+    """The frames in a packet's body."""
     frames: list[Buffer] = []
+    start = 0
     for length in lengths:
-        frames.append(data[end : end + length])
-        end += length
-    return end, Packet(request_id, frames)
+        frames.append(body[start : start + length])
+        start += length
+    return frames
 
 
-def _check_prefix(count: int, reserved: int, request_id: int, limits: WireLimits) -> None:
+def _head_bytes(data: memoryview | bytearray, limits: WireLimits) -> int:
+    """How long the head is that the data begins with, as far as it says so."""
+    if len(data) < _PREFIX.size:
+        return _PREFIX.size
+    count, reserved, request_id = _PREFIX.unpack_from(data)
     if count == 0 or count > limits.frames or reserved or request_id >= _MAX_ID:
         raise RemoteProtocolError(f"a packet of {count} frames is outside 1..the limit")
+    return _PREFIX.size + 8 * int(count)
+
+
+def _read_head(
+    data: memoryview | bytearray,
+    size: int,
+    limits: WireLimits,
+    check: Callable[[int], None] | None,
+) -> tuple[int, tuple[int, ...]]:
+    """A whole head's request id, and the lengths of its frames."""
+    request_id = _PREFIX.unpack_from(data)[2]
+    if check is not None:
+        check(request_id)
+    lengths = struct.unpack_from(f"<{(size - _PREFIX.size) // 8}Q", data, _PREFIX.size)
+    _check_lengths(lengths, limits)
+    return request_id, lengths
 
 
 def _check_lengths(lengths: tuple[int, ...], limits: WireLimits) -> None:
@@ -141,29 +161,17 @@ class PacketReader:
 
     def _fill_head(self, data: memoryview) -> memoryview:
         # not a byte of what follows: a chunk of many small packets would be copied for each
-        taken = data[: self._head_bytes() - len(self._pending)]
+        taken = data[: _head_bytes(self._pending, self._limits) - len(self._pending)]
         self._pending += taken
-        if len(self._pending) == self._head_bytes():
+        if len(self._pending) == _head_bytes(self._pending, self._limits):
             self._begin_body()
         return data[taken.nbytes :]
 
-    def _head_bytes(self) -> int:
-        if len(self._pending) < _PREFIX.size:
-            return _PREFIX.size
-        count, reserved, request_id = _PREFIX.unpack_from(self._pending)
-        _check_prefix(count, reserved, request_id, self._limits)
-        return _PREFIX.size + 8 * int(count)
-
     def _begin_body(self) -> None:
-        count, _, request_id = _PREFIX.unpack_from(self._pending)
-        if self._check is not None:
-            self._check(request_id)
-        lengths = struct.unpack_from(f"<{count}Q", self._pending, _PREFIX.size)
-        _check_lengths(lengths, self._limits)
-        self._head = request_id, lengths
+        self._head = _read_head(self._pending, len(self._pending), self._limits, self._check)
         self._pending.clear()
         # numpy maps large blocks lazily: a length that is declared and never sent costs no memory
-        self._body = np.empty(sum(lengths), np.uint8).data
+        self._body = np.empty(sum(self._head[1]), np.uint8).data
         self._filled = 0
 
     def _fill_body(self, data: memoryview) -> memoryview:
@@ -177,10 +185,6 @@ class PacketReader:
         assert self._head is not None
         assert self._body is not None
         request_id, lengths = self._head
-        frames: list[Buffer] = []
-        start = 0
-        for length in lengths:
-            frames.append(self._body[start : start + length])
-            start += length
+        frames = _cut(self._body, lengths)
         self._head = self._body = None
         return Packet(request_id, frames)
