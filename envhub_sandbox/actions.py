@@ -17,10 +17,10 @@ from gymnasium import spaces
 
 from envhub_sandbox.errors import ActionError
 from envhub_worker.protocol.slabs import DTYPE_CODES
+from envhub_worker.protocol.spaces import ARRAY_SPACES
 
 _INTEGERS = frozenset("iub")
 _NUMBERS = frozenset("fiub")
-_ARRAYS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 
 @singledispatch
@@ -107,7 +107,7 @@ class ActionReader:
         self._count = count
         self._shape: tuple[int, ...] | None = None
         self._dtypes: frozenset[Any] = frozenset()
-        if isinstance(space, _ARRAYS):
+        if isinstance(space, ARRAY_SPACES):
             self._shape = (count, *(space.shape or ()))
             kinds = _kinds_for(space)
             self._dtypes = frozenset(dtype for dtype in DTYPE_CODES if dtype.kind in kinds)

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec import Buffer
 from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.spaces import ARRAY_SPACES
 
 HISTORY_BYTES = 8 << 20
 """Memory that the history of one environment takes at most."""
@@ -27,7 +27,6 @@ _REQUEST_BYTES = 500
 """What Python's objects take beside the bytes of a step, and of another request."""
 _EVICTED = 64
 _PRELUDE = 256
-_ARRAYS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 _LASTING = (m.Call, m.SetAttr, m.CallOwn)
 
 
@@ -101,7 +100,7 @@ class History:
         space = manifest.single_action_space
         self._num_envs = manifest.num_envs
         self._shape = (manifest.num_envs, *(space.shape or ()))
-        self._flat = isinstance(space, _ARRAYS)
+        self._flat = isinstance(space, ARRAY_SPACES)
         size = 8 * int(np.prod(self._shape, dtype=np.int64)) if self._flat else 0
         self._unit = _ENTRY_BYTES + size
         self._capacity = min(limit, max(1, HISTORY_BYTES // self._unit))

@@ -20,9 +20,8 @@ from envhub_sandbox.remote_env import RemoteEnv
 from envhub_sandbox.results import StepResult
 from envhub_sandbox.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.inert import one_line
-from envhub_worker.protocol.spaces import OpaqueSpace
+from envhub_worker.protocol.spaces import ARRAY_SPACES, OpaqueSpace
 
-_ARRAYS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 _SHOWN = 200
 
 
@@ -97,7 +96,7 @@ def holds(space: gym.Space[Any], member: Any) -> bool:
             return False
         return all(map(holds, space.spaces, member))
     try:
-        if isinstance(space, _ARRAYS):
+        if isinstance(space, ARRAY_SPACES):
             member = np.asarray(member)
             if member.dtype != space.dtype and np.can_cast(member.dtype, space.dtype, "same_kind"):
                 member = member.astype(space.dtype)

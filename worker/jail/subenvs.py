@@ -19,9 +19,9 @@ from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from envhub_worker.jail.infos import Pairs
 from envhub_worker.protocol import slabs
+from envhub_worker.protocol.spaces import ARRAY_SPACES
 
 Store = Callable[[int, Any], None]
-_ARRAYS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 
 class Batch:
@@ -60,7 +60,7 @@ class Batch:
         self.choose(0)
 
     def _rows_of(self, leaves: list[Any]) -> list[Any]:
-        if not isinstance(self._space, _ARRAYS):
+        if not isinstance(self._space, ARRAY_SPACES):
             return [None] * self._count
         return [leaves[0][index, ...] for index in range(self._count)]
 
@@ -110,7 +110,7 @@ class SubEnvs(SyncVectorEnv):
         self._done = [False] * self.num_envs
         self._flagged: list[int] = []  # whose flags are not both False
         self._mode = autoreset_mode
-        self._plain_actions = isinstance(self.single_action_space, _ARRAYS)
+        self._plain_actions = isinstance(self.single_action_space, ARRAY_SPACES)
 
     def run_reset(self, seeds: Any, options: dict[str, Any] | None, mask: Any) -> Pairs:
         """Reset the sub-environments that the mask names, or all; returns the infos.

@@ -17,9 +17,9 @@ from gymnasium import spaces
 from gymnasium.spaces.graph import GraphInstance
 
 from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.spaces import ARRAY_SPACES
 
 Bounds = Sequence[tuple[int, int]]
-_ARRAYS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 
 def even_bounds(count: int, parts: int) -> list[tuple[int, int]]:
@@ -50,7 +50,7 @@ def _split_tuple(space: spaces.Tuple[Any], batch: Any, bounds: Bounds) -> list[A
 @singledispatch
 def join(space: gym.Space[Any], parts: Sequence[Any]) -> Any:
     """One batch out of the shards' slices, in order."""
-    if isinstance(space, _ARRAYS):
+    if isinstance(space, ARRAY_SPACES):
         return np.concatenate(parts)
     return tuple(member for part in parts for member in part)
 
@@ -73,7 +73,7 @@ def conforms(space: gym.Space[Any], batch: Any, count: int) -> bool:
 
     Values are not looked at: many environments leave their own bounds.
     """
-    if isinstance(space, _ARRAYS):
+    if isinstance(space, ARRAY_SPACES):
         shape = (count, *(space.shape or ()))
         return type(batch) is np.ndarray and batch.dtype == space.dtype and batch.shape == shape
     return type(batch) is tuple and len(batch) == count

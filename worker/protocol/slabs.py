@@ -29,6 +29,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from envhub_worker.protocol.spaces import ARRAY_SPACES
+
 LINE = 64
 """Bytes of a cache line: words that two cores poll must not share one."""
 INFO_BYTES = 64 * 1024
@@ -80,7 +82,6 @@ ACTION_DTYPES = tuple(
 DTYPE_CODES = {dtype: code for code, dtype in enumerate(ACTION_DTYPES)}
 _ACTION_ITEM_BYTES = 8
 
-_LEAVES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 Array = npt.NDArray[Any]
 
 
@@ -174,7 +175,7 @@ def observation_layout(space: gym.Space[Any], count: int, slots: int) -> Observa
 
 
 def _leaves(space: gym.Space[Any], path: tuple[Any, ...] = ()) -> Iterator[Any]:
-    if isinstance(space, _LEAVES):
+    if isinstance(space, ARRAY_SPACES):
         yield path, np.dtype(space.dtype), tuple(space.shape or ())
     elif isinstance(space, spaces.Dict):
         for key, sub in space.spaces.items():
@@ -221,11 +222,11 @@ def words(buffer: Any) -> memoryview:
 
 def assembler(space: gym.Space[Any]) -> Callable[[list[Any]], Any]:
     """A function that puts a flat list of leaves, in their order, into the space's structure."""
-    if isinstance(space, _LEAVES):
+    if isinstance(space, ARRAY_SPACES):
         return _first
     if isinstance(space, spaces.Dict):
         keys = list(space.spaces)
-        if all(isinstance(sub, _LEAVES) for sub in space.spaces.values()):
+        if all(isinstance(sub, ARRAY_SPACES) for sub in space.spaces.values()):
             return lambda leaves: dict(zip(keys, leaves, strict=True))
     nested = _nested(space)
     return lambda leaves: nested(iter(leaves))

@@ -26,9 +26,11 @@ from envhub_worker.protocol.opaque import (
 )
 from envhub_worker.protocol.space_reader import decode_space
 
-__all__ = ["OpaqueSpace", "decode_space", "encode_space"]
+__all__ = ["ARRAY_SPACES", "OpaqueSpace", "decode_space", "encode_space"]
 
 Space = gym.Space[Any]
+ARRAY_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+"""Whose members are arrays or numbers, and whose batches are one array."""
 
 
 def encode_space(space: Space) -> dict[str, object]:
