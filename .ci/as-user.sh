@@ -1,8 +1,10 @@
-# as-user.sh COMMAND...: runs it in the current folder as a user that owns just this folder and a
-# home, with an environment of its own. To be run as root.
+# as-user.sh NUMBER COMMAND...: runs it in the current folder as a plain user, another one for each
+# NUMBER, that owns just this folder and a home, with an environment of its own. To be run as root.
 set -euo pipefail
-uid=$(($(awk -F: '$3 < 60000 && $3 > max {max = $3} END {print max}' /etc/passwd) + 1000))
-home=$CI_WORK/home
+taken=$(awk -F: '$3 < 60000 && $3 > max {max = $3} END {print max}' /etc/passwd)
+uid=$((taken + 1000 + $1))
+home=$CI_WORK/home-$1
+shift
 mkdir -p "$home"
 chown -R "$uid:$uid" "$PWD" "$home"
 permitted=(ENVHUB_CI=1 ENVHUB_CI_WITHOUT_CGROUPS=1)
