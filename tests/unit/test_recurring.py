@@ -197,6 +197,12 @@ def test_a_peer_that_never_repeats_itself_fills_nothing() -> None:
     assert set(m._INCOMING._forms.values()) == {None}
 
 
+@given(st.integers(-(2**63), 2**64 - 1))
+def test_an_id_is_packed_as_msgpack_packs_it(number: int) -> None:
+    """A liar's are negative."""
+    assert recurring.pack_id(number) == msgpack.packb(number)
+
+
 @given(st.integers(0, 2**64 - 1), st.binary(min_size=1, max_size=40))
 def test_an_id_is_read_as_msgpack_reads_it(number: int, rest: bytes) -> None:
     """Whatever follows it, and whatever its size."""

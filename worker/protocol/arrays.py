@@ -134,7 +134,7 @@ class ArrayReader:
         else:
             array = _read_only(np.ndarray(shape, dtype, self._frame(nbytes)))
         if dtype.kind in "bU":
-            _check_content(array)
+            check_content(array)
         return array
 
     def finish(self) -> None:
@@ -248,7 +248,7 @@ def read_scalar(data: bytes) -> np.generic:
         raise RemoteProtocolError("A numpy scalar has a wrong number of bytes.")
     flat = np.frombuffer(data, dtype, 1, offset)
     if dtype.kind in "bU":
-        _check_content(flat)
+        check_content(flat)
     scalar: np.generic = flat[0]
     return scalar
 
@@ -335,7 +335,7 @@ def _read_only(array: Array) -> Array:
     return array
 
 
-def _check_content(array: Array) -> None:
+def check_content(array: Array) -> None:
     """Refuses bytes that are not values of their dtype.
 
     numpy counts a mask's True values by adding its bytes and writes that many elements, so

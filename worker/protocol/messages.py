@@ -631,7 +631,7 @@ def pack(
     if form is not None and form.limits is limits:
         return form.frames(request_id, arrays)
     frames = encode([cls.kind, request_id, *values], pickler=pickler, limits=limits)
-    _OUTGOING.met((cls, outline), lambda: recurring.Outgoing(frames[0], limits))
+    _OUTGOING.met((cls, outline), lambda: recurring.Outgoing(frames, arrays, limits))
     return frames
 
 

@@ -15,7 +15,14 @@ from typing import Any, Generic, TypeVar
 import msgpack  # type: ignore[import-untyped]
 import numpy as np
 
-from envhub_worker.protocol.arrays import Array, ArrayReader, ArrayWriter, Buffer
+from envhub_worker.protocol.arrays import (
+    Array,
+    ArrayReader,
+    ArrayWriter,
+    Buffer,
+    check_content,
+    parse_descriptor,
+)
 from envhub_worker.protocol.codec import check_outgoing, split
 from envhub_worker.protocol.kinds import ARRAY, DOCUMENT_BYTES, TUPLE
 from envhub_worker.protocol.limits import WireLimits
@@ -31,6 +38,13 @@ _NUMBERS = frozenset("biufc")
 _ID = 2
 """Where a message's id begins: after the array's head and the kind, a byte each."""
 _ID_BYTES = {0xCC: 2, 0xCD: 3, 0xCE: 5, 0xCF: 9}
+_ID_FORMS = (
+    (b"", struct.Struct(">B"), 0x80),
+    (b"\xcc", struct.Struct(">B"), 1 << 8),
+    (b"\xcd", struct.Struct(">H"), 1 << 16),
+    (b"\xce", struct.Struct(">I"), 1 << 32),
+    (b"\xcf", struct.Struct(">Q"), 1 << 64),
+)
 
 K = TypeVar("K")
 F = TypeVar("F")
@@ -57,17 +71,29 @@ class Forms(Generic[K, F]):
 class Outgoing:
     """How to pack messages of one outline.
 
+    Args:
+        frames: What the codec has made of one of them.
+        arrays: That one's arrays.
+        limits: For which it was encoded.
+
     Attributes:
         limits: For which it holds; None if it does not hold at all.
     """
 
-    __slots__ = ("_after", "_before", "limits")
+    __slots__ = ("_after", "_before", "_in_header", "limits")
 
-    def __init__(self, header: Buffer, limits: WireLimits) -> None:
-        cut = without_id(split([header], limits)[0])
+    def __init__(self, frames: list[Buffer], arrays: list[Array], limits: WireLimits) -> None:
+        document, tail, buffers = split(frames, limits)
+        cut = without_id(document)
         self.limits = None if cut is None else limits
         document = b"" if cut is None else cut[0]
         self._before, self._after = document[:_ID], document[_ID:]
+        longest = DOCUMENT_BYTES.size + len(document) + len(pack_id(2**63)) + len(tail)
+        self._in_header = (
+            not buffers
+            and longest <= min(limits.header_bytes, limits.message_bytes)
+            and all(array.dtype.isnative for array in arrays)
+        )
 
     def frames(self, request_id: int, arrays: list[Array]) -> list[Buffer]:
         """What ``encode`` would return.
@@ -76,12 +102,13 @@ class Outgoing:
             LocalProtocolError: More than the receiver accepts.
         """
         assert self.limits is not None
-        packed_id = msgpack.packb(request_id)
-        document = b"".join((self._before, packed_id, self._after))
+        document = self._before + pack_id(request_id) + self._after
+        prefix = DOCUMENT_BYTES.pack(len(document))
+        if self._in_header:
+            return [b"".join([prefix, document, *[array.tobytes() for array in arrays]])]
         writer = ArrayWriter()
         for array in arrays:
             writer.add(array)
-        prefix = DOCUMENT_BYTES.pack(len(document))
         frames: list[Buffer] = [b"".join((prefix, document, *writer.tail)), *writer.frames]
         check_outgoing(frames, self.limits)
         return frames
@@ -99,20 +126,36 @@ class Incoming(Generic[T]):
         limits: For which it holds; None if it does not hold at all.
     """
 
-    __slots__ = ("_make", "_message", "_shape", "limits")
+    __slots__ = ("_descriptors", "_make", "_message", "_shape", "_tail_bytes", "_views", "limits")
 
     def __init__(self, document: bytes, make: Callable[..., T], limits: WireLimits) -> None:
         self._make = make
         self._message: T | None = None
         self._shape: list[Any] = []
+        self._descriptors: list[bytes] = []
+        self._views: list[tuple[np.dtype[Any], tuple[int, ...], slice]] = []
+        self._tail_bytes: int | None = 0
         self.limits: WireLimits | None = limits
         try:
-            _, _, *self._shape = _shaped(msgpack.unpackb(document, strict_map_key=False))
+            fields = msgpack.unpackb(document, strict_map_key=False)
+            _, _, *self._shape = _shaped(fields, self._descriptors)
         except _IrregularError:
             self.limits = None
         else:
+            self._lay_out()
             if all(map(_is_constant, self._shape)):
                 self._message = make(*self._shape)
+
+    def _lay_out(self) -> None:
+        """Where each array lies, if all lie in the tail of the header and hold numbers."""
+        start = 0
+        for dtype, shape, nbytes, own_frame in map(parse_descriptor, self._descriptors):
+            if own_frame or dtype.kind not in _NUMBERS:
+                self._tail_bytes = None
+                return
+            self._views.append((dtype, shape, slice(start, start + nbytes)))
+            start += nbytes
+        self._tail_bytes = start
 
     def message(self, tail: Buffer, buffers: list[Buffer]) -> T:
         """The message with these arrays. Trust: as ``decode``.
@@ -121,13 +164,35 @@ class Incoming(Generic[T]):
             RemoteProtocolError: Their bytes are not what the document says.
         """
         assert self.limits is not None
-        reader = ArrayReader(tail, buffers, self.limits, copy=True)
-        if self._message is not None:
-            message = self._message
+        if len(tail) == self._tail_bytes and not buffers:
+            arrays = [_own(tail[where], dtype, shape) for dtype, shape, where in self._views]
         else:
-            message = self._make(*[_fill(shape, reader.take) for shape in self._shape])
-        reader.finish()
-        return message
+            reader = ArrayReader(tail, buffers, self.limits, copy=True)
+            arrays = [reader.take(descriptor) for descriptor in self._descriptors]
+            reader.finish()
+        if self._message is not None:
+            return self._message
+        take = iter(arrays).__next__
+        return self._make(
+            *[take() if type(shape) is _Place else _fill(shape, take) for shape in self._shape]
+        )
+
+
+def _own(raw: Buffer, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
+    """An array of its own memory."""
+    array: Array = np.ndarray(shape, dtype, bytearray(raw))
+    if dtype.kind == "b":
+        check_content(array)
+    return array
+
+
+def pack_id(number: int) -> bytes:
+    """An id as msgpack packs it, in less time."""
+    for head, form, limit in _ID_FORMS:
+        if 0 <= number < limit:
+            return head + form.pack(number)
+    packed: bytes = msgpack.packb(number)
+    return packed
 
 
 def without_id(document: bytes) -> tuple[bytes, bytes] | None:
@@ -147,32 +212,34 @@ def read_id(packed: bytes) -> int:
 
 
 class _Place:
-    """Where an array goes; ``descriptor`` is what the document says of it."""
+    """Where the next array goes."""
 
-    __slots__ = ("descriptor",)
+    __slots__ = ()
 
-    def __init__(self, descriptor: bytes) -> None:
-        self.descriptor = descriptor
+
+_PLACE = _Place()
 
 
 class _IrregularError(Exception):
     """There is no form for this."""
 
 
-def _shaped(value: Any) -> Any:
+def _shaped(value: Any, descriptors: list[bytes]) -> Any:
+    """A value with places for its arrays, and what the document says of those, in its order."""
     kind = type(value)
     if kind is msgpack.ExtType:
         if value.code != ARRAY:
             raise _IrregularError
-        return _Place(value.data)
+        descriptors.append(value.data)
+        return _PLACE
     if kind is dict:
         if set(map(type, value)) - {str}:
             raise _IrregularError
-        return {key: _shaped(item) for key, item in value.items()}
+        return {key: _shaped(item, descriptors) for key, item in value.items()}
     if kind is list:
         if value and type(value[0]) is msgpack.ExtType and value[0].code == TUPLE:
-            return tuple(map(_shaped, value[1:]))
-        return list(map(_shaped, value))
+            return tuple([_shaped(item, descriptors) for item in value[1:]])
+        return [_shaped(item, descriptors) for item in value]
     return value
 
 
@@ -183,11 +250,11 @@ def _is_constant(shape: Any) -> bool:
     return type(shape) not in (_Place, dict, list)
 
 
-def _fill(shape: Any, take: Callable[[bytes], Array]) -> Any:
+def _fill(shape: Any, take: Callable[[], Array]) -> Any:
     """A fresh value of a shape; ``take`` gives the arrays, in their order."""
     kind = type(shape)
     if kind is _Place:
-        return take(shape.descriptor)
+        return take()
     if kind is dict:
         return {key: _fill(item, take) for key, item in shape.items()}
     if kind is tuple:
