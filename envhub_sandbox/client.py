@@ -27,6 +27,7 @@ from envhub_worker.protocol.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimits
 from envhub_worker.protocol.text import printable
 
+_MORE, _NOW = int(zmq.SNDMORE), int(zmq.NOBLOCK)
 _FAR_VERSION = 2
 _FIRST_OF_VERSION_2 = 17
 SESSION = secrets.token_bytes(16)
@@ -149,7 +150,7 @@ class WorkerClient:
             if self._compression:
                 travelling = packing.pack_frames(frames, self._compression)
         size = sum(map(len, travelling))
-        self._socket.send_multipart(travelling, copy=size < LARGE_BYTES)
+        self._put(travelling, copy=size < LARGE_BYTES)
         self.sent_bytes += size
 
     def receive(self, request_id: int, deadline: Deadline) -> tuple[m.Message, list[Buffer]]:
@@ -180,12 +181,20 @@ class WorkerClient:
                 self.hello(deadline)
                 self._send(request_id, unanswered)
 
+    def _put(self, frames: Sequence[Buffer], *, copy: bool) -> None:
+        # one by one: pyzmq's own loop costs more than the calls in it
+        for frame in frames[:-1]:
+            self._socket.send(frame, _MORE, copy)
+        self._socket.send(frames[-1], 0, copy)
+
     def _take(self) -> list[Buffer]:
         """The message that is there. What is large stays in ZeroMQ's memory until it is decoded."""
-        frames: list[Buffer] = [self._socket.recv(zmq.NOBLOCK)]
-        while self._socket.getsockopt(zmq.RCVMORE):
-            frame = self._socket.recv(zmq.NOBLOCK, copy=False)
+        frames: list[Buffer] = []
+        more = True
+        while more:
+            frame = self._socket.recv(_NOW, copy=False)
             frames.append(frame.bytes if len(frame) < LARGE_BYTES else frame.buffer)
+            more = frame.more
         return frames
 
     def _must_say_hello(self, request_id: int, reply: m.Message) -> bool:

@@ -95,20 +95,18 @@ class RemoteEnv(Mortal):
                 with self._turn("step"):
                     self._refuse_unless_usable("step")
                     self._start()
-            if self._lane is None:
-                with self._turn("step"):
-                    self._send("step", self._step_requests(actions))
-                self.history.step(actions)
-                return
             try:
-                # first: an interrupt from here on leaves a reply that may come
-                self._pending = _BY_LANE
-                self.lifecycle.on(Event.SUBMIT)
-                self._lane.ask(actions)
+                if self._lane is None:
+                    self._send("step", self._step_requests(actions))
+                else:
+                    # first: an interrupt from here on leaves a reply that may come
+                    self._pending = _BY_LANE
+                    self.lifecycle.on(Event.SUBMIT)
+                    self._lane.ask(actions)
+                    self.counters.lane_steps += 1
             except BaseException:
                 with self._turn("step"):
                     raise
-            self.counters.lane_steps += 1
             self.history.step(actions)  # while the jail is at it
 
     def _step_requests(self, actions: Any) -> list[tuple[int, m.Message]]:

@@ -6,7 +6,7 @@ import signal
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from time import monotonic
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from envhub_worker.idleness import Idleness
 from envhub_worker.link import HostLink
@@ -16,8 +16,7 @@ from envhub_worker.protocol.codec import Buffer
 from envhub_worker.spawner import Jail
 
 
-@dataclass(frozen=True)
-class Asker:
+class Asker(NamedTuple):
     """Who asked: the reply goes to this identity under this id. Jails belong to its session.
 
     ``key`` was proved in the handshake; empty where none is needed.
@@ -38,7 +37,7 @@ class Opening:
     hosts: tuple[int, ...]
 
 
-@dataclass
+@dataclass(slots=True)
 class Pending:
     """A ``Relay`` that hosts still owe answers to."""
 

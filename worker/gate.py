@@ -19,6 +19,7 @@ from envhub_worker.jails import Jails
 from envhub_worker.jailspec import confinement_from_wire
 from envhub_worker.keys import AuthorizedClients, KeyPair
 from envhub_worker.loop import Loop
+from envhub_worker.multipart import receive
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.keys import KEY_BYTES, key_text
@@ -100,7 +101,7 @@ class LocalGate:
 
     def receive(self, router: zmq.Socket[bytes]) -> tuple[bytes, bytes, list[bytes]]:
         """Nobody has a key."""
-        identity, *frames = router.recv_multipart(zmq.NOBLOCK)
+        identity, *frames = receive(router)
         return identity, b"", frames
 
     def greet(self, sessions: Sessions, key: bytes, name: bytes) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 from envhub_worker.protocol.codec import Buffer
 from envhub_worker.protocol.errors import RemoteProtocolError
-from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.limits import LARGE_BYTES, WireLimits
 from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
 
 MAX_PENDING = 16
@@ -57,6 +57,8 @@ class HostLink:
             return
         self.pending[request_id] = owner
         buffers = pack_packet(request_id, frames)
+        if sum(map(len, buffers)) < LARGE_BYTES:
+            buffers = [b"".join(buffers)]
         self._unsent += [memoryview(buffer).cast("B") for buffer in buffers if buffer]
         self.flush()
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import zmq
 
-from envhub_worker import __version__
+from envhub_worker import __version__, multipart
 from envhub_worker.entries import Asker
 from envhub_worker.gate import Gate, LocalGate
 from envhub_worker.jails import Jails
@@ -109,8 +109,7 @@ class Server:
 
     def _serve_clients(self) -> None:
         for _ in range(_ROUND):
-            # not by an exception where there is nothing: that is how every round would end
-            if not int(self._router.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+            if not multipart.has_message(self._router):
                 return
             self._serve(*self._gate.receive(self._router))
 
@@ -119,7 +118,7 @@ class Server:
             return
         session = self._sessions.find(identity, key)
         try:
-            if self._sessions.compression(identity, key):
+            if self._compression(identity, key):
                 frames[:] = packing.unpack_frames(frames, self._limits)
             request_id, request = m.unpack(frames[:1], limits=self._limits)
         except ProtocolError:
@@ -161,11 +160,14 @@ class Server:
         """Answer a request."""
         self._gate.answered(asker)
         frames: list[Buffer] = [*m.pack(message, asker.request_id), *payload]
-        compression = self._sessions.compression(asker.identity, asker.key)
+        compression = self._compression(asker.identity, asker.key)
         if compression:
             frames = packing.pack_frames(frames, compression)
         copy = sum(map(len, payload)) < LARGE_BYTES
-        self._router.send_multipart([asker.identity, *frames], zmq.NOBLOCK, copy=copy)
+        multipart.send(self._router, [asker.identity, *frames], copy=copy)
+
+    def _compression(self, identity: bytes, key: bytes) -> str:
+        return self._sessions.compression(identity, key) if self._gate.compresses else ""
 
     def refuse(
         self, asker: Asker, error: str, message: str, layer: str = "", fix: str = ""

@@ -47,6 +47,7 @@ LOCKDOWN_KNOWS = {
 WITHOUT_IO = {"asyncio", "multiprocessing", "os", "select", "socket", "subprocess", "zmq"}
 ZEROMQ = {
     *("envhub_sandbox.client", "envhub_sandbox.far", "envhub_worker.loop", "envhub_worker.server"),
+    "envhub_worker.multipart",
     # sockets, keys and handshakes of clients on other hosts
     *(
         "envhub_worker.gate",
