@@ -19,7 +19,7 @@ from envhub_sandbox.jail import HostsDiedError, check, typed
 from envhub_sandbox.jail_sources import JailSource, SharedJail
 from envhub_sandbox.log import WORKER
 from envhub_sandbox.results import Results, StepResult
-from envhub_sandbox.reviving import SeedBook, marked, resets, truncated
+from envhub_sandbox.reviving import SeedBook, Settings, marked, resets, truncated
 from envhub_sandbox.sharding import PaceBook
 from envhub_sandbox.survivors import Requests
 from envhub_sandbox.tenant import Tenant
@@ -52,6 +52,7 @@ class Mortal(Tenant):
         self.results = Results(manifest, self.bounds)
         self._revives = jails.repository.policy.restart == "transparent"
         self._seeds = SeedBook(manifest.num_envs, manifest.shardable)
+        self._settings = Settings()
         self._asked: MessageFor | None = None  # what was asked last, and when
         self._asked_ns = 0
 
@@ -251,11 +252,22 @@ class Mortal(Tenant):
         if self._revives and operation == "reset":
             self._seeds.remember(self._reset_of((0, self.manifest.num_envs)))
 
+    def _done(self) -> None:
+        """What was asked has been done; fresh hosts need what was set."""
+        if self._revives and self._asked is not None:
+            message = self._asked(self._number, (0, self.manifest.num_envs))
+            if isinstance(message, m.SetAttr):
+                self._settings.remember(message)
+
     def _revivals(self, index: int) -> list[m.Message]:
-        return [m.Revive(self._number, self._derived(index))]
+        return [*self._set_again(index), m.Revive(self._number, self._derived(index))]
 
     def _resets(self, index: int) -> list[m.Message]:
-        return resets(self._reset_of(self.bounds[index]), self._derived(index))
+        reset = self._reset_of(self.bounds[index])
+        return [*self._set_again(index), *resets(reset, self._derived(index))]
+
+    def _set_again(self, index: int) -> list[m.Message]:
+        return self._settings.messages(self._number, self.bounds[index])
 
     def _derived(self, index: int) -> Any:
         return self._seeds.derived(self.bounds[index], self._restarts.count)

@@ -77,6 +77,7 @@ class RemoteEnv(Mortal):
                 replies = self._survive_request(deaths)
             for reply in replies:
                 check(reply)
+            self._done()
             return replies
 
     def request(

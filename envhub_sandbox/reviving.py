@@ -57,6 +57,23 @@ class SeedBook:
         return derived_seed(self._own, restart)
 
 
+class Settings:
+    """Attributes that the caller has set, which fresh hosts have not: the last value of each."""
+
+    def __init__(self) -> None:
+        self._values: dict[str, tuple[Any, ...]] = {}
+
+    def remember(self, message: m.SetAttr) -> None:
+        """Take note of what was set in all sub-environments."""
+        self._values.pop(message.name, None)  # the last one counts, in its place
+        self._values[message.name] = message.values
+
+    def messages(self, number: int, bounds: Bounds) -> list[m.Message]:
+        """What sets them in a shard's fresh host."""
+        rows = slice(*bounds)
+        return [m.SetAttr(number, name, values[rows]) for name, values in self._values.items()]
+
+
 def derived_seed(seed: int | None, restart: int) -> int | None:
     """The seed of a sub-environment that comes back with an environment's ``restart``-th restart.
 

@@ -272,6 +272,27 @@ def test_a_call_is_not_repeated(lane: str) -> None:
 
 
 @lanes
+def test_attributes_that_were_set_are_set_again(lane: str) -> None:
+    """In the fresh process, before anything else is asked of it: the last value of each."""
+    with made(lane) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        env.set_attr("weight", 1)
+        env.set_attr("colour", ["red", "green", "blue", "white"])
+        env.set_attr("weight", [5, 6, 7, 8])
+        with pytest.raises(errors.RemoteEnvError):
+            env.set_attr("fixed", 3)
+        *_, truncated, info = env.step(LAST_DIES)
+        assert truncated.tolist() == [False, False, True, True]
+        assert restarted(info)
+        assert env.get_attr("weight") == (5, 6, 7, 8)
+        assert env.get_attr("colour") == ("red", "green", "blue", "white")
+        os.kill(pids(env)[1], signal.SIGKILL)
+        env.reset(seed=SEED)
+        assert env.get_attr("weight") == (5, 6, 7, 8)
+
+
+@lanes
 def test_a_death_between_requests_is_met_by_the_next(lane: str) -> None:
     """Killed from outside while nothing is asked: a call says so, a step brings it back."""
     with made(lane) as suites:

@@ -72,6 +72,11 @@ class Mortal(gym.Env):
     def hello(self) -> str:
         return "hello"
 
+    @property
+    def fixed(self) -> int:
+        """What cannot be set."""
+        return 2
+
     def _observe(self):
         return np.array([self.drawn, self.steps, self.np_random.random()])
 
