@@ -56,6 +56,7 @@ class Builder:
         own = not isinstance(jails, SharedJail)
         self._own = own
         self._keeps = own and jails.repository.policy.restart == "transparent"
+        self._number = next(_numbers)  # in every jail: what was packed for one, another understands
 
     def build(self, loaded: LoadedJail, deadline: Deadline) -> Place:
         """Build all of it in a loaded jail.
@@ -71,7 +72,7 @@ class Builder:
         if idle_s is not None and idle_s < float("inf"):
             loaded.jail.expire(idle_s, deadline)
         hosts = self._repository.spread(loaded, len(self._bounds), deadline)
-        place = Place(loaded, hosts, next(_numbers), None)
+        place = Place(loaded, hosts, self._number, None)
         shards = range(len(hosts))
         self._build(place, shards, deadline)
         return replace(place, lane=self._open_lane(place, deadline))

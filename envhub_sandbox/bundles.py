@@ -113,7 +113,7 @@ def _doubts(
     if dropped:
         yield f"{dropped} requests had been forgotten before it died (crash_history of the policy)"
     elif history.get("mixed"):
-        yield "some sub-environments had lost what calls had changed, in a transparent restart"
+        yield "what was set or called before a transparent restart need not hold everywhere"
     elif not _member(history, "exact", bool):
         yield "some requests held objects that only pickle could carry, and are not repeated"
     if not _member(arguments, "exact", bool):

@@ -28,7 +28,6 @@ _REQUEST_BYTES = 500
 _EVICTED = 64
 _PRELUDE = 256
 _LASTING = (m.Call, m.SetAttr, m.CallOwn)
-_SET = m.SetAttr.__name__.lower()
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,11 +123,10 @@ class History:
     def revived(self) -> None:
         """Some sub-environments are fresh: before all are seeded, nobody can say what follows.
 
-        What calls have changed, the fresh ones have lost, and the others have not.
+        Attributes that were set, the fresh ones have lost, and the others have not.
         """
-        calls = [one for one in self._lasting.values() if one.operation != _SET]
-        self._mixed = self._mixed or bool(calls)
-        self._before = tuple(self._lasting.values())
+        self._mixed = self._mixed or bool(self._lasting)
+        self._before = ()
         self._seeded = False
         self._restart()
 

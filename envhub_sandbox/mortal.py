@@ -18,8 +18,9 @@ from envhub_sandbox.fast_lane import Outcome
 from envhub_sandbox.jail import HostsDiedError, check, typed
 from envhub_sandbox.jail_sources import JailSource, SharedJail
 from envhub_sandbox.log import WORKER
+from envhub_sandbox.repository import LoadedJail
 from envhub_sandbox.results import Results, StepResult
-from envhub_sandbox.reviving import SeedBook, Settings, marked, resets, truncated
+from envhub_sandbox.reviving import Frames, SeedBook, Settings, marked, resets, truncated
 from envhub_sandbox.sharding import PaceBook
 from envhub_sandbox.survivors import Requests
 from envhub_sandbox.tenant import Tenant
@@ -53,8 +54,13 @@ class Mortal(Tenant):
         self._revives = jails.repository.policy.restart == "transparent"
         self._seeds = SeedBook(manifest.num_envs, manifest.shardable)
         self._settings = Settings()
+        self._setting: tuple[str, list[Frames]] | None = None  # what is being set
         self._asked: MessageFor | None = None  # what was asked last, and when
         self._asked_ns = 0
+
+    def _build_in(self, loaded: LoadedJail, deadline: Deadline) -> None:
+        super()._build_in(loaded, deadline)
+        self._settings.clear()
 
     # --- how it is learnt, and told ------------------------------------------------------------
 
@@ -241,33 +247,41 @@ class Mortal(Tenant):
     def _ask_anew(self, dead: list[int], requests: Requests) -> dict[int, m.Message]:
         assert self._place is not None
         reset_s = self.repository.timeouts.reset_s
+        deadline = Deadline(reset_s)
         try:
-            return survivors.ask_anew(self._place, dead, requests, Deadline(reset_s))
+            for name in survivors.set_again(self._place, dead, self._settings.messages(), deadline):
+                WORKER.warning("%s: %r could not be set again", self.repository.label, name)
+            return survivors.ask_anew(self._place, dead, requests, deadline)
         except WorkerTimeoutError as error:
             raise self._late("reset", reset_s) from error
 
     def _remember(self, operation: str, message_for: MessageFor) -> None:
         """What was asked may have to be asked again, and fresh hosts need seeds."""
         self._asked = message_for
+        self._setting = None
         if self._revives and operation == "reset":
             self._seeds.remember(self._reset_of((0, self.manifest.num_envs)))
+        if self._revives and operation == "set_attr":
+            self._setting = self._packed([message_for(self._number, one) for one in self.bounds])
 
-    def _done(self) -> None:
-        """What was asked has been done; fresh hosts need what was set."""
-        if self._revives and self._asked is not None:
-            message = self._asked(self._number, (0, self.manifest.num_envs))
-            if isinstance(message, m.SetAttr):
-                self._settings.remember(message)
+    def _packed(self, messages: Sequence[m.Message]) -> tuple[str, list[Frames]]:
+        """An attribute's name, and copies of the frames that set it: their values may change."""
+        assert self._loaded is not None
+        pack = self._loaded.jail.pack
+        frames: list[Frames] = [list(map(bytes, pack(message))) for message in messages]
+        return typed(messages[0], m.SetAttr).name, frames
+
+    def _has_set(self) -> None:
+        """Every sub-environment has answered: fresh ones are told what was set, if it was."""
+        if self._setting is not None:
+            self._settings.remember(*self._setting)
+            self._setting = None
 
     def _revivals(self, index: int) -> list[m.Message]:
-        return [*self._set_again(index), m.Revive(self._number, self._derived(index))]
+        return [m.Revive(self._number, self._derived(index))]
 
     def _resets(self, index: int) -> list[m.Message]:
-        reset = self._reset_of(self.bounds[index])
-        return [*self._set_again(index), *resets(reset, self._derived(index))]
-
-    def _set_again(self, index: int) -> list[m.Message]:
-        return self._settings.messages(self._number, self.bounds[index])
+        return resets(self._reset_of(self.bounds[index]), self._derived(index))
 
     def _derived(self, index: int) -> Any:
         return self._seeds.derived(self.bounds[index], self._restarts.count)

@@ -77,7 +77,7 @@ class RemoteEnv(Mortal):
                 replies = self._survive_request(deaths)
             for reply in replies:
                 check(reply)
-            self._done()
+            self._has_set()
             return replies
 
     def request(
@@ -252,12 +252,16 @@ class RemoteEnv(Mortal):
         if self._lane and not self._revives and lane_requests.takes(operation, messages):
             self._tell(operation, messages)
             return
-        request_id = jail.relay(operation, packed)
+        self.lifecycle.on(Event.SUBMIT)  # first, as for a step by the lane
+        try:
+            request_id = jail.relay(operation, packed)
+        except EnvHubError:  # nothing was sent
+            self._moved(Event.REPLY)
+            raise
+        self._pending = (request_id, operation)
         if self._lane and operation == "reset":
             self._lane.observations.leave()
         self.counters.requests += 1
-        self._pending = (request_id, operation)
-        self.lifecycle.on(Event.SUBMIT)
 
     def _tell(self, operation: str, messages: list[list[Buffer]]) -> None:
         assert self._place is not None

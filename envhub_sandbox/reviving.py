@@ -5,18 +5,23 @@ Nothing here asks anybody: it makes the requests for a fresh host and reads its 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec import Buffer
 
 RESTARTED = "worker_restarted"
 """In the infos: whether a sub-environment was lost and came back reset."""
 
 Bounds = tuple[int, int]
 Seeds = list[int | None]
+Frames = list[Buffer]
+_SETTINGS = 256
+"""Attributes that are remembered, the last ones."""
 
 
 class SeedBook:
@@ -58,20 +63,25 @@ class SeedBook:
 
 
 class Settings:
-    """Attributes that the caller has set, which fresh hosts have not: the last value of each."""
+    """Attributes that the caller has set: the last message of each, as the shards were sent it."""
 
     def __init__(self) -> None:
-        self._values: dict[str, tuple[Any, ...]] = {}
+        self._sent: dict[str, Sequence[Frames]] = {}
 
-    def remember(self, message: m.SetAttr) -> None:
-        """Take note of what was set in all sub-environments."""
-        self._values.pop(message.name, None)  # the last one counts, in its place
-        self._values[message.name] = message.values
+    def remember(self, name: str, sent: Sequence[Frames]) -> None:
+        """Take note of what was set, given the frames for each shard."""
+        self._sent.pop(name, None)  # the last one counts, in its place
+        self._sent[name] = sent
+        if len(self._sent) > _SETTINGS:
+            del self._sent[next(iter(self._sent))]
 
-    def messages(self, number: int, bounds: Bounds) -> list[m.Message]:
-        """What sets them in a shard's fresh host."""
-        rows = slice(*bounds)
-        return [m.SetAttr(number, name, values[rows]) for name, values in self._values.items()]
+    def clear(self) -> None:
+        """There is a fresh jail, in which nothing has been set."""
+        self._sent.clear()
+
+    def messages(self) -> list[tuple[str, Sequence[Frames]]]:
+        """Names, and the frames for each shard."""
+        return list(self._sent.items())
 
 
 def derived_seed(seed: int | None, restart: int) -> int | None:

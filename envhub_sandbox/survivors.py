@@ -13,6 +13,7 @@ from envhub_sandbox.jail import HostsDiedError
 from envhub_sandbox.results import Results
 from envhub_worker.protocol import batches
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec import Buffer
 from envhub_worker.protocol.manifest import EnvManifest
 
 _CAUSE_S = 10.0
@@ -97,6 +98,30 @@ def _fetch_infos(place: Place, host: int) -> m.Message:
     asked = [(host, m.FetchInfos(place.number))]
     [reply] = place.loaded.jail.exchange("step", asked, Deadline(_CAUSE_S))
     return reply
+
+
+def set_again(
+    place: Place,
+    dead: Sequence[int],
+    settings: Sequence[tuple[str, Sequence[list[Buffer]]]],
+    deadline: Deadline,
+) -> list[str]:
+    """Set attributes in the fresh hosts of some shards; the names of those whose setter raised.
+
+    Raises:
+        WorkerError: One died again, or took too long.
+    """
+    jail = place.loaded.jail
+    failed = []
+    for name, frames in settings:
+        asked = [(place.hosts[index], frames[index]) for index in dead]
+        try:
+            replies = jail.receive(jail.relay("set_attr", asked), deadline)
+        except HostsDiedError as error:
+            raise error.first from None
+        if any(isinstance(reply, m.Raised) for reply in replies):
+            failed.append(name)
+    return failed
 
 
 def ask_anew(

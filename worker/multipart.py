@@ -31,10 +31,9 @@ def receive(socket: zmq.Socket[bytes]) -> list[bytes]:
 
 
 def send(socket: zmq.Socket[bytes], frames: Sequence[Buffer], *, copy: bool) -> None:
-    """Send without waiting. Without ``copy``, large frames must stay as they are until then.
+    """Send without waiting; what a client's queue has no room for is dropped.
 
-    Raises:
-        zmq.Again: There is no room; nothing was sent.
+    Without ``copy``, nobody may write large frames any more.
     """
     for frame in frames[:-1]:
         socket.send(frame, _NOW | _MORE, copy)

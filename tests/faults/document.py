@@ -57,8 +57,10 @@ test for each sentence here.
 - **In a `call`, `get_attr`, `set_attr` or `render`** nothing is repeated, for nobody knows how far
   it came: it raises `WorkerDiedError`, and so do others until a step (which then reports the rows
   as above) or a reset has brought them back. A death between two requests is met by the next.
-- **Attributes** that `set_attr` had set are set again, the last value of each, before anything else
-  is asked. What calls had changed is lost.
+- **Attributes** that `set_attr` had set everywhere are set again, as they were sent, the last value
+  of each, before anything else is asked; one whose setter raises there is left out, and the log
+  says so. What calls had changed is lost. A fresh jail after a timeout, an expiry or a death that
+  was told has neither.
 - **Seeds**: whoever was last seeded with `s` comes back with
   `int(np.random.SeedSequence((abs(s), n)).generate_state(1)[0])` at the environment's `n`-th
   restart, so that a seeded run with the same deaths is the same run. Whoever was never seeded

@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+import zmq
 from gymnasium.error import ClosedEnvironmentError
 
 from envhub_sandbox import errors, make_env, remote_env, restarts, tenant
@@ -66,6 +67,33 @@ def test_a_second_ctrl_c_in_recovery_leaves_a_usable_environment(
         env.reset()
         assert remote._loaded is not first
         assert env.render() is not None
+
+
+@pytest.mark.parametrize("moment", ["amid the frames", "when all is sent"])
+def test_ctrl_c_in_sending_a_step_leaves_a_late_reply(
+    moment: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody knows whether it was done, so nobody goes on as if it was not."""
+    with made("frames") as suites:
+        env, remote = suites.env, suites.env._remote
+        jail = remote._loaded.jail
+        with monkeypatch.context() as patch:
+            if moment == "amid the frames":
+                patch.setattr(jail.client, "_put", lambda frames, copy: _half(jail.client, frames))
+            else:
+                relay = jail.relay
+                patch.setattr(jail, "relay", lambda *all_of_it: interrupted(relay(*all_of_it)))
+            with pytest.raises(KeyboardInterrupt):
+                env.step([0, 0])
+        with pytest.raises(errors.WorkerTimeoutError, match="call reset"):
+            env.step([0, 0])
+        env.reset()
+        env.step([0, 0])
+
+
+def _half(client: Any, frames: Any) -> None:
+    client._socket.send(frames[0], zmq.SNDMORE)
+    raise KeyboardInterrupt
 
 
 @lanes

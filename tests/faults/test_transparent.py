@@ -292,6 +292,51 @@ def test_attributes_that_were_set_are_set_again(lane: str) -> None:
         assert env.get_attr("weight") == (5, 6, 7, 8)
 
 
+def test_attributes_are_set_again_as_they_were_sent() -> None:
+    """Whatever the caller has done with the values since."""
+    with made() as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        goals = {"goal": np.zeros(2)}
+        env.set_attr("goals", [goals] * 4)
+        goals["goal"][:] = 9
+        goals["lock"] = threading.Lock()
+        env.step(LAST_DIES)
+        assert [one["goal"].tolist() for one in env.get_attr("goals")] == [[0, 0]] * 4
+
+
+def test_an_attribute_that_cannot_be_set_again_is_left_out(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Its setter wants a reset to have been; the rows come back without it, and the log says so."""
+    with made() as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        env.set_attr("drawn_so_far", 0.5)
+        with caplog.at_level("WARNING", "envhub_sandbox.worker"):
+            *_, truncated, _ = env.step(LAST_DIES)
+        assert truncated.tolist() == [False, False, True, True]
+        assert "'drawn_so_far' could not be set again" in caplog.text
+
+
+@lanes
+def test_a_fresh_jail_has_no_attributes_of_the_last(lane: str) -> None:
+    """What was set in a jail that was given up, no row of the next one gets."""
+    with made(lane, timeouts={"step_s": 0.05}) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        env.set_attr("weight", 7)
+        with pytest.raises(errors.WorkerTimeoutError):
+            env.step([SPIN, LIVE, LIVE, LIVE])
+        env.reset(seed=SEED)
+        with pytest.raises(errors.RemoteEnvError):
+            env.get_attr("weight")
+        os.kill(pids(env)[1], signal.SIGKILL)
+        env.reset(seed=SEED)
+        with pytest.raises(errors.RemoteEnvError):
+            env.get_attr("weight")
+
+
 @lanes
 def test_a_death_between_requests_is_met_by_the_next(lane: str) -> None:
     """Killed from outside while nothing is asked: a call says so, a step brings it back."""

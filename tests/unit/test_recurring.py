@@ -203,7 +203,7 @@ def test_an_id_is_packed_as_msgpack_packs_it(number: int) -> None:
     assert recurring.pack_id(number) == msgpack.packb(number)
 
 
-@given(st.integers(0, 2**64 - 1), st.binary(min_size=1, max_size=40))
+@given(st.integers(0, 2**63 - 1), st.binary(min_size=1, max_size=40))
 def test_an_id_is_read_as_msgpack_reads_it(number: int, rest: bytes) -> None:
     """Whatever follows it, and whatever its size."""
     packed = msgpack.packb(number)
@@ -212,9 +212,42 @@ def test_an_id_is_read_as_msgpack_reads_it(number: int, rest: bytes) -> None:
     assert recurring.read_id(packed) == number
 
 
-def test_an_id_that_is_cut_off_is_refused() -> None:
+@pytest.mark.parametrize("message", [m.Value(None), m.Done()], ids=["a field", "no field"])
+def test_an_id_that_is_cut_off_is_refused(message: m.Message) -> None:
     """No form is taken for it."""
-    _known(None)
-    document = b"\x93\x30\xcd\x01"
-    with pytest.raises(RemoteProtocolError):
-        m.unpack([struct.pack("<I", len(document)) + document], limits=DEFAULT_LIMITS)
+    for _ in range(3):
+        [known] = m.pack(message, 1)
+        m.unpack([known])
+    for packed in (b"\xcd\x01", b"\xcd", b""):
+        document = bytes(known)[4:6] + packed
+        with pytest.raises(RemoteProtocolError):
+            m.unpack([struct.pack("<I", len(document)) + document], limits=DEFAULT_LIMITS)
+
+
+@pytest.mark.parametrize("number", [2**63, 2**64 - 1, 2**64, -(2**63) - 1])
+def test_an_id_that_nobody_can_answer_under_is_refused(number: int) -> None:
+    """With a form and without: a server that failed to pack its answer would end for everybody."""
+    for _ in range(4):
+        with pytest.raises(RemoteProtocolError):
+            m.unpack(encode([m.Done.kind, number]))
+        m.unpack(encode([m.Done.kind, 2**63 - 1]))
+
+
+def test_memory_that_is_not_there_is_the_peers_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As without a form."""
+    header, large = _framed()
+    monkeypatch.setattr(recurring.ArrayReader, "take", _without_memory)
+    with pytest.raises(MessageTooLargeError):
+        m.unpack([header, large])
+
+
+def _framed() -> tuple[bytes, bytes]:
+    """A known message with a frame of its own."""
+    for _ in range(3):
+        frames = m.pack(m.Value(np.zeros(50_000, np.uint8)), 1)
+        m.unpack(frames)
+    return bytes(frames[0]), bytes(frames[1])
+
+
+def _without_memory(*_: object) -> None:
+    raise MemoryError

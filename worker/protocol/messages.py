@@ -673,7 +673,7 @@ def _decode(
         raise RemoteProtocolError("a message is a list that starts with its kind and its id")
     kind, request_id, *rest = value
     cls = KINDS.get(kind) if type(kind) is int else None
-    if cls is None or type(request_id) is not int:
+    if cls is None or type(request_id) is not int or request_id.bit_length() > 63:
         raise RemoteProtocolError(f"unknown message kind {str(kind)[:40]!r}")
     _check_fields(cls, rest)
     return request_id, cls(*rest)

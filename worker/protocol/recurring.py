@@ -24,6 +24,7 @@ from envhub_worker.protocol.arrays import (
     parse_descriptor,
 )
 from envhub_worker.protocol.codec import check_outgoing, split
+from envhub_worker.protocol.errors import MessageTooLargeError
 from envhub_worker.protocol.kinds import ARRAY, DOCUMENT_BYTES, TUPLE
 from envhub_worker.protocol.limits import WireLimits
 
@@ -152,6 +153,7 @@ class Incoming(Generic[T]):
         for dtype, shape, nbytes, own_frame in map(parse_descriptor, self._descriptors):
             if own_frame or dtype.kind not in _NUMBERS:
                 self._tail_bytes = None
+                self._views.clear()
                 return
             self._views.append((dtype, shape, slice(start, start + nbytes)))
             start += nbytes
@@ -167,15 +169,21 @@ class Incoming(Generic[T]):
         if len(tail) == self._tail_bytes and not buffers:
             arrays = [_own(tail[where], dtype, shape) for dtype, shape, where in self._views]
         else:
-            reader = ArrayReader(tail, buffers, self.limits, copy=True)
-            arrays = [reader.take(descriptor) for descriptor in self._descriptors]
-            reader.finish()
+            arrays = self._read(ArrayReader(tail, buffers, self.limits, copy=True))
         if self._message is not None:
             return self._message
         take = iter(arrays).__next__
         return self._make(
             *[take() if type(shape) is _Place else _fill(shape, take) for shape in self._shape]
         )
+
+    def _read(self, reader: ArrayReader) -> list[Array]:
+        try:
+            arrays = [reader.take(descriptor) for descriptor in self._descriptors]
+        except MemoryError as error:
+            raise MessageTooLargeError("There is not enough memory to decode it.") from error
+        reader.finish()
+        return arrays
 
 
 def _own(raw: Buffer, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
@@ -201,8 +209,10 @@ def without_id(document: bytes) -> tuple[bytes, bytes] | None:
         return None
     array, kind, first = document[: _ID + 1]
     size = 1 if first < 0x80 else _ID_BYTES.get(first, 0)
-    if not (size and 0x92 <= array <= 0x9F and kind < 0x80):
+    if not (size and _ID + size <= len(document) and 0x92 <= array <= 0x9F and kind < 0x80):
         return None
+    if size == _ID_BYTES[0xCF] and document[_ID + 1] > 0x7F:
+        return None  # larger than an id may be
     return document[:_ID] + document[_ID + size :], document[_ID : _ID + size]
 
 

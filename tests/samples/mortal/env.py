@@ -77,6 +77,15 @@ class Mortal(gym.Env):
         """What cannot be set."""
         return 2
 
+    @property
+    def drawn_so_far(self) -> float:
+        """What can only be set once there was a reset."""
+        return self.drawn
+
+    @drawn_so_far.setter
+    def drawn_so_far(self, value: float) -> None:
+        self.drawn += value
+
     def _observe(self):
         return np.array([self.drawn, self.steps, self.np_random.random()])
 
