@@ -23,13 +23,16 @@ from __future__ import annotations
 import contextlib
 import gc
 import importlib
+import io
 import os
 import select
 import signal
 import socket
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import cast
 
 from envhub_worker import blas, init
 from envhub_worker.channel import Channel, close_fds
@@ -71,6 +74,8 @@ def main(argv: Sequence[str]) -> int:
         refuse(channel, error)
         return 0
     process.become_subreaper()
+    # what a repository prints must not lie in a buffer when its process dies
+    cast(io.TextIOWrapper, sys.stdout).reconfigure(line_buffering=True)
     preload(config.target)
     common = replace(common, set_blas_threads=blas.find_setter())
     gc.collect()

@@ -42,6 +42,58 @@ def test_the_last_words_are_in_the_file(tmp_path: Path) -> None:
     assert followers() == []
 
 
+@pytest.mark.parametrize("how", ["close", "exit", "kill", "segfault"])
+def test_a_plain_print_is_not_lost_in_a_buffer(tmp_path: Path, how: str) -> None:
+    """Nobody writes ``flush=True``; what came before a death is in the error, too."""
+    path = tmp_path / "worker.log"
+    repository = tmp_path / "repository"
+    repository.mkdir()
+    (repository / "env.py").write_text(_CHATTY)
+    with make_env(str(repository), env_kwargs={"how": how}, policy={"output": str(path)}) as suites:
+        suites.env.reset()
+        suites.env.step([0])
+        if how != "close":
+            with pytest.raises(errors.WorkerDiedError, match="step 2") as caught:
+                suites.env.step([1])
+            assert "step 1" in caught.value.log_tail
+    last = "closed" if how == "close" else "step 2"
+    assert path.read_text().splitlines()[:3] == ["reset", "step 1", last]
+
+
+_CHATTY = """
+import ctypes, os, signal
+import gymnasium as gym
+
+class Chatty(gym.Env):
+    observation_space = action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, how):
+        self.how = how
+
+    def reset(self, *, seed=None, options=None):
+        self.steps = 0
+        print("reset")
+        return 0, {}
+
+    def step(self, action):
+        self.steps += 1
+        print("step", self.steps)
+        if action and self.how == "exit":
+            os._exit(3)
+        if action and self.how == "kill":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if action:
+            ctypes.string_at(0)
+        return 0, 0.0, False, False, {}
+
+    def close(self):
+        print("closed")
+
+def make_env(n_envs=1, use_async_envs=False, how=""):
+    return gym.vector.SyncVectorEnv([lambda: Chatty(how)] * n_envs)
+"""
+
+
 def test_output_of_loading_and_closing_is_there(tmp_path: Path) -> None:
     """From the first line to the last."""
     with pytest.raises(errors.LoadError):
@@ -78,11 +130,17 @@ def test_a_flood_is_bounded_and_said(tmp_path: Path) -> None:
 
 
 def test_a_file_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
-    """Before anything runs."""
-    with made(tmp_path / "nowhere" / "w.log", "exit") as suites:
+    """Before anything runs, whether it is ``make_env`` or the first reset that would run it."""
+    with made(None, "exit"):
+        pass  # its manifest is known from here on
+    nowhere = tmp_path / "nowhere" / "w.log"
+    with made(nowhere, "exit") as suites:
         with pytest.raises(errors.PolicyError, match="output"):
             suites.env.reset()
         assert suites.env.sandbox_report == []
+    with pytest.raises(errors.PolicyError, match="output"):
+        made(nowhere, "never met before")
+    assert followers() == []
 
 
 def test_the_log_tells_the_life_of_a_jail(caplog: pytest.LogCaptureFixture) -> None:
