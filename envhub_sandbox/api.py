@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox import inprocess, snapshot_store
+from envhub_sandbox import arguments, inprocess, snapshot_store
 from envhub_sandbox.config import plain_config
 from envhub_sandbox.deadline import Deadline
-from envhub_sandbox.errors import PolicyError
+from envhub_sandbox.errors import HubReferenceError, PolicyError, SnapshotError
 from envhub_sandbox.jail_sources import JailSource, OwnJails, SharedJail
 from envhub_sandbox.manifest_cache import ManifestCache, manifest_key
 from envhub_sandbox.policy import Limits, Policy, Timeouts, limits_from, policy_from, timeouts_from
@@ -93,18 +93,33 @@ def make_env(
     reference, config = _reference(cfg)
     if lane not in _LANES:
         raise PolicyError(f"lane is {lane!r}; it is one of {', '.join(_LANES)}")
-    if n_envs < 1:
-        raise ValueError("`n_envs` must be at least 1")
+    n_envs = arguments.sub_environments(n_envs)
+    use_async_envs = arguments.flag("use_async_envs", use_async_envs)
+    num_workers = arguments.workers(num_workers)
+    further = arguments.keyword_arguments(env_kwargs)
     if sandbox is None and not trust_remote_code:
         raise inprocess.refusal(reference)
-    if sandbox is None and validate:
-        raise PolicyError("validate=True is for environments in a sandbox; here there is none")
+    if sandbox is None:
+        arguments.only_in_a_sandbox(
+            {
+                "policy": policy,
+                "timeouts": timeouts,
+                "limits": limits,
+                "python": python,
+                "num_workers": num_workers,
+                "validate": validate,
+                "server_key": server_key,
+            }
+        )
     chosen_policy = policy_from(policy, limits_from(limits))
     chosen_timeouts = timeouts_from(timeouts)
     place = None if sandbox is None else _sandbox(sandbox, server_key)
+    runs_on = arguments.interpreter(python)
+    if sandbox == "process":
+        arguments.check_executable(runs_on)
     snapshot = _snapshot(reference, hub_cache_dir, token, endpoint)
     if place is None:
-        envs = inprocess.make(snapshot, n_envs, use_async_envs, config, dict(env_kwargs or {}))
+        envs = inprocess.make(snapshot, n_envs, use_async_envs, config, further)
         return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))
     repository = Repository(
         snapshot,
@@ -112,12 +127,12 @@ def make_env(
             n_envs=n_envs,
             use_async_envs=use_async_envs,
             cfg=None if config is None else plain_config(config),
-            env_kwargs=dict(env_kwargs or {}),
+            env_kwargs=further,
         ),
         chosen_policy,
         chosen_timeouts,
         place,
-        _interpreter(python),
+        runs_on,
         snapshot_store.cache_root() / "snapshots",
         lane,
         copy,
@@ -230,12 +245,14 @@ def _reference(cfg: Any) -> tuple[str, Any]:
     if isinstance(cfg, os.PathLike):
         return os.path.abspath(cfg), None
     hub_path = getattr(cfg, "hub_path", None)
-    if not isinstance(hub_path, str):
-        raise TypeError(
-            "cfg is a hub reference, a folder, or an object with a hub_path, not "
-            f"{type(cfg).__module__}.{type(cfg).__qualname__}"
-        )
-    return hub_path, cfg
+    if isinstance(hub_path, os.PathLike):
+        return os.path.abspath(hub_path), cfg
+    if isinstance(hub_path, str):
+        return hub_path, cfg
+    kind = f"{type(cfg).__module__}.{type(cfg).__qualname__}"
+    if hasattr(cfg, "hub_path"):
+        raise TypeError(f"cfg is a {kind} whose hub_path is {hub_path!r}; it takes a hub reference")
+    raise TypeError(f"cfg is a hub reference, a folder, or an object with a hub_path, not {kind}")
 
 
 def _snapshot(
@@ -243,8 +260,14 @@ def _snapshot(
 ) -> Snapshot:
     if is_local(reference):
         return local(reference)
-    ref = HubRef.parse(reference)
-    return fetch(ref, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
+    try:
+        ref = HubRef.parse(reference)
+        return fetch(ref, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
+    except (HubReferenceError, SnapshotError) as error:
+        if os.path.exists(reference.partition(":")[0]):
+            hint = f"There is such a folder here; for it, write './{reference}'."
+            error.args = (f"{error}\n{hint}",)
+        raise
 
 
 def _sandbox(sandbox: str | Sandbox, server_key: str | None) -> Sandbox:
@@ -256,13 +279,13 @@ def _sandbox(sandbox: str | Sandbox, server_key: str | None) -> Sandbox:
         raise PolicyError(
             "server_key is for sandbox='tcp://HOST:PORT'; a RemoteSandbox has its own"
         )
-    if not isinstance(sandbox, str):
+    if not isinstance(sandbox, str) and callable(getattr(sandbox, "acquire", None)):
         return sandbox
     if sandbox == "process":
         from envhub_sandbox.sandboxes.process import PROCESS
 
         return PROCESS
-    kind, _, image = sandbox.partition(":")
+    kind, _, image = sandbox.partition(":") if isinstance(sandbox, str) else ("", "", "")
     if kind == "docker":
         from envhub_sandbox.sandboxes.docker import DockerSandbox
 
@@ -271,7 +294,3 @@ def _sandbox(sandbox: str | Sandbox, server_key: str | None) -> Sandbox:
         f"sandbox is {sandbox!r}; it is 'process', 'docker', 'tcp://HOST:PORT', or None to run the "
         "code here"
     )
-
-
-def _interpreter(python: str | Path | None) -> str:
-    return "" if python is None else os.path.abspath(os.path.expanduser(python))

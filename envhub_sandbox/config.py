@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
@@ -15,7 +16,7 @@ _MAX_DEPTH = 16
 
 
 def plain_config(config: Any) -> dict[str, object]:
-    """The ``vars()`` of a config object, nested ones included.
+    """The ``vars()`` of a config object with nested ones, and its own public properties.
 
     Dataclasses and other plain objects become mappings, enums their values, paths text. What has
     no plain form (a function, an open file) is left out: nothing of the caller is pickled.
@@ -28,7 +29,23 @@ def _attributes(config: Any, depth: int) -> dict[str, object]:
     if is_dataclass(config):
         names = list(dict.fromkeys([*(item.name for item in fields(config)), *names]))
     made = {name: _plain(getattr(config, name, None), depth + 1) for name in names}
+    if not depth:
+        made |= {name: _plain(_property(config, name), 1) for name in _properties(config)}
     return {name: value for name, value in made.items() if value is not _LEFT_OUT}
+
+
+def _properties(config: Any) -> list[str]:
+    """What the class of a config computes: LeRobot's have their ``type`` so."""
+    kind = type(config)
+    public = [name for name in dir(kind) if not name.startswith("_")]
+    return [name for name in public if isinstance(inspect.getattr_static(kind, name), property)]
+
+
+def _property(config: Any, name: str) -> Any:
+    try:
+        return getattr(config, name)
+    except Exception:
+        return _LEFT_OUT
 
 
 _LEFT_OUT = object()

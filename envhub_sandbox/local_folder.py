@@ -39,12 +39,16 @@ def split_local(text: str, path: str) -> tuple[Path, str]:
     """The folder and entry of ``./env``, ``./env:sub/env.py`` or ``./env/other.py``.
 
     Raises:
-        RepositoryUnavailableError: There is no such folder.
+        RepositoryUnavailableError: There is no such folder, or the file is not Python's.
     """
     folder = Path(os.path.abspath(os.path.expanduser(text)))
     if folder.is_dir():
         return folder, os.path.normpath(path)
     if folder.is_file():
+        if folder.suffix != ".py":
+            raise RepositoryUnavailableError(
+                f"local file {text!r}: an entry is a .py file, or a folder with an env.py"
+            )
         return folder.parent, folder.name
     before, colon, after = text.rpartition(":")
     if colon and before and after:

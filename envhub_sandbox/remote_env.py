@@ -225,10 +225,14 @@ class RemoteEnv(Mortal):
                 request=operation,
             )
         if state is State.DEAD:
+            advice = "call reset() first"
+            if self.repository.policy.restart == "never":
+                advice = (
+                    "make the environment again, or use policy={'restart': 'on_reset'} and call "
+                    "reset()"
+                )
             raise WorkerDiedError(
-                f"cannot {operation}: the worker process has died; make the environment again, or "
-                "use policy={'restart': 'on_reset'} and call reset()",
-                request=operation,
+                f"cannot {operation}: the worker process has died; {advice}", request=operation
             )
         if state is State.EXPIRED:
             raise self._expired(operation, "it was idle for too long")

@@ -23,6 +23,15 @@ _PROGRAMS = {
     "probe": "envhub_worker.lockdown.probe",
 }
 
+_NEEDED = {
+    "cloudpickle": "cloudpickle",
+    "gymnasium": "gymnasium",
+    "msgpack": "msgpack",
+    "numpy": "numpy",
+    "zmq": "pyzmq",
+}
+"""What this package imports, and what that is called where it is installed from."""
+
 
 def command(python: str, program: str, *args: str) -> list[str]:
     """The argv that runs ``program`` (a key of ``_PROGRAMS``) with ``args`` in ``python``."""
@@ -50,8 +59,18 @@ def main(argv: Sequence[str]) -> int:
         sys.stderr.write(f"usage: bootstrap.py {{{','.join(_PROGRAMS)}}} ARGS...\n")
         return 2
     load_package()
-    program = importlib.import_module(_PROGRAMS[argv[0]])
-    return int(program.main(list(argv[1:])) or 0)
+    try:
+        program = importlib.import_module(_PROGRAMS[argv[0]])
+        return int(program.main(list(argv[1:])) or 0)
+    except ModuleNotFoundError as error:
+        if error.name not in _NEEDED:
+            raise
+        needed = " ".join(_NEEDED.values())
+        sys.stderr.write(
+            f"ModuleNotFoundError: {sys.executable} has no {_NEEDED[error.name]}, which the worker needs; install what "
+            f"it needs there: {sys.executable} -m pip install {needed}\n"
+        )
+        return 1
 
 
 if __name__ == "__main__":

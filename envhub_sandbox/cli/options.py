@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import re
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -13,8 +14,8 @@ from typing import Annotated, Any
 import typer
 
 from envhub_sandbox.cli.exits import ForeignError, UsageError
-from envhub_sandbox.errors import EnvHubError, HubReferenceError, SnapshotError
-from envhub_sandbox.reference import is_local
+from envhub_sandbox.errors import EnvHubError
+from envhub_worker.protocol.limits import MAX_NUM_ENVS
 
 _CODE, _LIMITS, _HUB = "How it is built", "What it may do", "Where it comes from"
 _UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
@@ -29,7 +30,9 @@ Ref = Annotated[
 ]
 NEnvs = Annotated[
     int,
-    typer.Option("--n-envs", "-n", min=1, help="Sub-environments.", rich_help_panel=_CODE),
+    typer.Option(
+        "--n-envs", "-n", min=1, max=MAX_NUM_ENVS, help="Sub-environments.", rich_help_panel=_CODE
+    ),
 ]
 UseAsync = Annotated[
     bool,
@@ -241,18 +244,10 @@ class MakeOptions:
 
     @contextlib.contextmanager
     def explained(self) -> Iterator[None]:
-        """Say more of an error than who raised it could know.
-
-        A reference that is a folder here gets a hint. Without a sandbox, whatever is raised is the
-        repository's own.
-        """
+        """Without a sandbox whatever is raised is the repository's, and its prints go to stderr."""
         try:
-            yield
-        except (HubReferenceError, SnapshotError) as error:
-            if not is_local(self.ref) and os.path.exists(self.ref.partition(":")[0]):
-                hint = f"There is such a folder here; for it, write './{self.ref}'."
-                error.args = (f"{error}\n{hint}",)
-            raise
+            with prints_on_stderr() if self.in_process else contextlib.nullcontext():
+                yield
         except Exception as error:
             if not self.in_process or isinstance(error, EnvHubError):
                 raise
@@ -284,6 +279,20 @@ class MakeOptions:
 
 def _given(options: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in options.items() if value is not None}
+
+
+@contextlib.contextmanager
+def prints_on_stderr() -> Iterator[None]:
+    """Keep stdout to the results: what Python prints meanwhile, and what libraries do."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
 
 
 def read_size(option: str, text: str | None) -> int | None:

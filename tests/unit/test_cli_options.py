@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,7 +9,7 @@ import pytest
 from envhub_sandbox.cli.exits import ForeignError, UsageError
 from envhub_sandbox.cli.options import MakeOptions, read_env_kwargs, read_size
 from envhub_sandbox.cli.select import select
-from envhub_sandbox.errors import HubReferenceError, RemoteEnvError
+from envhub_sandbox.errors import RemoteEnvError
 
 NOTHING: dict[str, Any] = dict.fromkeys(
     (
@@ -104,24 +103,6 @@ def test_running_unprotected_needs_the_word() -> None:
     with pytest.raises(UsageError, match="--trust-remote-code"):
         options(sandbox="none").arguments()
     assert options(sandbox="none", trust=True).arguments()["sandbox"] is None
-
-
-def test_a_folder_written_like_a_repository_gets_a_hint(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """``examples/cartpole`` is a hub reference; the folder is ``./examples/cartpole``."""
-    (tmp_path / "examples" / "cartpole").mkdir(parents=True)
-    monkeypatch.chdir(tmp_path)
-    with (
-        pytest.raises(HubReferenceError, match=r"write '\./examples/cartpole:env\.py'"),
-        options(ref="examples/cartpole:env.py").explained(),
-    ):
-        raise HubReferenceError("not found")
-    with (
-        pytest.raises(HubReferenceError, match=r"not found$"),
-        options(ref="examples/other").explained(),
-    ):
-        raise HubReferenceError("not found")
 
 
 def test_only_without_a_sandbox_are_strange_errors_the_repositorys() -> None:

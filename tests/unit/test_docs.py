@@ -16,8 +16,8 @@ import pytest
 
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import TABLE, Event, State
-from envhub_worker.protocol.limits import DEFAULT_LIMITS
-from envhub_worker.protocol.manifest import MAX_ENVS, MAX_NAME, MAX_NUM_ENVS
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, MAX_NUM_ENVS
+from envhub_worker.protocol.manifest import MAX_ENVS, MAX_NAME
 from tests.unit.test_imports import folder
 
 CHECKOUT = Path(__file__).resolve().parents[2]

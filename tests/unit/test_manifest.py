@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 
 from envhub_worker.protocol.codec import decode, encode
 from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.limits import MAX_NUM_ENVS
 from envhub_worker.protocol.manifest import (
     MAX_ENVS,
     MAX_NAME,
     MAX_NAMES,
-    MAX_NUM_ENVS,
     EnvManifest,
     Manifest,
     decode_env,

@@ -223,6 +223,8 @@ def test_dead_zygote_is_told_with_its_log(folder: Path, confinement: Confinement
     wait_until(lambda: any(isinstance(e, ZygoteDied) for e in _keep(spawner)), "it lives")
     died = next(event for event in _SEEN if isinstance(event, ZygoteDied))
     assert "ModuleNotFoundError" in died.log
+    assert "pip install cloudpickle gymnasium msgpack numpy pyzmq" in died.log
+    assert "Traceback" not in died.log
     assert died.code == 1
     spawner.close()
 

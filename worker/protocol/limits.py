@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 KIB = 1024
 MIB = 1024 * KIB
+MAX_NUM_ENVS = 65_536
+"""Sub-environments of one vector environment."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,12 +13,11 @@ from typing import Any
 import gymnasium as gym
 
 from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.limits import MAX_NUM_ENVS
 from envhub_worker.protocol.spaces import decode_space, encode_space
 
 MAX_ENVS = 4096
 """Vector environments in one manifest: a benchmark suite has a few hundred tasks."""
-MAX_NUM_ENVS = 65_536
-"""Sub-environments of one vector environment."""
 MAX_NAME = 512
 """Characters of a suite, task, attribute or package name."""
 MAX_NAMES = 1024
