@@ -67,8 +67,8 @@ def main(argv: Sequence[str]) -> int:
             raise
         needed = " ".join(_NEEDED.values())
         sys.stderr.write(
-            f"ModuleNotFoundError: {sys.executable} has no {_NEEDED[error.name]}, which the worker needs; install what "
-            f"it needs there: {sys.executable} -m pip install {needed}\n"
+            f"ModuleNotFoundError: {sys.executable} has no {_NEEDED[error.name]}, which the worker "
+            f"needs; install all of it there: {sys.executable} -m pip install {needed}\n"
         )
         return 1
 
