@@ -52,22 +52,23 @@ def make_env(
 
     Args:
         cfg: A hub reference (``"org/repo@commit:path"``), a local folder (``"./my-env"``), or a
-            ``HubEnvConfig``-like object with ``hub_path``, whose ``vars()`` the repository's
-            ``make_env`` gets as ``cfg``.
+            ``HubEnvConfig``-like object with ``hub_path``, whose ``vars()`` and public properties
+            the repository's ``make_env`` gets as ``cfg``.
         n_envs: Number of sub-environments, passed to the repository's ``make_env``.
         use_async_envs: Passed on likewise; sub-environments may then run in several processes.
         hub_cache_dir: huggingface_hub's ``cache_dir``.
         trust_remote_code: Only for ``sandbox=None``.
         sandbox: ``"process"``; ``"docker"``, ``"docker:IMAGE"`` or a ``DockerSandbox``;
             ``"tcp://HOST:PORT"`` or a ``RemoteSandbox``; or None to run the code here, as LeRobot
-            does.
+            does, where nothing of what protects can be asked for.
         env_kwargs: Further keyword arguments for the repository's ``make_env``.
         policy: What the code may reach; see ``Policy``.
         timeouts: How long operations may take; see ``Timeouts``.
         limits: Hard caps; replaces ``policy.limits``.
         token: As in huggingface_hub.
         endpoint: As in huggingface_hub.
-        python: The interpreter that runs the repository; this one by default.
+        python: The interpreter that runs the repository; this one by default. It needs cloudpickle,
+            gymnasium, msgpack, numpy and pyzmq beside the repository's own packages.
         num_workers: Processes over which the sub-environments are spread; by default one, or with
             ``use_async_envs`` as many as are useful for the cores there are.
         lane: ``"auto"`` steps over shared memory where that is possible, ``"frames"`` never does.
@@ -83,6 +84,7 @@ def make_env(
 
     Raises:
         HubReferenceError: ``cfg`` cannot be read.
+        TypeError, ValueError: A plain argument that nothing can be made of.
         SnapshotError: The files cannot be had, or are not what the commit says.
         PolicyError: An unknown or impossible policy, limit or timeout.
         SandboxUnavailableError: This host cannot enforce the policy.

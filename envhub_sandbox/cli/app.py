@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import typer
 
 from envhub_sandbox.cli import cache, doctor, gc, image, inspect, replay, run, version
@@ -18,6 +20,29 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+def _print_versions(wanted: bool) -> None:
+    if wanted:
+        version.version()
+        raise typer.Exit
+
+
+@app.callback()
+def envhub(
+    versions: Annotated[
+        bool,
+        typer.Option(
+            "--version",
+            callback=_print_versions,
+            is_eager=True,
+            help="Print versions, as the command does.",
+        ),
+    ] = False,
+) -> None:
+    """What stands before a command."""
+
+
 app.command("run", epilog=EXIT_CODES)(run.run)
 app.command("inspect", epilog=EXIT_CODES)(inspect.inspect)
 app.command("replay", epilog=EXIT_CODES)(replay.replay)

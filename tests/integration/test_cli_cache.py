@@ -104,4 +104,5 @@ def test_version_names_everything_that_matters() -> None:
     versions = json.loads(RUNNER.invoke(app, ["version", "--json"]).stdout)
     assert versions["envhub-sandbox"] == __version__
     assert {"protocol", "python", "gymnasium", "huggingface_hub"} <= set(versions)
-    assert __version__ in RUNNER.invoke(app, ["version"]).stdout
+    for words in (["version"], ["--version"]):
+        assert __version__ in RUNNER.invoke(app, words).stdout

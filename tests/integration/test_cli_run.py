@@ -16,6 +16,17 @@ from tests.support.processes import descendants, eventually
 from tests.support.repositories import write_repository
 from tests.support.samples import EXAMPLES, sample
 
+_PRINTS = """
+import os
+import gymnasium as gym
+
+print("printed by Python")
+os.system("echo printed by a child")
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([lambda: gym.make("CartPole-v1")] * n_envs)
+"""
+
 _ONE_ENV = """
 import gymnasium as gym
 import numpy as np
@@ -337,3 +348,15 @@ def test_nothing_is_left_running() -> None:
     envhub("run", EXAMPLES / "cartpole", "--episodes", "1")
     envhub("run", sample("exits"), "--episodes", "1")
     assert eventually(lambda: descendants() <= before)
+
+
+@pytest.mark.parametrize("command", ["run", "inspect"])
+def test_prints_stay_off_stdout_without_a_sandbox(command: str, tmp_path: Path) -> None:
+    """It has the results and nothing else, whoever prints in this process or below it."""
+    folder = write_repository(tmp_path / "prints", _PRINTS)
+    words = [command, folder, "--sandbox", "none", "--trust-remote-code"]
+    done = envhub(*words, "--json")
+    assert done.returncode == 0, done.stderr
+    json.loads(done.stdout)
+    assert "printed by Python" in done.stderr
+    assert "printed by a child" in done.stderr

@@ -18,6 +18,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import TABLE, Event, State
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, MAX_NUM_ENVS
 from envhub_worker.protocol.manifest import MAX_ENVS, MAX_NAME
+from tests.support import settings
 from tests.unit.test_imports import folder
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -295,3 +296,8 @@ def test_error_tree_is_the_tree() -> None:
             assert issubclass(cls, parents[depth - 1]), name
     shown = {name for _, name in tree}
     assert {name for name in errors.__all__ if name.endswith("Error")} <= shown
+
+
+def test_settings_are_written_from_the_docstrings() -> None:
+    """``python -m tests.support.settings`` writes them again."""
+    assert settings.DOCUMENT.read_text() == settings.document()
