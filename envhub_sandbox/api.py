@@ -10,18 +10,17 @@ from typing import Any
 from envhub_sandbox import arguments, inprocess, snapshot_store
 from envhub_sandbox.config import plain_config
 from envhub_sandbox.deadline import Deadline
-from envhub_sandbox.errors import HubReferenceError, PolicyError, SnapshotError
+from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.jail_sources import JailSource, OwnJails, SharedJail
 from envhub_sandbox.manifest_cache import ManifestCache, manifest_key
 from envhub_sandbox.policy import Limits, Policy, Timeouts, limits_from, policy_from, timeouts_from
 from envhub_sandbox.provenance import provenance_of
 from envhub_sandbox.recipe import Recipe, pinned
-from envhub_sandbox.reference import HubRef, is_local
 from envhub_sandbox.remote_env import RemoteEnv
 from envhub_sandbox.repository import LoadArguments, LoadedJail, Repository
 from envhub_sandbox.sandboxes.base import Sandbox
 from envhub_sandbox.sharding import bounds_for
-from envhub_sandbox.snapshot import Snapshot, fetch, local
+from envhub_sandbox.snapshot import named
 from envhub_sandbox.suites import EnvSuites
 from envhub_sandbox.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.manifest import EnvManifest, Manifest
@@ -99,9 +98,9 @@ def make_env(
     use_async_envs = arguments.flag("use_async_envs", use_async_envs)
     num_workers = arguments.workers(num_workers)
     further = arguments.keyword_arguments(env_kwargs)
-    if sandbox is None and not trust_remote_code:
-        raise inprocess.refusal(reference)
     if sandbox is None:
+        if not trust_remote_code:
+            raise inprocess.refusal(reference)
         arguments.only_in_a_sandbox(
             {
                 "policy": policy,
@@ -119,7 +118,7 @@ def make_env(
     runs_on = arguments.interpreter(python)
     if sandbox == "process":
         arguments.check_executable(runs_on)
-    snapshot = _snapshot(reference, hub_cache_dir, token, endpoint)
+    snapshot = named(reference, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
     if place is None:
         envs = inprocess.make(snapshot, n_envs, use_async_envs, config, further)
         return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))
@@ -257,21 +256,6 @@ def _reference(cfg: Any) -> tuple[str, Any]:
     raise TypeError(f"cfg is a hub reference, a folder, or an object with a hub_path, not {kind}")
 
 
-def _snapshot(
-    reference: str, hub_cache_dir: str | Path | None, token: str | bool | None, endpoint: str | None
-) -> Snapshot:
-    if is_local(reference):
-        return local(reference)
-    try:
-        ref = HubRef.parse(reference)
-        return fetch(ref, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
-    except (HubReferenceError, SnapshotError) as error:
-        if os.path.exists(reference.partition(":")[0]):
-            hint = f"There is such a folder here; for it, write './{reference}'."
-            error.args = (f"{error}\n{hint}",)
-        raise
-
-
 def _sandbox(sandbox: str | Sandbox, server_key: str | None) -> Sandbox:
     if isinstance(sandbox, str) and sandbox.startswith("tcp://"):
         from envhub_sandbox.sandboxes.remote import RemoteSandbox
@@ -281,18 +265,24 @@ def _sandbox(sandbox: str | Sandbox, server_key: str | None) -> Sandbox:
         raise PolicyError(
             "server_key is for sandbox='tcp://HOST:PORT'; a RemoteSandbox has its own"
         )
-    if not isinstance(sandbox, str) and callable(getattr(sandbox, "acquire", None)):
+    if not isinstance(sandbox, str):
+        if not callable(getattr(sandbox, "acquire", None)):
+            raise _unknown(sandbox)
         return sandbox
     if sandbox == "process":
         from envhub_sandbox.sandboxes.process import PROCESS
 
         return PROCESS
-    kind, _, image = sandbox.partition(":") if isinstance(sandbox, str) else ("", "", "")
+    kind, _, image = sandbox.partition(":")
     if kind == "docker":
         from envhub_sandbox.sandboxes.docker import DockerSandbox
 
         return DockerSandbox(image=image) if image else DockerSandbox()
-    raise PolicyError(
+    raise _unknown(sandbox)
+
+
+def _unknown(sandbox: object) -> PolicyError:
+    return PolicyError(
         f"sandbox is {sandbox!r}; it is 'process', 'docker', 'tcp://HOST:PORT', or None to run the "
         "code here"
     )

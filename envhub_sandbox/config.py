@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import os
 from collections.abc import Mapping
@@ -30,22 +31,20 @@ def _attributes(config: Any, depth: int) -> dict[str, object]:
         names = list(dict.fromkeys([*(item.name for item in fields(config)), *names]))
     made = {name: _plain(getattr(config, name, None), depth + 1) for name in names}
     if not depth:
-        made |= {name: _plain(_property(config, name), 1) for name in _properties(config)}
+        made |= {name: _plain(value, 1) for name, value in _computed(config).items()}
     return {name: value for name, value in made.items() if value is not _LEFT_OUT}
 
 
-def _properties(config: Any) -> list[str]:
-    """What the class of a config computes: LeRobot's have their ``type`` so."""
+def _computed(config: Any) -> dict[str, Any]:
+    """The public properties of a config that can be had: LeRobot's have their ``type`` so."""
     kind = type(config)
-    public = [name for name in dir(kind) if not name.startswith("_")]
-    return [name for name in public if isinstance(inspect.getattr_static(kind, name), property)]
-
-
-def _property(config: Any, name: str) -> Any:
-    try:
-        return getattr(config, name)
-    except Exception:
-        return _LEFT_OUT
+    found = {}
+    for name in dir(kind):
+        if name.startswith("_") or not isinstance(inspect.getattr_static(kind, name), property):
+            continue
+        with contextlib.suppress(Exception):
+            found[name] = getattr(config, name)
+    return found
 
 
 _LEFT_OUT = object()

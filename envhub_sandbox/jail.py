@@ -154,14 +154,21 @@ class RemoteJail:
     def exchange(
         self, operation: str, requests: Sequence[tuple[int, m.Message]], deadline: Deadline
     ) -> list[m.Message]:
-        """``send`` and ``receive``; a host's exception is raised."""
-        try:
-            replies = self.receive(self.send(operation, requests), deadline)
-        except HostsDiedError as error:
-            raise error.first from None
+        """``ask`` for messages that are not packed; a host's exception is raised."""
+        packed = [(host, self.pack(message)) for host, message in requests]
+        replies = self.ask(operation, packed, deadline)
         for reply in replies:
             check(reply)
         return replies
+
+    def ask(
+        self, operation: str, requests: Sequence[tuple[int, list[Buffer]]], deadline: Deadline
+    ) -> list[m.Message]:
+        """``relay`` and ``receive``; of deaths, the first is raised."""
+        try:
+            return self.receive(self.relay(operation, requests), deadline)
+        except HostsDiedError as error:
+            raise error.first from None
 
     def output(self, operation: str, deadline: Deadline) -> str:
         """The last lines that the jail printed.

@@ -255,21 +255,21 @@ class Mortal(Tenant):
         except WorkerTimeoutError as error:
             raise self._late("reset", reset_s) from error
 
-    def _remember(self, operation: str, message_for: MessageFor) -> None:
-        """What was asked may have to be asked again, and fresh hosts need seeds."""
+    def _remember(self, message_for: MessageFor, message: m.Message, sent: list[Frames]) -> None:
+        """What was asked may have to be asked again, and fresh hosts need seeds.
+
+        Args:
+            message_for: Makes it again.
+            message: What the first shard was asked.
+            sent: What was sent to each.
+        """
         self._asked = message_for
         self._setting = None
-        if self._revives and operation == "reset":
+        if self._revives and isinstance(message, m.Reset):
             self._seeds.remember(self._reset_of((0, self.manifest.num_envs)))
-        if self._revives and operation == "set_attr":
-            self._setting = self._packed([message_for(self._number, one) for one in self.bounds])
-
-    def _packed(self, messages: Sequence[m.Message]) -> tuple[str, list[Frames]]:
-        """An attribute's name, and copies of the frames that set it: their values may change."""
-        assert self._loaded is not None
-        pack = self._loaded.jail.pack
-        frames: list[Frames] = [list(map(bytes, pack(message))) for message in messages]
-        return typed(messages[0], m.SetAttr).name, frames
+        if self._revives and isinstance(message, m.SetAttr):
+            # copies: large values are sent from where they lie, and may change
+            self._setting = message.name, [list(map(bytes, frames)) for frames in sent]
 
     def _has_set(self) -> None:
         """Every sub-environment has answered: fresh ones are told what was set, if it was."""

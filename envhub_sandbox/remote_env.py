@@ -58,8 +58,8 @@ class RemoteEnv(Mortal):
                 (host, message_for(self._number, bounds))
                 for host, bounds in zip(self._hosts, self.bounds, strict=True)
             ]
-            self._send(operation, requests)
-            self._remember(operation, message_for)
+            sent = self._send(operation, requests)
+            self._remember(message_for, requests[0][1], sent)
             self.history.requested(message_for)
 
     def collect(self, timeout_s: float | None) -> list[m.Message]:
@@ -246,7 +246,10 @@ class RemoteEnv(Mortal):
         if state not in (State.IDLE, State.READY):
             raise WorkerError(f"cannot {operation}: the environment is {state.value}")
 
-    def _send(self, operation: str, requests: Sequence[tuple[int, m.Message]]) -> None:
+    def _send(
+        self, operation: str, requests: Sequence[tuple[int, m.Message]]
+    ) -> list[list[Buffer]]:
+        """Send each host its message; returns the frames of each."""
         assert self._loaded is not None
         self._asked_ns = perf_counter_ns()
         jail = self._loaded.jail
@@ -255,7 +258,7 @@ class RemoteEnv(Mortal):
         # what may have to be repeated in a fresh host goes by the server, who knows the dead
         if self._lane and not self._revives and lane_requests.takes(operation, messages):
             self._tell(operation, messages)
-            return
+            return messages
         self.lifecycle.on(Event.SUBMIT)  # first, as for a step by the lane
         try:
             request_id = jail.relay(operation, packed)
@@ -266,6 +269,7 @@ class RemoteEnv(Mortal):
         if self._lane and operation == "reset":
             self._lane.observations.leave()
         self.counters.requests += 1
+        return messages
 
     def _tell(self, operation: str, messages: list[list[Buffer]]) -> None:
         assert self._place is not None

@@ -8,16 +8,17 @@ read-only in a store of our own. A full commit that is in the store costs no req
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
 from envhub_sandbox import snapshot_store as store
-from envhub_sandbox.errors import RepositoryUnavailableError, SnapshotError
+from envhub_sandbox.errors import HubReferenceError, RepositoryUnavailableError, SnapshotError
 from envhub_sandbox.hub import HubClient, Repository, checked_endpoint, checked_token
 from envhub_sandbox.hub_failures import ABSENT, UNREACHABLE, HubFailure, Kind
 from envhub_sandbox.hub_fetch import Candidate, missing_entry
 from envhub_sandbox.local_folder import content_commit, copier, hash_files, scan, split_local
-from envhub_sandbox.reference import DEFAULT_PATH, HubRef
+from envhub_sandbox.reference import DEFAULT_PATH, HubRef, is_local
 from envhub_sandbox.snapshot_records import (
     DEFAULT_LIMITS,
     FileRecord,
@@ -31,6 +32,29 @@ __all__ = ["FileRecord", "Snapshot", "SnapshotLimits", "fetch", "local"]
 
 _SHOWN_COMMITS = 5
 _LOCAL_COPIES_DAYS = 14.0
+
+
+def named(
+    reference: str,
+    *,
+    hub_cache_dir: str | Path | None = None,
+    token: str | bool | None = None,
+    endpoint: str | None = None,
+) -> Snapshot:
+    """The snapshot of a hub reference or of a local folder; raises as ``fetch`` and ``local`` do.
+
+    A reference that is also a folder here gets a hint.
+    """
+    if is_local(reference):
+        return local(reference)
+    try:
+        ref = HubRef.parse(reference)
+        return fetch(ref, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
+    except (HubReferenceError, SnapshotError) as error:
+        if os.path.exists(reference.partition(":")[0]):
+            hint = f"There is such a folder here; for it, write './{reference}'."
+            error.args = (f"{error}\n{hint}",)
+        raise
 
 
 def fetch(

@@ -9,11 +9,11 @@ from envhub_sandbox.building import Place
 from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError, WorkerError
 from envhub_sandbox.fast_lane import Outcome
-from envhub_sandbox.jail import HostsDiedError
+from envhub_sandbox.jail import HostsDiedError, typed
 from envhub_sandbox.results import Results
+from envhub_sandbox.reviving import Frames
 from envhub_worker.protocol import batches
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec import Buffer
 from envhub_worker.protocol.manifest import EnvManifest
 
 _CAUSE_S = 10.0
@@ -103,24 +103,24 @@ def _fetch_infos(place: Place, host: int) -> m.Message:
 def set_again(
     place: Place,
     dead: Sequence[int],
-    settings: Sequence[tuple[str, Sequence[list[Buffer]]]],
+    settings: Sequence[tuple[str, Sequence[Frames]]],
     deadline: Deadline,
 ) -> list[str]:
     """Set attributes in the fresh hosts of some shards; the names of those whose setter raised.
 
     Raises:
         WorkerError: One died again, or took too long.
+        RemoteProtocolError: One answered with something else.
     """
-    jail = place.loaded.jail
     failed = []
     for name, frames in settings:
         asked = [(place.hosts[index], frames[index]) for index in dead]
-        try:
-            replies = jail.receive(jail.relay("set_attr", asked), deadline)
-        except HostsDiedError as error:
-            raise error.first from None
+        replies = place.loaded.jail.ask("set_attr", asked, deadline)
         if any(isinstance(reply, m.Raised) for reply in replies):
             failed.append(name)
+        for reply in replies:
+            if not isinstance(reply, m.Raised):
+                typed(reply, m.Value)
     return failed
 
 

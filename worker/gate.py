@@ -200,7 +200,7 @@ class RemoteGate:
         identity = router.recv(zmq.NOBLOCK)
         # not of the frame before: libzmq 4.3.4 knows nothing of who sent the first one
         header = router.recv(zmq.NOBLOCK, copy=False)
-        rest = router.recv_multipart(zmq.NOBLOCK) if header.more else []
+        rest = receive(router) if header.more else []
         return identity, self._key_of(header), [header.bytes, *rest]
 
     def _key_of(self, frame: zmq.Frame) -> bytes:

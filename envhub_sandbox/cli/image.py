@@ -60,7 +60,9 @@ def build(
     with reported(debug=debug):
         with Bar(quiet=json) as bar:
             bar.begin(f"reading {ref}")
-            snapshot = _snapshot(ref, token, endpoint, hub_cache_dir)
+            from envhub_sandbox.snapshot import named
+
+            snapshot = named(ref, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
             bar.begin("resolving and building")
             made = _build(snapshot, base, engine, apt or [], exclude_newer, build_network)
         if json:
@@ -69,18 +71,6 @@ def build(
         console().print(safe_line(made["image"], 300), soft_wrap=True)
         say(f"{len(made['packages'])} packages, lock sha256:{made['lock']}")
         say(f"Use it: envhub run {safe_line(ref)} --sandbox docker:{made['image']}")
-
-
-def _snapshot(
-    ref: str, token: str | None, endpoint: str | None, hub_cache_dir: str | None
-) -> Snapshot:
-    from envhub_sandbox.reference import HubRef, is_local
-    from envhub_sandbox.snapshot import fetch, local
-
-    if is_local(ref):
-        return local(ref)
-    parsed = HubRef.parse(ref)
-    return fetch(parsed, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
 
 
 def _build(

@@ -11,6 +11,7 @@ import pytest
 
 from envhub_sandbox import errors, make_env
 from tests.support.processes import eventually
+from tests.support.repositories import write_repository
 from tests.support.samples import sample
 
 pytestmark = pytest.mark.usefixtures("neighbour")
@@ -46,9 +47,7 @@ def test_the_last_words_are_in_the_file(tmp_path: Path) -> None:
 def test_a_plain_print_is_not_lost_in_a_buffer(tmp_path: Path, how: str) -> None:
     """Nobody writes ``flush=True``; what came before a death is in the error, too."""
     path = tmp_path / "worker.log"
-    repository = tmp_path / "repository"
-    repository.mkdir()
-    (repository / "env.py").write_text(_CHATTY)
+    repository = write_repository(tmp_path / "repository", _CHATTY)
     with make_env(str(repository), env_kwargs={"how": how}, policy={"output": str(path)}) as suites:
         suites.env.reset()
         suites.env.step([0])

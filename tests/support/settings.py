@@ -41,11 +41,10 @@ def _arguments() -> dict[str, str]:
 
 def _defaults(kind: type[Any]) -> dict[str, str]:
     made = kind()
-    return {item.name: _default(item.name, getattr(made, item.name)) for item in _fields(kind)}
-
-
-def _fields(kind: type[Any]) -> tuple[dataclasses.Field[Any], ...]:
-    return dataclasses.fields(kind)
+    return {
+        item.name: _default(item.name, getattr(made, item.name))
+        for item in dataclasses.fields(kind)
+    }
 
 
 def _default(name: str, value: Any) -> str:
@@ -71,7 +70,7 @@ def _section(text: str, title: str) -> Iterator[tuple[str, str]]:
     body = text.partition(f"{title}:\n")[2].partition("\n\n")[0]
     for entry in re.split(r"\n(?=    \w)", body):
         name, _, words = entry.strip().partition(": ")
-        yield name, re.sub(r"\s+", " ", words)
+        yield name, words
 
 
 def _markdown(text: str) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envhub_sandbox import api, arguments, make_env
+from envhub_sandbox import api, arguments, make_env, snapshot
 from envhub_sandbox.config import plain_config
 from envhub_sandbox.errors import HubReferenceError, PolicyError, RepositoryUnavailableError
 from tests.support.samples import sample
@@ -132,7 +132,7 @@ def test_a_folder_written_like_a_repository_gets_a_hint(
 
     (tmp_path / "examples" / "cartpole").mkdir(parents=True)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(api, "fetch", missing)
+    monkeypatch.setattr(snapshot, "fetch", missing)
     with pytest.raises(HubReferenceError, match=r"write '\./examples/cartpole:env\.py'"):
         make_env("examples/cartpole:env.py")
     with pytest.raises(HubReferenceError, match=r"not found$"):
