@@ -5,6 +5,9 @@ builds the sub-environments that it needs and drives them itself, so a suite of 
 nothing before it is used. The object is a real instance of its class: whoever looks into it (a
 wrapper, the repository itself) makes it build itself after all, and it is driven as it is.
 
+Its end is no look: what was never built has nothing to close. Gymnasium's ``__del__`` asks for
+attributes, and would build all processes of every task that nobody used, only to end them.
+
 Followed: ``gymnasium.vector.SyncVectorEnv.__init__`` and ``AsyncVectorEnv.__init__`` (1.1 to 1.4).
 Older releases have other autoreset semantics; there the classes are left alone.
 """
@@ -15,13 +18,14 @@ import inspect
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
 
 _KEY = "_envhub_recording"
-_ANSWERED = frozenset({"__class__", "__dict__", "unwrapped", "spec", "closed", "num_envs"})
+_ANSWERED = frozenset({"unwrapped", "spec", "closed", "close", "num_envs"})
 # arguments that change what the class does in ways the worker's own loop does not follow
 _FOREIGN_ARGUMENTS = frozenset({"worker", "observation_space", "action_space"})
 
@@ -46,8 +50,9 @@ class Recording:
 
 
 def recording(env: object) -> Recording | None:
-    """The recording of a vector environment that nobody has looked into, else None."""
-    found = object.__getattribute__(env, "__dict__").get(_KEY) if _is_lazy(env) else None
+    """The recording of a vector environment that nobody has looked into or closed, else None."""
+    own = object.__getattribute__(env, "__dict__") if _is_lazy(env) else {}
+    found = None if own.get("closed") else own.get(_KEY)
     return found if isinstance(found, Recording) else None
 
 
@@ -110,23 +115,47 @@ def _record(
 
 def _build_after_all(env: Any, cls: type) -> None:
     kept = dict(object.__getattribute__(env, "__dict__"))
-    made = kept.pop(_KEY)
+    made, closed = kept.pop(_KEY), kept.pop("closed", False)
     env.__class__ = cls
-    env.__dict__.pop(_KEY)
+    del env.__dict__[_KEY]
+    env.__dict__.pop("closed", None)
     _REAL_INIT[cls](env, **made.arguments)
     env.__dict__.update(kept)
+    if closed:  # and looked into only then
+        env.close()
 
 
 def _lazy_class(cls: type[VectorEnv[Any, Any, Any]]) -> type:
     def __getattribute__(self: Any, name: str) -> Any:
         own = object.__getattribute__(self, "__dict__")
-        if name not in _ANSWERED and name not in own:
+        # what Python itself asks for, by names of its own, is no look either
+        if not name.startswith("__") and name not in _ANSWERED and name not in own:
             _build_after_all(self, cls)
             return getattr(self, name)
         return object.__getattribute__(self, name)
 
-    body = {"__getattribute__": __getattribute__, "__doc__": cls.__doc__, "__module__": __name__}
+    def __reduce_ex__(self: Any, protocol: Any) -> Any:
+        made: Recording = self.__dict__[_KEY]
+        return partial(cls, **made.arguments), ()  # a copy is the same call once more
+
+    body: dict[str, Any] = {
+        "__getattribute__": __getattribute__,
+        "__reduce_ex__": __reduce_ex__,
+        "__del__": _end,
+        "close": _close,
+        "__doc__": cls.__doc__,
+        "__module__": __name__,
+    }
     return type(cls.__name__, (cls,), body)
+
+
+def _end(self: Any) -> None:
+    """Nothing of it was ever started."""
+
+
+def _close(self: Any, **kwargs: Any) -> None:
+    """As Gymnasium's ``close``, of what has nothing to close."""
+    self.__dict__["closed"] = True
 
 
 _CLASSES: tuple[Any, ...] = (SyncVectorEnv, AsyncVectorEnv)
