@@ -15,6 +15,7 @@ may read it; the oldest give way to the newest. ``bundles`` reads it.
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -30,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+from envhub_sandbox import folders
 from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
 from envhub_sandbox.history import Recording, Requested, Steps, encoded
 from envhub_sandbox.policy import Policy, Timeouts
@@ -81,7 +83,7 @@ def keep(folder: Path, crash: Crash) -> Path:
     Raises:
         OSError: It cannot be written; nothing is left of it.
     """
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    folders.make(folder, folders.PRIVATE_MODE)
     building = Path(tempfile.mkdtemp(prefix=_BUILDING, dir=folder))  # 0700
     try:
         _write(building, crash)
@@ -134,14 +136,22 @@ def _write(folder: Path, crash: Crash) -> None:
             "requests": requests.index,
         },
     }
-    (folder / "bundle.json").write_text(json.dumps(document, indent=1, default=str))
-    (folder / "arguments.bin").write_bytes(_packet(encoded(crash.load).frames))
     packets = [*before.packets, *requests.packets]
-    (folder / "requests.bin").write_bytes(b"".join(map(_packet, packets)))
-    for name, rows in requests.arrays.items():
-        with open(folder / name, "wb") as file:
-            np.lib.format.write_array(file, np.concatenate(rows), allow_pickle=False)
-    (folder / "README.txt").write_text(_in_words(crash), "utf-8")
+    content = {
+        "bundle.json": json.dumps(document, indent=1, default=str).encode(),
+        "arguments.bin": _packet(encoded(crash.load).frames),
+        "requests.bin": b"".join(map(_packet, packets)),
+        "README.txt": _in_words(crash).encode(),
+        **{name: _array_file(rows) for name, rows in requests.arrays.items()},
+    }
+    for name, data in content.items():
+        folders.write_private(folder / name, data)
+
+
+def _array_file(rows: list[Any]) -> bytes:
+    file = io.BytesIO()
+    np.lib.format.write_array(file, np.concatenate(rows), allow_pickle=False)
+    return file.getvalue()
 
 
 class _Requests:

@@ -13,6 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from envhub_sandbox import folders
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.policy import Policy
 from envhub_sandbox.sharding import PaceBook
@@ -47,6 +48,8 @@ class ManifestCache:
         if self._path is None:
             return None
         try:
+            if not folders.is_ours_alone(self._path.parent):
+                return None
             [packet] = PacketReader().feed(self._path.read_bytes())
             _, message = m.unpack(packet.frames)
             if isinstance(message, m.Loaded):
@@ -63,7 +66,7 @@ class ManifestCache:
             return
         data = b"".join(map(bytes, pack_packet(1, m.pack(m.Loaded(value), 1))))
         with contextlib.suppress(OSError):
-            self._path.parent.mkdir(parents=True, exist_ok=True)
+            folders.make_private(self._path.parent)
             fd, temporary = tempfile.mkstemp(dir=self._path.parent)
             with os.fdopen(fd, "wb") as file:
                 file.write(data)

@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
+from envhub_sandbox import folders
 from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
 from envhub_sandbox.hashing import Mismatch, digest_of
 from envhub_sandbox.snapshot_records import FileRecord
@@ -37,8 +38,8 @@ _FORMAT = 1
 _BUILDING = ".building-"
 _ABANDONED_AFTER_S = 24 * 3600.0
 _FILE_MODE = 0o444
+_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _TREE_FOLDER_MODE = 0o555
-_STORE_FOLDER_MODE = 0o755
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,8 @@ class _Entry(NamedTuple):
     inode: int
 
     def matches(self, found: os.stat_result) -> bool:
+        if found.st_mode & _OTHERS_WRITE:
+            return False
         return (self.size, self.mtime_ns, self.ctime_ns, self.inode) == (
             found.st_size,
             found.st_mtime_ns,
@@ -123,12 +126,14 @@ def load(slot: Slot) -> tuple[FileRecord, ...] | None:
         SnapshotIntegrityError: The tree is not what was verified; the text says how to remove it.
     """
     try:
+        _refuse_shared_store(slot.record)
         text = slot.record.read_bytes()
     except FileNotFoundError:
         if os.path.lexists(slot.home):
             raise _damaged(slot, "its record.json is missing") from None
         return None
-    _refuse_shared_store(slot.folder)
+    with contextlib.suppress(FileNotFoundError):  # which is said below
+        _refuse_shared_store(slot.tree)
     document, entries = _read_record(slot, text)
     found = dict(_walk(slot, slot.tree, ""))
     _compare_names(slot, entries, found)
@@ -162,7 +167,11 @@ def _walk(slot: Slot, folder: Path | str, prefix: str) -> Iterator[tuple[str, os
     with listing:
         for item in listing:
             status = item.stat(follow_symlinks=False)
+            if not folders.is_trusted(status.st_uid):
+                raise _damaged(slot, f"{prefix + item.name!r} belongs to uid {status.st_uid}")
             if stat.S_ISDIR(status.st_mode):
+                if status.st_mode & _OTHERS_WRITE:
+                    raise _damaged(slot, f"others can write in {prefix + item.name!r}")
                 yield from _walk(slot, item.path, f"{prefix}{item.name}/")
             elif stat.S_ISREG(status.st_mode):
                 yield prefix + item.name, status
@@ -217,6 +226,7 @@ def publish(
         _fill(tree, files, copy)
         document = {"format": _FORMAT, **note, "fetched": time.strftime("%FT%TZ", time.gmtime())}
         _write_record(building, tree, document, list(files))
+        building.chmod(folders.SHARED_MODE)
         with _another_may_have_won():
             os.rename(building, slot.home)
     except OSError as error:
@@ -227,11 +237,12 @@ def publish(
 
 def _begin(slot: Slot) -> Path:
     try:
-        _make_folders(slot.folder)
+        folders.make(slot.folder)
         _refuse_shared_store(slot.folder)
         _remove_abandoned(slot.folder)
+        # 0700 until it is complete: its files have the umask's modes while they are written
         building = Path(tempfile.mkdtemp(prefix=_BUILDING, dir=slot.folder))
-        building.chmod(_STORE_FOLDER_MODE)
+        building.chmod(folders.PRIVATE_MODE)
     except OSError as error:
         raise _not_writable(slot.folder, error) from error
     return building
@@ -252,25 +263,17 @@ def mark_used(slot: Slot) -> None:
         os.utime(slot.record)
 
 
-def _make_folders(folder: Path) -> None:
-    """Make the store's folders readable for a worker of another uid, whatever the umask is."""
-    missing = []
-    while not folder.is_dir():
-        missing.append(folder)
-        folder = folder.parent
-    for path in reversed(missing):
-        path.mkdir(exist_ok=True)
-        path.chmod(_STORE_FOLDER_MODE)
-
-
-def _refuse_shared_store(folder: Path) -> None:
-    # Whoever can write here can put both a tree and a record that vouches for it.
-    status = folder.stat()
-    foreign = status.st_uid not in (0, os.geteuid()) and os.geteuid() != 0
-    if foreign or status.st_mode & stat.S_IWOTH:
+def _refuse_shared_store(place: Path) -> None:
+    """Whoever can write there can put both a tree and a record that vouches for it."""
+    root = cache_root()
+    try:
+        why = folders.why_distrusted(place, root)
+    except PermissionError as error:
+        raise SnapshotError(f"the snapshot store {root} cannot be looked at: {error}") from error
+    if why:
         raise SnapshotError(
-            f"the snapshot store {folder} can be written by other users, so nothing in it can be "
-            f"trusted; set {CACHE_VARIABLE} to a folder of your own"
+            f"the snapshot store {root} is not trusted, since other users can change what is in "
+            f"it: {why}; or set {CACHE_VARIABLE} to a folder of your own"
         )
 
 
@@ -285,16 +288,16 @@ def _remove_abandoned(folder: Path) -> None:
 def _fill(
     tree: Path, files: tuple[FileRecord, ...], copy: Callable[[FileRecord, Path], None]
 ) -> None:
-    folders = {tree}
-    tree.mkdir()
+    made = {tree}
+    folders.make(tree)
     for file in files:
         target = tree / file.path
-        if target.parent not in folders:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            folders.update(p for p in target.parents if tree in p.parents)
+        if target.parent not in made:
+            folders.make(target.parent)
+            made.update(p for p in target.parents if tree in p.parents)
         copy(file, target)
         target.chmod(_FILE_MODE)
-    for folder in folders:
+    for folder in made:
         folder.chmod(_TREE_FOLDER_MODE)
 
 

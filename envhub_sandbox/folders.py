@@ -1,0 +1,195 @@
+"""Our folders on disk: made with the modes that are meant, and believed where only we can write.
+
+The umask says nothing about them: under 0 it would let others in, under 077 it would keep a worker
+of another user out. It belongs to the whole process, so it is never changed here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import grp
+import os
+import pwd
+import shlex
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+SHARED_MODE = 0o755
+PRIVATE_MODE = 0o700
+_PRIVATE_FILE_MODE = 0o600
+_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
+_MAX_LINKS = 40
+_ACL = "system.posix_acl_access"
+
+
+def make(folder: Path, mode: int = SHARED_MODE) -> None:
+    """Make a folder, and those above it that are missing (0755), whatever the umask is.
+
+    One that is there keeps its mode.
+
+    Raises:
+        OSError: It cannot be made.
+    """
+    missing = []
+    above = folder
+    while not above.is_dir():
+        missing.append(above)
+        above = above.parent
+    for path in reversed(missing):
+        _make_one(path, mode if path == folder else SHARED_MODE)
+
+
+def _make_one(path: Path, mode: int) -> None:
+    try:
+        os.mkdir(path, PRIVATE_MODE)
+    except FileExistsError:
+        if not path.is_dir():
+            raise
+    else:
+        os.chmod(path, mode)
+
+
+def make_private(folder: Path) -> None:
+    """The same for a folder that is ours alone; one that is there becomes it.
+
+    Raises:
+        OSError: It cannot be made, or is somebody else's.
+    """
+    make(folder, PRIVATE_MODE)
+    if stat.S_IMODE(folder.stat().st_mode) != PRIVATE_MODE:
+        os.chmod(folder, PRIVATE_MODE)
+
+
+def write_private(path: Path, content: bytes) -> None:
+    """Write a new file that only its owner may read, whatever the umask is.
+
+    Raises:
+        OSError: It is there, or cannot be written.
+    """
+    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, _PRIVATE_FILE_MODE)
+    with os.fdopen(fd, "wb") as file:
+        os.fchmod(fd, _PRIVATE_FILE_MODE)
+        file.write(content)
+
+
+def why_distrusted(place: Path, ours: Path) -> str:
+    """Who besides us and root can change what lies at a place, and what to do; empty for nobody.
+
+    Every step of the path counts, links and what they lead to included: whoever can write in a
+    folder can put another one in the place of what is in it. In a sticky folder, such as /tmp,
+    only its owner can, so there it counts whose the next step is. A POSIX access list shows in
+    the group's bits, which are its mask.
+
+    Args:
+        place: An existing absolute path.
+        ours: Where the folders begin that we made: these must be writable for nobody else. Above,
+            the group may write if it is its user's own, as many systems set homes up.
+
+    Raises:
+        OSError: A step cannot be looked at.
+    """
+    inner = os.path.realpath(ours)
+    for path, status in _steps(place):
+        strict = path == inner or path.startswith(f"{inner}/")
+        fault = _fault(path, status, strict)
+        if fault:
+            return fault
+    return ""
+
+
+def _steps(place: Path) -> Iterator[tuple[str, os.stat_result]]:
+    """Each step of a path from the root on; a link, and then each step of what it leads to."""
+    left, here, links = list(reversed(place.parts[1:])), "/", 0
+    yield here, os.lstat(here)
+    while left:
+        step = left.pop()
+        if step == "..":
+            here = os.path.dirname(here)
+            continue
+        path = os.path.join(here, step)
+        status = os.lstat(path)
+        yield path, status
+        if not stat.S_ISLNK(status.st_mode):
+            here = path
+            continue
+        links += 1
+        if links > _MAX_LINKS:
+            raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), path)
+        target = os.readlink(path)
+        here = "/" if target.startswith("/") else here
+        left += [part for part in reversed(target.split("/")) if part not in ("", ".")]
+
+
+def _fault(path: str, status: os.stat_result, strict: bool) -> str:
+    kind = "link" if stat.S_ISLNK(status.st_mode) else "folder"
+    kind = "file" if stat.S_ISREG(status.st_mode) else kind
+    quoted = shlex.quote(path)
+    if not is_trusted(status.st_uid):
+        mend = f"If you trust them with it: chown {'-h ' * (kind == 'link')}{os.geteuid()} {quoted}"
+        return f"the {kind} {path} belongs to {_user(status.st_uid)}. {mend}"
+    mode = stat.S_IMODE(status.st_mode)
+    if kind == "link" or not mode & _OTHERS_WRITE or (mode & stat.S_ISVTX and not strict):
+        return ""
+    if not mode & stat.S_IWOTH and not strict and _is_own_group(path, status):
+        return ""
+    who = "everybody" if mode & stat.S_IWOTH else f"the group {_group(status.st_gid)}"
+    return (
+        f"the {kind} {path} can be written by {who} (mode {mode:04o}). "
+        f"If nobody has done so: chmod go-w {quoted}"
+    )
+
+
+def is_ours_alone(folder: Path) -> bool:
+    """Whether nobody but its owner, who is us or root, writes in a folder.
+
+    Raises:
+        OSError: It cannot be looked at.
+    """
+    status = folder.stat()
+    return is_trusted(status.st_uid) and not status.st_mode & _OTHERS_WRITE
+
+
+def is_trusted(user: int) -> bool:
+    """Whether a user could change our files anyway: ourselves, root, and whoever owns ``/``.
+
+    The last is root, as it looks from inside a user namespace.
+    """
+    return user in (0, os.geteuid(), os.lstat("/").st_uid)
+
+
+def _is_own_group(path: str, status: os.stat_result) -> bool:
+    """Whether a group is that of one user, who is us, and no access list adds others."""
+    if os.geteuid() == 0 or _has_access_list(path):
+        return False
+    try:
+        group, owner = grp.getgrgid(status.st_gid), pwd.getpwuid(os.geteuid())
+    except KeyError:
+        return False
+    others = [user for user in pwd.getpwall() if user.pw_gid == group.gr_gid]
+    return (
+        group.gr_gid == owner.pw_gid
+        and set(group.gr_mem) <= {owner.pw_name}
+        and all(user.pw_uid == owner.pw_uid for user in others)
+    )
+
+
+def _has_access_list(path: str) -> bool:
+    with contextlib.suppress(OSError):
+        return _ACL in os.listxattr(path)
+    return False
+
+
+def _user(uid: int) -> str:
+    try:
+        return f"the user {pwd.getpwuid(uid).pw_name} (uid {uid})"
+    except KeyError:
+        return f"uid {uid}"
+
+
+def _group(gid: int) -> str:
+    try:
+        return f"{grp.getgrgid(gid).gr_name} (gid {gid})"
+    except KeyError:
+        return str(gid)

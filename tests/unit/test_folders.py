@@ -1,0 +1,251 @@
+"""Our folders have the modes that are meant, and are believed only where nobody else can write."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import stat
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox import folders
+from envhub_sandbox import snapshot_store as store
+from envhub_sandbox.errors import SnapshotError
+from envhub_sandbox.manifest_cache import ManifestCache
+from envhub_sandbox.snapshot_records import FileRecord
+from tests.hub.stub_hub import git_blob_id
+
+COMMIT = "c" * 40
+GOOD = b"print(1)\n"
+UMASKS = [0o000, 0o022, 0o027, 0o077]
+needs_root = pytest.mark.skipif(os.getuid() != 0, reason="needs root, who can be another user")
+SOMEBODY = 12345
+
+
+@contextmanager
+def umask(mask: int) -> Iterator[None]:
+    """Another umask for a while."""
+    before = os.umask(mask)
+    try:
+        yield
+    finally:
+        os.umask(before)
+
+
+def mode(path: Path) -> int:
+    """The permission bits."""
+    return stat.S_IMODE(path.lstat().st_mode)
+
+
+@pytest.mark.parametrize("mask", UMASKS)
+def test_modes_do_not_follow_the_umask(tmp_path: Path, mask: int) -> None:
+    """A shared folder is 0755 and a private one 0700, with every folder above it 0755."""
+    with umask(mask):
+        folders.make(tmp_path / "a" / "b")
+        folders.make_private(tmp_path / "c" / "d")
+        folders.write_private(tmp_path / "c" / "file", b"x")
+    assert [mode(tmp_path / name) for name in ("a", "a/b", "c")] == [0o755] * 3
+    assert mode(tmp_path / "c" / "d") == 0o700
+    assert mode(tmp_path / "c" / "file") == 0o600
+
+
+def test_folder_that_is_there_keeps_its_mode_unless_it_is_private(tmp_path: Path) -> None:
+    """What the user made stays as it is; what is ours alone is closed again."""
+    (tmp_path / "his").mkdir()
+    (tmp_path / "his").chmod(0o750)
+    folders.make(tmp_path / "his" / "ours")
+    assert mode(tmp_path / "his") == 0o750
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open").chmod(0o777)
+    folders.make_private(tmp_path / "open")
+    assert mode(tmp_path / "open") == 0o700
+
+
+@pytest.mark.parametrize("mask", UMASKS)
+def test_manifests_are_nobody_elses(tmp_path: Path, mask: int) -> None:
+    """The folder and what is in it, under every umask; an open one is not read, and closed."""
+    cache = ManifestCache(tmp_path / "cache" / "manifests", "key")
+    with umask(mask):
+        cache.save({})
+    assert mode(tmp_path / "cache") == 0o755
+    assert mode(tmp_path / "cache" / "manifests") == 0o700
+    assert mode(tmp_path / "cache" / "manifests" / "key") == 0o600
+
+
+@pytest.fixture
+def slot(snapshot_store: Path) -> store.Slot:
+    """A snapshot in the store."""
+    made = store.Slot(store.local_folder(), COMMIT, "model/org/repo@ccc")
+    _publish(made, GOOD)
+    return made
+
+
+def _publish(slot: store.Slot, content: bytes) -> None:
+    record = FileRecord("env.py", len(content), f"git-sha1:{git_blob_id(content)}")
+    store.publish(slot, (record,), lambda _, target: target.write_bytes(content) and None, {})
+
+
+def _above(path: Path) -> list[Path]:
+    """The folder that the store lies in, and the store's own."""
+    return [path.parent, path, path / "snapshots", path / "snapshots" / "local"]
+
+
+@pytest.mark.parametrize("which", range(4))
+@pytest.mark.parametrize("bits", [0o770, 0o775, 0o777])
+def test_folder_that_others_can_write_is_named_and_mended(
+    snapshot_store: Path, slot: store.Slot, which: int, bits: int
+) -> None:
+    """Every folder down to the snapshot counts, its group too; the error's command mends it."""
+    wrong = _above(snapshot_store)[which]
+    wrong.chmod(bits)
+    if which == 0 and bits != 0o777 and folders._is_own_group(str(wrong), wrong.stat()):
+        assert store.load(slot) is not None  # above the store a plain user's own group may write
+        return
+    for use in (store.load, lambda slot: _publish(slot, GOOD)):
+        with pytest.raises(SnapshotError, match="ENVHUB_CACHE") as caught:
+            use(slot)
+        assert str(wrong) in str(caught.value)
+        assert f"{bits:04o}" in str(caught.value)
+    command = f"chmod go-w {shlex.quote(str(wrong))}"
+    assert command in str(caught.value)
+    subprocess.run(command, shell=True, check=True)
+    assert store.load(slot) is not None
+
+
+def test_sticky_folder_above_the_store_is_no_reason(snapshot_store: Path, slot: store.Slot) -> None:
+    """In one like /tmp only we can move what is ours; as the store itself it will not do."""
+    snapshot_store.parent.chmod(0o1777)
+    assert store.load(slot) is not None
+    snapshot_store.chmod(0o1777)
+    with pytest.raises(SnapshotError, match="1777"):
+        store.load(slot)
+
+
+def test_links_are_followed_step_by_step(
+    tmp_path: Path, snapshot_store: Path, slot: store.Slot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A store behind links is as good as the folders that they go through, and no better."""
+    (tmp_path / "open" / "x").mkdir(parents=True)
+    (tmp_path / "open" / "store").symlink_to(f"../{snapshot_store.name}/.")
+    (tmp_path / "link").symlink_to(tmp_path / "open" / "x" / ".." / "store")
+    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "link"))
+    behind = store.Slot(store.local_folder(), COMMIT, "x")
+    assert store.load(behind) is not None
+    (tmp_path / "open").chmod(0o777)
+    with pytest.raises(SnapshotError, match="open can be written by everybody"):
+        store.load(behind)
+
+
+def test_links_in_a_circle_end(tmp_path: Path) -> None:
+    """They are an error, as for the kernel."""
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    with pytest.raises(OSError, match="Too many levels"):
+        folders.why_distrusted(tmp_path / "a" / "x", tmp_path)
+
+
+@needs_root
+@pytest.mark.parametrize("which", range(6))
+def test_root_trusts_no_users_folder(snapshot_store: Path, slot: store.Slot, which: int) -> None:
+    """What belongs to somebody else can be changed by him, whoever asks."""
+    places = [*_above(snapshot_store), slot.home, slot.record]
+    os.chown(places[which], SOMEBODY, -1)
+    with pytest.raises(SnapshotError, match=f"belongs to uid {SOMEBODY}") as caught:
+        store.load(slot)
+    command = f"chown 0 {shlex.quote(str(places[which]))}"
+    assert command in str(caught.value)
+    subprocess.run(command, shell=True, check=True)
+    assert store.load(slot) is not None
+
+
+@needs_root
+def test_somebody_elses_link_is_not_followed(
+    tmp_path: Path, snapshot_store: Path, slot: store.Slot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In /tmp he may point it elsewhere whenever he likes."""
+    tmp_path.chmod(0o1777)
+    (tmp_path / "link").symlink_to(snapshot_store)
+    os.chown(tmp_path / "link", SOMEBODY, -1, follow_symlinks=False)
+    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "link"))
+    with pytest.raises(SnapshotError, match=r"the link .* belongs to uid"):
+        store.load(store.Slot(store.local_folder(), COMMIT, "x"))
+
+
+@needs_root
+@pytest.mark.parametrize("way", ["his own", "his group's"])
+def test_planted_snapshot_is_refused(
+    snapshot_store: Path, slot: store.Slot, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
+    """Somebody puts a snapshot and a record that vouches for it; unchecked it is believed."""
+    place = store.local_folder()
+    for folder in [snapshot_store, *snapshot_store.parents]:
+        if folder.stat().st_mode & 0o001 == 0 and folder.stat().st_uid == 0:
+            folder.chmod(folder.stat().st_mode | 0o011)
+    os.chown(place, SOMEBODY if way == "his own" else 0, SOMEBODY)
+    place.chmod(0o775)
+    as_somebody(lambda: os.rename(slot.home, place / ("d" * 40)))
+    planted = store.Slot(place, "d" * 40, "x")
+    with pytest.raises(SnapshotError, match="not trusted"):
+        store.load(planted)
+    monkeypatch.setattr(folders, "why_distrusted", lambda *_: "")
+    assert store.load(planted) is not None
+
+
+def as_somebody(act: Callable[[], object]) -> None:
+    """Do it in a process of another user; it must work there."""
+    pid = os.fork()
+    if pid == 0:
+        code = 1
+        try:
+            os.setgroups([])
+            os.setresgid(SOMEBODY, SOMEBODY, SOMEBODY)
+            os.setresuid(SOMEBODY, SOMEBODY, SOMEBODY)
+            act()
+            code = 0
+        finally:
+            os._exit(code)
+    assert os.waitpid(pid, 0)[1] == 0
+
+
+@needs_root
+def test_files_of_others_in_a_snapshot_are_refused(slot: store.Slot) -> None:
+    """Whose file it is, he can change it after it was verified."""
+    os.chown(slot.tree / "env.py", SOMEBODY, -1)
+    with pytest.raises(SnapshotError, match=r"'env\.py' belongs to uid"):
+        store.load(slot)
+
+
+def test_file_that_others_can_write_is_closed(slot: store.Slot) -> None:
+    """It is hashed once more, and read-only afterwards."""
+    (slot.tree / "env.py").chmod(0o666)
+    assert store.load(slot) is not None
+    assert mode(slot.tree / "env.py") == 0o444
+
+
+@pytest.mark.parametrize("mask", UMASKS)
+def test_store_is_the_same_under_every_umask(snapshot_store: Path, mask: int) -> None:
+    """Shared folders, read-only trees, and a record of its owner's."""
+    made = store.Slot(store.local_folder(), COMMIT, "x")
+    with umask(mask):
+        _publish(made, GOOD)
+    assert [mode(path) for path in (*_above(snapshot_store)[1:], made.home)] == [0o755] * 4
+    assert (mode(made.tree), mode(made.tree / "env.py")) == (0o555, 0o444)
+    assert mode(made.record) == 0o600
+
+
+def test_nobody_gets_at_a_snapshot_before_it_is_complete(snapshot_store: Path) -> None:
+    """While its files have the umask's modes, their folder is ours alone."""
+    made, seen = store.Slot(store.local_folder(), COMMIT, "x"), []
+
+    def copy(_: FileRecord, target: Path) -> None:
+        target.write_bytes(GOOD)
+        seen.append((mode(target), mode(target.parent.parent)))
+
+    record = FileRecord("env.py", len(GOOD), f"git-sha1:{git_blob_id(GOOD)}")
+    with umask(0):
+        store.publish(made, (record,), copy, {})
+    assert seen == [(0o666, 0o700)]
