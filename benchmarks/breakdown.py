@@ -22,6 +22,7 @@ from benchmarks.workloads import WORKLOADS, Workload, action_batches, makers
 from envhub_sandbox import make_env
 from envhub_sandbox.spinning import SpinChooser
 from envhub_worker.jail.subenvs import SubEnvs
+from tests.support import inside
 
 _STEPS = 3000
 _LONGEST_NS = 1_500_000_000
@@ -54,12 +55,13 @@ def breakdown(workload: Workload, count: int, shards: int) -> dict[str, dict[str
 
 def _client(env: Any, batches: list[Any], spin_ns: int | None) -> dict[str, float]:
     marks: list[int] = []
-    lane = env._remote._lane
+    lane = inside.lane(env)
+    assert lane is not None
     lane.ask, lane.wait = (
         _marking(type(lane).ask, lane, marks),
         _marking(type(lane).wait, lane, marks),
     )
-    lane._step_spin = _Forced(spin_ns) if spin_ns is not None else SpinChooser(True)
+    inside.force_spin(lane, _Forced(spin_ns) if spin_ns is not None else SpinChooser(True))
     parts: list[tuple[int, int, int, int]] = []
     actions = itertools.cycle(batches)
     until = perf_counter_ns() + _LONGEST_NS

@@ -29,9 +29,8 @@ import numpy as np
 import psutil
 
 from envhub_sandbox import errors, make_env
-from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.reviving import RESTARTED, derived_seed
-from envhub_worker.protocol import messages as m
+from tests.support import inside
 
 REPOSITORY = Path(__file__).parent / "repositories" / "walk"
 LANES = ("auto", "frames")
@@ -78,7 +77,7 @@ class Soak:
         self._compare((*got, infos), self._oracle.reset(seed=self._seed))
 
     def _compare(self, got: Any, expected: Any) -> None:
-        if not _same(got, expected):
+        if not same(got, expected):
             self.counts["mismatches"] += 1
 
     def step(self) -> None:
@@ -106,7 +105,7 @@ class Soak:
     def _revive(self, expected: Any, lost: Any) -> None:
         """Do to the oracle what was promised for the rows that came back."""
         observations, rewards, terminations, truncations, infos = expected
-        shards = [lost[start:stop] for start, stop in self.env._remote.bounds]
+        shards = [lost[start:stop] for start, stop in inside.bounds(self.env)]
         if any(shard.any() != shard.all() for shard in shards):
             self.counts["mismatches"] += 1
         restart = self.env.stats()["restarts"]
@@ -137,7 +136,7 @@ class Soak:
     def _stall(self, actions: Any) -> None:
         """A process that does not run for a while."""
         self.counts["stalls"] += 1
-        pid = int(self._rng.choice(_hosts(self.env)))
+        pid = int(self._rng.choice(inside.pids(self.env)))
         os.kill(pid, signal.SIGSTOP)
         self.env.step_async(actions)
         time.sleep(SLOW_S)
@@ -162,7 +161,7 @@ class Soak:
     def _kill(self, actions: Any) -> None:
         """From outside, at any moment: a step before may still succeed."""
         self.counts["kills"] += 1
-        os.kill(int(self._rng.choice(_hosts(self.env))), signal.SIGKILL)
+        os.kill(int(self._rng.choice(inside.pids(self.env))), signal.SIGKILL)
         if self._transparent:
             while not self._step(actions):
                 pass
@@ -192,14 +191,8 @@ def _oracle(n_envs: int) -> Any:
     return module.make_env(n_envs)
 
 
-def _hosts(env: Any) -> list[int]:
-    """Pids of the processes that run this environment, as its server knows them."""
-    jail = env._remote._loaded.jail
-    status, _ = jail.client.request(m.GetStatus(), deadline=Deadline(60))
-    return next(list(one["pids"]) for one in status.jails if one["jail"] == jail.number)
-
-
-def _same(got: Any, expected: Any) -> bool:
+def same(got: Any, expected: Any) -> bool:
+    """Whether two steps gave the very same arrays and infos."""
     *arrays, infos = got
     *expected_arrays, expected_infos = expected
     pairs = zip(arrays, expected_arrays, strict=True)
@@ -217,7 +210,7 @@ def _equal(a: Any, b: Any) -> bool:
 def _footprint(soak: Soak) -> dict[str, float]:
     """Descriptors, resident MiB and processes of this process and of its worker server."""
     gc.collect()
-    server = psutil.Process(soak.env._remote._loaded.server.process.pid)
+    server = psutil.Process(inside.server(soak.env).process.pid)
     found: dict[str, float] = {"processes": len(server.children(recursive=True))}
     for name, process in (("client", psutil.Process()), ("server", server)):
         found[f"{name}_descriptors"] = process.num_fds()

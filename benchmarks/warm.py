@@ -10,6 +10,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.client import WorkerClient
 from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.jail import open_jail
+from tests.support import inside
 
 _LONG_S = 60.0
 
@@ -30,8 +31,8 @@ class Warm:
         self._patience = patience
         self._suites = make_env(reference)
         self._suites.env.reset(seed=0)
-        self._repository: Any = self._suites.env._remote.repository
-        self._server = self._suites.env._remote._loaded.server
+        self._repository: Any = inside.repository(self._suites.env)
+        self._server = inside.server(self._suites.env)
         report = self._suites.env.sandbox_report
         self.layers = [layer["layer"] for layer in report if layer["enforced"]]
 
@@ -47,7 +48,7 @@ class Warm:
         client = WorkerClient(server.endpoint, server.process_fd, repository.wire_limits)
         client.hello(Deadline(_LONG_S))
         self._patience.wait()
-        order, limits = repository._order(server), repository.wire_limits
+        order, limits = inside.order(repository, server), repository.wire_limits
         start = perf_counter()
         jail = open_jail(client, order, limits, Deadline(_LONG_S))
         taken = (perf_counter() - start) * 1000

@@ -9,6 +9,7 @@ from gymnasium.vector import AutoresetMode
 
 from tests.compliance.pair import Pair
 from tests.compliance.vector_env import Case, VectorEnvCompliance, cases
+from tests.support import inside
 from tests.support.compare import assert_same
 
 
@@ -106,7 +107,7 @@ class TestCartPole(VectorEnvCompliance):
     def test_lane_is_the_one_that_was_asked_for(self, pair: Pair, lane: str) -> None:
         """Spaces with a fixed layout go over shared memory unless that is forbidden."""
         pair.reset(seed=1)
-        in_use = pair.sandboxed._remote._lane is not None
+        in_use = inside.lane(pair.sandboxed) is not None
         assert in_use is (lane == "auto")
 
 

@@ -9,6 +9,7 @@ import pytest
 from envhub_sandbox.sandboxes.docker import DockerSandbox
 from tests.compliance.pair import Pair
 from tests.compliance.vector_env import Case, VectorEnvCompliance, cases, paired
+from tests.support import inside
 
 
 @pytest.fixture(scope="class")
@@ -40,7 +41,7 @@ class TestCartPole(VectorEnvCompliance):
     def test_lane_is_the_one_that_was_asked_for(self, pair: Pair, lane: str) -> None:
         """Descriptors cross the container's wall: memory is shared with the jail itself."""
         pair.reset(seed=1)
-        in_use = pair.sandboxed._remote._lane is not None
+        in_use = inside.lane(pair.sandboxed) is not None
         assert in_use is (lane == "auto")
 
 

@@ -28,8 +28,9 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from envhub_sandbox import errors, make_env, remote_env
+from envhub_sandbox import errors, make_env
 from envhub_worker.protocol.lifecycle import State
+from tests.support import inside
 from tests.support.samples import sample
 
 _SLOW_S = 0.12
@@ -71,7 +72,7 @@ class Attribution(RuleBasedStateMachine):
     @property
     def state(self) -> State:
         """Where the environment says it is."""
-        return self.env._remote.lifecycle.state  # type: ignore[no-any-return]
+        return inside.state(self.env)
 
     def after(self, ask: Callable[[], Any], check: Callable[[Any], bool]) -> None:
         """Ask; what comes back is checked, and what is raised says where we are now."""
@@ -150,7 +151,7 @@ class Attribution(RuleBasedStateMachine):
     @rule(grace=st.sampled_from([0.01, 2.0]))
     def patience(self, grace: float) -> None:
         """How long a reset waits for a late reply before it starts afresh."""
-        remote_env._GRACE_S = grace
+        setattr(*inside.LATE_REPLY_GRACE, grace)
 
     @precondition(lambda self: self.expected is not State.CLOSED)
     @rule()
@@ -204,7 +205,7 @@ class Attribution(RuleBasedStateMachine):
 
     def teardown(self) -> None:
         """Whatever has happened, it can be closed."""
-        remote_env._GRACE_S = 2.0
+        setattr(*inside.LATE_REPLY_GRACE, 2.0)
         started = time.monotonic()
         self.suites.close()
         assert time.monotonic() - started < _AGES_S

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import errors, make_env
+from tests.support import inside
 from tests.support.samples import sample
 
 
@@ -32,9 +33,9 @@ def test_late_reply_survives_the_question() -> None:
     with make_env(sample("echo"), lane="frames") as suites:
         env = suites.env
         env.reset()
-        before = env._remote._loaded
+        before = inside.loaded(env)
         env.step_async([[1.0, 0.3]])
         with pytest.raises(errors.WorkerTimeoutError):
             env.step_wait(timeout=0.05)
         env.reset(options={"token": 2.0, "delay": 0.0})
-        assert env._remote._loaded is before
+        assert inside.loaded(env) is before

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from typing import Any, cast
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
-import zmq
 from gymnasium.error import ClosedEnvironmentError
 
-from envhub_sandbox import errors, make_env, remote_env, restarts, tenant
-from envhub_sandbox.remote_env import RemoteEnv
+from envhub_sandbox import errors, make_env, restarts
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
+from tests.support import inside
 from tests.support.samples import sample
 
 pytestmark = pytest.mark.usefixtures("neighbour")
@@ -34,16 +34,16 @@ def interrupted(*arguments: Any, **options: Any) -> Any:
     raise KeyboardInterrupt
 
 
-def released(remote: RemoteEnv) -> list[bool]:
+def released(env: Any) -> list[bool]:
     """Have the environment hold its server; what is returned says when it has let it go."""
     found: list[bool] = []
-    give_back = remote.repository.hold()
+    give_back = inside.repository(env).hold()
 
     def release() -> None:
         give_back()
         found.append(True)
 
-    remote._release_server = release
+    inside.hold_server(env, release)
     return found
 
 
@@ -52,20 +52,21 @@ def test_a_second_ctrl_c_in_recovery_leaves_a_usable_environment(
     lane: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The jail that was given up is given back, and the next reset has another."""
-    monkeypatch.setattr(remote_env, "_GRACE_S", 0.05)
+    monkeypatch.setattr(*inside.LATE_REPLY_GRACE, 0.05)
     with made(lane, timeouts={"step_s": 0.05}) as suites:
-        env, remote = suites.env, suites.env._remote
+        env = suites.env
         with pytest.raises(TimeoutError):
             env.step([0, 1])
-        first = remote._loaded
+        first = inside.loaded(env)
         with monkeypatch.context() as patch:
-            patch.setattr(remote._jails, "end", interrupted)
+            patch.setattr(*inside.ending(env), interrupted)
             with pytest.raises(KeyboardInterrupt):
                 env.reset()
+        assert first is not None
         assert first.closed
-        assert remote.lifecycle.state is State.LATE
+        assert inside.state(env) is State.LATE
         env.reset()
-        assert remote._loaded is not first
+        assert inside.loaded(env) is not first
         assert env.render() is not None
 
 
@@ -75,11 +76,12 @@ def test_ctrl_c_in_sending_a_step_leaves_a_late_reply(
 ) -> None:
     """Nobody knows whether it was done, so nobody goes on as if it was not."""
     with made("frames") as suites:
-        env, remote = suites.env, suites.env._remote
-        jail = remote._loaded.jail
+        env = suites.env
+        jail = inside.jail(env)
         with monkeypatch.context() as patch:
             if moment == "amid the frames":
-                patch.setattr(jail.client, "_put", lambda frames, copy: _half(jail.client, frames))
+                half = partial(_half, jail.client)
+                patch.setattr(*inside.sending(jail.client), half)
             else:
                 relay = jail.relay
                 patch.setattr(jail, "relay", lambda *all_of_it: interrupted(relay(*all_of_it)))
@@ -91,8 +93,8 @@ def test_ctrl_c_in_sending_a_step_leaves_a_late_reply(
         env.step([0, 0])
 
 
-def _half(client: Any, frames: Any) -> None:
-    client._socket.send(frames[0], zmq.SNDMORE)
+def _half(client: Any, frames: Any, copy: bool) -> None:
+    inside.send_half(client, frames)
     raise KeyboardInterrupt
 
 
@@ -103,16 +105,17 @@ def test_ctrl_c_in_close_leaves_nothing(
 ) -> None:
     """While the repository's ``close`` is waited for, or the pace noted; it can be repeated."""
     suites = made(lane)
-    env, remote = suites.env, suites.env._remote
-    loaded, release = remote._loaded, released(remote)
+    env = suites.env
+    loaded, release = inside.loaded(env), released(env)
+    assert loaded is not None
     if owner == "jail":
         monkeypatch.setattr(loaded.jail, "receive", interrupted)
     else:
-        monkeypatch.setattr(remote, "_note_pace", interrupted)
+        monkeypatch.setattr(*inside.noting_pace(env), interrupted)
     with pytest.raises(KeyboardInterrupt):
         env.close()
     assert loaded.closed
-    assert (remote._lane, release) == (None, [True])
+    assert (inside.lane(env), release) == (None, [True])
     suites.close()
 
 
@@ -171,41 +174,42 @@ def test_close_ends_the_wait_before_a_restart(
     waiting.leave()
     policy = {"restart": restart, "crash_history": 0}
     with made(policy=policy, fails={"moment": "step", "fault": "kill"}) as suites:
-        env, remote = suites.env, suites.env._remote
+        env = suites.env
         if restart == "on_reset":
             with pytest.raises(errors.WorkerDiedError):
                 env.step([0, 1])
         monkeypatch.setattr(restarts, "backoff_s", waiting)
-        loaded = remote._loaded
+        loaded = inside.loaded(env)
+        assert loaded is not None
         thread, raised = told(env.reset if restart == "on_reset" else lambda: env.step([0, 1]))
         waiting.wait()
         env.close()
         thread.join(60)
         assert [type(one) for one in raised] == [ClosedEnvironmentError]
         assert loaded.closed
-        assert remote.stats()["restarts"] == 0
+        assert env.stats()["restarts"] == 0
 
 
 def test_who_outlasts_a_close_gives_everything_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """``close`` does not wait for ever for a thread that holds the environment."""
-    monkeypatch.setattr(tenant, "_INTERRUPT_S", 0.0)
+    monkeypatch.setattr(*inside.CLOSE_PATIENCE, 0.0)
     policy = {"restart": "on_reset", "crash_history": 0}
     with made(policy=policy, fails={"moment": "step", "fault": "kill"}) as suites:
-        env, remote = suites.env, suites.env._remote
+        env = suites.env
         with pytest.raises(errors.WorkerDiedError):
             env.step([0, 1])
         found: list[list[bool]] = []
 
         def hold() -> Callable[[], None]:
             monkeypatch.undo()
-            found.append(released(remote))
-            return cast("Callable[[], None]", remote._release_server)
+            found.append(released(env))
+            return inside.release_of_server(env)
 
         forgetting = Inside(hold)
-        monkeypatch.setattr(remote.repository, "hold", forgetting)
+        monkeypatch.setattr(*inside.holding(env), forgetting)
         close_during_reset(env, forgetting)
         assert found == [[True]]
-        assert remote._loaded is None
+        assert inside.loaded(env) is None
 
 
 @pytest.mark.parametrize("moment", ["built", "started"])
@@ -213,31 +217,28 @@ def test_a_jail_that_comes_up_after_close_is_given_back(
     moment: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whoever closes does not wait for it: whoever opened it gives it back."""
-    monkeypatch.setattr(tenant, "_INTERRUPT_S", 0.0)
+    monkeypatch.setattr(*inside.CLOSE_PATIENCE, 0.0)
     with make_env(sample("faulty"), env_kwargs={"tasks": 2}) as suites:
         suites["suite"][0].reset()
         env = suites["suite"][1]
-        remote = env._remote
-        assert remote.lifecycle.state is State.IDLE
+        assert inside.state(env) is State.IDLE
         places: list[Any] = []
-        monkeypatch.setattr(
-            remote, "_settle", lambda at, do=remote._settle: places.append(at) or do(at)
-        )
-        owner, name = (
-            (remote._builder, "build") if moment == "built" else (remote.history, "started")
-        )
+        owner, name = inside.settling(env)
+        settle = getattr(owner, name)
+        monkeypatch.setattr(owner, name, lambda at: places.append(at) or settle(at))
+        owner, name = (inside.building if moment == "built" else inside.started)(env)
         coming = Inside(getattr(owner, name))
         monkeypatch.setattr(owner, name, coming)
         close_during_reset(env, coming)
         assert all(place.loaded.closed for place in places)
-        assert remote._lane is None
+        assert inside.lane(env) is None
 
 
 class Closing(Lifecycle):
     """Closes the environment at a move, in the same thread, as a signal handler does."""
 
     def __init__(self, env: Any, event: Event, *, before: bool) -> None:
-        self.state = env._remote.lifecycle.state
+        self.state = inside.state(env)
         self._env, self._event, self._before = env, event, before
 
     def on(self, event: Event) -> State:
@@ -252,7 +253,7 @@ class Closing(Lifecycle):
 
 def recover(env: Any) -> None:
     """Reset after a step that nobody waits for any more."""
-    env._remote.submit_step(np.zeros(2, np.int64))
+    inside.session(env).submit_step(np.zeros(2, np.int64))
     env.reset()
 
 
@@ -272,10 +273,11 @@ def test_closed_in_the_midst_says_closed(lane: str, before: bool, operation: str
     """A signal handler that closes while a request is on its way out, or looked after."""
     event, ask = OPERATIONS[operation]
     with made(lane) as suites:
-        env, remote = suites.env, suites.env._remote
-        loaded = remote._loaded
-        remote.lifecycle = Closing(env, event, before=before)
+        env = suites.env
+        loaded = inside.loaded(env)
+        assert loaded is not None
+        inside.live_by(env, Closing(env, event, before=before))
         with pytest.raises(ClosedEnvironmentError):
             ask(env)
         assert loaded.closed
-        assert (remote._loaded, remote._lane) == (None, None)
+        assert (inside.loaded(env), inside.lane(env)) == (None, None)

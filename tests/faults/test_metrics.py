@@ -16,6 +16,7 @@ from prometheus_client.parser import text_string_to_metric_families  # noqa: E40
 from envhub_sandbox import errors, make_env, stats  # noqa: E402
 from envhub_sandbox.metrics import EnvHubCollector  # noqa: E402
 from envhub_sandbox.stats import Counters, Labels, Ledger, lane_step_bytes  # noqa: E402
+from tests.support import inside  # noqa: E402
 from tests.support.samples import sample  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("neighbour")
@@ -128,10 +129,10 @@ def test_bytes_are_counted_over_both_lanes(lane: str) -> None:
 def test_a_lane_step_is_its_arrays() -> None:
     """Actions there; observations, rewards and two flags back."""
     with make_env(sample("echo"), n_envs=4) as suites:
-        manifest = suites.env._remote.manifest
+        manifest = inside.manifest(suites.env)
     assert lane_step_bytes(manifest) == (4 * 2 * 8, 4 * (2 * 8 + 8 + 1 + 1))
     with make_env(sample("exotic_spaces")) as suites:
-        assert lane_step_bytes(next(iter(suites.envs()))._remote.manifest) == (0, 0)  # type: ignore[attr-defined]
+        assert lane_step_bytes(inside.manifest(next(iter(suites.envs())))) == (0, 0)
 
 
 class Env:
@@ -162,7 +163,7 @@ def test_what_is_gone_takes_no_room() -> None:
     [row] = ledger.rows()
     assert (row.numbers["steps"], row.numbers["step_seconds"]) == (1000, 1000.0)
     assert (row.numbers["restarts"], row.states, row.latencies_s.size) == (2000, {}, 0)
-    assert not ledger._living
+    assert not inside.living(ledger)
     ledger.forget()
     assert ledger.rows() == []
 

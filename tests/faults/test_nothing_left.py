@@ -245,9 +245,10 @@ def test_dead_server_is_told_and_replaced(folder: Path) -> None:
     client = start(
         folder,
         """
+        from tests.support import inside
         for lane in ("auto", "frames"):
             suites = made(lane=lane, policy={"restart": "on_reset"})
-            suites.env._remote._loaded.server.process.kill()
+            inside.server(suites.env).process.kill()
             try:
                 while True:  # the jail may live a moment longer
                     suites.env.step([0, 0])

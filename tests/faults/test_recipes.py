@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import make_env
+from tests.support import inside
 from tests.support.samples import sample
 
 
@@ -51,10 +52,10 @@ def test_options_and_tasks_travel() -> None:
             assert again is not suites
         one = pickle.loads(pickle.dumps(suites["suite"][1]))
         assert one.num_envs == 3
-        assert one._timeouts.step_s == 12.5
-        assert one._remote.repository.policy.restart == "on_reset"
-        assert one._remote.repository.lane == "frames"
-        assert one._manifest.task == 1
+        assert inside.repository(one).timeouts.step_s == 12.5
+        assert inside.repository(one).policy.restart == "on_reset"
+        assert inside.repository(one).lane == "frames"
+        assert inside.manifest(one).task == 1
         one.close()
 
 
@@ -70,7 +71,7 @@ def test_config_object_travels_as_its_attributes() -> None:
         secret=lambda: 0,
     )
     with make_env(config) as suites:
-        recipe = suites._recipe
+        recipe = inside.recipe(suites)
         assert recipe is not None
         assert recipe.config is not None
         assert "secret" not in recipe.config

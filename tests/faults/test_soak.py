@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks import soak
-from envhub_sandbox import remote_env
+from tests.support import inside
 
 
 @pytest.mark.usefixtures("neighbour")
@@ -25,7 +25,7 @@ def test_short_soak(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Deaths, kills, stalls and time-outs among many steps: no result differs, nothing grows."""
-    monkeypatch.setattr(remote_env, "_GRACE_S", 0.2)
+    monkeypatch.setattr(*inside.LATE_REPLY_GRACE, 0.2)
     short = ["--steps", "400", "--fault-every", "20", "--seed", "3", "--restart", restart]
     code = soak.main([*short, "--lane", lane, "--num-workers", str(workers)])
     found = json.loads(capsys.readouterr().out)[lane]
@@ -43,10 +43,10 @@ def _result(**changes: Any) -> Any:
 
 def test_soak_would_notice_a_difference() -> None:
     """The comparison is not satisfied by anything but the very same results."""
-    assert soak._same(_result(), _result())
-    assert not soak._same(_result(), _result(infos={}))
-    assert not soak._same(_result(), _result(second=np.zeros(2)))
-    assert not soak._same(_result(), _result(first=np.zeros(2, np.float32)))
+    assert soak.same(_result(), _result())
+    assert not soak.same(_result(), _result(infos={}))
+    assert not soak.same(_result(), _result(second=np.zeros(2)))
+    assert not soak.same(_result(), _result(first=np.zeros(2, np.float32)))
 
 
 def test_soak_would_notice_growth() -> None:

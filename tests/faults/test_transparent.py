@@ -13,11 +13,10 @@ import pytest
 from gymnasium.error import ClosedEnvironmentError
 
 from envhub_sandbox import api, errors, make_env
-from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.reviving import derived_seed
 from envhub_sandbox.sharding import bounds_for
-from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import State
+from tests.support import inside
 from tests.support.processes import eventually
 from tests.support.samples import reference, sample
 
@@ -82,20 +81,6 @@ def restarted(info: dict[str, Any], rows: slice = DEAD) -> bool:
     return all(np.array_equal(one, expected) for one in both)
 
 
-def state(env: Any) -> State:
-    """Where the environment is in its life."""
-    return env._remote.lifecycle.state  # type: ignore[no-any-return]
-
-
-def pids(env: Any) -> list[int]:
-    """The processes of an environment's jail, as its server knows them."""
-    jail = env._remote._loaded.jail
-    status, _ = jail.client.request(m.GetStatus(), deadline=Deadline(60))
-    assert isinstance(status, m.Status)
-    jails = [one for one in status.jails if isinstance(one, dict)]
-    return next(list(one["pids"]) for one in jails if one["jail"] == jail.number)
-
-
 lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
 
 
@@ -119,7 +104,7 @@ def test_the_dead_come_back_and_the_others_go_on(lane: str, how: int) -> None:
         assert not terminated.any()
         assert restarted(info)
         assert info["at"].tolist() == [2, 2, 0, 0]
-        assert state(env) is State.READY
+        assert inside.state(env) is State.READY
         assert env.stats()["deaths"] == env.stats()["restarts"] == 1
 
 
@@ -174,7 +159,7 @@ def test_the_only_process_comes_back_whole(lane: str) -> None:
     with made(lane, shards=1) as suites:
         env = suites.env
         env.reset(seed=SEED)
-        jail = env._remote._loaded.jail.number
+        jail = inside.jail(env).number
         for restart in (1, 2):
             observation, rewards, _, truncated, info = env.step(LAST_DIES)
             assert np.array_equal(observation, fresh(restart, slice(4)))
@@ -182,7 +167,7 @@ def test_the_only_process_comes_back_whole(lane: str) -> None:
             assert not rewards.any()
             assert restarted(info, slice(4))
             assert not env.step(ALL_LIVE)[3].any()  # the reset after a truncation
-        assert env._remote._loaded.jail.number == jail
+        assert inside.jail(env).number == jail
 
 
 def test_seeded_runs_with_the_same_deaths_are_the_same() -> None:
@@ -244,7 +229,7 @@ def test_who_dies_again_in_coming_back_is_dead(lane: str) -> None:
         with pytest.raises(errors.WorkerDiedError) as caught:
             env.reset(options={"exit": True})
         assert caught.value.exit_code == 4
-        assert state(env) is State.DEAD
+        assert inside.state(env) is State.DEAD
         with pytest.raises(errors.WorkerDiedError, match="cannot step"):
             env.step(ALL_LIVE)
         env.reset(seed=SEED)
@@ -263,7 +248,7 @@ def test_a_call_is_not_repeated(lane: str) -> None:
                 env.call("last_words")
             assert caught.value.exit_code == 5
             assert caught.value.request == "call"
-            assert state(env) is State.READY
+            assert inside.state(env) is State.READY
         observation, _, _, truncated, info = env.step(ALL_LIVE)
         assert truncated.all()
         assert restarted(info, slice(4))
@@ -287,7 +272,7 @@ def test_attributes_that_were_set_are_set_again(lane: str) -> None:
         assert restarted(info)
         assert env.get_attr("weight") == (5, 6, 7, 8)
         assert env.get_attr("colour") == ("red", "green", "blue", "white")
-        os.kill(pids(env)[1], signal.SIGKILL)
+        os.kill(inside.pids(env)[1], signal.SIGKILL)
         env.reset(seed=SEED)
         assert env.get_attr("weight") == (5, 6, 7, 8)
 
@@ -331,7 +316,7 @@ def test_a_fresh_jail_has_no_attributes_of_the_last(lane: str) -> None:
         env.reset(seed=SEED)
         with pytest.raises(errors.RemoteEnvError):
             env.get_attr("weight")
-        os.kill(pids(env)[1], signal.SIGKILL)
+        os.kill(inside.pids(env)[1], signal.SIGKILL)
         env.reset(seed=SEED)
         with pytest.raises(errors.RemoteEnvError):
             env.get_attr("weight")
@@ -343,7 +328,7 @@ def test_a_death_between_requests_is_met_by_the_next(lane: str) -> None:
     with made(lane) as suites:
         env = suites.env
         env.reset(seed=SEED)
-        victim = pids(env)[1]
+        victim = inside.pids(env)[1]
         os.kill(victim, signal.SIGKILL)
         assert eventually(lambda: not psutil.pid_exists(victim))
         with pytest.raises(errors.WorkerDiedError, match="SIGKILL"):
@@ -360,7 +345,7 @@ def test_a_reset_brings_back_who_died_between_requests(lane: str) -> None:
     with made(lane) as suites:
         env = suites.env
         env.reset(seed=SEED)
-        os.kill(pids(env)[1], signal.SIGKILL)
+        os.kill(inside.pids(env)[1], signal.SIGKILL)
         observation, info = env.reset(seed=SEED)
         assert np.array_equal(observation, oracle().reset(seed=SEED)[0])
         assert restarted(info)
@@ -372,8 +357,8 @@ def test_the_end_of_the_jail_takes_all_rows(lane: str) -> None:
     with made(lane) as suites:
         env = suites.env
         env.reset(seed=SEED)
-        jail = env._remote._loaded.jail.number
-        hosts = pids(env)
+        jail = inside.jail(env).number
+        hosts = inside.pids(env)
         init = psutil.Process(hosts[0]).parent()
         assert init is not None
         init.kill()
@@ -382,7 +367,7 @@ def test_the_end_of_the_jail_takes_all_rows(lane: str) -> None:
         assert truncated.all()
         assert restarted(info, slice(4))
         assert np.array_equal(observation, fresh(1, slice(4)))
-        assert env._remote._loaded.jail.number != jail
+        assert inside.jail(env).number != jail
 
 
 @lanes
@@ -419,7 +404,7 @@ def test_one_that_raises_beside_a_death_is_told_first(lane: str) -> None:
         env.reset(seed=SEED)
         with pytest.raises(errors.RemoteEnvError, match="as told"):
             env.step([LIVE, RAISE, LIVE, EXIT])
-        assert state(env) is State.READY
+        assert inside.state(env) is State.READY
         assert restarted(env.step(ALL_LIVE)[4])
 
 
@@ -432,7 +417,7 @@ def test_a_late_sibling_is_a_timeout_all_the_same(lane: str) -> None:
         env.step_async([SLOW, LIVE, LIVE, EXIT])
         with pytest.raises(errors.WorkerTimeoutError):
             env.step_wait(timeout=0.1)
-        assert state(env) is State.LATE
+        assert inside.state(env) is State.LATE
         observation, _ = env.reset(seed=SEED)
         assert np.array_equal(observation, oracle().reset(seed=SEED)[0])
         assert env.step(ALL_LIVE)[0][:, 1].tolist() == [1, 1, 1, 1]
@@ -461,7 +446,7 @@ def test_budget_ends_in_the_death_itself(lane: str) -> None:
             env.step(LAST_DIES)
         assert caught.value.exit_code == 3
         assert "all 1 restarts" in str(caught.value.__cause__)
-        assert state(env) is State.DEAD
+        assert inside.state(env) is State.DEAD
         with pytest.raises(errors.WorkerDiedError, match="all 1 restarts"):
             env.reset()
 
@@ -516,7 +501,7 @@ def test_close_does_not_wait_for_who_is_coming_back() -> None:
         with pytest.raises(ClosedEnvironmentError):
             env.step(LAST_DIES)
         closing.join()
-        assert state(env) is State.CLOSED
+        assert inside.state(env) is State.CLOSED
 
 
 def test_coming_back_has_a_deadline() -> None:
@@ -527,7 +512,7 @@ def test_coming_back_has_a_deadline() -> None:
         env.reset(seed=SEED)
         with pytest.raises(errors.WorkerTimeoutError, match="make_env"):
             env.step(LAST_DIES)
-        assert state(env) is State.LATE
+        assert inside.state(env) is State.LATE
         assert np.array_equal(env.reset(seed=SEED)[0], oracle().reset(seed=SEED)[0])
 
 
@@ -541,7 +526,7 @@ def test_interrupted_in_coming_back_it_starts_afresh() -> None:
             signal.setitimer(signal.ITIMER_REAL, 0.3)
             with pytest.raises(KeyboardInterrupt):
                 env.step(LAST_DIES)
-            assert state(env) is State.LATE
+            assert inside.state(env) is State.LATE
             env.reset(seed=SEED)
             assert env.step(ALL_LIVE)[0][:, 1].tolist() == [1, 1, 1, 1]
     finally:
@@ -559,6 +544,6 @@ def test_the_dead_leave_nothing_in_their_jail() -> None:
             env.step(LAST_DIES)
             env.step(ALL_LIVE)
         assert len(os.listdir("/proc/self/fd")) == held
-        init = psutil.Process(pids(env)[0]).parent()
+        init = psutil.Process(inside.pids(env)[0]).parent()
         assert init is not None
         assert eventually(lambda: len(init.children(recursive=True)) == 2)

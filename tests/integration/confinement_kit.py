@@ -77,19 +77,19 @@ class Cell:
         self.jail = jail
         self.events: list[Any] = []
         self.output = b""
-        self._streams: dict[int, Any] = {}
+        self.streams: dict[int, Any] = {}
 
     def start(self, fds: tuple[int, ...] = ()) -> int:
         """Start a host; its id."""
         host, stream = self.jail.start_host(fds)
         stream.settimeout(DEADLINE_S)
-        self._streams[host] = stream.makefile("rw")
+        self.streams[host] = stream.makefile("rw")
         stream.close()
         return host
 
     def run(self, source: str, host: int = 1) -> dict[str, Any]:
         """Run ``source`` in ``host``; see ``execute``."""
-        lines = self._streams[host]
+        lines = self.streams[host]
         lines.write(json.dumps(source) + "\n")
         lines.flush()
         try:
@@ -100,7 +100,7 @@ class Cell:
 
     def hang_up(self, host: int = 1) -> None:
         """Close the host's stream, so that it ends."""
-        self._streams.pop(host).close()
+        self.streams.pop(host).close()
 
     def pump(self, timeout_s: float = 0.05) -> None:
         """Collect events and output."""

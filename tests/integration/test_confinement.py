@@ -33,6 +33,7 @@ from tests.integration.confinement_kit import (
     unconfined,
     wait_until,
 )
+from tests.support import inside
 
 
 @pytest.fixture(scope="module")
@@ -606,7 +607,7 @@ def test_denial_that_does_not_hold_aborts(profile: str) -> None:
         # Grants the server's own runtime folder, where the canary lies.
         confinement = Confinement(profile=profile, readable=(str(folder),))
         with spawner_in(folder, confinement) as spawner:
-            spawner._folder.chmod(0o755)  # under root, the jail is another user
+            inside.runtime_folder(spawner).chmod(0o755)  # under root, the jail is another user
             cell = new_cell(spawner, make_snapshot(folder), confinement)
             cell.start()
             failed = cell.wait_for(Failed)

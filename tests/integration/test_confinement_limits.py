@@ -281,7 +281,7 @@ def test_output_flood_does_not_block_the_host(profile: str) -> None:
     """Whoever reads the pipe keeps what it wants; the host writes on."""
     with limited(profile) as cell:
         flood = "import os\nfor _ in range(64): os.write(1, b'x' * 65536)\nresult = 'done'"
-        stream = cell._streams[1]
+        stream = cell.streams[1]
         stream.write(json.dumps(flood) + "\n")
         stream.flush()
         while len(cell.output) < 64 * 65536:

@@ -82,8 +82,8 @@ def test_missing_task_falls_back_as_in_lerobot() -> None:
     """An environment without a task gives empty ones: the error is an AttributeError."""
     with make_env(sample("pendulum"), n_envs=2) as suites:
         suites.env.reset(seed=0)
-        assert lerobot._tasks(suites.env) == ["", ""]
-        assert not lerobot._has_attribute(suites.env, "task")
+        assert lerobot.tasks_of(suites.env) == ["", ""]
+        assert not lerobot.has_attribute(suites.env, "task")
         assert suites.env.call("_max_episode_steps") == (25, 25)
 
 

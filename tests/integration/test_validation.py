@@ -17,6 +17,7 @@ from envhub_sandbox.errors import ActionError, ObservationError, PolicyError
 from envhub_sandbox.validation import holds
 from envhub_worker.protocol.lifecycle import State
 from envhub_worker.protocol.spaces import OpaqueSpace
+from tests.support import inside
 from tests.support.repositories import write_repository
 from tests.support.samples import sample
 
@@ -128,10 +129,10 @@ def test_who_drops_it_has_closed_it() -> None:
         suites = make_env(sample("pendulum"), 2, validate=True)
         env = suites.env
         env.reset(seed=0)
-        remote = env._remote
+        session = inside.session(env)
         suites.clear()
         del suites, env
-        assert remote.lifecycle.state is State.CLOSED
+        assert session.lifecycle.state is State.CLOSED
     finally:
         gc.enable()
 

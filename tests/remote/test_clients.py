@@ -21,6 +21,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.keys import key_text
 from tests.remote.listening import Listening, listening
+from tests.support import inside
 from tests.support.processes import eventually
 
 ALICE, MALLORY = keys.generate(), keys.generate()
@@ -96,7 +97,7 @@ def mallory(shared: Listening) -> Iterator[Peer]:
 
 def test_another_clients_jail_is_not_there(alice: Any, mallory: Peer) -> None:
     """By number and session, which are Alice's own; to Alice it is there, as the control."""
-    jail = alice._remote._loaded.jail
+    jail = inside.jail(alice)
     for request in (
         m.StartHosts(jail.number, 1),
         m.ReadOutput(jail.number, ""),

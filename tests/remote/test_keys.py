@@ -23,6 +23,7 @@ from envhub_worker.keys import AuthorizedClients
 from envhub_worker.protocol.keys import key_text, parse_key
 from envhub_worker.refusals import LINES, Log
 from tests.remote.listening import WORKER, Listening, listening
+from tests.support import inside
 
 
 def test_keys_are_read_in_both_forms() -> None:
@@ -81,7 +82,7 @@ def test_a_container_without_landlock_permits_no_weak_profile_by_itself(
     monkeypatch: pytest.MonkeyPatch, abi: int, default: str
 ) -> None:
     """A jail of the profile ``container`` is the server's user: it would read every store."""
-    monkeypatch.setattr("envhub_worker.listen._CONTAINER_MARKS", ("/",))
+    monkeypatch.setattr(*inside.CONTAINER_MARKS, ("/",))
     monkeypatch.setattr("envhub_worker.lockdown.landlock.version", lambda: abi)
     parser = argparse.ArgumentParser()
     listen.add_arguments(parser)
@@ -104,16 +105,16 @@ def test_without_landlock_a_weak_profile_is_for_one_client(
     identity = listen.Identity(keys.generate(), path)
     monkeypatch.setattr("envhub_worker.lockdown.landlock.version", lambda: 0)
     with pytest.raises(ValueError, match="without Landlock"):
-        listen._gate(options, tmp_path, identity)
+        inside.gate_of(options, tmp_path, identity)
     path.write_text(f"{one}\n")
-    listen._gate(options, tmp_path, identity)
+    inside.gate_of(options, tmp_path, identity)
     few = AuthorizedClients(path, {}, 1)
     path.write_text(f"{one}\n{other}\n")
     with pytest.raises(ValueError, match="2 clients"):
         few.refresh()
     assert few.name_of(parse_key(other)) is None
     monkeypatch.setattr("envhub_worker.lockdown.landlock.version", lambda: 1)
-    listen._gate(options, tmp_path, identity)
+    inside.gate_of(options, tmp_path, identity)
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from envhub_sandbox.errors import SandboxUnavailableError, WorkerDiedError
 from tests.remote.hosts import OtherHost, other_host
 from tests.remote.listening import Listening, counting, listening
 from tests.remote.relay import relay
+from tests.support import inside
 from tests.support.processes import eventually
 
 HEARTBEAT_S = 1.0
@@ -75,9 +76,9 @@ def test_a_client_that_comes_back_finds_its_jail_again(
     with make_env(repository, sandbox=far_server.sandbox(heartbeat_s=HEARTBEAT_S)) as suites:
         suites.env.reset(seed=1)
         suites.env.step(np.array([0]))
-        link = suites.env._remote._loaded.jail.client._link
+        link = inside.link(suites.env)
         far.unplug()
-        assert eventually(lambda: link.drain() or not link._up)
+        assert eventually(lambda: link.drain() or not inside.link_is_up(link))
         far.plug()
         assert suites.env.step(np.array([0]))[0].tolist() == [[2.0]]
 
@@ -104,10 +105,10 @@ def test_a_connection_that_breaks_between_steps_is_made_anew(
         suites.env.reset(seed=1)
         for count in range(1, 4):
             assert suites.env.step(np.array([0]))[0].tolist() == [[count]]
-            link = suites.env._remote._loaded.jail.client._link
-            before = link._lost
+            link = inside.link(suites.env)
+            before = inside.link_losses(link)
             wire.cut()
-            assert eventually(lambda: link.drain() or link._lost > before)  # noqa: B023
+            assert eventually(lambda: link.drain() or inside.link_losses(link) > before)  # noqa: B023
 
 
 def test_a_slow_wire_changes_no_result(server: Listening, repository: Path) -> None:
@@ -135,8 +136,7 @@ def test_a_client_that_was_silent_for_too_long_is_told_so(
     """Its jail was ended; when it comes back it hears why."""
     with make_env(repository, sandbox=server.sandbox()) as suites:
         suites.env.reset(seed=1)
-        host = suites.env._remote._loaded.server.host
-        host._stop.set()  # the thread that says that we live
+        inside.fall_silent(suites.env)
         assert eventually(lambda: server.jails() == 0)
         with pytest.raises(WorkerDiedError, match="nothing was heard of its client for 2 s"):
             suites.env.step(np.array([0]))

@@ -31,6 +31,7 @@ from envhub_worker.sessions import Sessions
 from envhub_worker.uploads import Uploads
 from tests.remote.listening import Listening, listening
 from tests.remote.relay import relay
+from tests.support import inside
 from tests.support.processes import eventually
 
 _MIB = 1 << 20
@@ -128,7 +129,7 @@ def test_nobody_comes_in_while_nobody_can_be_asked(tmp_path: Path) -> None:
                 router.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 0)
             port = router.bind_to_random_port("tcp://127.0.0.1")
             peer.setsockopt(zmq.LINGER, 0)
-            peer.setsockopt(zmq.CURVE_SERVERKEY, gate._rules.keys.public)  # type: ignore[union-attr]
+            peer.setsockopt(zmq.CURVE_SERVERKEY, inside.public_key(gate))
             peer.setsockopt(zmq.CURVE_SECRETKEY, pair.secret)
             peer.setsockopt(zmq.CURVE_PUBLICKEY, pair.public)
             peer.connect(f"tcp://127.0.0.1:{port}")
@@ -247,15 +248,15 @@ def test_a_door_that_cannot_be_shut_ends_nothing(monkeypatch: pytest.MonkeyPatch
         for broken in ("os.listdir", "os.dup"):
             with monkeypatch.context() as patch:
                 patch.setattr(broken, _no_descriptors)
-                doorman._happened(zmq.EVENT_ACCEPTED)
-            assert doorman._shut_door is None
+                inside.happen(doorman, zmq.EVENT_ACCEPTED)
+            assert not inside.door_is_shut(doorman)
         assert "and no end" in said[0]
-        doorman._happened(zmq.EVENT_ACCEPTED)
-        assert doorman._shut_door is not None
+        inside.happen(doorman, zmq.EVENT_ACCEPTED)
+        assert inside.door_is_shut(doorman)
         for _ in range(3):
-            doorman._happened(zmq.EVENT_DISCONNECTED)
+            inside.happen(doorman, zmq.EVENT_DISCONNECTED)
         doorman.tick()
-        assert doorman._shut_door is None
+        assert not inside.door_is_shut(doorman)
         doorman.close()
 
 

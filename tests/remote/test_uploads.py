@@ -19,6 +19,7 @@ from envhub_worker.quotas import Quotas, RefusedError
 from envhub_worker.stores import BLOCK_BYTES
 from envhub_worker.uploads import PREFIX, Uploads
 from tests.remote.listening import Listening, counting
+from tests.support import inside
 
 ALICE, BOB = b"a" * 32, b"b" * 32
 OWNER = ALICE + b"session"
@@ -271,7 +272,7 @@ def test_only_the_edited_file_travels_to_a_real_server(server: Listening, tmp_pa
     with make_env(repository, sandbox=server.sandbox()) as suites:
         suites.env.reset(seed=1)
         suites.env.step(np.array([0]))
-        remote = suites.env._remote._loaded.server
+        remote = inside.server(suites.env)
         client = WorkerClient(remote.endpoint, remote.process_fd, far=remote.far)
         client.hello(Deadline(30))
         (repository / "empty").write_bytes(b"no more")

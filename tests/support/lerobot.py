@@ -33,12 +33,12 @@ def rollout(env: Any, policy: Policy, seeds: list[int] | None, frames: list[Any]
     done = np.array([False] * env.num_envs)
     max_steps = env.call("_max_episode_steps")[0]
     for name in ("task_description", "task"):
-        _has_attribute(env, name)
+        has_attribute(env, name)
     step = 0
     while not np.all(done) and step < max_steps:
         prepared = {"observation.state": torch.from_numpy(observation["agent_pos"]).float()}
         observations.append(deepcopy(prepared))
-        tasks.append(_tasks(env))
+        tasks.append(tasks_of(env))
         with torch.inference_mode():
             action = policy(prepared | {"task": tasks[-1]})
         action_numpy = action.to("cpu").numpy()
@@ -128,7 +128,8 @@ def _one_by_one(tasks: Any, policy: Policy, n_episodes: int) -> dict[Any, Any]:
     return results
 
 
-def _has_attribute(env: Any, name: str) -> bool:
+def has_attribute(env: Any, name: str) -> bool:
+    """Whether it is there, for somebody who takes any error for a no."""
     try:
         env.get_attr(name)
     except Exception:
@@ -136,7 +137,8 @@ def _has_attribute(env: Any, name: str) -> bool:
     return True
 
 
-def _tasks(env: Any) -> list[str]:
+def tasks_of(env: Any) -> list[str]:
+    """What each sub-environment says that its task is, or nothing."""
     for name in ("task_description", "task"):
         try:
             return list(env.call(name))

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envhub_sandbox import api, arguments, make_env, snapshot
+from envhub_sandbox import arguments, make_env, snapshot
 from envhub_sandbox.config import plain_config
 from envhub_sandbox.errors import HubReferenceError, PolicyError, RepositoryUnavailableError
+from tests.support import inside
 from tests.support.samples import sample
 
 MIB = 1 << 20
@@ -52,7 +53,7 @@ def test_what_cannot_be_is_refused(
     """By its name, and not as the repository's fault."""
     (tmp_path / "README.md").touch()
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(api, "_Maker", None)
+    monkeypatch.setattr(*inside.MAKER, None)
     with pytest.raises(error, match=words):
         make_env(**{"cfg": sample("cartpole"), **given})
 

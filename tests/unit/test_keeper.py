@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.sandboxes import docker
+from tests.support import inside
 from tests.support.processes import eventually
 
 _ENGINE = """#!/bin/sh
@@ -62,7 +62,8 @@ def kept(tmp_path: Path, what: str) -> Iterator[Kept]:
     pidfd, (ready, ready_end) = os.pidfd_open(client.pid), os.pipe()
     words = [str(pidfd), str(ready_end), str(folder), "envhub-test", "--", str(engine), "run"]
     keeper = subprocess.Popen(
-        [sys.executable, "-I", "-S", str(docker._KEEPER), *words], pass_fds=(pidfd, ready_end)
+        [sys.executable, "-I", "-S", str(inside.keeper_script()), *words],
+        pass_fds=(pidfd, ready_end),
     )
     os.close(ready_end)
     os.close(pidfd)

@@ -14,6 +14,7 @@ from envhub_worker.lockdown.environment import jail_environment, zygote_environm
 from envhub_worker.lockdown.scratch import remove_tree
 from envhub_worker.lockdown.watchdog import MemoryWatch, folder_usage, seconds_to_next_look
 from envhub_worker.protocol.confinement import GIB, MIB, Limits
+from tests.support import inside
 
 V1_MOUNTS = """\
 30 29 0:26 / /sys/fs/cgroup/memory rw,relatime shared:9 - cgroup cgroup rw,memory
@@ -86,8 +87,8 @@ def test_v2_processes_in_the_way_move_to_a_leaf(tmp_path: Path) -> None:
     (tmp_path / "cgroup.type").write_text("domain\n")
     moved = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cgroups, "_write", lambda path, text: moved.append((path, text)))
-        cgroups._step_aside(str(tmp_path))
+        patch.setattr(*inside.CGROUP_WRITE, lambda path, text: moved.append((path, text)))
+        inside.step_aside(str(tmp_path))
     leaf = f"{tmp_path}/envhub-{os.getpid()}-leaf/cgroup.procs"
     assert moved == [(leaf, "7"), (leaf, "8")]
 
@@ -96,7 +97,7 @@ def test_group_that_cannot_be_limited_is_not_left_behind(tmp_path: Path) -> None
     """No limit, no group: the caller then measures instead."""
     taken = tmp_path / "jail"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cgroups, "_write", _refuse)
+        patch.setattr(*inside.CGROUP_WRITE, _refuse)
         with pytest.raises(PermissionError):
             Group("cgroup-v1", [str(taken), str(tmp_path / "pids")], Limits())
     assert list(tmp_path.iterdir()) == []

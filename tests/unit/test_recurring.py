@@ -22,6 +22,7 @@ from envhub_worker.protocol.errors import (
     RemoteProtocolError,
 )
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+from tests.support import inside
 
 _DTYPES = ("bool", "int8", "uint16", "int64", "float16", "float32", ">f8", "complex64")
 _LEAVES = st.one_of(
@@ -48,11 +49,14 @@ _VALUES = st.recursive(
 )
 
 
+OUTGOING, INCOMING = inside.FORMS
+
+
 @pytest.fixture(autouse=True)
 def no_forms(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever other tests have sent."""
-    monkeypatch.setattr(m, "_OUTGOING", recurring.Forms())
-    monkeypatch.setattr(m, "_INCOMING", recurring.Forms())
+    for spot in (OUTGOING, INCOMING):
+        monkeypatch.setattr(*spot, recurring.Forms())
 
 
 def alike(one: Any, other: Any) -> bool:
@@ -118,7 +122,7 @@ def _known(value: object) -> bytes:
     for _ in range(3):
         frames = m.pack(m.Value(value), 1)
         m.unpack(frames)
-    assert list(m._INCOMING._forms.values()) != [None]
+    assert list(inside.forms(INCOMING).values()) != [None]
     [header] = frames
     return bytes(header)
 
@@ -192,9 +196,9 @@ def test_a_peer_that_never_repeats_itself_fills_nothing() -> None:
     """Forms are bounded."""
     for number in range(2000):
         m.unpack(m.pack(m.Value(f"{number}"), 1))
-    assert len(m._INCOMING._forms) <= 256
-    assert len(m._OUTGOING._forms) <= 256
-    assert set(m._INCOMING._forms.values()) == {None}
+    assert len(inside.forms(INCOMING)) <= 256
+    assert len(inside.forms(OUTGOING)) <= 256
+    assert set(inside.forms(INCOMING).values()) == {None}
 
 
 @given(st.integers(-(2**63), 2**64 - 1))

@@ -27,6 +27,7 @@ from tests.integration.confinement_kit import (
     spawner_in,
     wait_until,
 )
+from tests.support import inside
 
 
 @pytest.fixture(params=["strict", "no-userns"])
@@ -208,7 +209,7 @@ def test_close_leaves_no_process_and_no_file(folder: Path, confinement: Confinem
         cell = new_cell(spawner, make_snapshot(folder), confinement)
         cell.start()
         assert cell.run("result = 1") == {"result": 1}
-        zygote = spawner._process.pid
+        zygote = inside.zygote_pid(spawner)
     assert not os.path.exists(f"/proc/{zygote}")
     assert list(runtime.iterdir()) == []
 

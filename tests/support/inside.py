@@ -1,0 +1,287 @@
+"""What tests and benchmarks see of the inside: the one place that knows private names.
+
+A test asks for what it needs by the name of what it gets: ``inside.jail(env)``, and not by where
+that lies today. When the packages are arranged anew this file is changed, and no test is. So a
+test names nothing that starts with an underscore; ``test_imports`` finds who does. What is missing
+here is added here: a function, or a *spot*, which is an owner and a name, for
+``monkeypatch.setattr(*inside.ending(env), interrupted)``.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from envhub_sandbox import api, crashes, folders, remote_env, tenant
+from envhub_sandbox.client import WorkerClient
+from envhub_sandbox.deadline import Deadline
+from envhub_sandbox.fast_lane import FastLane
+from envhub_sandbox.jail import RemoteJail
+from envhub_sandbox.recipe import Recipe
+from envhub_sandbox.remote_env import RemoteEnv
+from envhub_sandbox.repository import LoadedJail, Repository
+from envhub_sandbox.sandboxes import docker
+from envhub_sandbox.stats import Ledger
+from envhub_worker import listen
+from envhub_worker.doorman import Doorman
+from envhub_worker.gate import RemoteGate
+from envhub_worker.lockdown import cgroups
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.lifecycle import Lifecycle, State
+from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.spawner import Spawner
+
+Spot = tuple[Any, str]
+
+# --- one environment ---------------------------------------------------------------------------
+
+
+def session(env: Any) -> RemoteEnv:
+    """What lies behind the Gymnasium face of an environment."""
+    found: RemoteEnv = env._remote
+    return found
+
+
+def state(env: Any) -> State:
+    """Where it is in its life."""
+    return session(env).lifecycle.state
+
+
+def live_by(env: Any, lifecycle: Lifecycle) -> None:
+    """Have another table of its states."""
+    session(env).lifecycle = lifecycle
+
+
+def manifest(env: Any) -> EnvManifest:
+    """What its worker said that it is."""
+    return session(env).manifest
+
+
+def bounds(env: Any) -> list[tuple[int, int]]:
+    """The slices of its sub-environments, one for each shard."""
+    return session(env).bounds
+
+
+def repository(env: Any) -> Repository:
+    """The repository that it comes from, with its policy and its servers."""
+    return session(env).repository
+
+
+def recipe(suites: Any) -> Recipe | None:
+    """What a pickle of these suites holds."""
+    found: Recipe | None = suites._recipe
+    return found
+
+
+# --- where it lives ----------------------------------------------------------------------------
+
+
+def loaded(env: Any) -> LoadedJail | None:
+    """The jail that it has, and the server of that; None while it runs nowhere."""
+    return session(env)._loaded
+
+
+def jail(env: Any) -> RemoteJail:
+    """The jail that it runs in."""
+    return _running(env).jail
+
+
+def client(env: Any) -> WorkerClient:
+    """The connection to its server."""
+    return jail(env).client
+
+
+def server(env: Any) -> Any:
+    """Its worker server: an endpoint, and a process where that is ours."""
+    return _running(env).server
+
+
+def pids(env: Any) -> list[int]:
+    """The processes of its jail, as its server knows them."""
+    status, _ = client(env).request(m.GetStatus(), deadline=Deadline(60))
+    assert isinstance(status, m.Status)
+    jails = [one for one in status.jails if isinstance(one, dict)]
+    return next(list(one["pids"]) for one in jails if one["jail"] == jail(env).number)
+
+
+def lane(env: Any) -> FastLane | None:
+    """Its fast lane, where it has one."""
+    return session(env)._lane
+
+
+def force_spin(used: FastLane, chooser: Any) -> None:
+    """Have another one decide for how long a step spins."""
+    used._step_spin = chooser
+
+
+def release_of_server(env: Any) -> Callable[[], None]:
+    """What lets go of the server that it holds while it has no jail."""
+    return session(env)._release_server
+
+
+def hold_server(env: Any, release: Callable[[], None]) -> None:
+    """Have it hold its server, and call this to let go of it."""
+    session(env)._release_server = release
+
+
+def order(known: Repository, of: Any) -> Any:
+    """What is asked of a server for a jail of this repository."""
+    return known._order(of)
+
+
+def _running(env: Any) -> LoadedJail:
+    found = loaded(env)
+    assert found is not None, f"the environment has no jail: {state(env).name}"
+    return found
+
+
+# --- the connection to another host ------------------------------------------------------------
+
+
+def link(env: Any) -> Any:
+    """The link to a server elsewhere, as its client sees it."""
+    return client(env)._link
+
+
+def link_is_up(found: Any) -> bool:
+    """Whether it is connected, as far as is known."""
+    return bool(found._up)
+
+
+def link_losses(found: Any) -> int:
+    """How often it was lost."""
+    return int(found._lost)
+
+
+def fall_silent(env: Any) -> None:
+    """End the thread that tells the server that this client lives."""
+    server(env).host._stop.set()
+
+
+def send_half(connection: WorkerClient, frames: Sequence[Buffer]) -> None:
+    """The first frame of a message, and no more."""
+    connection._socket.send(frames[0], zmq.SNDMORE)
+
+
+# --- spots -------------------------------------------------------------------------------------
+
+LATE_REPLY_GRACE: Spot = (remote_env, "_GRACE_S")
+"""For how long ``reset`` waits for a late reply."""
+CLOSE_PATIENCE: Spot = (tenant, "_INTERRUPT_S")
+"""For how long ``close`` waits for another thread."""
+MAKER: Spot = (api, "_Maker")
+"""What ``make_env`` starts to work with when its arguments have been checked."""
+CONTAINER_MARKS: Spot = (listen, "_CONTAINER_MARKS")
+"""The files by which a container is told."""
+CGROUP_WRITE: Spot = (cgroups, "_write")
+"""What writes a file of a control group."""
+FORMS: tuple[Spot, Spot] = ((m, "_OUTGOING"), (m, "_INCOMING"))
+"""What is remembered of the shape of messages, each way."""
+
+
+def building(env: Any) -> Spot:
+    """Where it is built in a jail."""
+    return session(env)._builder, "build"
+
+
+def settling(env: Any) -> Spot:
+    """Where it takes up what was built."""
+    return session(env), "_settle"
+
+
+def started(env: Any) -> Spot:
+    """Where its history is told that it has started."""
+    return session(env).history, "started"
+
+
+def ending(env: Any) -> Spot:
+    """Where its jail is ended."""
+    return session(env)._jails, "end"
+
+
+def holding(env: Any) -> Spot:
+    """Where it takes hold of its server, while it has no jail."""
+    return repository(env), "hold"
+
+
+def noting_pace(env: Any) -> Spot:
+    """Where the pace of its steps is noted, at its close."""
+    return session(env), "_note_pace"
+
+
+def sending(connection: WorkerClient) -> Spot:
+    """Where the frames of a message go out."""
+    return connection, "_put"
+
+
+# --- one module at a time ----------------------------------------------------------------------
+
+
+def forms(spot: Spot) -> dict[Any, Any]:
+    """What one of the ``FORMS`` remembers now."""
+    owner, name = spot
+    found: dict[Any, Any] = getattr(owner, name)._forms
+    return found
+
+
+def living(ledger: Ledger) -> Any:
+    """The environments that a ledger still knows."""
+    return ledger._living
+
+
+def packet(frames: Sequence[Buffer]) -> bytes:
+    """A message as a crash bundle keeps it."""
+    return crashes._packet(frames)
+
+
+def keeper_script() -> Path:
+    """The script that ends a container after its client."""
+    return docker._KEEPER
+
+
+def is_own_group(path: Path) -> bool:
+    """Whether the group of a file is this user's alone."""
+    return folders._is_own_group(str(path), os.stat(path))
+
+
+def zygote_pid(spawner: Spawner) -> int:
+    """The zygote's process."""
+    assert spawner._process is not None
+    return spawner._process.pid
+
+
+def runtime_folder(spawner: Spawner) -> Path:
+    """Where a spawner keeps its own files."""
+    return spawner._folder
+
+
+def step_aside(group: str) -> None:
+    """Move the processes of a control group to a leaf of it."""
+    cgroups._step_aside(group)
+
+
+def gate_of(options: Any, folder: Path, identity: listen.Identity) -> Any:
+    """The gate that ``envhub-worker listen`` puts before a server."""
+    return listen._gate(options, folder, identity)
+
+
+def public_key(gate: RemoteGate) -> bytes:
+    """The key by which a gate is known."""
+    keys = gate._rules.keys
+    assert keys is not None
+    return keys.public
+
+
+def happen(doorman: Doorman, event: int) -> None:
+    """Tell a doorman what libzmq's monitor would."""
+    doorman._happened(event)
+
+
+def door_is_shut(doorman: Doorman) -> bool:
+    """Whether nobody is let in at present."""
+    return doorman._shut_door is not None
