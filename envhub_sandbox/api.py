@@ -17,13 +17,13 @@ from envhub_sandbox.policy import Limits, Policy, Timeouts, limits_from, policy_
 from envhub_sandbox.provenance import provenance_of
 from envhub_sandbox.recipe import Recipe, pinned
 from envhub_sandbox.remote_env import RemoteEnv
-from envhub_sandbox.repository import LoadArguments, LoadedJail, Repository
+from envhub_sandbox.repository import Known, LoadArguments, LoadedJail, Repository
 from envhub_sandbox.sandboxes.base import Sandbox
 from envhub_sandbox.sharding import bounds_for
 from envhub_sandbox.snapshot import named
 from envhub_sandbox.suites import EnvSuites
 from envhub_sandbox.vector_env import SandboxVectorEnv
-from envhub_worker.protocol.manifest import EnvManifest, Manifest
+from envhub_worker.protocol.manifest import Manifest
 
 
 def make_env(
@@ -203,7 +203,7 @@ class _Maker:
     def _suites(self, manifest: Manifest, loaded: LoadedJail | None) -> EnvSuites:
         repository = self._repository
         shared = None if manifest.lazy or len(manifest.envs) == 1 else self._shared(loaded)
-        remotes = [self._remote(env, shared) for env in manifest.envs]
+        remotes = [self._remote(Known(manifest, env), shared) for env in manifest.envs]
         if loaded is not None and shared is None:
             self._use(loaded, remotes)
         envs: dict[str, dict[Any, Any]] = {}
@@ -223,8 +223,8 @@ class _Maker:
             shared.provide(loaded)
         return shared
 
-    def _remote(self, env: EnvManifest, shared: SharedJail | None) -> RemoteEnv:
-        own = OwnJails(self._repository, self._cache.forget)
+    def _remote(self, known: Known, shared: SharedJail | None) -> RemoteEnv:
+        env, own = known.task, OwnJails(self._repository, self._cache.forget, known)
         source: JailSource = own if shared is None else shared
         paces = self._cache.paces
         bounds = bounds_for(env, self._num_workers, paces.of(env))

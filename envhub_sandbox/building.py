@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NoReturn
 
 from envhub_sandbox.client import SESSION
 from envhub_sandbox.deadline import Deadline
@@ -15,7 +15,7 @@ from envhub_sandbox.jail import typed
 from envhub_sandbox.jail_sources import JailSource, SharedJail
 from envhub_sandbox.repository import LoadedJail
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.manifest import EnvManifest, decode_env
 
 Bounds = list[tuple[int, int]]
 _numbers = itertools.count(1)
@@ -71,7 +71,8 @@ class Builder:
         idle_s = self._repository.timeouts.idle_s
         if idle_s is not None and idle_s < float("inf"):
             loaded.jail.expire(idle_s, deadline)
-        hosts = self._repository.spread(loaded, len(self._bounds), deadline)
+        hosts = self._repository.spread(loaded, len(self._bounds), deadline, self._manifest)
+        self._check_manifest(loaded)
         place = Place(loaded, hosts, self._number, None)
         shards = range(len(hosts))
         self._build(place, shards, deadline)
@@ -90,7 +91,8 @@ class Builder:
         place.loaded.loaded.difference_update(gone)
         for index, host in zip(dead, fresh, strict=True):
             hosts[index] = host
-        self._repository.load(place.loaded, fresh, deadline)
+        self._repository.load(place.loaded, fresh, deadline, self._manifest)
+        self._check_manifest(place.loaded)
         place = replace(place, hosts=hosts)
         self._build(place, dead, deadline)
         if place.lane is not None:
@@ -109,7 +111,17 @@ class Builder:
             )
             for index in shards
         ]
-        place.loaded.jail.exchange("make_env", builds, deadline)
+        replies = place.loaded.jail.exchange("make_env", builds, deadline)
+        for index, reply in zip(shards, replies, strict=True):
+            self._check_built(typed(reply, m.Built), *self._bounds[index])
+
+    def _check_built(self, reply: m.Built, start: int, stop: int) -> None:
+        """Hold what was built against the manifest. Trust: input from the worker."""
+        most = self._repository.policy.limits.elements
+        built, wanted = decode_env(reply.manifest, max_elements=most), self._manifest
+        count = stop - start if wanted.shardable else wanted.num_envs
+        if built.num_envs != count or _kind(built) != _kind(wanted):
+            self._refuse()
 
     def _open_lane(self, place: Place, deadline: Deadline) -> FastLane | None:
         """Agree with the hosts on slabs and doorbells; None where frames have to serve."""
@@ -154,19 +166,26 @@ class Builder:
     def _check_manifest(self, loaded: LoadedJail) -> None:
         key = (self._manifest.suite, self._manifest.task)
         found = next((e for e in loaded.manifest.envs if (e.suite, e.task) == key), None)
-        if found is None or _shape(found) != _shape(self._manifest):
-            self._jails.forget_manifest()
-            raise LoadError(
-                f"make_env returned another environment for {key} than before: its result must "
-                "not change between calls. The remembered description has been dropped; call "
-                "make_env again"
-            )
+        if found is None or loaded.changed or _shape(found) != _shape(self._manifest):
+            self._refuse()
+
+    def _refuse(self) -> NoReturn:
+        self._jails.forget_manifest()
+        key = (self._manifest.suite, self._manifest.task)
+        raise LoadError(
+            f"make_env returned another environment for {key} than before: its result must "
+            "not change between calls. The remembered description has been dropped; call "
+            "make_env again"
+        )
 
 
 def _shape(manifest: EnvManifest) -> tuple[Any, ...]:
+    return (manifest.num_envs, manifest.shardable, *_kind(manifest))
+
+
+def _kind(manifest: EnvManifest) -> tuple[Any, ...]:
+    """What a slice has in common with the whole."""
     return (
-        manifest.num_envs,
-        manifest.shardable,
         manifest.autoreset_mode,
         manifest.single_observation_space,
         manifest.single_action_space,

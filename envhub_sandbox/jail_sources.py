@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from envhub_sandbox.deadline import Deadline
-from envhub_sandbox.repository import LoadedJail, Repository
+from envhub_sandbox.repository import Known, LoadedJail, Repository
 
 
 class JailSource(Protocol):
@@ -38,15 +38,18 @@ class JailSource(Protocol):
 
 
 class OwnJails:
-    """A jail for each environment."""
+    """A jail for each environment, of which ``known`` says what it is going to be."""
 
-    def __init__(self, repository: Repository, forget_manifest: Callable[[], None]) -> None:
+    def __init__(
+        self, repository: Repository, forget_manifest: Callable[[], None], known: Known
+    ) -> None:
         self.repository = repository
         self.forget_manifest = forget_manifest
+        self._known = known
 
     def take(self, deadline: Deadline) -> LoadedJail:
         """A fresh jail."""
-        return self.repository.open(deadline)
+        return self.repository.open(deadline, self._known)
 
     def end(self, loaded: LoadedJail) -> None:
         """End it."""

@@ -22,7 +22,7 @@ from envhub_sandbox.errors import (
     name_source,
 )
 from envhub_sandbox.history import Recording
-from envhub_sandbox.jail import RemoteJail, open_jail
+from envhub_sandbox.jail import RemoteJail, open_jail, typed
 from envhub_sandbox.log import CRASHES, WORKER
 from envhub_sandbox.policy import Policy, Timeouts
 from envhub_sandbox.provenance import provenance_of
@@ -39,10 +39,12 @@ from envhub_sandbox.snapshot_store import cache_root
 from envhub_sandbox.worker_output import OutputFollower, Wanted
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import WireLimits
-from envhub_worker.protocol.manifest import Manifest, decode_manifest
+from envhub_worker.protocol.manifest import EnvManifest, Manifest, decode_manifest
 
 _CLOSE_S = 5.0
 _STATUS_S = 1.0
+_FIRST_WITH_LOAD_TASK = 3
+"""The version of the protocol."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +60,24 @@ class LoadArguments:
         """As it travels."""
         return m.Load(self.n_envs, self.use_async_envs, self.cfg, self.env_kwargs)
 
+    def message_for(self, task: EnvManifest) -> m.LoadTask:
+        """The same, where it is known what it returns."""
+        given = (self.n_envs, self.use_async_envs, self.cfg, self.env_kwargs)
+        return m.LoadTask(*given, task.suite, task.task)
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a repository's ``make_env`` has returned before.
+
+    Attributes:
+        manifest: All of it.
+        task: The environment that a jail is wanted for.
+    """
+
+    manifest: Manifest
+    task: EnvManifest
+
 
 @dataclass
 class LoadedJail:
@@ -67,6 +87,7 @@ class LoadedJail:
         jail: The jail.
         manifest: What ``make_env`` returned, checked.
         loaded: Hosts that have called it.
+        changed: Whether it returned something else in one of them than the manifest says.
     """
 
     jail: RemoteJail
@@ -75,6 +96,7 @@ class LoadedJail:
     loaded: set[int]
     server: WorkerServer
     closed: bool = False
+    changed: bool = False
 
 
 class Repository:
@@ -212,8 +234,13 @@ class Repository:
         """Keep the server between two jails; returns what gives it back."""
         return partial(self._sandbox.release, self._sandbox.acquire(self._store))
 
-    def open(self, deadline: Deadline) -> LoadedJail:
+    def open(self, deadline: Deadline, known: Known | None = None) -> LoadedJail:
         """Fork a jail and have its first host call ``make_env``.
+
+        Args:
+            deadline: For all of it.
+            known: What that returns. It is then described no more, which for a suite means to
+                build an environment of each of its tasks; ``Built`` is held against it instead.
 
         Raises:
             LoadError: The repository failed to load, or returned something unusable.
@@ -222,12 +249,12 @@ class Repository:
         server = self._sandbox.acquire(self._store)
         try:
             with self.starting():
-                return self._open(server, deadline)
+                return self._open(server, deadline, known)
         except BaseException:
             self._sandbox.release(server)
             raise
 
-    def _open(self, server: WorkerServer, deadline: Deadline) -> LoadedJail:
+    def _open(self, server: WorkerServer, deadline: Deadline, known: Known | None) -> LoadedJail:
         wanted = self._wanted_output()
         client = self._client(server)
         try:
@@ -246,7 +273,11 @@ class Repository:
                 jail.before_end = follower.stop
             around = server.layers if isinstance(server, EnclosedServer) else ()
             self.report = [*map(dict, around), *jail.report]
-            return self._load(jail, server, deadline)
+            if known is None or client.version < _FIRST_WITH_LOAD_TASK:
+                return self._load(jail, server, deadline)
+            loaded = LoadedJail(jail, known.manifest, {}, set(), server)
+            self.load(loaded, jail.hosts[:1], deadline, known.task)
+            return loaded
         except BaseException:
             jail.close(Deadline(_CLOSE_S))
             raise
@@ -296,7 +327,9 @@ class Repository:
             raise
         return client
 
-    def spread(self, loaded: LoadedJail, shards: int, deadline: Deadline) -> list[int]:
+    def spread(
+        self, loaded: LoadedJail, shards: int, deadline: Deadline, task: EnvManifest
+    ) -> list[int]:
         """The first ``shards`` hosts of a jail, forked and loaded if they are not yet."""
         jail = loaded.jail
         if len(jail.hosts) < shards:
@@ -304,13 +337,22 @@ class Repository:
         hosts = jail.hosts[:shards]
         fresh = [host for host in hosts if host not in loaded.loaded]
         if fresh:
-            self.load(loaded, fresh, deadline)
+            self.load(loaded, fresh, deadline, task)
         return hosts
 
-    def load(self, loaded: LoadedJail, hosts: list[int], deadline: Deadline) -> None:
-        """Have further hosts of a jail call ``make_env``."""
-        load = self.arguments.message()
-        loaded.jail.exchange("make_env", [(host, load) for host in hosts], deadline)
+    def load(
+        self, loaded: LoadedJail, hosts: list[int], deadline: Deadline, task: EnvManifest
+    ) -> None:
+        """Have hosts of a jail call ``make_env``, for a task that is known."""
+        jail = loaded.jail
+        if jail.client.version < _FIRST_WITH_LOAD_TASK:
+            load = self.arguments.message()
+            jail.exchange("make_env", [(host, load) for host in hosts], deadline)
+        else:
+            again = self.arguments.message_for(task)
+            replies = jail.exchange("make_env", [(host, again) for host in hosts], deadline)
+            found = [typed(reply, m.Value).value for reply in replies]
+            loaded.changed |= not all(_is_what(value, task) for value in found)
         loaded.loaded.update(hosts)
 
     def connect(self, loaded: LoadedJail, deadline: Deadline) -> LoadedJail:
@@ -372,3 +414,10 @@ class Repository:
             pass  # the server has gone, and the jail with it
         finally:
             client.close()
+
+
+def _is_what(value: object, task: EnvManifest) -> bool:
+    """Whether an answer to ``LoadTask`` says what is known. Trust: input from the worker."""
+    if type(value) is not tuple or tuple(map(type, value)) != (int, bool):
+        return False  # arrays, for instance, compare to something else than a bool
+    return value == (task.num_envs, task.shardable)

@@ -189,6 +189,7 @@ def honest(request: m.Message) -> m.Message:
         m.ReadOutput: m.Output(""),
         m.GetStatus: m.Status(()),
         m.Load: m.Loaded(manifest()),
+        m.LoadTask: m.Value((NUM_ENVS, True)),
         m.Build: m.Built(encode_env(env_manifest())),
         m.Call: m.Value((None,) * NUM_ENVS),
     }

@@ -25,6 +25,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerError, WorkerTimeoutError
 from envhub_sandbox.suites import EnvSuites
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.manifest import encode_env
 from envhub_worker.protocol.opaque import MAX_SPACE_DEPTH
 from envhub_worker.protocol.spaces import encode_space
 from tests.attacks.lying_server import (
@@ -33,6 +34,7 @@ from tests.attacks.lying_server import (
     Frames,
     LyingSandbox,
     LyingServer,
+    env_manifest,
     lying,
     manifest,
     step_done,
@@ -306,6 +308,39 @@ def test_lying_manifests_are_refused(liar: LyingServer, folder: str, what: str) 
     """A description that cannot be true, or is absurdly large, is refused before it is built."""
     liar.lies[m.Load] = relayed(described(MANIFESTS[what]()))
     refuses(lambda: opened(liar, folder))
+
+
+OTHERS: dict[str, tuple[type[m.Message], m.Message]] = {
+    "no such task": (m.LoadTask, m.Value(None)),
+    "another number": (m.LoadTask, m.Value((NUM_ENVS + 1, True))),
+    "a vector environment of its own": (m.LoadTask, m.Value((NUM_ENVS, False))),
+    "arrays": (m.LoadTask, m.Value((np.arange(3), np.arange(3)))),
+    "an array": (m.LoadTask, m.Value(np.arange(2))),
+    "a manifest": (m.LoadTask, m.Loaded(manifest())),
+    "fewer built": (m.Build, m.Built(encode_env(env_manifest(num_envs=1)))),
+    "another mode built": (m.Build, m.Built(encode_env(env_manifest(autoreset_mode="Disabled")))),
+    "nothing built": (m.Build, m.Built({})),
+    "a value built": (m.Build, m.Value(None)),
+}
+
+
+@pytest.mark.parametrize("what", list(OTHERS))
+def test_another_environment_than_remembered_is_refused(
+    liar: LyingServer, folder: str, what: str
+) -> None:
+    """Whichever way it shows that what a jail holds is not what the manifest says."""
+    opened(liar, folder).close()
+    asked, answer = OTHERS[what]
+    liar.lies[asked] = relayed(answer)
+    with opened(liar, folder) as suites:
+        refuses(suites.env.reset)
+
+
+def test_what_is_remembered_is_not(liar: LyingServer, folder: str) -> None:
+    """The control: the honest answers."""
+    opened(liar, folder).close()
+    with opened(liar, folder) as suites:
+        suites.env.reset()
 
 
 DISAGREEING: dict[str, dict[str, Any]] = {

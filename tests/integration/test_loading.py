@@ -414,3 +414,85 @@ class TestWhatGoesWrong:
         suites.env.reset(seed=0)
         suites.close()
         assert suites.env.closed
+
+
+SUITE = """
+import gymnasium as gym
+
+BUILT = []
+
+
+class Box(gym.Env):
+    observation_space = action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, name):
+        BUILT.append(name)
+
+    def reset(self, *, seed=None, options=None):
+        return 0, {}
+
+    def built(self):
+        return list(BUILT)
+
+
+def make_env(n_envs, use_async_envs):
+    kind = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv
+    return {"suite": {task: kind([lambda i=i: Box(f"{task}/{i}") for i in range(n_envs)])
+                      for task in ("a", "b", "c")}}
+""".replace("lambda i=i: Box", "lambda i=i, task=task: Box")
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_known_task_is_all_that_its_jail_builds(tmp_path: Path, workers: int) -> None:
+    """Not an environment of every task, to learn its spaces; and in each process its own slice."""
+    folder = write_repository(tmp_path / "suite", SUITE)
+    with make_env(folder, 2, workers > 1, num_workers=workers) as suites:
+        env = suites["suite"]["b"]
+        env.reset(seed=0)
+        built = env.call("built")
+    own = ["b/0", "b/1"]
+    assert list(built) == ([own, own] if workers == 1 else [own[:1], own[1:]])
+
+
+CHANGING = """
+import time
+import gymnasium as gym
+from gymnasium.spaces import Discrete
+
+NOW = time.time_ns()  # another in each process
+
+
+class One(gym.Env):
+    action_space = Discrete(2)
+
+    def __init__(self, size):
+        self.observation_space = Discrete(size)
+
+    def reset(self, *, seed=None, options=None):
+        return 0, {}
+
+
+def make_env(n_envs, what):
+    size = NOW % 10**9 + 2 if what == "space" else 2
+    count = NOW % 10**4 + 1 if what == "count" else n_envs
+    task = f"task {NOW}" if what == "task" else "task"
+    return {"suite": {task: gym.vector.SyncVectorEnv([lambda: One(size)] * count), "other":
+                      gym.vector.SyncVectorEnv([lambda: One(2)] * n_envs)}}
+"""
+
+
+@pytest.mark.parametrize("what", ["space", "count", "task"])
+def test_a_result_that_changes_is_refused(tmp_path: Path, what: str) -> None:
+    """What was remembered of it is held against what is built."""
+    folder = write_repository(tmp_path / "changing", CHANGING)
+    with make_env(folder, 2, env_kwargs={"what": what}) as suites:
+        env = next(iter(suites["suite"].values()))
+        with pytest.raises(LoadError, match=r"another environment for \('suite', 'task.*"):
+            env.reset(seed=0)
+
+
+def test_a_result_that_stays_is_not(tmp_path: Path) -> None:
+    """The control: the same repository."""
+    folder = write_repository(tmp_path / "changing", CHANGING)
+    with make_env(folder, 2, env_kwargs={"what": "nothing"}) as suites:
+        suites["suite"]["task"].reset(seed=0)

@@ -52,6 +52,7 @@ SAMPLES: list[m.Message] = [
     m.KeepJail(3),
     m.RelayedPartly((2, 1), (1,)),
     m.Load(4, True, {"task": "pick"}, {"seed": 1}),
+    m.LoadTask(4, True, {"task": "pick"}, {"seed": 1}, "suite", "task"),
     m.Loaded({"envs": ()}),
     m.Build(1, "suite", "task", 0, 2),
     m.Built({"num_envs": 2}),

@@ -113,7 +113,14 @@ def _plain(metadata: dict[Any, Any]) -> dict[str, Any]:
 
 def _interpreter() -> dict[str, str]:
     version = f"{platform.python_implementation()} {platform.python_version()}"
-    return {"version": version, "executable": sys.executable or "", "platform": platform.platform()}
+    return {"version": version, "executable": sys.executable or "", "platform": _platform()}
+
+
+def _platform() -> str:
+    """As ``platform.platform()`` says it, which starts a process to find out."""
+    host = os.uname()
+    libc = (os.confstr("CS_GNU_LIBC_VERSION") or "").replace(" ", "")
+    return "-".join(filter(None, (host.sysname, host.release, host.machine, libc)))
 
 
 def _packages() -> dict[str, str]:

@@ -112,6 +112,15 @@ class Host:
 
     def load(self, request: m.Load) -> m.Message:
         """Import the repository, call ``make_env``, describe what came back."""
+        return m.Loaded(encode_manifest(describe.describe(self._load(request))))
+
+    def load_task(self, request: m.LoadTask) -> m.Message:
+        """Import the repository, call ``make_env``, and describe nothing: it is known."""
+        self._load(request)
+        task = self._tasks.get((request.suite, request.task))
+        return m.Value(None if task is None else (task.num_envs, task.recording is not None))
+
+    def _load(self, request: m.Load | m.LoadTask) -> list[Task]:
         self._stage = "import"
         make_env = loader.import_entry(self._snapshot, self._entry, os.environ["HOME"])
         self._stage = "make_env"
@@ -124,7 +133,7 @@ class Host:
 
         tasks = tasks_of(result, request.n_envs, request.use_async_envs, again)
         self._tasks = {(task.suite, task.task): task for task in tasks}
-        return m.Loaded(encode_manifest(describe.describe(tasks)))
+        return tasks
 
     def build(self, request: m.Build) -> m.Message:
         """Build a slice of a task."""
@@ -243,6 +252,7 @@ def _own(env: Any, name: str) -> Any:
 
 _HANDLERS: dict[type[m.Message], Callable[[Host, Any], m.Message]] = {
     m.Load: Host.load,
+    m.LoadTask: Host.load_task,
     m.Build: Host.build,
     m.Reset: Host.reset,
     m.Step: Host.step,

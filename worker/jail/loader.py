@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from envhub_worker.protocol.messages import Load
+from envhub_worker.protocol.messages import Load, LoadTask
 
 PACKAGE = "hub_env"
 
@@ -56,7 +56,7 @@ def import_entry(snapshot: str, entry: str, scratch: str) -> Callable[..., Any]:
     return make_env  # type: ignore[no-any-return]
 
 
-def call_make_env(make_env: Callable[..., Any], request: Load) -> Any:
+def call_make_env(make_env: Callable[..., Any], request: Load | LoadTask) -> Any:
     """Call ``make_env`` with those of our arguments that it takes.
 
     Raises:

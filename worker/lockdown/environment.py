@@ -27,6 +27,10 @@ def zygote_environment(host: Mapping[str, str], python: str) -> dict[str, str]:
         "HOME": "/nonexistent",
         # A thread in the zygote would make unshare(CLONE_NEWUSER) fail, and die in the fork.
         "OPENBLAS_NUM_THREADS": "1",
+        # In cycles, a power of two; read once as well. By default a host's threads would spin for
+        # a tenth of a second after their start and after each use, on the cores of its siblings
+        # and of the client, and its page faults would wait for them.
+        "OPENBLAS_THREAD_TIMEOUT": "20",
     }
 
 

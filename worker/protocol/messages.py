@@ -21,10 +21,10 @@ from envhub_worker.protocol.codec import Buffer, decode_parts, encode, split
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 
-VERSION = 2
+VERSION = 3
 """The newest version of the protocol: ``Hello`` offers a range, ``Welcome`` agrees to one.
 
-Version 2 added kinds 17 to 31; nothing of version 1 changed.
+Version 2 added kinds 17 to 31, version 3 kind 53; nothing that there was changed.
 """
 OLDEST_VERSION = 1
 """The oldest version that this code still speaks."""
@@ -580,6 +580,22 @@ class Revive(Message):
 
     env: int
     seeds: object
+
+
+@_message(53)
+@dataclass(frozen=True, slots=True)
+class LoadTask(Message):
+    """As ``Load``, where the client knows what comes back: nothing is described, nor built for it.
+
+    Reply: ``Value`` of the task's ``(num_envs, shardable)``, None if there is none, or ``Raised``.
+    """
+
+    n_envs: int
+    use_async_envs: bool
+    cfg: dict[str, object] | None
+    env_kwargs: dict[str, object]
+    suite: str
+    task: object
 
 
 @_message(48)
