@@ -1,25 +1,24 @@
 """The client's end of the fast lane: steps over shared memory, straight to the jail's hosts.
 
-Each shard has two sealed memfds and two eventfds. A step costs one wake-up per shard and one copy
-out. Trust: the jail writes the reply slab whenever it likes, so every word is read once and
-bounded, and bytes are copied before they are looked at. ``F_SEAL_SHRINK`` keeps it from cutting
-the memory away under us (which would be a SIGBUS).
+Each shard has two sealed memfds and a doorbell each way (``doorbell``). A step costs one wake-up
+per shard and one copy out. Trust: the jail writes the reply slab whenever it likes, so every word
+is read once and bounded, and bytes are copied before they are looked at. ``F_SEAL_SHRINK`` keeps
+it from cutting the memory away under us (which would be a SIGBUS).
 """
 
 from __future__ import annotations
 
 import os
 import platform
-import select
 import socket
 from collections import deque
 from collections.abc import Sequence
-from contextlib import suppress
 from time import perf_counter_ns
 from typing import Any
 
 from envhub_sandbox.cores import CPUS, Cores
 from envhub_sandbox.deadline import Deadline
+from envhub_sandbox.doorbell import HostBell, OwnBell, Watch
 from envhub_sandbox.errors import RemoteProtocolError, WorkerTimeoutError
 from envhub_sandbox.observations import RING, ObservationSlab
 from envhub_sandbox.sharding import ASK_NS, Cost, Pace, Sample, awake_shards, pace_of
@@ -32,7 +31,6 @@ from envhub_worker.protocol.columns import Column, columns_of
 from envhub_worker.protocol.manifest import EnvManifest
 from envhub_worker.protocol.stream import read_packet
 
-_RING = (1).to_bytes(8, "little")
 _RECHECK_MS = 2
 _CONNECT_S = 5.0
 _PACE_STEPS = 256
@@ -65,17 +63,18 @@ class LaneShard:
 
     Attributes:
         fds: What the host gets: three slabs, its doorbell, ours.
-        bell: Our doorbell.
+        bell: Our doorbell, to be watched.
     """
 
     def __init__(self, layout: slabs.Layout, observations: int) -> None:
         self.layout = layout
         self._request, request_fd = slab("request", layout.request_bytes, SEAL_FUTURE_WRITE)
         self._reply, reply_fd = slab("reply", layout.reply_bytes)
-        self._host_bell = os.eventfd(0, os.EFD_CLOEXEC)
-        self.bell = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._host_bell, self.bell = HostBell(), OwnBell()
+        self._ring = self._host_bell.ring
         self._slab_fds = [request_fd, reply_fd]
-        self.fds = [request_fd, reply_fd, observations, self._host_bell, self.bell]
+        bells = [self._host_bell.theirs, self.bell.fileno()]
+        self.fds = [request_fd, reply_fd, observations, *bells]
         self._asks = slabs.words(self._request)
         self._tells = slabs.words(self._reply)
         self._columns: list[tuple[Column, Any]] = []
@@ -89,6 +88,7 @@ class LaneShard:
         """The host has its copies of the descriptors; the maps keep ours alive."""
         while self._slab_fds:
             os.close(self._slab_fds.pop())
+        self._host_bell.handed_over()
 
     def ask(self, leaves: Sequence[Any], slot: int, spin_ns: int, cpu: int = 0) -> None:
         """Write a shard's actions and announce them; its observations are to go to ``slot``."""
@@ -124,7 +124,7 @@ class LaneShard:
         self.sequence += 1
         self._asks[slabs.SEQUENCE] = self.sequence
         if self._tells[slabs.PARKED]:
-            os.write(self._host_bell, _RING)
+            self._ring()
 
     def _wish(self, spin_ns: int, slot: int, cpu: int) -> None:
         asks = self._asks
@@ -165,11 +165,6 @@ class LaneShard:
     def park(self, parked: int) -> None:
         """Say whether we sleep and want our doorbell rung."""
         self._asks[slabs.PARKED] = parked
-
-    def silence(self) -> None:
-        """Take back a ring of our doorbell."""
-        with suppress(BlockingIOError):
-            os.read(self.bell, 8)
 
     def outcome(self) -> Outcome:
         """How the request went. Trust: input from the worker; the length is bounded here.
@@ -214,8 +209,8 @@ class LaneShard:
     def close(self) -> None:
         """Give everything back."""
         self.handed_over()
-        os.close(self._host_bell)
-        os.close(self.bell)
+        self._host_bell.close()
+        self.bell.close()
         self._asks.release()
         self._tells.release()
         # the maps go with the last array over them
@@ -247,10 +242,10 @@ class FastLane:
         leaves = layouts[0].actions
         self._flat_actions = len(leaves) == 1 and not leaves[0].path
         self._pidfds: dict[int, int] = {}
-        self._poller = select.poll()
-        self._poller.register(process_fd, select.POLLIN)
+        self._watch = Watch()
+        self._watch.death(process_fd)
         for shard in self.shards:
-            self._poller.register(shard.bell, select.POLLIN)
+            self._watch.bell(shard.bell)
         may_spin = _ORDERED_STORES and len(CPUS) > 1
         self._spin = self._step_spin = SpinChooser(may_spin)
         self._talk_spin = SpinChooser(may_spin)  # messages take another time than steps
@@ -293,16 +288,16 @@ class FastLane:
     def watch_host(self, index: int, pidfd: int) -> None:
         """End waits when a shard's host ends, or all of its jail. Takes the descriptor over."""
         self._pidfds[index] = pidfd
-        self._poller.register(pidfd, select.POLLIN)
+        self._watch.death(pidfd)
 
     def renew(self, index: int) -> None:
         """Give a shard whose host has died slabs that the dead one never saw."""
         old, pidfd = self.shards[index], self._pidfds.pop(index)
-        self._poller.unregister(pidfd)
+        self._watch.forget(pidfd)
         os.close(pidfd)
-        self._poller.unregister(old.bell)
+        self._watch.forget(old.bell)
         fresh = self.shards[index] = LaneShard(old.layout, self.observations.fd)
-        self._poller.register(fresh.bell, select.POLLIN)
+        self._watch.bell(fresh.bell)
         self._sleepers = self.shards[self._awake :]
         self._wakers = self.shards[: self._awake]
         old.close()
@@ -394,23 +389,13 @@ class FastLane:
             # a ring may cross with our going to sleep: look again soon, once
             timeout: int | None = _RECHECK_MS
             while not shard.answered():
-                for fd, _ in self._poller.poll(timeout):
-                    if fd == shard.bell:
-                        shard.silence()
-                    elif not self._is_bell(fd) and not shard.answered():
-                        raise JailGoneError
+                if self._watch.wait(timeout) and not shard.answered():
+                    raise JailGoneError
                 if deadline.passed and not shard.answered():
                     raise WorkerTimeoutError("the worker did not answer in time")
                 timeout = deadline.left_ms()
         finally:
             shard.park(0)
-
-    def _is_bell(self, fd: int) -> bool:
-        for shard in self.shards:
-            if shard.bell == fd:
-                shard.silence()
-                return True
-        return False
 
     def _sample(self) -> None:
         """Take note of the last step, which every shard has measured."""
@@ -442,6 +427,7 @@ class FastLane:
         """Give everything back."""
         for shard in self.shards:
             shard.close()
+        self._watch.close()
         self.observations.close()
         while self._pidfds:
             os.close(self._pidfds.popitem()[1])
@@ -449,16 +435,14 @@ class FastLane:
 
 def _answers(shard: LaneShard, pidfd: int, deadline: Deadline) -> bool:
     """Whether a shard's answer comes before its host's death."""
-    poller = select.poll()
-    poller.register(shard.bell, select.POLLIN)
-    poller.register(pidfd, select.POLLIN)
+    watch = Watch()
+    watch.bell(shard.bell)
+    watch.death(pidfd)
     shard.park(1)
     try:
         timeout: int | None = _RECHECK_MS
         while not shard.answered():
-            ready = [fd for fd, _ in poller.poll(timeout)]
-            shard.silence()
-            if pidfd in ready:
+            if watch.wait(timeout):
                 return shard.answered()
             if deadline.passed and not shard.answered():
                 raise WorkerTimeoutError("the worker did not answer in time")
@@ -466,6 +450,7 @@ def _answers(shard: LaneShard, pidfd: int, deadline: Deadline) -> bool:
         return True
     finally:
         shard.park(0)
+        watch.close()
 
 
 def deposit(path: str, session: bytes, jail: int, host: int, fds: Sequence[int]) -> int:

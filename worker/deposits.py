@@ -15,7 +15,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import ProtocolError
 
 FDS = 5
-"""Descriptors of one deposit: three slabs, the host's doorbell, the client's."""
+"""Descriptors of one deposit: three slabs, the doorbell that the host hears, the one it rings."""
 _REQUEST_BYTES = 4096
 _WAIT_S = 1.0
 

@@ -49,7 +49,8 @@ def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
             if host.lane is not lane and host.lane is not None:
                 poller.register(host.lane.bell, select.POLLIN)
         elif lane is not None and ready:
-            lane.wake()
+            if not lane.wake():
+                poller.unregister(lane.bell)
         elif lane is not None:
             lane.serve()
         # a request may cross with our going to sleep: look again soon, once

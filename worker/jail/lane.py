@@ -1,6 +1,8 @@
 """The jail's end of the fast lane: steps out of one slab into another, at the ring of a doorbell.
 
-Followed: ``eventfd(2)``, ``memfd_create(2)``. The request slab is mapped read-only (the client has
+Our doorbell is the other end of the client's socket, the client's an eventfd (an older client's are
+two of these): both are read and written with whole words. Followed: ``eventfd(2)``, ``unix(7)``,
+``memfd_create(2)``. The request slab is mapped read-only (the client has
 sealed it against our writes); the reply slab belongs to both.
 """
 
@@ -96,12 +98,18 @@ class Lane:
     def _rows(self, leaf: slabs.Leaf, base: int, start: int) -> Any:
         return slabs.view(self._observations, leaf, base=base)[start : start + self._layout.count]
 
-    def wake(self) -> None:
-        """After the doorbell: silence it, and serve while requests keep coming quickly."""
+    def wake(self) -> bool:
+        """After the doorbell: silence it, and serve while requests keep coming quickly.
+
+        Returns:
+            Whether it can ring again: no, once the client has closed its end.
+        """
+        rung = True
         with contextlib.suppress(BlockingIOError):
-            os.read(self.bell, 8)
+            rung = bool(os.read(self.bell, 8))
         while self.serve() and self._wait_awake():
             pass
+        return rung
 
     def _wait_awake(self) -> bool:
         """Wait for the next request without sleeping, for as long as the client says."""
@@ -128,8 +136,12 @@ class Lane:
         self._served = sequence
         told[slabs.SEQUENCE] = sequence
         if self._asked[slabs.PARKED]:
-            os.write(self._client_bell, _RING)
+            self._ring()
         return True
+
+    def _ring(self) -> None:
+        with contextlib.suppress(BlockingIOError):  # it is full: it has been rung already
+            os.write(self._client_bell, _RING)
 
     def _run_measured(self) -> None:
         told, start = self._told, perf_counter_ns()
