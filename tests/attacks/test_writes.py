@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import stat
 from collections.abc import Callable
 from pathlib import Path
 
@@ -91,7 +92,7 @@ def test_files_outside_cannot_be_created(arena: Arena, home: Path, title: str, f
     place = Path(folder.format(home=home, cache=snapshot_store.cache_root()))
     ours = not place.exists()
     place.mkdir(parents=True, exist_ok=True)
-    path = place / f"planted-{token()}"
+    path, sticky = place / f"planted-{token()}", place.stat().st_mode & stat.S_ISVTX
     try:
         arena.attack(
             f"create a file in {title}",
@@ -103,6 +104,7 @@ def test_files_outside_cannot_be_created(arena: Arena, home: Path, title: str, f
         )
     finally:
         path.unlink(missing_ok=True)
+        assert place.stat().st_mode & stat.S_ISVTX == sticky  # the control is no vandal
         if ours:
             place.rmdir()
 

@@ -6,6 +6,7 @@ import os
 
 def attack(path, text):
     with contextlib.suppress(OSError):
-        os.chmod(os.path.dirname(path), 0o777)
+        folder = os.path.dirname(path)
+        os.chmod(folder, os.stat(folder).st_mode | 0o777)  # /tmp keeps its sticky bit
     with open(path, "w") as file:
         file.write(text)

@@ -14,7 +14,8 @@ def attack(path, text):
 
 
 def _make_writable(path, text):
-    os.chmod(os.path.dirname(path), 0o777)
+    folder = os.path.dirname(path)
+    os.chmod(folder, os.stat(folder).st_mode | 0o777)  # /tmp keeps its sticky bit
     os.chmod(path, 0o666)
 
 
