@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import stat
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -51,27 +50,6 @@ def pytest_make_collect_report() -> Iterator[None]:
     """In CI a skipped module is a failed one."""
     report = yield
     return _no_skips(report)  # type: ignore[return-value]
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Root's jails run as another user, who must be able to read the interpreter.
-
-    With a private root that is arranged; without one it takes an interpreter that all may read.
-    """
-    if os.getuid() != 0 or _others_may_read(Path(os.__file__)):
-        return
-    unreadable = pytest.mark.skip(reason=f"other users than root may not read {os.__file__}")
-    for item in items:
-        case = getattr(getattr(item, "callspec", None), "id", "")
-        if "no-userns" in case or "container" in case:
-            item.add_marker(unreadable)
-
-
-def _others_may_read(path: Path) -> bool:
-    readable = path.stat().st_mode & stat.S_IROTH
-    return bool(readable) and all(
-        folder.stat().st_mode & stat.S_IXOTH for folder in path.resolve().parents
-    )
 
 
 def _no_skips(report: pytest.TestReport | pytest.CollectReport) -> object:

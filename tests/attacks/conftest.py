@@ -17,8 +17,8 @@ from envhub_sandbox import snapshot_store
 from envhub_sandbox.sandboxes.process import PROCESS
 from tests.attacks import table
 from tests.attacks.harness import Arena
+from tests.support.interpreter import profiles
 
-PROFILES = ("strict", "no-userns")
 _TABLE = table.Collected("attack", "ENVHUB_ATTACK_TABLE")
 
 
@@ -50,7 +50,7 @@ def home(_open_ground: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-@pytest.fixture(params=PROFILES)
+@pytest.fixture(params=profiles("strict", "no-userns"))
 def arena(request: pytest.FixtureRequest) -> Iterator[Arena]:
     """Where a test attacks, once for each profile."""
     made = Arena(request.param, request.node.module.FAMILY)

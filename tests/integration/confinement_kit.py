@@ -29,7 +29,8 @@ from envhub_worker.spawner import (
 )
 
 DEADLINE_S = 60.0
-TARGET = f"{os.path.abspath(__file__)}:serve_source"
+KIT = os.path.abspath(__file__)
+TARGET = f"{KIT}:serve_source"
 
 
 def execute(source: str) -> dict[str, Any]:
@@ -151,8 +152,7 @@ def spawner_in(folder: Path, confinement: Confinement, **options: Any) -> Iterat
 
 def with_kit(confinement: Confinement) -> Confinement:
     """The same, and the jail may read this file."""
-    kit = os.path.abspath(__file__)
-    return replace(confinement, readable=(*confinement.readable, kit))
+    return replace(confinement, readable=(*confinement.readable, KIT))
 
 
 @contextmanager
@@ -203,6 +203,7 @@ def wait_until(condition: Any, what: str) -> None:
 
 
 __all__ = [
+    "KIT",
     "Cell",
     "HostExited",
     "HostStarted",

@@ -19,6 +19,7 @@ from tests.integration.confinement_kit import (
     open_folder,
     unconfined,
 )
+from tests.support.interpreter import needs, profiles
 
 MEMORY = 300 * MIB
 BOMB = 700 * MIB
@@ -63,7 +64,7 @@ def limited(profile: str, **limits: int) -> Iterator[Cell]:
         yield cell
 
 
-@pytest.fixture(params=["strict", "no-userns"])
+@pytest.fixture(params=profiles("strict", "no-userns"))
 def profile(request: pytest.FixtureRequest) -> str:
     """Both ways to hold a jail."""
     return str(request.param)
@@ -146,6 +147,7 @@ def test_fork_bomb_stops_at_the_limit() -> None:
         assert errno
 
 
+@needs("no-userns")
 def test_fork_bomb_stops_without_a_user_namespace() -> None:
     """There the kernel counts the user's other processes too, so the limit is about right."""
     with limited("no-userns", processes=60) as cell:
@@ -200,6 +202,7 @@ def test_scratch_folders_share_one_quota() -> None:
         assert errno
 
 
+@needs("no-userns")
 def test_disk_fill_ends_the_host_without_a_mount_namespace() -> None:
     """There is no quota there; init counts and ends the host."""
     source = FILL.format(folder=HOME, mib=15) + "\nimport time\n"

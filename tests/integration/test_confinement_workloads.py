@@ -9,6 +9,7 @@ import pytest
 
 from envhub_worker.protocol.confinement import Confinement, Limits
 from tests.integration.confinement_kit import Cell, cell_in, open_folder
+from tests.support.interpreter import needs, profiles
 
 STRICT = Confinement(limits=Limits(processes=256))
 
@@ -28,7 +29,7 @@ def bare() -> Iterator[Cell]:
         yield cell
 
 
-@pytest.fixture(params=["strict", "no-userns"])
+@pytest.fixture(params=profiles("strict", "no-userns"))
 def cell(request: pytest.FixtureRequest) -> Cell:
     """Both."""
     name = "strict" if request.param == "strict" else "bare"
@@ -164,6 +165,7 @@ with mp.get_context("fork").Manager() as manager:
     assert in_fresh_host(strict, source) == [7, {"a": 1, "b": 2}]
 
 
+@needs("no-userns")
 def test_pipes_to_forked_children_without_namespaces(bare: Cell) -> None:
     """There no shared semaphore can be made; processes and pipes work."""
     source = """

@@ -28,9 +28,10 @@ from tests.integration.confinement_kit import (
     wait_until,
 )
 from tests.support import inside
+from tests.support.interpreter import profiles
 
 
-@pytest.fixture(params=["strict", "no-userns"])
+@pytest.fixture(params=profiles("strict", "no-userns"))
 def confinement(request: pytest.FixtureRequest) -> Confinement:
     """Both structures: with a pid namespace that ends everything, and without."""
     return Confinement(profile=request.param, environment={"GRANTED": "yes"})
