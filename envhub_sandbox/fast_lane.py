@@ -30,6 +30,7 @@ from envhub_worker.protocol import slabs
 from envhub_worker.protocol.columns import Column, columns_of
 from envhub_worker.protocol.manifest import EnvManifest
 from envhub_worker.protocol.stream import read_packet
+from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _RECHECK_MS = 2
 _CONNECT_S = 5.0
@@ -179,7 +180,8 @@ class LaneShard:
         start = self.layout.infos
         message = m.unpack([self._reply[start : start + length]], tensors=to_tensor)[1]
         if isinstance(message, m.Value) and type(message.value) is dict:
-            self._learn(message.value)
+            with UNTRUSTED:
+                self._learn(message.value)
         return kind, message
 
     def answer(self) -> m.Message | None:
@@ -192,7 +194,8 @@ class LaneShard:
         if kind == slabs.RAISED:
             return self.outcome()[1]
         start = self.layout.answer
-        packet = read_packet(self._reply[start : start + length])
+        with UNTRUSTED:
+            packet = read_packet(self._reply[start : start + length])
         return m.unpack(packet.frames, tensors=to_tensor)[1]
 
     def _learn(self, infos: dict[Any, Any]) -> None:

@@ -25,6 +25,7 @@ from envhub_worker.protocol.codec import Buffer
 from envhub_worker.protocol.inert import one_line
 from envhub_worker.protocol.limits import WireLimits
 from envhub_worker.protocol.text import printable
+from envhub_worker.protocol.untrusted import UNTRUSTED
 
 
 class HostsDiedError(WorkerDiedError):
@@ -78,6 +79,7 @@ class RemoteJail:
         self.report = report
         self.before_end: Callable[[], None] = _nothing
         self._limits = limits
+        self._asked: dict[int, int] = {}  # how many hosts, by request
 
     def through(self, client: WorkerClient) -> RemoteJail:
         """The same jail over another connection of ours."""
@@ -88,9 +90,7 @@ class RemoteJail:
     def start_hosts(self, count: int, deadline: Deadline) -> list[int]:
         """Fork further hosts; returns their numbers."""
         reply, _ = self.client.request(m.StartHosts(self.number, count), deadline=deadline)
-        started = list(expect(reply, m.JailOpened).hosts)
-        if len(started) != count:
-            raise RemoteProtocolError(f"the worker started {len(started)} hosts, not {count}")
+        started = _hosts(expect(reply, m.JailOpened), count)
         self.hosts += started
         return started
 
@@ -123,7 +123,9 @@ class RemoteJail:
         """``send`` for messages that are packed."""
         parts = tuple((host, len(frames)) for host, frames in requests)
         payload = [frame for _, frames in requests for frame in frames]
-        return self.client.send(m.Relay(self.number, operation, parts), payload)
+        request_id = self.client.send(m.Relay(self.number, operation, parts), payload)
+        self._asked[request_id] = len(parts)
+        return request_id
 
     def receive(self, request_id: int, deadline: Deadline) -> list[m.Message]:
         """The hosts' replies, in the order of the request.
@@ -135,16 +137,22 @@ class RemoteJail:
             RemoteProtocolError: A host broke the rules.
         """
         reply, payload = self.client.receive(request_id, deadline)
-        if self.kept and isinstance(reply, m.RelayedPartly):
-            raise self._died(reply, payload)
-        return [self._unpack(part) for part in _cut(payload, expect(reply, m.Relayed).parts)]
+        asked = self._asked.pop(request_id, None)
+        with UNTRUSTED:
+            if not (self.kept and isinstance(reply, m.RelayedPartly)):
+                reply = expect(reply, m.Relayed)
+            parts = _cut(payload, reply.parts)
+            if len(parts) != asked:
+                raise RemoteProtocolError(f"{asked} hosts were asked, {len(parts)} answered")
+            if isinstance(reply, m.RelayedPartly):
+                raise self._died(reply.dead, parts)
+            return [self._unpack(part) for part in parts]
 
-    def _died(self, reply: m.RelayedPartly, payload: list[Buffer]) -> HostsDiedError:
+    def _died(self, dead: Sequence[int], parts: list[list[Buffer]]) -> HostsDiedError:
         """Who has died is the server's word, which no host can say."""
-        parts = _cut(payload, reply.parts)
-        if not reply.dead or not set(reply.dead) <= set(range(len(parts))):
+        if not dead or not set(dead) <= set(range(len(parts))):
             raise RemoteProtocolError("the worker names dead hosts that were not asked")
-        deaths = {index: death(typed(self._unpack(parts[index]), m.Died)) for index in reply.dead}
+        deaths = {index: death(typed(self._unpack(parts[index]), m.Died)) for index in dead}
         living = [None if i in deaths else self._unpack(part) for i, part in enumerate(parts)]
         return HostsDiedError(living, deaths)
 
@@ -193,7 +201,7 @@ class RemoteJail:
 
 def _cut(payload: list[Buffer], counts: Sequence[int]) -> list[list[Buffer]]:
     """The frames of each part."""
-    if sum(counts) != len(payload) or any(count < 1 for count in counts):
+    if any(type(count) is not int or count < 1 for count in counts) or sum(counts) != len(payload):
         raise RemoteProtocolError("the worker's frames do not add up")
     frames = iter(payload)
     return [list(islice(frames, count)) for count in counts]
@@ -214,11 +222,18 @@ def open_jail(
     """
     reply, _ = client.request(request, deadline=deadline)
     opened = expect(reply, m.JailOpened)
-    if len(opened.hosts) != request.hosts:
-        raise RemoteProtocolError(f"the worker opened a jail of {len(opened.hosts)} hosts")
+    hosts = _hosts(opened, request.hosts)
     report = [dict(layer) for layer in opened.report if isinstance(layer, dict)]
     client.hold(opened.jail)
-    return RemoteJail(client, opened.jail, opened.hosts, report, limits)
+    return RemoteJail(client, opened.jail, hosts, report, limits)
+
+
+def _hosts(opened: m.JailOpened, count: int) -> list[int]:
+    """The numbers of as many hosts as were asked for."""
+    hosts = list(opened.hosts)
+    if not all(type(host) is int for host in hosts) or not len(set(hosts)) == len(hosts) == count:
+        raise RemoteProtocolError(f"the worker did not start {count} hosts, each with a number")
+    return hosts
 
 
 def check(reply: m.Message) -> None:

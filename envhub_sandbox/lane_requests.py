@@ -18,6 +18,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec import Buffer
 from envhub_worker.protocol.manifest import EnvManifest
 from envhub_worker.protocol.stream import pack_packet
+from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _BULKY = frozenset({"render"})
 """What hardly ever fits the lane."""
@@ -73,12 +74,13 @@ def with_observations(
 ) -> list[m.Message]:
     """Replies to a reset as they would have come through the server."""
     assert place.lane is not None
-    batch = place.lane.observation()
-    parts = batches.split(manifest.single_observation_space, batch, bounds)
-    return [
-        reply if isinstance(reply, m.Raised) else results.reset_done(part, reply)
-        for part, reply in zip(parts, replies, strict=True)
-    ]
+    with UNTRUSTED:
+        batch = place.lane.observation()
+        parts = batches.split(manifest.single_observation_space, batch, bounds)
+        return [
+            reply if isinstance(reply, m.Raised) else results.reset_done(part, reply)
+            for part, reply in zip(parts, replies, strict=True)
+        ]
 
 
 def infos(

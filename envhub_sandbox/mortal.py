@@ -13,7 +13,12 @@ from typing import Any
 
 from envhub_sandbox import survivors
 from envhub_sandbox.deadline import Deadline, StartupDeadline
-from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerTimeoutError
+from envhub_sandbox.errors import (
+    EnvHubError,
+    RemoteProtocolError,
+    WorkerDiedError,
+    WorkerTimeoutError,
+)
 from envhub_sandbox.fast_lane import Outcome
 from envhub_sandbox.jail import HostsDiedError, check, typed
 from envhub_sandbox.jail_sources import JailSource, SharedJail
@@ -120,6 +125,15 @@ class Mortal(Tenant):
         if isinstance(error, WorkerDiedError):
             self._keep_crash(error)
         return error
+
+    def _distrust(self, error: RemoteProtocolError) -> None:
+        """Its reply came, and broke a rule: it is ended, whatever else it may have to say."""
+        self.counters.deaths += 1
+        self._pending = None
+        self._moved(Event.DEATH)
+        WORKER.info("%s: %s", self.repository.label, str(error).partition("\n")[0])
+        if self._loaded is not None:
+            self._jails.end(self._loaded)
 
     def _keep_crash(self, error: WorkerDiedError | WorkerTimeoutError) -> None:
         task = {

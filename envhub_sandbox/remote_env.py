@@ -8,14 +8,21 @@ life in jails is in ``tenant``, what becomes of it when one dies in ``mortal``.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from time import perf_counter_ns
 from typing import Any, TypeVar
 
 from envhub_sandbox import lane_requests, survivors
 from envhub_sandbox.deadline import Deadline
-from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
+from envhub_sandbox.errors import (
+    EnvHubError,
+    RemoteProtocolError,
+    WorkerDiedError,
+    WorkerError,
+    WorkerTimeoutError,
+)
 from envhub_sandbox.fast_lane import JailGoneError, Outcome
 from envhub_sandbox.jail import HostsDiedError, check, typed
 from envhub_sandbox.mortal import MessageFor, Mortal
@@ -24,6 +31,7 @@ from envhub_worker.protocol import batches
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec import Buffer
 from envhub_worker.protocol.lifecycle import Event, State
+from envhub_worker.protocol.untrusted import blamed, is_fault
 
 _GRACE_S = 2.0
 """How long ``reset`` waits for a late reply before it gives the jail up and starts another."""
@@ -70,7 +78,7 @@ class RemoteEnv(Mortal):
             WorkerDiedError: The environment is then DEAD; with ``restart="transparent"`` READY.
             RemoteEnvError: The repository's code raised; the environment is still usable.
         """
-        with self._turn("a request"):
+        with self._turn("a request"), self._judging():
             try:
                 replies = self._collect(Deadline(timeout_s), timeout_s)
             except HostsDiedError as deaths:
@@ -86,6 +94,33 @@ class RemoteEnv(Mortal):
         """``submit`` and ``collect``."""
         self.submit(operation, message_for)
         return self.collect(timeout_s)
+
+    @contextmanager
+    def handling(self) -> Iterator[None]:
+        """Handle a reply that has come: who breaks a rule in it is given up, and not asked again.
+
+        Raises:
+            RemoteProtocolError: It did, whatever the handling raised; the environment is then DEAD.
+        """
+        with self._turn("a request"), self._judging():
+            yield
+
+    @contextmanager
+    def _judging(self) -> Iterator[None]:
+        """``handling`` for who has the turn."""
+        try:
+            yield
+        except Exception as error:
+            # in any other state somebody has dealt with it already, or interrupted a wait
+            if self.lifecycle.state is not State.READY:
+                raise
+            if is_fault(error):
+                broken = blamed(error)
+                self._distrust(broken)
+                raise broken from error
+            if isinstance(error, RemoteProtocolError):
+                self._distrust(error)
+            raise
 
     # --- steps ---------------------------------------------------------------------------------
 
@@ -131,10 +166,10 @@ class RemoteEnv(Mortal):
                     check(reply)
                 return self.results.step([typed(reply, m.StepDone) for reply in replies])
             except HostsDiedError as deaths:
-                with self._turn("step"):
+                with self._turn("step"), self._judging():
                     return self._survive_step(deaths)
             except BaseException:
-                with self._turn("step"):
+                with self._turn("step"), self._judging():
                     raise
 
     def _collect_by_lane(self, timeout_s: float | None) -> StepResult:

@@ -53,9 +53,10 @@ class Results:
 
     def infos(self, parts: list[dict[Any, Any]]) -> dict[Any, Any]:
         """One mapping of the shards' infos."""
-        infos = parts[0] if len(parts) == 1 else self._joined_infos(parts)
+        infos = parts[0] if len(parts) == 1 else batches.join_infos(parts, self._sizes)
         final = infos.get("final_obs") if self._restores else None
-        if final is not None:
+        # one that is something else is the repository's own, who has a step of its own
+        if type(final) is np.ndarray and final.dtype == object and final.ndim == 1:
             for index, member in enumerate(final):
                 final[index] = batches.restore(self._space, member)
         return infos
@@ -95,7 +96,9 @@ class Results:
                         f"the worker sent an observation that is not a batch of {self._space}"
                     )
         joined = parts[0] if len(parts) == 1 else batches.join(self._space, parts)
-        return batches.restore_batch(self._space, joined) if self._restores else joined
+        if not (self._restores and batches.conforms(self._space, joined, sum(self._sizes))):
+            return joined
+        return batches.restore_batch(self._space, joined)
 
     def _per_env(self, name: str, parts: list[Any]) -> Any:
         for part, size in zip(parts, self._sizes, strict=True):
@@ -105,12 +108,6 @@ class Results:
             if not (_numeric(part) and (not self._declared or name == "rewards" or _flags(part))):
                 raise RemoteProtocolError(f"the worker sent {name} of a wrong dtype or shape")
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-    def _joined_infos(self, parts: list[dict[Any, Any]]) -> dict[Any, Any]:
-        try:
-            return batches.join_infos(parts, self._sizes)
-        except (AttributeError, TypeError, ValueError) as error:
-            raise RemoteProtocolError(f"the shards' infos do not fit together: {error}") from error
 
     @staticmethod
     def _info(part: Any) -> dict[Any, Any]:

@@ -24,6 +24,7 @@ from envhub_sandbox.jail import typed
 from envhub_sandbox.remote_env import RemoteEnv
 from envhub_sandbox.results import StepResult
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.untrusted import UNTRUSTED
 
 Bounds = tuple[int, int]
 
@@ -122,7 +123,8 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
         """The results of ``reset_async``; ``timeout`` in seconds, else ``Timeouts.reset_s``."""
         replies = self._collect("reset", timeout, self._timeouts.reset_s, m.ResetDone)
-        return self._remote.results.reset(replies)
+        with self._remote.handling():
+            return self._remote.results.reset(replies)
 
     def step(self, actions: Any) -> StepResult:
         """Step every sub-environment.
@@ -187,7 +189,8 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         replies = self._collect("call", timeout, self._timeouts.call_s, m.Value)
         if not self._manifest.shardable:
             return cast("tuple[Any, ...]", replies[0].value)
-        return self._remote.results.one_each("call", replies)
+        with self._remote.handling():
+            return self._remote.results.one_each("call", replies)
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """An attribute of every sub-environment."""
@@ -211,16 +214,18 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         replies = self._ask("render", lambda number, _: m.Render(number))
         if not self._manifest.shardable:
             return cast("tuple[Any, ...] | None", replies[0].value)
-        return self._remote.results.one_each("render", replies)
+        with self._remote.handling():
+            return self._remote.results.one_each("render", replies)
 
     @property  # type: ignore[misc]  # there is nothing to set, as in SyncVectorEnv
     def np_random(self) -> Any:
         """Copies of the generators: ``SyncVectorEnv`` has one for each sub-environment."""
         replies = self._ask("np_random", lambda number, _: m.GetRandom(number))
-        if type(replies[0].value) is dict:
-            return declared.generator(replies[0].value)
-        states = self._remote.results.one_each("np_random", replies)
-        return tuple(declared.generator(state) for state in states)
+        with UNTRUSTED:  # a generator that numpy does not know breaks no rule of the wire
+            if type(replies[0].value) is dict:
+                return declared.generator(replies[0].value)
+            states = self._remote.results.one_each("np_random", replies)
+            return tuple(declared.generator(state) for state in states)
 
     @property
     def np_random_seed(self) -> Any:
@@ -228,7 +233,8 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         replies = self._ask("np_random_seed", lambda number, _: m.GetOwn(number, "np_random_seed"))
         if type(replies[0].value) is not tuple:
             return replies[0].value
-        return self._remote.results.one_each("np_random_seed", replies)
+        with self._remote.handling():
+            return self._remote.results.one_each("np_random_seed", replies)
 
     @property
     def envs(self) -> tuple[SubEnvironment, ...]:
@@ -328,7 +334,8 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         except WorkerDiedError:
             self._raise_if_closed()  # close() in another thread ended it under us
             raise
-        return [typed(reply, kind) for reply in replies]
+        with self._remote.handling():
+            return [typed(reply, kind) for reply in replies]
 
     def _end_wait(self, operation: str) -> None:
         self._raise_if_closed()

@@ -180,6 +180,8 @@ CONTAINER_MARKS: Spot = (listen, "_CONTAINER_MARKS")
 """The files by which a container is told."""
 CGROUP_WRITE: Spot = (cgroups, "_write")
 """What writes a file of a control group."""
+DECODING: Spot = (m, "_decode")
+"""What makes a message of a document that has no form yet."""
 FORMS: tuple[Spot, Spot] = ((m, "_OUTGOING"), (m, "_INCOMING"))
 """What is remembered of the shape of messages, each way."""
 

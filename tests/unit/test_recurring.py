@@ -38,12 +38,22 @@ _LEAVES = st.one_of(
         st.sampled_from(_DTYPES),
     ),
 )
+_KEYS = st.recursive(
+    st.one_of(st.none(), st.integers(), st.text(max_size=3), st.binary(max_size=3)),
+    lambda inner: st.one_of(
+        st.tuples(inner, inner),
+        st.frozensets(inner, max_size=3),
+        st.builds(range, st.integers(-5, 5)),
+    ),
+    max_leaves=4,
+)
 _VALUES = st.recursive(
     _LEAVES,
     lambda inner: st.one_of(
         st.lists(inner, max_size=3),
         st.lists(inner, max_size=3).map(tuple),
         st.dictionaries(st.text(max_size=3), inner, max_size=3),
+        st.dictionaries(_KEYS, inner, max_size=3),
     ),
     max_leaves=8,
 )
@@ -105,6 +115,16 @@ def test_what_is_equal_and_not_the_same_is_kept_apart(one: Any, other: Any) -> N
         _, message = m.unpack(m.pack(m.Value((value, np.zeros(2))), 1))
         assert isinstance(message, m.Value)
         assert alike(message.value, (value, np.zeros(2)))
+
+
+@pytest.mark.parametrize(
+    "key", [(1, 2), frozenset({1, 2}), range(3), ((), (range(2), "a"))], ids=repr
+)
+def test_keys_that_are_no_text_recur(key: object) -> None:
+    """Repositories count visits by ``(x, y)``: the second such message is read as the first was."""
+    for number in range(4):
+        _, message = m.unpack(m.pack(m.Value({"visits": {key: number % 2}}), number))
+        assert message == m.Value({"visits": {key: number % 2}})
 
 
 def test_arrays_of_a_recurring_message_are_the_receivers_own() -> None:

@@ -18,6 +18,7 @@ from gymnasium.spaces.graph import GraphInstance
 
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.spaces import ARRAY_SPACES
+from envhub_worker.protocol.untrusted import FAULTS
 
 Bounds = Sequence[tuple[int, int]]
 
@@ -93,9 +94,6 @@ def _conforms_tuple(space: spaces.Tuple[Any], batch: Any, count: int) -> bool:
     return all(conforms(sub, item, count) for sub, item in zip(space.spaces, batch, strict=True))
 
 
-_MISFITS = (AttributeError, KeyError, OverflowError, TypeError, ValueError)
-
-
 def join_infos(parts: Sequence[dict[Any, Any]], sizes: Sequence[int]) -> dict[Any, Any]:
     """The infos of all shards as ``VectorEnv._add_info`` would have built them in one go.
 
@@ -110,7 +108,7 @@ def join_infos(parts: Sequence[dict[Any, Any]], sizes: Sequence[int]) -> dict[An
     for part, start, size in zip(parts, starts, sizes, strict=False):
         try:
             _join_part(joined, part, slice(start, start + size), starts[-1])
-        except _MISFITS as error:
+        except FAULTS as error:
             raise RemoteProtocolError(f"the shards' infos do not fit together: {error}") from error
     return joined
 
@@ -120,13 +118,17 @@ def _join_part(joined: dict[Any, Any], part: dict[Any, Any], window: slice, coun
         if isinstance(value, dict):
             _join_part(joined.setdefault(key, {}), value, window, count)
             continue
-        if len(value) != window.stop - window.start:  # or its other dimensions cost nothing
-            raise ValueError(f"{key!r} does not have one entry per sub-environment")
+        size = window.stop - window.start
+        if len(value) != size:  # or its other dimensions cost nothing
+            raise ValueError("an entry does not have one value per sub-environment")
         array = joined.setdefault(key, _blank(value, count))
         if (array.dtype, array.shape[1:]) == (value.dtype, value.shape[1:]):
             array[window] = value
         else:  # the first sub-environment that has the key decides, as in Gymnasium
-            _place(array, value, part[f"_{key}"], window.start)
+            mask = part[f"_{key}"]
+            if mask.shape != (size,):
+                raise ValueError("a mask does not have one value per sub-environment")
+            _place(array, value, mask, window.start)
 
 
 def _blank(value: Any, count: int) -> Any:

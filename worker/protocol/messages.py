@@ -20,6 +20,7 @@ from envhub_worker.protocol import recurring
 from envhub_worker.protocol.codec import Buffer, decode_parts, encode, split
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+from envhub_worker.protocol.untrusted import UNTRUSTED
 
 VERSION = 3
 """The newest version of the protocol: ``Hello`` offers a range, ``Welcome`` agrees to one.
@@ -663,17 +664,18 @@ def unpack(
     Raises:
         RemoteProtocolError: The peer broke the rules.
     """
-    document, tail, buffers = split(frames, limits)
-    plain = recurring.without_id(document)
-    if plain is None:
-        return _decode(document, tail, buffers, limits, unpickler, tensors)
-    key, packed_id = plain
-    form = _INCOMING.get(key)
-    if form is not None and form.limits is limits:
-        return recurring.read_id(packed_id), form.message(tail, buffers)
-    request_id, message = _decode(document, tail, buffers, limits, unpickler, tensors)
-    _INCOMING.met(key, lambda: recurring.Incoming(document, type(message), limits))
-    return request_id, message
+    with UNTRUSTED:
+        document, tail, buffers = split(frames, limits)
+        plain = recurring.without_id(document)
+        if plain is None:
+            return _decode(document, tail, buffers, limits, unpickler, tensors)
+        key, packed_id = plain
+        form = _INCOMING.get(key)
+        if form is not None and form.limits is limits:
+            return recurring.read_id(packed_id), form.message(tail, buffers)
+        request_id, message = _decode(document, tail, buffers, limits, unpickler, tensors)
+        _INCOMING.met(key, lambda: recurring.Incoming(document, type(message), limits))
+        return request_id, message
 
 
 def _decode(

@@ -138,7 +138,8 @@ class Incoming(Generic[T]):
         self._tail_bytes: int | None = 0
         self.limits: WireLimits | None = limits
         try:
-            fields = msgpack.unpackb(document, strict_map_key=False)
+            # as tuples: what is a key has to be hashed, and was before in another form
+            fields = msgpack.unpackb(document, strict_map_key=False, use_list=False)
             _, _, *self._shape = _shaped(fields, self._descriptors)
         except _IrregularError:
             self.limits = None
@@ -246,7 +247,7 @@ def _shaped(value: Any, descriptors: list[bytes]) -> Any:
         if set(map(type, value)) - {str}:
             raise _IrregularError
         return {key: _shaped(item, descriptors) for key, item in value.items()}
-    if kind is list:
+    if kind is tuple:  # either sort of sequence: a real tuple has a head
         if value and type(value[0]) is msgpack.ExtType and value[0].code == TUPLE:
             return tuple([_shaped(item, descriptors) for item in value[1:]])
         return [_shaped(item, descriptors) for item in value]
