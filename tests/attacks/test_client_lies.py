@@ -27,7 +27,7 @@ from envhub_sandbox.suites import EnvSuites
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest import encode_env
 from envhub_worker.protocol.opaque import MAX_SPACE_DEPTH
-from envhub_worker.protocol.spaces import encode_space
+from envhub_worker.protocol.spaces import decode_space, encode_space
 from tests.attacks.lying_server import (
     NUM_ENVS,
     Asked,
@@ -249,6 +249,19 @@ def box(**fields: Any) -> dict[str, Any]:
     return {**encode_space(spaces.Box(-1, 1, (3,), np.float32)), **fields}  # type: ignore[dict-item]
 
 
+WIDE, ELEMENTS = 4_000_000, 10_000_000
+
+
+def wide(number: int) -> dict[str, Any]:
+    """A Box of 40 megabytes in the client, unlike any other; a few hundred bytes say so."""
+    return box(shape=(WIDE,), low=np.array(-number, np.float32))
+
+
+def test_a_wide_box_is_accepted() -> None:
+    """The control: one of those that are too many together."""
+    assert decode_space(wide(1), max_elements=ELEMENTS).shape == (WIDE,)
+
+
 def nested(levels: int) -> dict[str, Any]:
     """Tuples in tuples."""
     space: Any = encode_space(spaces.Discrete(2))
@@ -289,6 +302,24 @@ MANIFESTS: dict[str, Callable[[], dict[str, Any]]] = {
             "characters": "ab",
         }
     ),
+    "a Text that nobody could draw": lambda: changed(
+        single_observation_space={
+            "kind": "text",
+            "min_length": 0,
+            "max_length": 200_000_000,
+            "characters": "ab",
+        }
+    ),
+    "a hundred Boxes that would each pass": lambda: {
+        **manifest(),
+        "envs": tuple(
+            {**manifest()["envs"][0], "task": n, "single_observation_space": wide(n)}
+            for n in range(100)
+        ),
+    },
+    "a Box of Boxes that would each pass": lambda: changed(
+        observation_space={"kind": "tuple", "spaces": [wide(n) for n in range(100)]}
+    ),
     "an absurd MultiBinary": lambda: changed(
         single_observation_space={"kind": "multi_binary", "n": 2**40}
     ),
@@ -307,7 +338,8 @@ MANIFESTS: dict[str, Callable[[], dict[str, Any]]] = {
 def test_lying_manifests_are_refused(liar: LyingServer, folder: str, what: str) -> None:
     """A description that cannot be true, or is absurdly large, is refused before it is built."""
     liar.lies[m.Load] = relayed(described(MANIFESTS[what]()))
-    refuses(lambda: opened(liar, folder))
+    limits = {"elements": ELEMENTS}
+    refuses(lambda: opened(liar, folder, policy={"limits": limits}))
 
 
 OTHERS: dict[str, tuple[type[m.Message], m.Message]] = {

@@ -26,7 +26,7 @@ from envhub_worker.protocol.manifest import (
     encode_manifest,
 )
 
-ELEMENTS = 10_000
+ELEMENTS = 40_000
 OBSERVATION = spaces.Dict({"b": spaces.Box(-1, 1, (3,)), "a": spaces.Text(4)})
 ACTION = spaces.Discrete(3, start=1)
 

@@ -15,9 +15,11 @@ from gymnasium.vector.utils import batch_space
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from envhub_sandbox.errors import WorkerTimeoutError
 from envhub_worker.protocol.codec import decode, encode
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
 from envhub_worker.protocol.opaque import MAX_SPACE_DEPTH
+from envhub_worker.protocol.space_reader import ELEMENT_BYTES, SPACE_BYTES, SpaceReader
 from envhub_worker.protocol.spaces import OpaqueSpace, decode_space, encode_space
 from tests.support.compare import assert_same
 
@@ -336,23 +338,27 @@ def test_depth_is_bounded_on_both_sides() -> None:
 
 
 @pytest.mark.parametrize(
-    ("space", "elements"),
+    ("space", "spaces_in_it", "more"),
     [
-        (spaces.Box(0, 1, (3, 4)), 12),
-        (spaces.Box(0, 1, ()), 1),
-        (spaces.Discrete(10**9), 1),
-        (spaces.MultiDiscrete([5, 5]), 2),
-        (spaces.MultiBinary([2, 3]), 6),
-        (spaces.Text(4, charset="abc"), 4),
-        (spaces.Tuple([spaces.Box(0, 1, (3,)), spaces.Discrete(2)]), 4),
-        (spaces.Dict({"a": spaces.Box(0, 1, (3,))}), 3),
-        (spaces.Sequence(spaces.Box(0, 1, (3,))), 6),
-        (spaces.Graph(spaces.Box(0, 1, (3,)), spaces.Discrete(2)), 8),
+        (spaces.Box(0, 1, (3, 4)), 1, 12 * 10),
+        (spaces.Box(0, 1, (), np.float64), 1, 18),
+        (spaces.Discrete(10**9), 1, 0),
+        (spaces.MultiDiscrete([5, 5]), 1, 2 * 32),
+        (spaces.MultiBinary([2, 3]), 1, 6 * 10),
+        (spaces.Text(4, charset="abc"), 1, 3 * 256 + 4 * 10),
+        (spaces.Tuple([spaces.Box(0, 1, (3,)), spaces.Discrete(2)]), 3, 3 * 10),
+        (spaces.Dict({"a": spaces.Box(0, 1, (3,))}), 2, 3 * 10),
+        (spaces.Sequence(spaces.Box(0, 1, (3,))), 3, 6 * 10),
+        (spaces.Graph(spaces.Box(0, 1, (3,)), spaces.Discrete(2)), 5, 6 * 10),
+        (spaces.Tuple([spaces.Box(0, 1, (3,))] * 4), 5, 3 * 10),
     ],
     ids=repr,
 )
-def test_elements_of_all_spaces_together_are_counted(space: Space, elements: int) -> None:
-    """``max_elements`` is exact: all that is built counts."""
+def test_bytes_of_all_spaces_together_are_counted(
+    space: Space, spaces_in_it: int, more: int
+) -> None:
+    """``max_elements`` is exact: all that is built counts, and what is alike counts once."""
+    elements = -(-(spaces_in_it * SPACE_BYTES + more) // ELEMENT_BYTES)
     assert decode_space(encode_space(space), max_elements=elements) == space
     with pytest.raises(RemoteProtocolError, match="max_elements"):
         decode_space(encode_space(space), max_elements=elements - 1)
@@ -386,6 +392,44 @@ def test_absurd_sizes_are_refused_before_they_are_allocated(value: dict[str, Any
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 2 * MANY
+
+
+def test_boxes_that_are_alike_share_their_bounds_and_nothing_else() -> None:
+    """A suite's hundred tasks cost what one does; each draws numbers of its own."""
+    value = encode_space(spaces.Box(0, 255, (100, 100), np.uint8))
+    reader = SpaceReader(10_000 + 2 * SPACE_BYTES)
+    boxes = [reader.space(decode(encode(value))) for _ in range(20)]
+    assert all(box == boxes[0] for box in boxes)
+    assert all(np.shares_memory(box.low, boxes[0].low) for box in boxes)  # type: ignore[attr-defined]
+    boxes[0].seed(0)
+    boxes[1].seed(1)
+    assert boxes[0].np_random is not boxes[1].np_random
+    assert (boxes[0].sample() != boxes[1].sample()).any()
+    with pytest.raises(RemoteProtocolError, match="max_elements"):
+        reader.space(encode_space(spaces.Box(0, 254, (100, 100), np.uint8)))
+
+
+def test_what_is_in_a_sequence_has_bounds_of_its_own() -> None:
+    """Gymnasium makes a batch of it, which is paid for however often it comes."""
+    box = spaces.Box(0, 1, (1000,))
+    value = encode_space(spaces.Tuple([box, *[spaces.Sequence(box)] * 3]))
+    with pytest.raises(RemoteProtocolError, match="max_elements"):
+        decode_space(value, max_elements=1000 * (1 + 2 * 2 + 1))
+
+
+def test_reading_asks_before_each_space() -> None:
+    """Whatever ends it, such as a deadline, is what comes out."""
+    asked = []
+
+    def check() -> None:
+        asked.append(1)
+        if len(asked) == 3:
+            raise WorkerTimeoutError("late")
+
+    value = encode_space(spaces.Tuple([spaces.Discrete(2)] * 5))
+    with pytest.raises(WorkerTimeoutError):
+        SpaceReader(MANY, check).space(value)
+    assert len(asked) == 3
 
 
 BOX = encode_space(spaces.Box(0, 1, (2,)))

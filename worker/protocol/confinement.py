@@ -24,7 +24,8 @@ class Limits:
         file_bytes: Size of one file, or None for ``disk_bytes``.
         output_bytes: Bytes of stdout and stderr that are kept (the last ones).
         message_bytes: Size of one message from the jail.
-        elements: Elements of all spaces of one vector environment together.
+        elements: What all spaces of a repository may cost the client, in elements of a float32
+            ``Box`` (ten bytes each). Boxes that are alike count once.
     """
 
     memory_bytes: int = 8 * GIB
@@ -36,7 +37,7 @@ class Limits:
     file_bytes: int | None = None
     output_bytes: int = 64 * 1024
     message_bytes: int = 256 * MIB
-    elements: int = 200_000_000
+    elements: int = 100_000_000
 
 
 @dataclass(frozen=True, kw_only=True)

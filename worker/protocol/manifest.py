@@ -6,7 +6,7 @@ are bounded, names are strings of bounded length, spaces are checked before they
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,7 +14,9 @@ import gymnasium as gym
 
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import MAX_NUM_ENVS
-from envhub_worker.protocol.spaces import decode_space, encode_space
+from envhub_worker.protocol.space_reader import SpaceReader
+from envhub_worker.protocol.spaces import encode_space
+from envhub_worker.protocol.untrusted import UNTRUSTED
 
 MAX_ENVS = 4096
 """Vector environments in one manifest: a benchmark suite has a few hundred tasks."""
@@ -104,17 +106,29 @@ def encode_manifest(manifest: Manifest) -> dict[str, object]:
     }
 
 
-def decode_manifest(value: object, *, max_elements: int) -> Manifest:
+def decode_manifest(
+    value: object, *, max_elements: int, check: Callable[[], None] | None = None
+) -> Manifest:
     """Read a manifest. Trust: input from the worker.
+
+    Args:
+        value: What the wire brought.
+        max_elements: What all spaces of all environments may cost together.
+        check: Called before each space; raises what ends the reading, such as a deadline.
 
     Raises:
         RemoteProtocolError: It is not a manifest, or over a limit.
     """
+    with UNTRUSTED:
+        return _decode_manifest(value, SpaceReader(max_elements, check))
+
+
+def _decode_manifest(value: object, reader: SpaceReader) -> Manifest:
     fields = _mapping(value, _FIELDS, "a manifest")
     envs = fields["envs"]
     if type(envs) is not tuple or not 1 <= len(envs) <= MAX_ENVS:
         raise RemoteProtocolError(f"a manifest holds 1 to {MAX_ENVS} environments")
-    decoded = tuple(decode_env(env, max_elements=max_elements) for env in envs)
+    decoded = tuple(_decode_env(env, reader) for env in envs)
     if len({(env.suite, env.task) for env in decoded}) != len(decoded):
         raise RemoteProtocolError("a manifest names the same task twice")
     return Manifest(
@@ -131,11 +145,16 @@ def decode_env(value: object, *, max_elements: int) -> EnvManifest:
     Raises:
         RemoteProtocolError: It is not one, or over a limit.
     """
+    with UNTRUSTED:
+        return _decode_env(value, SpaceReader(max_elements))
+
+
+def _decode_env(value: object, reader: SpaceReader) -> EnvManifest:
     fields = _mapping(value, _ENV_FIELDS, "an environment's manifest")
     num_envs = _typed(fields, "num_envs", int)
     if not 1 <= num_envs <= MAX_NUM_ENVS:
         raise RemoteProtocolError(f"num_envs is {num_envs}, outside 1..{MAX_NUM_ENVS}")
-    spaces = {name: decode_space(fields[name], max_elements=max_elements) for name in _SPACES}
+    spaces = {name: reader.space(fields[name]) for name in _SPACES}
     mode = fields["autoreset_mode"]
     if mode is not None and mode not in AUTORESET_MODES:
         raise RemoteProtocolError(f"autoreset mode {str(mode)[:40]!r} is not one of Gymnasium's")
