@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+from envhub_sandbox import folders
 
 pytest_plugins = ["tests.hub.fixtures"]
 
@@ -24,6 +27,10 @@ settings.register_profile("local", deadline=None, suppress_health_check=[HealthC
 settings.register_profile("ci", settings.get_profile("local"), derandomize=True)
 settings.load_profile("ci" if "ENVHUB_CI" in os.environ else "local")
 
+
+# A store is trusted only where nobody else can move it: not in a /tmp that is not sticky.
+if folders.why_distrusted(Path(tempfile.gettempdir()), Path("/nowhere")):
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", "/var/tmp")
 
 # What a shell starts in the background ignores Ctrl-C, and so would every client of our tests.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:

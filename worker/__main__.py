@@ -38,6 +38,8 @@ from pathlib import Path
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command: see the head of this file."""
+    # jails of root are another user, who must get through to what we make; what is private says so
+    os.umask(0o022)
     arguments = _parser().parse_args(argv)
     run: Callable[[argparse.Namespace], int] = arguments.run
     return run(arguments)
@@ -144,4 +146,9 @@ def _add_remote(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
 
 
 if __name__ == "__main__":
+    if not (sys.flags.isolated or getattr(sys.flags, "safe_path", False)):
+        sys.exit(
+            "envhub-worker: not run, since python -m looks for modules in the current folder "
+            f"first. Use: envhub-worker, or: {sys.executable} -I -m envhub_worker"
+        )
     sys.exit(main())

@@ -59,10 +59,16 @@ def main(argv: Sequence[str]) -> int:
         sys.stderr.write(f"usage: bootstrap.py {{{','.join(_PROGRAMS)}}} ARGS...\n")
         return 2
     load_package()
+    # now: later this process may be another user, who may not read it
+    hidden = importlib.import_module("envhub_worker.unreadable").why_hidden
     try:
         program = importlib.import_module(_PROGRAMS[argv[0]])
         return int(program.main(list(argv[1:])) or 0)
     except ModuleNotFoundError as error:
+        why = hidden(error.name or "")
+        if why:
+            sys.stderr.write(f"PermissionError: {sys.executable}: {error}, but {why}\n")
+            return 1
         if error.name not in _NEEDED:
             raise
         needed = " ".join(_NEEDED.values())

@@ -351,6 +351,13 @@ def _make_private(folder: Path) -> None:
     folder.mkdir(mode=0o711 if os.getuid() == 0 else 0o700, parents=True, exist_ok=True)
     if not os.access(folder, os.W_OK):
         raise PermissionError(f"{folder} cannot be written")
+    found = folder.stat()
+    if found.st_uid != os.getuid() or found.st_mode & 0o022:
+        raise PermissionError(
+            f"the state folder {folder} holds keys, and others can change what is in it: it "
+            f"belongs to uid {found.st_uid} and has mode {stat.S_IMODE(found.st_mode):04o}. Give "
+            f"it to uid {os.getuid()} and chmod go-w it, or let --state-dir name a new one"
+        )
 
 
 def _is_ours(folder: Path) -> bool:

@@ -31,6 +31,8 @@ from envhub_worker.sessions import Sessions
 _RCVHWM = 64
 _ROUND = 64
 """Messages that are served before the jails have their turn."""
+_MAX_SAID = 4096
+"""Characters of a refusal."""
 
 
 class Server:
@@ -114,15 +116,16 @@ class Server:
             self._serve(*self._gate.receive(self._router))
 
     def _serve(self, identity: bytes, key: bytes, frames: list[Any]) -> None:
-        if not frames or len(frames[0]) > self._limits.header_bytes:
+        if not frames:
             return
         session = self._sessions.find(identity, key)
         try:
             if self._compression(identity, key):
                 frames[:] = packing.unpack_frames(frames, self._limits)
             request_id, request = m.unpack(frames[:1], limits=self._limits)
-        except ProtocolError:
-            return  # not our protocol; there is no id to answer to
+        except Exception as error:
+            self._refuse_unread(identity, key, frames[0], error)
+            return
         asker = Asker(identity, request_id, b"" if session is None else session.owner, key)
         try:
             self._dispatch(asker, request, frames[1:])
@@ -130,6 +133,16 @@ class Server:
             self.refuse(asker, refused.error, refused.message)
         except Exception as error:
             self.refuse(asker, "WorkerError", f"{type(error).__name__}: {error}")
+
+    def _refuse_unread(self, identity: bytes, key: bytes, frame: Any, error: Exception) -> None:
+        """A request that cannot be read: as long as its id can be, its sender need not wait."""
+        request_id = m.id_of(frame)
+        if request_id is None:
+            return  # not our protocol
+        asker = Asker(identity, request_id, b"", key)
+        known = isinstance(error, ProtocolError)
+        said = str(error) if known else type(error).__name__
+        self.refuse(asker, "LocalProtocolError", f"the request cannot be read: {said}")
 
     def _dispatch(self, asker: Asker, request: m.Message, payload: list[Any]) -> None:
         if isinstance(request, m.Hello):
@@ -173,7 +186,8 @@ class Server:
         self, asker: Asker, error: str, message: str, layer: str = "", fix: str = ""
     ) -> None:
         """Answer that it is not done."""
-        self.reply(asker, m.Refused(error, message, layer, fix))
+        # what the client has sent may be quoted in it, at any length
+        self.reply(asker, m.Refused(error, message[:_MAX_SAID], layer, fix))
 
     def _hello(self, asker: Asker, request: m.Hello) -> None:
         version = min(m.VERSION, request.newest)

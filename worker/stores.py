@@ -79,7 +79,7 @@ class Store:
         """A file has arrived whole."""
         part.chmod(0o444)
         blob = self.blob(sha256)
-        blob.parent.mkdir(exist_ok=True)
+        blob.parent.mkdir(mode=0o700, exist_ok=True)
         os.rename(part, blob)
         self.held += blob_charge(size) - self._blobs.get(blob.name, 0)
         self._blobs[blob.name] = blob_charge(size)
@@ -111,7 +111,7 @@ class Store:
         ``copying`` is told the size of each file that cannot be a link, before it is copied.
         """
         tree = self.tree(digest)
-        tree.parent.mkdir(exist_ok=True)
+        make_passable(tree.parent)
         building = Path(tempfile.mkdtemp(prefix=".building-", dir=tree.parent))
         try:
             for file in files:
@@ -128,6 +128,12 @@ class Store:
                 remove_tree(str(building))
         self._trees[digest] = _charge_on_disk(tree)
         self.held += self._trees[digest]
+
+
+def make_passable(folder: Path) -> None:
+    """Make a folder that nobody else lists; root's jails, another user, pass through to a tree."""
+    folder.mkdir(parents=True, exist_ok=True)
+    os.chmod(folder, 0o711 if os.getuid() == 0 else 0o700)
 
 
 def _modified(path: Path) -> float:

@@ -22,7 +22,7 @@ from typing import Any
 from envhub_worker.lockdown.scratch import remove_tree
 from envhub_worker.protocol import messages as m
 from envhub_worker.quotas import Quotas, RefusedError
-from envhub_worker.stores import Listed, Store, blob_charge, tree_charge
+from envhub_worker.stores import Listed, Store, blob_charge, make_passable, tree_charge
 
 MAX_PIECE_BYTES = 8 << 20
 """One ``PutBlob``: the server writes and hashes it while everybody else waits."""
@@ -79,7 +79,7 @@ class Uploads:
         self._quotas = quotas
         self._offers: dict[bytes, Offer] = {}
         self._partial: dict[tuple[bytes, bytes], Partial] = {}
-        folder.mkdir(parents=True, exist_ok=True)
+        make_passable(folder)
         for left in [*folder.glob("*/parts"), *folder.glob("*/trees/.building-*")]:
             remove_tree(str(left))
         # counted now: later everybody would wait for it
@@ -138,6 +138,8 @@ class Uploads:
         Raises:
             RefusedError: Nobody wanted it, it is out of order, or it is not what its hash says.
         """
+        if len(request.sha256) != _SHA256_BYTES:  # it would be a file's name
+            raise RefusedError("LocalProtocolError", "a hash has 32 bytes")
         offer = self._offers.get(owner)
         size = None if offer is None else offer.missing.get(request.sha256)
         if offer is None or size is None:
@@ -165,7 +167,8 @@ class Uploads:
             mine = sum(1 for known, _ in self._partial if known == owner)
             if partial is None and mine >= MAX_PARTIAL:
                 raise RefusedError("WorkerError", f"{MAX_PARTIAL} files are on their way already")
-            (home / "parts").mkdir(parents=True, exist_ok=True)
+            make_passable(home)
+            (home / "parts").mkdir(mode=0o700, exist_ok=True)
             name = hashlib.sha256(owner + request.sha256).hexdigest()
             partial = self._partial[place] = Partial(home / "parts" / name, size)
             partial.path.write_bytes(b"")

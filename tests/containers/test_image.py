@@ -109,7 +109,7 @@ def built(engine: Engine, repository: Path, *options: str) -> dict[str, Any]:
     """Build by the command line."""
     words = ("image", "build", str(repository), "--base", IMAGE, "--engine", engine.kind)
     done = subprocess.run(
-        [sys.executable, "-m", "envhub_sandbox", *words, "--build-network", "host", "--json"],
+        [sys.executable, "-I", "-m", "envhub_sandbox", *words, "--build-network", "host", "--json"],
         capture_output=True,
         text=True,
     )

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("neighbour")
 def envhub(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     """Run the command line to its end."""
     return subprocess.run(
-        [sys.executable, "-m", "envhub_sandbox", *map(str, arguments)],
+        [sys.executable, "-I", "-m", "envhub_sandbox", *map(str, arguments)],
         capture_output=True,
         text=True,
         timeout=240,

@@ -15,7 +15,7 @@ def gc(temporary: Path, *options: str) -> subprocess.CompletedProcess[str]:
     """Run it with a folder for temporary files of its own, and without an engine."""
     variables = {"TMPDIR": str(temporary), "PATH": str(temporary)}
     return subprocess.run(
-        [sys.executable, "-m", "envhub_sandbox", "gc", *options],
+        [sys.executable, "-I", "-m", "envhub_sandbox", "gc", *options],
         env=os.environ | variables,
         capture_output=True,
         text=True,

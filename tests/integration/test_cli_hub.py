@@ -14,7 +14,7 @@ import pytest
 from tests.hub.olah_server import OlahServer
 from tests.support.samples import EXAMPLES
 
-COMMAND = [sys.executable, "-m", "envhub_sandbox"]
+COMMAND = [sys.executable, "-I", "-m", "envhub_sandbox"]
 
 
 def envhub(*arguments: str) -> subprocess.CompletedProcess[str]:

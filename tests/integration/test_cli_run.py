@@ -54,7 +54,7 @@ def make_env(n_envs=1, use_async_envs=False, render_mode=None):
 def envhub(*arguments: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:
     """Run the command line to its end."""
     return subprocess.run(
-        [sys.executable, "-m", "envhub_sandbox", *map(str, arguments)],
+        [sys.executable, "-I", "-m", "envhub_sandbox", *map(str, arguments)],
         capture_output=True,
         text=True,
         encoding="utf-8",

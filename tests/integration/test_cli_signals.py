@@ -17,7 +17,7 @@ import pytest
 from tests.support.processes import eventually
 from tests.support.samples import EXAMPLES, sample
 
-COMMAND = [sys.executable, "-m", "envhub_sandbox"]
+COMMAND = [sys.executable, "-I", "-m", "envhub_sandbox"]
 _STEPPING = """
 import gymnasium as gym
 import numpy as np

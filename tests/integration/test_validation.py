@@ -159,7 +159,7 @@ def test_environments_in_this_process_are_not_validated() -> None:
 def test_envhub_run_validates(leaver: Path) -> None:
     """The environment broke the rules: exit code 1."""
     kwargs = ("--env-kwargs", "value=2.0", "--env-kwargs", "moment=step")
-    command = [sys.executable, "-m", "envhub_sandbox", "run", str(leaver), *kwargs]
+    command = [sys.executable, "-I", "-m", "envhub_sandbox", "run", str(leaver), *kwargs]
     for validate, code in ((), 0), (("--validate",), 1):
         done = subprocess.run(
             [*command, "--episodes", "1", *validate],

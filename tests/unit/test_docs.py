@@ -190,7 +190,7 @@ def test_readme_names_arguments_that_exist() -> None:
 def command_line_options() -> set[str]:
     """The options that ``envhub run`` takes, by its own help."""
     done = subprocess.run(
-        [sys.executable, "-m", "envhub_sandbox", "run", "--help"],
+        [sys.executable, "-I", "-m", "envhub_sandbox", "run", "--help"],
         capture_output=True,
         text=True,
         env={"COLUMNS": "200", "TERM": "dumb", "NO_COLOR": "1"},

@@ -7,6 +7,7 @@ import traceback
 
 from envhub_worker.protocol.messages import Raised
 from envhub_worker.protocol.text import printable
+from envhub_worker.unreadable import why_hidden
 
 _MAX_MESSAGE = 8_192
 _MAX_TRACEBACK = 32_768
@@ -15,6 +16,12 @@ _OURS = f"{__name__.rpartition('.')[0]}."
 
 def raised(error: BaseException, stage: str) -> Raised:
     """The message for an exception: its nearest builtin ancestor, its text, its traceback."""
+    # a package that may not be read is imported all the same, as one without a file of its own
+    nowhere = isinstance(error, ImportError) and error.path is None
+    hidden = why_hidden(str(getattr(error, "name", ""))) if nowhere else ""
+    if hidden:
+        denied = PermissionError(f"{_text(error)}, but {hidden}")
+        error = denied.with_traceback(error.__traceback__)
     kind = type(error)
     name = kind.__qualname__
     if kind.__module__ not in ("builtins", "__main__"):

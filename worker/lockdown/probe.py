@@ -44,6 +44,7 @@ profile envhub-worker {python} flags=(unconfined) {{
 
 def main(argv: Sequence[str]) -> int:
     """Print what this host can enforce as JSON."""
+    os.umask(0o022)  # as for the server: what is tried must not depend on the caller's
     print(json.dumps(probe(), indent=2))
     return 0
 

@@ -16,9 +16,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, TypeVar
 
+import msgpack  # type: ignore[import-untyped]
+
 from envhub_worker.protocol import recurring
 from envhub_worker.protocol.codec import Buffer, decode_parts, encode, split
 from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.kinds import DOCUMENT_BYTES
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
@@ -29,6 +32,8 @@ Version 2 added kinds 17 to 31, version 3 kind 53; nothing that there was change
 """
 OLDEST_VERSION = 1
 """The oldest version that this code still speaks."""
+_HEAD_BYTES = 64
+"""Enough for the length of a document, its kind and its id."""
 FIRST_HOST_KIND = 32
 """Kinds from here on are between client and jail host; a host may send no other."""
 
@@ -676,6 +681,22 @@ def unpack(
         request_id, message = _decode(document, tail, buffers, limits, unpickler, tensors)
         _INCOMING.met(key, lambda: recurring.Incoming(document, type(message), limits))
         return request_id, message
+
+
+def id_of(frame: Buffer) -> int | None:
+    """The id of a header that may be unreadable otherwise; None if there is none.
+
+    Trust: input from the other side. Only the first bytes are looked at.
+    """
+    head = msgpack.Unpacker(max_buffer_size=_HEAD_BYTES)
+    head.feed(bytes(memoryview(frame).cast("B")[DOCUMENT_BYTES.size : _HEAD_BYTES]))
+    try:
+        items, kind, number = head.read_array_header(), head.unpack(), head.unpack()
+    except Exception:  # whatever a decoder makes of noise
+        return None
+    if items < 2 or type(kind) is not int or type(number) is not int:
+        return None
+    return number if 0 < number < 1 << 63 else None
 
 
 def _decode(

@@ -1,0 +1,103 @@
+"""Whatever a client asks, it is answered, and others go on: also what breaks every rule."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_worker import keys
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.limits import DEFAULT_LIMITS
+from tests.remote.listening import Listening
+from tests.remote.test_clients import Peer, peer
+
+MIB = 1 << 20
+
+
+@pytest.fixture
+def client(server: Listening) -> Iterator[Peer]:
+    """A client that has said Hello, and keeps no rule after that."""
+    with peer(server, keys.load(server.state / "client.key")) as found:
+        assert isinstance(found.ask(m.Hello(1, 2, b"unruly")), m.Welcome)
+        yield found
+
+
+@pytest.fixture
+def good(server: Listening, repository: Path) -> Iterator[Any]:
+    """Another client's environment; afterwards it is still the same one."""
+    with make_env(repository, sandbox=server.sandbox()) as suites:
+        suites.env.reset(seed=1)
+        yield suites.env
+        assert suites.env.step(np.array([0]))[0].tolist() == [[1.0]]
+
+
+def raw(client: Peer, number: int, *fields: object) -> list[bytes]:
+    """A header that no function of ours would write, as it travels."""
+    document = msgpack.packb([*fields[:1], number, *fields[1:]])
+    return [len(document).to_bytes(4, "little") + document]
+
+
+@pytest.mark.parametrize("size", [0, 31, 33, 255, 3 * MIB])
+def test_a_hash_of_another_length_is_refused(client: Peer, good: Any, size: int) -> None:
+    """It would become the name of a file."""
+    refused = client.refused(m.PutBlob(b"h" * size, 0), b"data")
+    assert refused.error == "LocalProtocolError"
+    assert len(refused.message) < 10_000
+
+
+def test_a_long_text_is_not_sent_back_whole(client: Peer, good: Any) -> None:
+    """What is refused is named in a few words."""
+    for request in (
+        m.OpenJail("x" * MIB, "", "y" * MIB, "env.py", {"profile": "z" * MIB}, 1),
+        m.OpenJail("x", "", "sha256:" + "y" * MIB, "e/" * MIB, {}, 1),
+        m.OfferSnapshot((("p" * MIB, 1, b"h" * 32),)),
+        m.OfferSnapshot((("\x1b" * MIB, 1, b"h" * 32),)),
+    ):
+        assert len(client.refused(request).message) < 10_000
+
+
+def malformed() -> dict[str, list[object]]:
+    """Fields after the id, by what is wrong with them; the kind comes first."""
+    nested: list[object] = []
+    for _ in range(100):
+        nested = [nested]
+    return {
+        "unknown kind": [120],
+        "too few fields": [m.PutBlob.kind],
+        "too many fields": [m.PutBlob.kind, b"h" * 32, 0, 1, 2, 3],
+        "wrong types": [m.PutBlob.kind, "h", "0"],
+        "too deep": [m.OfferSnapshot.kind, nested],
+        "too many items": [m.OfferSnapshot.kind, list(range(DEFAULT_LIMITS.items + 1))],
+        "too long": [m.OfferSnapshot.kind, b"x" * (DEFAULT_LIMITS.header_bytes + 1)],
+        "a jail's message": [m.Step.kind],
+        "a reply": [m.Done.kind],
+    }
+
+
+@pytest.mark.parametrize("what", malformed())
+def test_a_malformed_request_is_refused(client: Peer, good: Any, what: str) -> None:
+    """As long as its id can be read there is somebody to tell."""
+    client.number += 1
+    client.socket.send_multipart(raw(client, client.number, *malformed()[what]))
+    assert client.socket.poll(30_000), "no answer"
+    number, reply = m.unpack(client.socket.recv_multipart()[:1])
+    assert number == client.number
+    assert isinstance(reply, m.Refused)
+
+
+def test_many_in_a_row_do_not_end_the_server(client: Peer, good: Any, server: Listening) -> None:
+    """Failures of the server itself, again and again, would."""
+    for _ in range(120):
+        client.tell(m.PutBlob(b"h" * (2 * MIB + 1), 0), b"data")
+        client.socket.send_multipart([b"\0\0\0\0"])
+        client.socket.send_multipart([b"\xff" * 100])
+        client.socket.send_multipart([b""])
+    assert isinstance(client.ask(m.GetStatus()), (m.Status, m.Refused))
+    assert server.process.poll() is None
+    assert "Traceback" not in server.said()
