@@ -1,19 +1,18 @@
 """What a vector environment shows its user, made from what the worker declared.
 
-Trust: the manifest and generator states are input from the worker.
+Trust: the manifest is input from the worker.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from envhub_sandbox.actions import ActionReader
-from envhub_sandbox.errors import RemoteProtocolError
 from envhub_worker.protocol.manifest import EnvManifest
 from envhub_worker.protocol.spaces import OpaqueSpace
 
@@ -36,14 +35,41 @@ def metadata(manifest: EnvManifest) -> dict[str, Any]:
     return {**manifest.metadata, "autoreset_mode": mode}
 
 
-def spec(manifest: EnvManifest) -> EnvSpec | None:
-    """``env.spec``, where the repository gave one."""
-    if manifest.spec is None or type(manifest.spec.get("id")) is not str:
+_REFUSAL = f"{__name__}:not_here"
+
+
+def spec(manifest: EnvManifest, reference: str) -> EnvSpec | None:
+    """``env.spec``, where the repository gave one: its facts, and nothing that makes anything.
+
+    A string names what refuses, so that it can be written as JSON like any other.
+    """
+    given = manifest.spec
+    # gym.make imports what stands before a colon
+    if given is None or given.get("id") is None or ":" in given["id"]:
         return None
+    facts = {name: value for name, value in given.items() if value is not None}
     try:
-        return EnvSpec(**manifest.spec)
+        return EnvSpec(
+            **facts,
+            entry_point=_REFUSAL,
+            vector_entry_point=_REFUSAL,
+            kwargs={"reference": reference},
+        )
     except Exception:  # an id that this Gymnasium cannot read: not worth failing for
         return None
+
+
+def not_here(*args: Any, reference: str = "", **kwargs: Any) -> NoReturn:
+    """What ``gym.make(env.spec)`` calls.
+
+    Raises:
+        gymnasium.error.Error: Always.
+    """
+    raise gym.error.Error(
+        f"this spec is of an environment in a sandbox, {reference}: gym.make would need its code "
+        "in this process, which it never enters. Use envhub_sandbox.make_env with that repository, "
+        "or copy.deepcopy(env) for another one like it"
+    )
 
 
 def check_mask(mask: Any, num_envs: int) -> None:
@@ -61,28 +87,3 @@ def check_mask(mask: Any, num_envs: int) -> None:
             "`options['reset_mask']` must contain a boolean array with at least one True value, "
             f"got reset_mask={mask}"
         )
-
-
-_BIT_GENERATORS = {
-    kind.__name__: kind
-    for kind in (
-        np.random.PCG64,
-        np.random.PCG64DXSM,
-        np.random.MT19937,
-        np.random.Philox,
-        np.random.SFC64,
-    )
-}
-
-
-def generator(state: Any) -> np.random.Generator:
-    """A generator in a given state. Trust: the state is input from the worker."""
-    kind = _BIT_GENERATORS.get(str(state.get("bit_generator"))) if type(state) is dict else None
-    if kind is None:
-        raise RemoteProtocolError("the worker sent the state of an unknown random generator")
-    bits = kind()
-    try:
-        bits.state = state
-    except (TypeError, ValueError, KeyError, OverflowError) as error:
-        raise RemoteProtocolError(f"the worker sent a broken generator state: {error}") from error
-    return np.random.Generator(bits)

@@ -218,6 +218,7 @@ class RemoteEnvError(EnvHubError):
         return (
             remote_error,
             (_builtin_of(type(self)), self.type_name, self.message, self.traceback),
+            {"args": self.args},  # with where it came from
         )
 
 

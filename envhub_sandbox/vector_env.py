@@ -6,6 +6,7 @@ the results.
 
 from __future__ import annotations
 
+import html
 import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, cast
@@ -18,12 +19,13 @@ from gymnasium.error import (
 )
 from gymnasium.vector import VectorEnv
 
-from envhub_sandbox import declared
+from envhub_sandbox import declared, generators
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.jail import typed
 from envhub_sandbox.remote_env import RemoteEnv
 from envhub_sandbox.results import StepResult
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.names import is_servable
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 Bounds = tuple[int, int]
@@ -58,7 +60,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         self.action_space = manifest.action_space
         self.metadata = declared.metadata(manifest)
         self.render_mode = manifest.render_mode
-        self.spec = declared.spec(manifest)
+        self.spec = declared.spec(manifest, remote.repository.label)
         # a proxy that nobody holds any more must not keep processes alive
         weakref.finalize(self, remote.close).atexit = False
 
@@ -223,18 +225,19 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         replies = self._ask("np_random", lambda number, _: m.GetRandom(number))
         with UNTRUSTED:  # a generator that numpy does not know breaks no rule of the wire
             if type(replies[0].value) is dict:
-                return declared.generator(replies[0].value)
+                return generators.generator(replies[0].value)
             states = self._remote.results.one_each("np_random", replies)
-            return tuple(declared.generator(state) for state in states)
+            return tuple(generators.generator(state) for state in states)
 
     @property
     def np_random_seed(self) -> Any:
         """Their seeds."""
         replies = self._ask("np_random_seed", lambda number, _: m.GetOwn(number, "np_random_seed"))
         if type(replies[0].value) is not tuple:
-            return replies[0].value
+            return generators.seeds(replies[0].value)
         with self._remote.handling():
-            return self._remote.results.one_each("np_random_seed", replies)
+            seeds = self._remote.results.one_each("np_random_seed", replies)
+        return generators.seeds(seeds)
 
     @property
     def envs(self) -> tuple[SubEnvironment, ...]:
@@ -269,7 +272,10 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     def __getattr__(self, name: str) -> Any:
         """An attribute that the repository's vector environment has beyond Gymnasium's."""
         manifest = self.__dict__.get("_manifest")
-        if manifest is None or name not in manifest.attributes:
+        # Judged once more, whatever the manifest went through: what has a name of ours would be
+        # asked for when a property of that name fails.
+        ours = not is_servable(name) or hasattr(type(self), name)
+        if manifest is None or ours or name not in manifest.attributes:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         self._refuse_if_busy(name)
         [reply] = self._own("get attribute", m.GetOwn, name)
@@ -286,6 +292,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         return method
 
     def __reduce__(self) -> tuple[Any, ...]:
+        # For copy and deepcopy, too: two environments cannot share processes that either may end.
         recipe = self._remote.repository.recipe
         if recipe is None:
             raise TypeError(f"{self!r} does not know how it was made, so it cannot be pickled")
@@ -293,6 +300,11 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
     def __repr__(self) -> str:
         return f"SandboxVectorEnv({self._remote.repository.label}, num_envs={self.num_envs})"
+
+    def _repr_html_(self) -> str:
+        return f"<code>{html.escape(repr(self))}</code>"
+
+    __html__ = _repr_html_
 
     # --- inside --------------------------------------------------------------------------------
 
@@ -379,14 +391,34 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
 
 class SubEnvironment:
-    """Reads attributes of one sub-environment: ``env.envs[0].task``, ``hasattr`` included."""
+    """Reads attributes of one sub-environment: ``env.envs[0].task``, ``hasattr`` included.
+
+    What Gymnasium's environments have is answered here: looking at a method does not run it.
+    """
 
     def __init__(self, vector: SandboxVectorEnv, index: int) -> None:
         self._vector = vector
         self._index = index
+        self.action_space = vector.single_action_space
+        self.observation_space = vector.single_observation_space
+        self.metadata = vector.metadata
+        self.render_mode = vector.render_mode
+        self.spec = vector.spec
+
+    @property
+    def unwrapped(self) -> SubEnvironment:
+        """Itself: wrappers are not told from what they wrap."""
+        return self
+
+    def render(self) -> Any:
+        """What this one renders; the others do, too."""
+        return self._vector.call("render")[self._index]
 
     def __getattr__(self, name: str) -> Any:
         """The attribute; methods are called without arguments, as ``get_attr`` does."""
-        if name.startswith("__"):
-            raise AttributeError(name)
+        if not is_servable(name):
+            raise AttributeError(f"a sub-environment shows no {name!r}; ask the vector environment")
         return self._vector.get_attr(name)[self._index]
+
+    def __repr__(self) -> str:
+        return f"<sub-environment {self._index} of {self._vector!r}>"

@@ -69,6 +69,8 @@ class LyingServer:
     lies: dict[type[m.Message], Lie] = field(default_factory=dict)
     fd_path: None = None
     asked: list[m.Message] = field(default_factory=list)
+    heard: bytearray = field(default_factory=bytearray)
+    """Every byte that a client sent: what a hostile worker knows by then."""
 
     def __post_init__(self) -> None:
         self.folder = tempfile.mkdtemp(prefix="envhub-liar-")
@@ -91,6 +93,7 @@ class LyingServer:
                         self._router.send_multipart([identity, *answer])
 
     def _answers(self, frames: list[bytes]) -> list[Frames]:
+        self.heard += b"".join(frames)
         request_id, request = m.unpack(frames[:1])
         relayed = isinstance(request, m.Relay)
         if relayed:

@@ -16,8 +16,6 @@ from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import MAX_NUM_ENVS
 from envhub_worker.protocol.manifest import (
     MAX_ENVS,
-    MAX_NAME,
-    MAX_NAMES,
     EnvManifest,
     Manifest,
     decode_env,
@@ -25,6 +23,7 @@ from envhub_worker.protocol.manifest import (
     encode_env,
     encode_manifest,
 )
+from envhub_worker.protocol.names import MAX_NAME, MAX_NAMES
 
 ELEMENTS = 40_000
 OBSERVATION = spaces.Dict({"b": spaces.Box(-1, 1, (3,)), "a": spaces.Text(4)})

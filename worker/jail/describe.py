@@ -11,7 +11,8 @@ from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from envhub_worker.jail.tasks import Task
-from envhub_worker.protocol.manifest import MAX_NAMES, EnvManifest, Manifest
+from envhub_worker.protocol.manifest import EnvManifest, Manifest
+from envhub_worker.protocol.names import MAX_NAMES
 
 _GYMNASIUMS = frozenset(dir(VectorEnv)) | {"num_envs", "env", "envs"}
 _HEAD_BYTES = 2048

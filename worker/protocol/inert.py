@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import NoReturn
 
 from envhub_worker.protocol.text import printable
 
@@ -27,6 +28,14 @@ class RemoteObject:
 
     def __repr__(self) -> str:
         return f"<remote {self.type_name}: {self.text}>"
+
+    def __getattr__(self, name: str) -> NoReturn:
+        # While it is copied or unpickled it has no fields yet.
+        kind = self.__dict__.get("type_name", "object")
+        raise AttributeError(
+            f"a {type(self).__name__} has no attribute {name!r}: it is the description of a {kind} "
+            "that stays in the worker"
+        )
 
 
 @dataclass(frozen=True, repr=False)

@@ -13,18 +13,21 @@ from typing import Any
 import gymnasium as gym
 
 from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.facts import read_metadata, read_spec
 from envhub_worker.protocol.limits import MAX_NUM_ENVS
+from envhub_worker.protocol.names import (
+    MAX_NAMES,
+    checked_name,
+    is_servable,
+    optional_name,
+    string_keys,
+)
 from envhub_worker.protocol.space_reader import SpaceReader
 from envhub_worker.protocol.spaces import encode_space
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 MAX_ENVS = 4096
 """Vector environments in one manifest: a benchmark suite has a few hundred tasks."""
-MAX_NAME = 512
-"""Characters of a suite, task, attribute or package name."""
-MAX_NAMES = 1024
-"""Names in one list: attributes of an environment, packages of an interpreter."""
-
 AUTORESET_MODES = ("NextStep", "SameStep", "Disabled")
 
 TaskId = int | str
@@ -44,10 +47,12 @@ class EnvManifest:
         single_observation_space, single_action_space: Spaces of one sub-environment.
         observation_space, action_space: Batched spaces.
         autoreset_mode: ``"NextStep"``, ``"SameStep"``, ``"Disabled"``, or None if not stated.
-        metadata: The environment's metadata, without the autoreset mode.
+        metadata: The environment's metadata, without the autoreset mode; values are inert data.
         render_mode: As in Gymnasium.
-        spec: ``id`` and the plain fields of the environment's ``EnvSpec``, or None.
-        attributes: Names of attributes that the vector environment has beyond Gymnasium's.
+        spec: ``id``, ``max_episode_steps``, ``reward_threshold`` and ``nondeterministic`` of the
+            environment's ``EnvSpec``, as far as they are known, or None.
+        attributes: Names of attributes that the vector environment has beyond Gymnasium's, as far
+            as ``names.is_servable`` lets them in.
         type_name: The class that the repository returned.
     """
 
@@ -156,20 +161,20 @@ def _decode_env(value: object, reader: SpaceReader) -> EnvManifest:
         raise RemoteProtocolError(f"num_envs is {num_envs}, outside 1..{MAX_NUM_ENVS}")
     spaces = {name: reader.space(fields[name]) for name in _SPACES}
     mode = fields["autoreset_mode"]
-    if mode is not None and mode not in AUTORESET_MODES:
+    if mode is not None and (type(mode) is not str or mode not in AUTORESET_MODES):
         raise RemoteProtocolError(f"autoreset mode {str(mode)[:40]!r} is not one of Gymnasium's")
     return EnvManifest(
-        suite=_name(fields["suite"], "suite"),
+        suite=checked_name(fields["suite"], "suite"),
         task=_task(fields["task"]),
         num_envs=num_envs,
         shardable=_typed(fields, "shardable", bool),
         sync=_typed(fields, "sync", bool),
         autoreset_mode=mode,
-        metadata=_string_keys(fields["metadata"], "metadata"),
-        render_mode=_optional_name(fields["render_mode"], "render_mode"),
-        spec=None if fields["spec"] is None else _string_keys(fields["spec"], "spec"),
-        attributes=_names(fields["attributes"], "attributes"),
-        type_name=_name(fields["type_name"], "type_name"),
+        metadata=read_metadata(fields["metadata"]),
+        render_mode=optional_name(fields["render_mode"], "render_mode"),
+        spec=read_spec(fields["spec"]),
+        attributes=_attributes(fields["attributes"]),
+        type_name=checked_name(fields["type_name"], "type_name"),
         **spaces,
     )
 
@@ -186,35 +191,16 @@ def _typed(fields: Mapping[str, Any], name: str, kind: type) -> Any:
     return fields[name]
 
 
-def _name(value: object, what: str) -> str:
-    if type(value) is not str or len(value) > MAX_NAME:
-        raise RemoteProtocolError(f"{what} is not a string of at most {MAX_NAME} characters")
-    if not value.isprintable():  # names are printed all the time, and a terminal obeys what it gets
-        raise RemoteProtocolError(f"{what} holds control characters")
-    return value
-
-
-def _optional_name(value: object, what: str) -> str | None:
-    return None if value is None else _name(value, what)
-
-
 def _task(value: object) -> TaskId:
-    return value if type(value) is int else _name(value, "task")
+    return value if type(value) is int else checked_name(value, "task")
 
 
-def _names(value: object, what: str) -> tuple[str, ...]:
+def _attributes(value: object) -> tuple[str, ...]:
+    """Names that no attribute of a worker may have are left out: honest classes have them too."""
     if type(value) is not tuple or len(value) > MAX_NAMES:
-        raise RemoteProtocolError(f"{what} is not a tuple of at most {MAX_NAMES} names")
-    return tuple(_name(item, what) for item in value)
+        raise RemoteProtocolError(f"attributes is not a tuple of at most {MAX_NAMES} names")
+    return tuple(filter(is_servable, [checked_name(item, "attributes") for item in value]))
 
 
 def _texts(value: object, what: str) -> dict[str, str]:
-    return {key: _name(text, what) for key, text in _string_keys(value, what).items()}
-
-
-def _string_keys(value: object, what: str) -> dict[str, Any]:
-    if type(value) is not dict or len(value) > MAX_NAMES:
-        raise RemoteProtocolError(f"{what} is not a mapping of at most {MAX_NAMES} entries")
-    for key in value:
-        _name(key, what)
-    return value
+    return {key: checked_name(text, what) for key, text in string_keys(value, what).items()}

@@ -1,0 +1,88 @@
+"""Which names of a worker become attributes in the client: the one place that judges them.
+
+Libraries look for methods under agreed names and call them unasked: ``copy`` calls
+``__deepcopy__`` with everything that it has copied so far, numpy reads an address out of
+``__array_interface__`` and then reads and writes there, a notebook shows what ``_repr_html_``
+returns. Such a name must be the client's own or absent, whatever a worker lists. So a list of
+what is dangerous would never be complete; this is a list of forms that are not.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gymnasium.vector import VectorEnv
+
+from envhub_worker.protocol.errors import RemoteProtocolError
+
+MAX_NAME = 512
+"""Characters of a suite, task, attribute or package name."""
+MAX_NAMES = 1024
+"""Names in one list: attributes of an environment, packages of an interpreter."""
+
+SERVED_PRIVATE = frozenset({"_ensure", "_max_episode_steps"})
+"""Names with an underscore that callers of vector environments read: LeRobot's."""
+
+PROBED = frozenset(
+    {
+        # of files, mappings, classes and numbers; by the interpreter and the standard library
+        *("fileno", "keys", "mro", "as_integer_ratio", "getvalue", "conjugate"),
+        # of arrays and tensors; by numpy, pandas, torch and who wants to be polite to them
+        *("toarray", "to_numpy", "tolist", "numpy", "detach", "pin_memory", "dtype"),
+        # by notebooks: IPython's help and completion
+        *("getdoc", "trait_names"),
+    }
+)
+"""Names without an underscore that libraries look for in any object."""
+
+GYMNASIUMS = frozenset(dir(VectorEnv)) | {
+    *getattr(VectorEnv, "__annotations__", ()),
+    *("env", "envs", "env_fns", "num_envs", "autoreset_mode", "copy", "new_step_api"),
+    *("single_observation_space", "single_action_space", "observation_space", "action_space"),
+    *("metadata", "spec", "render_mode", "closed", "np_random", "np_random_seed"),
+}
+"""Names that mean something to Gymnasium: they are answered here, or by nobody."""
+
+
+def is_servable(name: str) -> bool:
+    """Whether an attribute of this name may be a worker's. Trust: input from the worker.
+
+    An identifier without a leading underscore that means nothing to Gymnasium, nor to a library
+    that looks for it in any object; and the few with an underscore that callers really read.
+    """
+    if name in SERVED_PRIVATE:
+        return True
+    if name.startswith("_") or not name.isidentifier() or len(name) > MAX_NAME:
+        return False
+    return name not in GYMNASIUMS and name not in PROBED
+
+
+def checked_name(value: object, what: str) -> str:
+    """A printable text of bounded length.
+
+    Raises:
+        RemoteProtocolError: It is none.
+    """
+    if type(value) is not str or len(value) > MAX_NAME:
+        raise RemoteProtocolError(f"{what} is not a string of at most {MAX_NAME} characters")
+    if not value.isprintable():  # names are printed all the time, and a terminal obeys what it gets
+        raise RemoteProtocolError(f"{what} holds control characters")
+    return value
+
+
+def optional_name(value: object, what: str) -> str | None:
+    """The same, or None."""
+    return None if value is None else checked_name(value, what)
+
+
+def string_keys(value: object, what: str) -> dict[str, Any]:
+    """A mapping with such names for keys.
+
+    Raises:
+        RemoteProtocolError: It is none, or has too many.
+    """
+    if type(value) is not dict or len(value) > MAX_NAMES:
+        raise RemoteProtocolError(f"{what} is not a mapping of at most {MAX_NAMES} entries")
+    for key in value:
+        checked_name(key, what)
+    return value
