@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from time import monotonic
 
 from envhub_worker.channel import close_fds
-from envhub_worker.protocol import slabs
+from envhub_worker.protocol.words import SEQUENCE
 
 _WORD = 8
 
@@ -58,4 +58,4 @@ class Idleness:
 
 
 def _sequence(slab: int) -> int:
-    return int.from_bytes(os.pread(slab, _WORD, slabs.SEQUENCE * _WORD), "little")
+    return int.from_bytes(os.pread(slab, _WORD, SEQUENCE * _WORD), "little")

@@ -30,6 +30,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from envhub_worker.protocol.spaces import ARRAY_SPACES
+from envhub_worker.protocol.words import SEQUENCE as SEQUENCE
 
 LINE = 64
 """Bytes of a cache line: words that two cores poll must not share one."""
@@ -39,9 +40,7 @@ goes through the server."""
 MAX_SLAB_BYTES = 1 << 31
 """Above this the frames lane serves: a slab is pinned memory."""
 
-# word numbers in the headers (a word is 8 bytes, a line holds 8 of them)
-SEQUENCE = 0
-"""Counts requests, or replies; polled by the other side."""
+# word numbers in the headers (a word is 8 bytes, a line holds 8 of them); ``SEQUENCE`` is first
 PARKED = 8
 """1 while this slab's writer sleeps in poll and wants its doorbell rung."""
 OUTCOME = 16
