@@ -1,7 +1,7 @@
 """The worker's program. Its contract:
 
 ``envhub-worker serve --endpoint E --runtime-dir D [--readable-root P ...] [--ready-fd N]
-[--client-pidfd N] [--fd-path F] [--until-eof] [--announce]``
+[--client-pidfd N] [--fd-path F] [--until-eof] [--announce] [--ahead]``
 
 - argv: ``E`` is the ZeroMQ endpoint to bind, ``ipc://`` in a folder of mode 0700. ``D`` is an
   existing private folder for what lives as long as the server; it is removed at the end. ``P``
@@ -14,6 +14,7 @@
 - in a container: ``F`` is where the socket that takes descriptors shall lie, in a folder that is
   shared with the client; ``D`` need not be. ``D`` is made if it is missing. ``--announce`` prints
   one line of JSON once the endpoint is bound: what holds around this process (``container.py``).
+- ``--ahead`` starts a zygote at once, in this interpreter, for whoever opens the first jail.
 - environment: nothing is read from it but what Python itself needs.
 - exit code: 0 after a stop, 2 for wrong arguments.
 
@@ -34,30 +35,36 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from envhub_worker.zygote_process import ZygoteProcess
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command: see the head of this file."""
     # jails of root are another user, who must get through to what we make; what is private says so
     os.umask(0o022)
-    arguments = _parser().parse_args(argv)
+    argv = sys.argv[1:] if argv is None else argv
+    arguments = _parser(remote=argv[:1] != ["serve"]).parse_args(argv)
     run: Callable[[argparse.Namespace], int] = arguments.run
     return run(arguments)
 
 
 def _serve(arguments: argparse.Namespace) -> int:
     """Run a worker server until it is told to stop or its client ends."""
-    from envhub_worker import container
+    arguments.runtime_dir.mkdir(mode=0o700, exist_ok=True)
+    ahead = _ahead(arguments)  # before anything heavy is imported: both are at it at once
     from envhub_worker.server import Server
 
-    announced = container.announcement() if arguments.announce else None
-    arguments.runtime_dir.mkdir(mode=0o700, exist_ok=True)
+    announced = _announced() if arguments.announce else None
     server = Server(
         arguments.endpoint,
         arguments.runtime_dir,
         arguments.readable_root,
         0 if arguments.until_eof else arguments.client_pidfd,  # stdin is readable at its end
         fd_path=arguments.fd_path,
+        ahead=ahead,
     )
     server.stop_on(signal.SIGTERM, signal.SIGINT)
     if arguments.ready_fd is not None:
@@ -67,6 +74,18 @@ def _serve(arguments: argparse.Namespace) -> int:
         print(announced, flush=True)
     server.run()
     return 0
+
+
+def _ahead(arguments: argparse.Namespace) -> ZygoteProcess | None:
+    from envhub_worker.zygote_process import ZygoteProcess
+
+    return ZygoteProcess.ahead(arguments.runtime_dir) if arguments.ahead else None
+
+
+def _announced() -> str:
+    from envhub_worker import container
+
+    return container.announcement()
 
 
 def _health(arguments: argparse.Namespace) -> int:
@@ -107,7 +126,8 @@ def _keygen(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(*, remote: bool) -> argparse.ArgumentParser:
+    """``remote``: with the commands that take long to import."""
     parser = argparse.ArgumentParser(
         prog="envhub-worker", description="Executes environments from the Hub under confinement."
     )
@@ -121,8 +141,10 @@ def _parser() -> argparse.ArgumentParser:
     serve.add_argument("--fd-path", type=Path)
     serve.add_argument("--until-eof", action="store_true")
     serve.add_argument("--announce", action="store_true")
+    serve.add_argument("--ahead", action="store_true")
     serve.set_defaults(run=_serve)
-    _add_remote(commands)
+    if remote:
+        _add_remote(commands)
     health = commands.add_parser("health", help="whether a server of this container answers")
     health.add_argument("--port", type=int, default=5555)
     health.add_argument("--state-dir", type=Path, help="as for listen")

@@ -15,7 +15,6 @@ import stat
 import struct
 
 import zmq
-from zmq.utils.monitor import parse_monitor_message
 
 from envhub_worker.loop import Loop
 from envhub_worker.refusals import Log
@@ -23,6 +22,7 @@ from envhub_worker.refusals import Log
 MAX_CONNECTIONS = 1024
 _FAILED = zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 _EVENTS = _FAILED | zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED
+_EVENT = struct.Struct("=H")  # a monitor's first frame begins with it (zmq_socket_monitor(3))
 _SO_ATTACH_FILTER = 26
 _SO_DETACH_FILTER = 27
 _DROP = struct.pack("=HBBI", 0x06, 0, 0, 0)  # BPF: return 0 bytes of the packet
@@ -53,7 +53,7 @@ class Doorman:
                 frames = self._monitor.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
                 return
-            self._happened(parse_monitor_message(frames)["event"])
+            self._happened(_EVENT.unpack_from(frames[0])[0])
 
     def _happened(self, event: int) -> None:
         if event == zmq.EVENT_ACCEPTED:

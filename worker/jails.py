@@ -45,6 +45,7 @@ from envhub_worker.spawner import (
     Spawner,
     ZygoteDied,
 )
+from envhub_worker.zygote_process import ZygoteProcess
 
 MAX_HOSTS = 64
 """Hosts of one jail: one per useful core, not one per sub-environment."""
@@ -68,6 +69,7 @@ class Jails:
         readable_roots: Where snapshots lie.
         limits: Bounds on what a host may say.
         fd_path: The socket that takes descriptors.
+        ahead: A process for the first zygote.
     """
 
     def __init__(
@@ -78,7 +80,9 @@ class Jails:
         readable_roots: Sequence[str],
         limits: WireLimits,
         fd_path: Path,
+        ahead: ZygoteProcess | None = None,
     ) -> None:
+        self._ahead = ahead
         self._loop = loop
         self._answers = answers
         self._runtime_dir = runtime_dir
@@ -96,6 +100,8 @@ class Jails:
             self._kill(entry)
         for spawner in self._spawners.values():
             spawner.close()
+        if self._ahead is not None:
+            self._ahead.discard()
         self._deposits.close()
 
     # --- requests ------------------------------------------------------------------------------
@@ -168,11 +174,13 @@ class Jails:
     def _spawner(self, key: tuple[object, ...], confinement: Confinement) -> Spawner:
         spawner = self._spawners.get(key)
         if spawner is None:
+            ahead, self._ahead = self._ahead, None
             spawner = self._spawners[key] = Spawner(
                 confinement,
                 runtime_dir=self._runtime_dir,
                 readable_roots=self._readable_roots,
                 python=str(key[0]) or None,
+                ahead=ahead,
             )
             self._loop.watch(spawner.fileno(), lambda: self._spawner_events(key))
         return spawner

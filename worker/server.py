@@ -27,6 +27,7 @@ from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimits
 from envhub_worker.quotas import RefusedError
 from envhub_worker.sessions import Sessions
+from envhub_worker.zygote_process import ZygoteProcess
 
 _RCVHWM = 64
 _ROUND = 64
@@ -47,6 +48,7 @@ class Server:
         limits: WireLimits = DEFAULT_LIMITS,
         fd_path: Path | None = None,
         gate: Gate | None = None,
+        ahead: ZygoteProcess | None = None,
     ) -> None:
         self._runtime_dir = runtime_dir
         self._limits = limits
@@ -60,7 +62,7 @@ class Server:
         self._router = self._listen(endpoint)
         self._loop.watch(self._router, self._serve_clients)
         fd_path = fd_path or runtime_dir / "fds"
-        self._jails = Jails(self._loop, self, runtime_dir, readable_roots, limits, fd_path)
+        self._jails = Jails(self._loop, self, runtime_dir, readable_roots, limits, fd_path, ahead)
         self._loop.tick(self._tick)
         if client_pidfd is not None:
             self._loop.watch(client_pidfd, self.stop)

@@ -11,7 +11,6 @@ import os
 import select
 import signal
 import socket
-import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -19,7 +18,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from envhub_worker import bootstrap
 from envhub_worker.channel import Channel, close_fds
 from envhub_worker.events import (
     Disconnected,
@@ -34,10 +32,10 @@ from envhub_worker.events import (
 from envhub_worker.jailspec import JailSpec
 from envhub_worker.lockdown import cgroups, process, user
 from envhub_worker.lockdown.context import ZygoteConfig
-from envhub_worker.lockdown.environment import zygote_environment
 from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.scratch import Scratch, remove_tree
 from envhub_worker.protocol.confinement import Confinement
+from envhub_worker.zygote_process import ZygoteProcess
 
 __all__ = [
     "HOST_TARGET",
@@ -91,6 +89,7 @@ class Spawner:
         readable_roots: Sequence[str],
         python: str | None = None,
         target: str = HOST_TARGET,
+        ahead: ZygoteProcess | None = None,
     ) -> None:
         """Execute the zygote; it preloads in the background.
 
@@ -101,22 +100,22 @@ class Spawner:
             python: The interpreter of the jails, by absolute path; default: this one.
             target: What a host runs once it is confined: ``"module:function"``, or
                 ``"/a/file.py:function"``.
+            ahead: A process to use, if it is one of this interpreter; else it is ended.
         """
         self._jails: dict[int, Jail] = {}
         self._count = 0
         self._pidfd = -1
         self._exited = False
-        self._folder = Path(tempfile.mkdtemp(prefix="zygote-", dir=runtime_dir))
+        self._process = _usable(ahead, python) or ZygoteProcess(
+            python or sys.executable, runtime_dir
+        )
+        self._folder = self._process.folder
         self._user, self._refusal = _choose_user()
         self._scratches = self._make_scratches(confinement)
         self._cgroups = self._make_cgroups()
-        self._log = self._folder / "log"
-        self._channel, theirs = Channel.pair()
-        python = python or sys.executable
-        config = self._config(confinement, readable_roots, target)
-        self._channel.send(asdict(config))
-        with theirs:
-            self._process = self._execute(python, theirs.fileno())
+        self._log = self._process.log
+        self._channel = self._process.channel
+        self._channel.send(asdict(self._config(confinement, readable_roots, target)))
 
     def _config(self, confinement: Confinement, roots: Sequence[str], target: str) -> ZygoteConfig:
         place = self._folder / "root"
@@ -152,19 +151,6 @@ class Spawner:
             with contextlib.suppress(OSError):
                 return cgroups.Tree(hierarchy, self._folder.name)
         return None
-
-    def _execute(self, python: str, control: int) -> subprocess.Popen[bytes]:
-        with open(self._log, "ab") as log:
-            return subprocess.Popen(
-                bootstrap.command(python, "zygote", str(control)),
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                cwd="/",
-                env=zygote_environment(os.environ, python),
-                pass_fds=[control],
-                start_new_session=True,
-            )
 
     def fileno(self) -> int:
         """Readable when ``poll`` has something to say."""
@@ -203,11 +189,7 @@ class Spawner:
 
     def _reap_zygote(self) -> int:
         """Wait for the zygote, and with it for everything that it started."""
-        try:
-            code = self._process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            code = self._process.wait()
+        code = self._process.wait()
         if self._pidfd >= 0:
             # Under namespaces it is a child of the process that we started, killed with it.
             select.select([self._pidfd], [], [], _END_S)
@@ -263,6 +245,13 @@ class Spawner:
             self._cgroups = None
         for folder in {self._folder, self._scratches or self._folder}:
             remove_tree(str(folder))
+
+
+def _usable(ahead: ZygoteProcess | None, python: str | None) -> ZygoteProcess | None:
+    if ahead is not None and ahead.python != (python or sys.executable):
+        ahead.discard()
+        return None
+    return ahead
 
 
 def _choose_user() -> tuple[int | None, dict[str, str] | None]:

@@ -4,8 +4,10 @@ It is executed with ``-I``, a built environment and named descriptors, never run
 code and never sees what a jail is for: a jail's specification, with the secrets that its caller
 may grant, goes straight from the server to the jail's init, so that no later fork inherits it.
 
-argv: the descriptor of its control channel. The first message there is its configuration (a
-command line can be read by every jail), with the fields of ``ZygoteConfig``. Then requests::
+argv: the descriptor of its control channel, and ``ahead`` if what every host needs shall be
+imported at once, and not only when it is confined. The first message on the channel is its
+configuration (a command line can be read by every jail), with the fields of ``ZygoteConfig``. Then
+requests::
 
     {"op": "spawn", "id": N} + [init's control socket, the jail's output pipe]
 
@@ -55,6 +57,7 @@ _PRELOAD = (
     "tempfile",
     "typing",
 )
+_JAIL = "envhub_worker.jail.host"
 _END_S = 5.0
 
 
@@ -63,6 +66,9 @@ def main(argv: Sequence[str]) -> int:
     control = int(argv[0])
     process.close_all_but({0, 1, 2, control})
     channel = Channel(socket.socket(fileno=control))
+    gc.disable()  # what is imported stays, and to look through it again and again takes a tenth
+    if argv[1:] == ["ahead"]:
+        preload(_JAIL)
     received = channel.receive()
     if received is None:
         return 0
@@ -78,8 +84,8 @@ def main(argv: Sequence[str]) -> int:
     cast(io.TextIOWrapper, sys.stdout).reconfigure(line_buffering=True)
     preload(config.target)
     common = replace(common, set_blas_threads=blas.find_setter())
-    gc.collect()
-    gc.freeze()
+    gc.freeze()  # without looking through it: there is next to nothing that could go
+    gc.enable()
     Zygote(channel, common).run()
     return 0
 

@@ -118,7 +118,7 @@ def _execute(folder: Path, store: Path, endpoint: str, ready: int) -> subprocess
         *(sys.executable, "-I", str(BOOTSTRAP), "worker", "serve"),
         *("--endpoint", endpoint, "--runtime-dir", str(folder)),
         *("--readable-root", str(store)),
-        *("--ready-fd", str(ready), "--client-pidfd", str(ourselves)),
+        *("--ready-fd", str(ready), "--client-pidfd", str(ourselves), "--ahead"),
     ]
     try:
         with (folder / "server.log").open("wb") as log:
@@ -128,12 +128,18 @@ def _execute(folder: Path, store: Path, endpoint: str, ready: int) -> subprocess
                 stdout=log,
                 stderr=log,
                 cwd="/",
-                env={name: os.environ[name] for name in _KEPT_VARIABLES if name in os.environ},
+                env=_environment(),
                 pass_fds=(ready, ourselves),
                 start_new_session=True,  # Ctrl-C is for the client, which then closes us
             )
     finally:
         os.close(ourselves)
+
+
+def _environment() -> dict[str, str]:
+    kept = {name: os.environ[name] for name in _KEPT_VARIABLES if name in os.environ}
+    # it computes nothing, and idle threads of OpenBLAS spin at first
+    return {**kept, "OPENBLAS_NUM_THREADS": "1"}
 
 
 def _wait_until_ready(ready: int, server: ProcessServer) -> None:

@@ -10,10 +10,13 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import psutil
 import pytest
 
+from envhub_worker import bootstrap
 from envhub_worker.protocol.confinement import Confinement, Limits
 from envhub_worker.spawner import Spawner, ZygoteDied
+from envhub_worker.zygote_process import ZygoteProcess
 from tests.integration.confinement_kit import (
     Cell,
     HostExited,
@@ -29,6 +32,7 @@ from tests.integration.confinement_kit import (
 )
 from tests.support import inside
 from tests.support.interpreter import profiles
+from tests.support.processes import eventually
 
 
 @pytest.fixture(params=profiles("strict", "no-userns"))
@@ -213,6 +217,51 @@ def test_close_leaves_no_process_and_no_file(folder: Path, confinement: Confinem
         zygote = inside.zygote_pid(spawner)
     assert not os.path.exists(f"/proc/{zygote}")
     assert list(runtime.iterdir()) == []
+
+
+def test_a_process_that_started_ahead_is_used(folder: Path, confinement: Confinement) -> None:
+    """It becomes the zygote, and what it has imported serves a jail that is as confined."""
+    ahead = ZygoteProcess.ahead(folder)
+    with spawner_in(folder, confinement, ahead=ahead) as spawner:
+        cell = new_cell(spawner, make_snapshot(folder), confinement)
+        cell.start()
+        assert cell.run("import sys; result = 'gymnasium' in sys.modules") == {"result": True}
+        assert inside.zygote_pid(spawner) == ahead.pid
+        layers = {layer["layer"] for layer in cell.wait_for(Ready).report if layer["enforced"]}
+        assert {"self-test", "seccomp"} <= layers
+    assert not os.path.exists(f"/proc/{ahead.pid}")
+
+
+def test_a_process_of_another_interpreter_is_not(folder: Path, confinement: Confinement) -> None:
+    """It ends at once, and leaves nothing."""
+    ahead = ZygoteProcess.ahead(folder)
+    other = folder / "python"
+    other.symlink_to(sys.executable)
+    spawner = Spawner(
+        confinement, runtime_dir=folder, readable_roots=[], python=str(other), ahead=ahead
+    )
+    assert inside.zygote_pid(spawner) != ahead.pid
+    assert not os.path.exists(f"/proc/{ahead.pid}")
+    assert not ahead.folder.exists()
+    spawner.close()
+
+
+def test_a_process_that_nobody_uses_ends_with_its_server(folder: Path) -> None:
+    """However soon that is, and also if it cannot say so."""
+    for ending in (signal.SIGTERM, signal.SIGKILL):
+        runtime = folder / ending.name
+        serve = ["serve", "--endpoint", f"ipc://{folder}/{ending.name}.sock", "--ahead"]
+        command = bootstrap.command(sys.executable, "worker", *serve, "--runtime-dir", str(runtime))
+        ready, tells = os.pipe()
+        server = subprocess.Popen([*command, "--ready-fd", str(tells)], pass_fds=[tells])
+        os.close(tells)
+        assert os.read(ready, 16)
+        os.close(ready)
+        [zygote] = psutil.Process(server.pid).children()
+        server.send_signal(ending)
+        server.wait(60)
+        assert eventually(lambda: not zygote.is_running())  # noqa: B023 - asked at once
+        assert runtime.exists() == (ending is signal.SIGKILL)
 
 
 def test_dead_zygote_is_told_with_its_log(folder: Path, confinement: Confinement) -> None:
