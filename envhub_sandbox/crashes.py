@@ -34,6 +34,7 @@ import numpy as np
 from envhub_sandbox import folders
 from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
 from envhub_sandbox.history import Recording, Requested, Steps, encoded
+from envhub_sandbox.logins import without_login
 from envhub_sandbox.policy import Policy, Timeouts
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec import Buffer
@@ -46,7 +47,6 @@ KEPT = 20
 """Bundles in one folder; older ones are removed."""
 _NAME = re.compile(r"\d{8}T\d{6}-[0-9a-f]{8}")
 _BUILDING = ".building-"
-_LOGIN = re.compile(r"://[^/@]*@")
 _ABANDONED_AFTER_S = 3600.0
 _SHOWN_REQUESTS = 8
 
@@ -224,7 +224,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (Policy, Timeouts)):
         return asdict(value)
     if isinstance(value, str):
-        return _LOGIN.sub("://***@", value)
+        return without_login(value)
     if value is None or isinstance(value, (bool, int, float)):
         return value
     return os.fspath(value) if isinstance(value, os.PathLike) else type(value).__name__

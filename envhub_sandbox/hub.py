@@ -23,6 +23,7 @@ from urllib.parse import parse_qsl, quote, urlsplit
 from envhub_sandbox.errors import HubReferenceError, SnapshotIntegrityError
 from envhub_sandbox.hashing import GIT_SHA1, SHA256
 from envhub_sandbox.hub_failures import HubFailure, Subject, explain
+from envhub_sandbox.logins import authorization, login_of, without_login
 from envhub_sandbox.reference_rules import is_commit
 from envhub_sandbox.snapshot_records import FileRecord
 
@@ -52,9 +53,15 @@ def checked_endpoint(endpoint: str | None) -> str:
         HubReferenceError: It is not an http(s) URL.
     """
     chosen = default_endpoint() if endpoint is None else endpoint.rstrip("/")
-    if not re.match(r"https?://[^/]", chosen):
+    shown = without_login(chosen)
+    if "@" in shown:
         raise HubReferenceError(
-            f"endpoint: {chosen!r} is not an http(s) URL such as {_DEFAULT_ENDPOINT!r}"
+            "endpoint: it has an @ behind the host; write a user or password with such characters "
+            "percent-encoded, as in https://user:p%2Fw@hub.example"
+        )
+    if not re.match(r"https?://[^/]", shown):
+        raise HubReferenceError(
+            f"endpoint: {shown!r} is not an http(s) URL such as {_DEFAULT_ENDPOINT!r}"
         )
     return chosen
 
@@ -78,7 +85,7 @@ class HubClient:
     """One endpoint, one token, one Hub cache. Every method raises ``HubFailure``.
 
     Attributes:
-        endpoint: Without a trailing slash.
+        endpoint: Without a trailing slash; a login in it goes into a header, and into no URL.
         token: As in huggingface_hub: None for the stored one, False for none.
         cache_dir: huggingface_hub's ``cache_dir``; None for its default.
     """
@@ -90,7 +97,7 @@ class HubClient:
     @property
     def public_endpoint(self) -> str:
         """The endpoint without a user and password, for errors and as a key."""
-        return re.sub(r"//[^/]*@", "//", self.endpoint)
+        return without_login(self.endpoint)
 
     def resolve(self, repo: Repository, revision: str | None) -> str:
         """Ask which full commit a revision is; None is ``main``, as in huggingface_hub."""
@@ -134,24 +141,33 @@ class HubClient:
             )
 
     def _arguments(self, repo: Repository, commit: str) -> dict[str, Any]:
+        login = self._login()
         return {
             **repo._asdict(),
             "revision": commit,
             # Not every version expands "~" itself; one would make a folder of that name.
             "cache_dir": None if self.cache_dir is None else os.path.expanduser(self.cache_dir),
-            "token": self.token,
-            "endpoint": self.endpoint,
+            "token": False if login else self.token,
+            "headers": login,
+            "endpoint": self.public_endpoint,
             **_LIBRARY,
         }
 
+    def _login(self) -> dict[str, str]:
+        """The header of a login, which goes before a token, as in a URL."""
+        login = login_of(self.endpoint)
+        return {} if login is None else {"authorization": authorization(login)}
+
     def _api(self, repo: Repository) -> str:
-        return f"{self.endpoint}/api/{repo.repo_type}s/{repo.repo_id}"
+        return f"{self.public_endpoint}/api/{repo.repo_type}s/{repo.repo_id}"
 
     def _get(self, url: str, query: dict[str, str]) -> Any:
         # HfApi.list_repo_tree has no timeout, and in 2.x retries a broken Hub for 24 s.
         client: Any = import_module("huggingface_hub.utils")
         timeout = import_module("huggingface_hub.constants").HF_HUB_ETAG_TIMEOUT
-        headers = client.build_hf_headers(token=self.token, **_LIBRARY)
+        login = self._login()
+        token = False if login else self.token
+        headers = {**client.build_hf_headers(token=token, **_LIBRARY), **login}
         response = client.get_session().get(url, headers=headers, params=query, timeout=timeout)
         client.hf_raise_for_status(response)
         return response
@@ -168,7 +184,9 @@ class HubClient:
         from huggingface_hub import get_token
 
         token = self.token if isinstance(self.token, str) else get_token()
-        return (token,) if token else ()
+        login = login_of(self.endpoint)
+        secrets = (token, *self._login().values(), login and login[1])
+        return tuple(secret for secret in secrets if secret)
 
 
 def _next_page(response: Any, query: dict[str, str]) -> dict[str, str] | None:

@@ -1,7 +1,8 @@
 """How to make environments again, in another process: what a pickle of a proxy holds.
 
 A process cannot be handed over, so a proxy travels as the arguments that made it. The other side
-gets a fresh environment in a worker of its own, of the very same commit. A token never travels.
+gets a fresh environment in a worker of its own, of the very same commit. A token never travels,
+nor does a login in ``endpoint``: the other side uses its own.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
+from envhub_sandbox.hub import default_endpoint
+from envhub_sandbox.logins import without_login
 from envhub_sandbox.reference import HubRef
 from envhub_sandbox.snapshot import Snapshot
 
@@ -28,15 +31,24 @@ class Recipe:
 
     make_env: Callable[..., Any]
     reference: str
-    config: dict[str, object] | None
-    options: dict[str, Any] = field(default_factory=dict)
+    config: dict[str, object] | None = field(repr=False)
+    options: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        endpoint = self.options.get("endpoint")
+        if isinstance(endpoint, str):
+            plain = {**self.options, "endpoint": without_login(endpoint)}
+            object.__setattr__(self, "options", plain)
 
     def make(self) -> Any:
         """Fresh environments: what ``make_env`` returns and raises."""
         cfg: Any = self.reference
         if self.config is not None:
             cfg = SimpleNamespace(**{**self.config, "hub_path": self.reference})
-        return self.make_env(cfg, **self.options)
+        options = dict(self.options)
+        if options.get("endpoint") == without_login(default_endpoint()):
+            options["endpoint"] = None  # it may come with a login here
+        return self.make_env(cfg, **options)
 
     def make_one(self, suite: str, task: int | str) -> Any:
         """One fresh environment of them; the others are made by nobody."""

@@ -12,7 +12,7 @@ import ipaddress
 import os
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from envhub_sandbox.client import WorkerClient
 from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import EnvHubError, PolicyError, SandboxUnavailableError
 from envhub_sandbox.far import Far
+from envhub_sandbox.logins import without_login
 from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes.base import WorkerServer
 from envhub_sandbox.sandboxes.sharing import Sharing
@@ -68,6 +69,17 @@ class RemoteSandbox:
             )
         if not self.heartbeat_s > 0:
             raise PolicyError(f"heartbeat_s is {self.heartbeat_s!r}; it takes seconds above 0")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """No secret key is in a pickle: its reader has one, or the file that is named."""
+        kept = self.client_key if _is_file(self.client_key) else None
+        return {**self.__dict__, "client_key": kept}
+
+    def __copy__(self) -> RemoteSandbox:
+        return replace(self)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> RemoteSandbox:
+        return replace(self)
 
     def for_repository(self, snapshot: Path, policy: Policy, python: str) -> RemoteRepository:
         """The sandbox for one repository. Connects to nothing.
@@ -121,6 +133,11 @@ def address_of(endpoint: str) -> str:
         PolicyError: It is none.
     """
     parts = urlsplit(endpoint)
+    if "@" in parts.netloc:
+        raise PolicyError(
+            "sandbox: a remote server knows its clients by their keys; leave the login before the "
+            f"@ out: {without_login(endpoint)!r}"
+        )
     try:
         port = parts.port
     except ValueError:
@@ -167,6 +184,17 @@ def _known(address: str) -> str | None:
             if len(words) == 2 and words[0] == address:
                 return words[1]
     return None
+
+
+def _is_file(key: str | os.PathLike[str] | None) -> bool:
+    """Whether it names a key's file, and is not the key."""
+    if not isinstance(key, str):
+        return key is not None
+    try:
+        parse_key(key)
+    except ValueError:
+        return os.sep in key  # anything else may be a key that was mistyped
+    return False
 
 
 def _client_key(given: str | os.PathLike[str] | None) -> bytes:

@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+import base64
+import contextlib
+import copy
+import importlib
+import logging
 import os
+import pickle
+import re
 import subprocess
 import sys
 import time
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from envhub_sandbox import make_env
 from envhub_sandbox.errors import HubReferenceError, RepositoryUnavailableError
 from envhub_sandbox.hub import HubClient, Repository
 from envhub_sandbox.reference import HubRef
 from envhub_sandbox.snapshot import Snapshot, fetch
 from tests.hub.stub_hub import StubHub
+from tests.support.repositories import CARTPOLES
 
 Fetch = Callable[..., Snapshot]
 TOKEN = "hf_SECRETSECRETSECRET"
@@ -251,10 +261,47 @@ def test_endpoint_that_is_no_url_is_refused(get: Fetch, endpoint: str) -> None:
         get(endpoint=endpoint)
 
 
-def test_password_in_the_endpoint_is_not_shown(stub_hub: StubHub, get: Fetch) -> None:
-    """An endpoint with a password works, and errors name it without the password."""
+def test_password_in_the_endpoint_is_not_shown(
+    stub_hub: StubHub, get: Fetch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """An endpoint with a password works; no error, cause, traceback or log has the password."""
+    endpoint = stub_hub.endpoint.replace("//", "//us%40er:s3cret@")
+    with caplog.at_level(logging.DEBUG):
+        assert get(endpoint=endpoint).path == "env.py"
+        login = base64.b64encode(b"us@er:s3cret").decode()
+        assert set(stub_hub.authorizations) == {f"Basic {login}"}
+        for status in (404, 500):
+            stub_hub.fail("/api/", status)
+            text = "".join(traceback.format_exception(failure(get, endpoint=endpoint)))
+            assert stub_hub.endpoint in text
+            assert not {"s3cret", login} & set(re.findall(r"[\w=]+", text + caplog.text))
+    assert "127.0.0.1" in caplog.text, "the control failed: nobody logs URLs"
+
+
+def test_url_with_a_password_is_logged_by_others(
+    stub_hub: StubHub, caplog: pytest.LogCaptureFixture
+) -> None:
+    """That is why it goes into no URL: the libraries below log and raise these."""
+    url = stub_hub.endpoint.replace("//", "//user:s3cret@") + "/api/models/org/none"
+    utils: Any = importlib.import_module("huggingface_hub.utils")
+    with caplog.at_level(logging.DEBUG), pytest.raises(Exception, match="s3cret"):
+        utils.hf_raise_for_status(utils.get_session().get(url))
+
+
+def test_environments_do_not_keep_the_password(stub_hub: StubHub, hub_cache: Path) -> None:
+    """Nor do their pickles, reprs and provenance; copies are made from what is here already."""
+    text = (
+        f"{CARTPOLES}\ndef make_env(n_envs=1, use_async_envs=False):\n    return cartpoles(n_envs)"
+    )
+    stub_hub.add("org/poles", {"env.py": text})
     endpoint = stub_hub.endpoint.replace("//", "//user:s3cret@")
-    assert get(endpoint=endpoint).path == "env.py"
-    stub_hub.fail("/api/", 500)
-    error = failure(get, endpoint=endpoint)
-    assert "s3cret" not in str(error)
+    with make_env("models/org/poles", endpoint=endpoint, hub_cache_dir=hub_cache) as suites:
+        kept = pickle.dumps(suites) + pickle.dumps(suites.env)
+        said = f"{suites!r} {suites.provenance} {suites.__reduce__()} {suites.env.__reduce__()}"
+        assert b"s3cret" not in kept
+        assert "s3cret" not in said
+        assert stub_hub.endpoint.encode() in kept
+        asked = len(stub_hub.requests)
+        with contextlib.closing(copy.deepcopy(suites.env)) as copied:
+            copied.reset(seed=0)
+        assert len(stub_hub.requests) == asked
