@@ -1,4 +1,4 @@
-"""One deadline per operation, asked for what is left at each wait."""
+"""One deadline per operation, made once and passed down, asked for what is left at each wait."""
 
 from __future__ import annotations
 
@@ -11,11 +11,16 @@ _LOOK_AGAIN_MS = 100
 
 
 class Deadline:
-    """A point in time. ``Deadline(None)`` never comes."""
+    """A point in time. ``Deadline(None)`` never comes.
 
-    __slots__ = ("_at",)
+    Attributes:
+        timeout_s: How far away it was.
+    """
+
+    __slots__ = ("_at", "timeout_s")
 
     def __init__(self, timeout_s: float | None) -> None:
+        self.timeout_s = timeout_s
         self._at = None if timeout_s is None else monotonic() + timeout_s
 
     def left_s(self) -> float | None:

@@ -305,11 +305,6 @@ class FastLane:
         self._wakers = self.shards[: self._awake]
         old.close()
 
-    @property
-    def waited_s(self) -> float:
-        """Seconds since the last request."""
-        return (perf_counter_ns() - self._asked_ns) / 1e9
-
     def survivors(self, deadline: Deadline) -> list[int]:
         """After ``JailGoneError``: the shards that have answered, once no other will any more.
 
@@ -353,7 +348,7 @@ class FastLane:
         """What the shards said to a message; None where it did not fit."""
         return [shard.answer() for shard in self.shards]
 
-    def wait(self, timeout_s: float | None) -> list[Outcome]:
+    def wait(self, deadline: Deadline) -> list[Outcome]:
         """Every shard's outcome; nothing at all if none says more than its results.
 
         Raises:
@@ -361,17 +356,15 @@ class FastLane:
             JailGoneError: The jail has ended.
             RemoteProtocolError: A shard wrote what the rules forbid.
         """
-        self.wait_for_all(timeout_s)
+        self.wait_for_all(deadline)
         for shard in self.shards:
             if not shard.has_nothing_to_say():
                 return [shard.outcome() for shard in self.shards]
         return _NOTHING
 
-    def wait_for_all(self, timeout_s: float | None) -> None:
+    def wait_for_all(self, deadline: Deadline) -> None:
         """Until every shard has answered; raises as ``wait`` does."""
-        deadline = None
         for shard in self._sleepers:
-            deadline = deadline or Deadline(timeout_s)
             self._sleep_for(shard, deadline)
         budget_ns = self._spin.budget_ns
         now_ns = perf_counter_ns()
@@ -381,7 +374,6 @@ class FastLane:
             if not budget_ns or not shard.answered_until(until_ns):
                 if budget_ns:
                     self._spin.missed()
-                deadline = deadline or Deadline(timeout_s)
                 self._sleep_for(shard, deadline)
         self.elapsed_ns = perf_counter_ns() - self._asked_ns
         self._spin.measured(self.elapsed_ns)

@@ -45,7 +45,7 @@ def tell(place: Place, operation: str, messages: Sequence[Sequence[Buffer]]) -> 
     place.lane.tell(packets, moves=operation == "reset")
 
 
-def answers(place: Place, operation: str, timeout_s: float | None) -> list[m.Message]:
+def answers(place: Place, operation: str, deadline: Deadline) -> list[m.Message]:
     """What the hosts answer; what did not fit the lane is fetched.
 
     Raises:
@@ -55,12 +55,12 @@ def answers(place: Place, operation: str, timeout_s: float | None) -> list[m.Mes
     """
     lane, jail = place.lane, place.loaded.jail
     assert lane is not None
-    lane.wait_for_all(timeout_s)
+    lane.wait_for_all(deadline)
     replies: list[m.Message] = []
     for host, answer in zip(place.hosts, lane.answers(), strict=True):
         if answer is None:
             asked = [(host, m.FetchInfos(place.number))]
-            [answer] = jail.receive(jail.send(operation, asked), Deadline(timeout_s))
+            [answer] = jail.receive(jail.send(operation, asked), deadline)
         replies.append(answer)
     return replies
 

@@ -19,7 +19,6 @@ from envhub_sandbox.errors import (
     WorkerDiedError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.fast_lane import Outcome
 from envhub_sandbox.jail import HostsDiedError, check, typed
 from envhub_sandbox.jail_sources import JailSource, SharedJail
 from envhub_sandbox.log import WORKER
@@ -91,8 +90,9 @@ class Mortal(Tenant):
                 self._moved(Event.EXPIRY)
         # of any other death the reset that follows hears as of its own
 
-    def _late(self, operation: str, timeout_s: float | None) -> WorkerTimeoutError:
+    def _late(self, operation: str, deadline: Deadline) -> WorkerTimeoutError:
         assert self._loaded is not None
+        timeout_s = deadline.timeout_s
         states = self.repository.states(self._loaded)
         WORKER.info("%s: no answer to %s after %s s", self.repository.label, operation, timeout_s)
         busy = f" (its processes: {', '.join(states)})" if states else ""
@@ -148,20 +148,13 @@ class Mortal(Tenant):
 
     # --- a request that is survived ------------------------------------------------------------
 
-    def _wait_for_survivors(self, timeout_s: float | None) -> list[Outcome]:
-        assert self._place is not None
-        assert self._lane is not None
-        if timeout_s is not None and self.lifecycle.state is State.PENDING:
-            timeout_s = max(0.0, timeout_s - self._lane.waited_s)
-        return survivors.wait(self._place, Deadline(timeout_s))
-
-    def _survive_request(self, deaths: HostsDiedError) -> list[m.Message]:
+    def _survive_request(self, deaths: HostsDiedError, deadline: Deadline) -> list[m.Message]:
         """A reset is done in fresh hosts; anything else is not repeated.
 
         Raises:
             WorkerDiedError: It was something else; the next step or reset brings them back.
         """
-        replies = self._of_survivors(deaths)
+        replies = self._of_survivors(deaths, deadline)
         assert self._pending is not None
         if self._pending[1] != "reset":
             self._pending = None
@@ -172,20 +165,21 @@ class Mortal(Tenant):
             replies[index] = replace(done, info=marked(done.info, self._size(index)))
         return [reply for reply in replies if reply is not None]
 
-    def _survive_step(self, deaths: HostsDiedError) -> StepResult:
+    def _survive_step(self, deaths: HostsDiedError, deadline: Deadline) -> StepResult:
         """The step's results, with fresh observations in the rows of the dead."""
         started = perf_counter_ns()
-        parts = self._of_survivors(deaths)
+        parts = self._of_survivors(deaths, deadline)
         for index, reply in self._revive(deaths, self._revivals).items():
             parts[index] = truncated(typed(reply, m.StepDone), self._size(index))
         self.counters.stepped(perf_counter_ns() - started)
         return self.results.step([typed(part, m.StepDone) for part in parts if part is not None])
 
-    def _of_survivors(self, deaths: HostsDiedError) -> list[m.Message | None]:
+    def _of_survivors(self, deaths: HostsDiedError, deadline: Deadline) -> list[m.Message | None]:
         """What the others answered; None where nobody did.
 
         Raises:
             RemoteEnvError: One of them raised. The next request meets the deaths.
+            WorkerTimeoutError: One of them kept something back for too long.
         """
         assert self._pending is not None
         try:
@@ -193,10 +187,14 @@ class Mortal(Tenant):
             if self._lane is not None and self._pending[1] == "step":
                 assert self._place is not None
                 found = (self.manifest, self.bounds, self.results)
-                replies = survivors.answers_by_lane(self._place, deaths, *found)
+                replies = survivors.answers_by_lane(self._place, deaths, *found, deadline)
             for reply in replies:
                 if reply is not None:
                     check(reply)
+        except WorkerTimeoutError as error:
+            late, self._pending = self._late(self._pending[1], deadline), None
+            self._moved(Event.TIMEOUT)
+            raise late from error
         except EnvHubError:
             self._pending = None
             self._moved(Event.REPLY)
@@ -260,14 +258,13 @@ class Mortal(Tenant):
 
     def _ask_anew(self, dead: list[int], requests: Requests) -> dict[int, m.Message]:
         assert self._place is not None
-        reset_s = self.repository.timeouts.reset_s
-        deadline = Deadline(reset_s)
+        deadline = Deadline(self.repository.timeouts.reset_s)
         try:
             for name in survivors.set_again(self._place, dead, self._settings.messages(), deadline):
                 WORKER.warning("%s: %r could not be set again", self.repository.label, name)
             return survivors.ask_anew(self._place, dead, requests, deadline)
         except WorkerTimeoutError as error:
-            raise self._late("reset", reset_s) from error
+            raise self._late("reset", deadline) from error
 
     def _remember(self, message_for: MessageFor, message: m.Message, sent: list[Frames]) -> None:
         """What was asked may have to be asked again, and fresh hosts need seeds.

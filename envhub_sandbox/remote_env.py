@@ -37,7 +37,6 @@ _GRACE_S = 2.0
 """How long ``reset`` waits for a late reply before it gives the jail up and starts another."""
 
 T = TypeVar("T")
-D = TypeVar("D")
 _LANE = 0
 """In place of a request's id, for what went by the fast lane; requests count from 1."""
 _BY_LANE = (_LANE, "step")
@@ -79,10 +78,11 @@ class RemoteEnv(Mortal):
             RemoteEnvError: The repository's code raised; the environment is still usable.
         """
         with self._turn("a request"), self._judging():
+            deadline = Deadline(timeout_s)
             try:
-                replies = self._collect(Deadline(timeout_s), timeout_s)
+                replies = self._collect(deadline)
             except HostsDiedError as deaths:
-                replies = self._survive_request(deaths)
+                replies = self._survive_request(deaths, deadline)
             for reply in replies:
                 check(reply)
             self._has_set()
@@ -157,47 +157,49 @@ class RemoteEnv(Mortal):
     def collect_step(self, timeout_s: float | None) -> StepResult:
         """What ``VectorEnv.step`` returns; raises as ``collect`` does."""
         with self._lock:
+            deadline = Deadline(timeout_s)
             try:
                 if self._pending is _BY_LANE:
-                    return self._collect_by_lane(timeout_s)
-                replies = self._collect(Deadline(timeout_s), timeout_s)
+                    return self._collect_by_lane(deadline)
+                replies = self._collect(deadline)
                 self.counters.stepped(perf_counter_ns() - self._asked_ns)
                 for reply in replies:
                     check(reply)
                 return self.results.step([typed(reply, m.StepDone) for reply in replies])
             except HostsDiedError as deaths:
                 with self._turn("step"), self._judging():
-                    return self._survive_step(deaths)
+                    return self._survive_step(deaths, deadline)
             except BaseException:
                 with self._turn("step"), self._judging():
                     raise
 
-    def _collect_by_lane(self, timeout_s: float | None) -> StepResult:
+    def _collect_by_lane(self, deadline: Deadline) -> StepResult:
         lane = self._lane
         assert lane is not None
-        outcomes = self._finish(self._wait_on_lane, timeout_s, timeout_s)
+        outcomes = self._finish(self._wait_on_lane, deadline)
         self.counters.stepped(lane.elapsed_ns)
         infos: dict[Any, Any] = {}
         if outcomes:
             assert self._place is not None
-            fetch = partial(self._fetch_infos, timeout_s=timeout_s)
+            fetch = partial(self._fetch_infos, deadline=deadline)
             parts = lane_requests.infos(self._place, outcomes, self.results, fetch)
             infos = self.results.infos(parts)
         return (lane.observation(), *lane.flags(), infos)
 
-    def _wait_on_lane(self, timeout_s: float | None) -> list[Outcome]:
+    def _wait_on_lane(self, deadline: Deadline) -> list[Outcome]:
         assert self._lane is not None
         try:
-            return self._lane.wait(timeout_s)
+            return self._lane.wait(deadline)
         except JailGoneError:
             if self._loaded is not None and self._loaded.jail.kept:
-                return self._wait_for_survivors(timeout_s)
+                assert self._place is not None
+                return survivors.wait(self._place, deadline)
             raise self._cause_of_death() from None
 
-    def _fetch_infos(self, host: int, timeout_s: float | None) -> m.Message:
+    def _fetch_infos(self, host: int, deadline: Deadline) -> m.Message:
         self._send("step", [(host, m.FetchInfos(self._number))])
         try:
-            [reply] = self._collect(Deadline(timeout_s), timeout_s)
+            [reply] = self._collect(deadline)
         except HostsDiedError as deaths:
             asked = [self._hosts.index(host)]
             raise survivors.among_all(deaths, asked, len(self.bounds)) from None
@@ -233,9 +235,9 @@ class RemoteEnv(Mortal):
             if pending is None:  # interrupted on the way out: nobody knows what was sent
                 raise WorkerTimeoutError("the request was interrupted")
             if pending is _BY_LANE and self._lane is not None:
-                self._wait_on_lane(_GRACE_S)
+                self._wait_on_lane(deadline)
             elif pending[0] == _LANE:
-                self._receive_by_lane(_GRACE_S)
+                self._receive_by_lane(deadline)
             else:
                 loaded.jail.receive(pending[0], deadline)
         except HostsDiedError:
@@ -313,12 +315,12 @@ class RemoteEnv(Mortal):
         lane_requests.tell(self._place, operation, messages)
         self.counters.requests += 1
 
-    def _receive_by_lane(self, timeout_s: float | None) -> list[m.Message]:
+    def _receive_by_lane(self, deadline: Deadline) -> list[m.Message]:
         place, pending = self._place, self._pending
         assert place is not None
         assert pending is not None
         try:
-            replies = lane_requests.answers(place, pending[1], timeout_s)
+            replies = lane_requests.answers(place, pending[1], deadline)
         except JailGoneError:
             raise self._cause_of_death() from None
         if pending[1] != "reset":
@@ -326,24 +328,24 @@ class RemoteEnv(Mortal):
         found = (self.manifest, self.bounds, self.results)
         return lane_requests.with_observations(place, replies, *found)
 
-    def _collect(self, deadline: Deadline, timeout_s: float | None) -> list[m.Message]:
+    def _collect(self, deadline: Deadline) -> list[m.Message]:
         loaded, pending = self._loaded, self._pending
         if loaded is None or pending is None:
             state = self.lifecycle.state.value
             raise WorkerError(f"there is no request to wait for: the environment is {state}")
         if pending[0] == _LANE:
-            return self._finish(self._receive_by_lane, timeout_s, timeout_s)
-        return self._finish(lambda at: loaded.jail.receive(pending[0], at), deadline, timeout_s)
+            return self._finish(self._receive_by_lane, deadline)
+        return self._finish(lambda at: loaded.jail.receive(pending[0], at), deadline)
 
-    def _finish(self, receive: Callable[[D], T], until: D, timeout_s: float | None) -> T:
+    def _finish(self, receive: Callable[[Deadline], T], deadline: Deadline) -> T:
         """Wait for the pending reply, and move on to the state that it leads to."""
         assert self._pending is not None
         try:
-            received = receive(until)
+            received = receive(deadline)
         except WorkerTimeoutError as error:
             self.counters.timeouts += 1
             self._moved(Event.TIMEOUT)
-            raise self._late(self._pending[1], timeout_s) from error
+            raise self._late(self._pending[1], deadline) from error
         except HostsDiedError:
             raise
         except EnvHubError as error:

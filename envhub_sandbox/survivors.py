@@ -69,6 +69,7 @@ def answers_by_lane(
     manifest: EnvManifest,
     bounds: Sequence[tuple[int, int]],
     results: Results,
+    deadline: Deadline,
 ) -> list[m.Message | None]:
     """What the living wrote into their slabs, as the messages that it stands for.
 
@@ -76,6 +77,7 @@ def answers_by_lane(
 
     Raises:
         RemoteEnvError: One of them raised.
+        WorkerTimeoutError: The deadline came before infos that had to be fetched.
     """
     lane = place.lane
     assert lane is not None
@@ -83,7 +85,8 @@ def answers_by_lane(
     observations = batches.split(manifest.single_observation_space, lane.observation(), bounds)
     flags = lane.flags()
     for index in [index for index in range(len(bounds)) if index not in deaths.deaths]:
-        shard, fetch = lane.shards[index], partial(_fetch_infos, place, place.hosts[index])
+        shard = lane.shards[index]
+        fetch = partial(_fetch_infos, place, place.hosts[index], deadline)
         try:
             info = results.lane_info(shard.outcome(), shard, fetch)
         except WorkerDiedError as error:
@@ -94,9 +97,9 @@ def answers_by_lane(
     return parts
 
 
-def _fetch_infos(place: Place, host: int) -> m.Message:
+def _fetch_infos(place: Place, host: int, deadline: Deadline) -> m.Message:
     asked = [(host, m.FetchInfos(place.number))]
-    [reply] = place.loaded.jail.exchange("step", asked, Deadline(_CAUSE_S))
+    [reply] = place.loaded.jail.exchange("step", asked, deadline)
     return reply
 
 

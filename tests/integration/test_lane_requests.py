@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import make_env
+from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import RemoteEnvError
 from envhub_worker.protocol import slabs
 from tests.support.compare import assert_same
@@ -91,6 +92,39 @@ def test_large_and_small_answers_are_not_mixed_up(talker: Path, num_workers: int
     """Whatever did not fit the lane is fetched for the request that it belongs to."""
     by_lane = conversation(talker, "auto", num_workers)
     assert_same(conversation(talker, "frames", num_workers), by_lane)
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+@pytest.mark.parametrize("restart", ["on_reset", "transparent"])
+def test_an_operation_has_one_deadline(
+    talker: Path, lane: str, restart: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many shards have answers to be fetched: no fetch starts the clock anew.
+
+    Or else hosts that answer each at the last moment would make a step last as long as they please.
+    """
+    made: list[float | None] = []
+    initialize = Deadline.__init__
+
+    def counted(self: Deadline, timeout_s: float | None) -> None:
+        made.append(timeout_s)
+        initialize(self, timeout_s)
+
+    timeouts = {"step_s": 1001.0, "reset_s": 1002.0, "call_s": 1003.0}
+    options = {"lane": lane, "num_workers": 4, "policy": {"restart": restart}}
+    with make_env(talker, 4, use_async_envs=True, timeouts=timeouts, **options) as suites:
+        env = suites.env
+        env.reset()
+        monkeypatch.setattr(Deadline, "__init__", counted)
+        for act, timeout_s in (
+            (lambda: env.step([1, 1, 1, 1]), 1001.0),
+            (lambda: env.reset(options={"large": True}), 1002.0),
+            (lambda: env.call("tell", True), 1003.0),
+        ):
+            made.clear()
+            act()
+            assert [one for one in made if one in timeouts.values()] == [timeout_s]
+        monkeypatch.undo()
 
 
 def test_a_reset_by_the_server_leaves_lent_batches_alone(talker: Path) -> None:
