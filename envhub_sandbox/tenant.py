@@ -28,7 +28,8 @@ from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from envhub_worker.protocol.manifest import EnvManifest
 
 _INTERRUPT_S = 10.0
-"""How long ``close`` waits for another thread to notice that the jail has gone."""
+"""How long ``close`` waits at most for another thread to notice that the jail has gone: no longer
+than it waits for the environment's own ``close``."""
 
 
 class Tenant:
@@ -255,7 +256,11 @@ class Tenant:
             self._paces.note(self.manifest, pace)
 
     def _interrupt(self) -> None:
-        """Another thread waits for a reply: end the jail under it, then clean up after it."""
+        """Another thread waits for a reply: end the jail under it, then clean up after it.
+
+        If it does not let go in time it cleans up itself, once it sees that this was closed: no
+        process is left for it to end.
+        """
         with self._ending:
             self._moved(Event.CLOSE)
             self._restarts.give_up()
@@ -265,7 +270,9 @@ class Tenant:
             if loaded is None:
                 return  # whoever brings one sees that it is closed
             self._jails.end(loaded)
-        if self._lock.acquire(timeout=_INTERRUPT_S):
+        close_s = self.repository.timeouts.close_s
+        patience_s = _INTERRUPT_S if close_s is None else min(close_s, _INTERRUPT_S)
+        if self._lock.acquire(timeout=patience_s):
             try:
                 self._moved(Event.CLOSE)  # the other may have moved at the same moment
                 self._let_go()  # of what is there now: it may have moved elsewhere, too

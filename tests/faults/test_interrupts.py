@@ -14,6 +14,7 @@ from gymnasium.error import ClosedEnvironmentError
 from envhub_sandbox import errors, make_env, restarts
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from tests.support import inside
+from tests.support.processes import descendants
 from tests.support.samples import sample
 
 pytestmark = pytest.mark.usefixtures("neighbour")
@@ -210,6 +211,33 @@ def test_who_outlasts_a_close_gives_everything_back(monkeypatch: pytest.MonkeyPa
         close_during_reset(env, forgetting)
         assert found == [[True]]
         assert inside.loaded(env) is None
+
+
+class Held:
+    """A lock that another thread never gives back; it notes how long one waits for it."""
+
+    def __init__(self) -> None:
+        self.waited: list[float] = []
+
+    def acquire(self, blocking: bool = True, timeout: float = 0.0) -> bool:
+        """In vain."""
+        self.waited.append(timeout)
+        return False
+
+
+@pytest.mark.parametrize(("close_s", "longest"), [(0.5, 0.5), (2.0, 2.0), (3600.0, 10.0)])
+def test_close_waits_no_longer_than_it_may(
+    close_s: float, longest: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For a thread that does not notice that its jail has gone: and that has gone."""
+    with made(timeouts={"close_s": close_s}) as suites:
+        held, before = Held(), descendants()
+        with monkeypatch.context() as patch:
+            patch.setattr(*inside.turn_lock(suites.env), held)
+            suites.env.close()
+        assert sum(held.waited) == longest
+        assert descendants() < before
+        inside.clean_up(suites.env)
 
 
 @pytest.mark.parametrize("moment", ["built", "started"])

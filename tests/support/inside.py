@@ -52,6 +52,17 @@ def state(env: Any) -> State:
     return session(env).lifecycle.state
 
 
+def turn_lock(env: Any) -> Spot:
+    """What a thread holds while it asks the environment something."""
+    return session(env), "_lock"
+
+
+def clean_up(env: Any) -> None:
+    """What a thread does that has outlasted a ``close``."""
+    with session(env)._turn("a test"):
+        return
+
+
 def live_by(env: Any, lifecycle: Lifecycle) -> None:
     """Have another table of its states."""
     session(env).lifecycle = lifecycle
