@@ -3,7 +3,8 @@
 argv: the repository, then one JSON object: ``policy``, ``options`` of ``make_env``, ``steps`` (the
 actions of each), ``close`` (the thread that does it: ``"same"`` or ``"other"``) and
 ``head_start_s`` of the one that steps. Prints what became of each step, and ``closed`` at the end.
-Whoever started it watches from outside whether that comes.
+Whoever started it watches from outside whether that comes. A neighbour, another jail of the same
+server, has to go on as if nothing had happened.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ def outcome(act: Any) -> str:
 
 def main(repository: str, order: dict[str, Any]) -> int:
     """Step and close, as told."""
+    neighbours = make_env(repository, policy=order["policy"])
+    neighbours.env.reset()
     suites = make_env(repository, policy=order["policy"], timeouts=TIMEOUTS, **order["options"])
     env = suites.env
     env.reset()
@@ -48,6 +51,8 @@ def main(repository: str, order: dict[str, Any]) -> int:
     if order["close"] == "other":
         driver.join()
     suites.close()
+    neighbours.env.step([0])
+    neighbours.close()
     print("closed", flush=True)
     return 0
 

@@ -1,7 +1,12 @@
-"""Smuggling open files in and out of a jail."""
+"""What a jail holds open: every descriptor is known, and whom it could disturb with it.
+
+Smuggling further ones in and out.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import os
 import socket
 import time
@@ -12,23 +17,76 @@ from typing import Any
 import psutil
 import pytest
 
-from envhub_sandbox import snapshot_store
+from envhub_sandbox import make_env, snapshot_store
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.sandboxes.process import PROCESS
+from tests.attacks.abuser import watched
 from tests.attacks.harness import (
+    TIMEOUTS,
     Arena,
     Run,
     call,
     control_run,
     new_alias,
+    pids_named,
     start_control,
     token,
 )
 from tests.support.processes import eventually
+from tests.support.repositories import write_repository
 
 FAMILY = "Open files"
 PATIENCE = 3000
 """Requests in which the server must have noticed the noise."""
+SHARED = {
+    "stdin: /dev/null": {"init", "zygote"},
+    "stdout: pipe": {"init"},
+    "stderr: pipe": {"init"},
+    "stream: socket": set(),
+    "slab: request": {"client"},
+    "slab: reply": {"client"},
+    "slab: observations": {"client"},
+    "what it hears: socket": set(),
+    "what it rings: eventfd": {"client"},
+}
+"""Every descriptor of a jail, and who else holds its open file description.
+
+``docs/threat-model.md`` says of each what a jail can do to them with it.
+"""
+KEEPER = """
+import ctypes, gymnasium as gym, numpy as np, os
+from envhub_worker.jail import host
+from envhub_worker.protocol import messages as m
+
+honest, kept = host.Host.attach, []
+
+def keep(self, request):
+    kept.extend(map(os.dup, self.descriptors))
+    return honest(self, request)
+
+host._HANDLERS[m.Attach] = keep
+
+class Keeper(gym.Env):
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(2, np.float32), {}
+
+    def name(self, alias):
+        ctypes.CDLL(None).prctl(15, alias.encode(), 0, 0, 0)  # PR_SET_NAME
+        return {str(fd): name for fd, name in zip(kept, NAMES)}
+
+NAMES = (
+    "slab: request", "slab: reply", "slab: observations",
+    "what it hears: socket", "what it rings: eventfd",
+)
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([Keeper])
+"""
+_KCMP = {"x86_64": 312, "aarch64": 272}
+_KCMP_FILE = 0
 
 
 @pytest.fixture
@@ -90,6 +148,73 @@ def open_files(pid: int) -> list[str]:
         except OSError:
             continue
     return links
+
+
+def test_every_descriptor_of_a_jail_is_known(arena: Arena, home: Path) -> None:
+    """There is none but these, and only they share them that are said to; asked of the kernel."""
+    repository, alias = write_repository(home / "keeper", KEEPER), new_alias()
+    with make_env(repository, timeouts=TIMEOUTS, **arena.place({})) as suites:
+        env = suites.env
+        env.reset()
+        [kept] = env.call("name", alias)
+        [host] = pids_named(alias)
+        names = {0: "stdin", 1: "stdout", 2: "stderr"} | {int(fd): kept[fd] for fd in kept}
+        held = {fd: open_file(host, fd) for fd in descriptors(host)}
+        # what is kept are copies: of what serves the lane, and of the slabs, which it has closed
+        copies = {
+            fd for fd in held if fd not in names and any(same(host, fd, host, at) for at in names)
+        }
+        [stream] = set(held) - set(names) - copies
+        names[stream] = "stream"
+        found = {
+            name if ": " in name else f"{name}: {held[fd]}": sharers(host, fd, held[fd])
+            for fd, name in names.items()
+        }
+    assert found == SHARED
+
+
+def descriptors(pid: int) -> list[int]:
+    """What a process has open."""
+    return sorted(map(int, os.listdir(f"/proc/{pid}/fd")))
+
+
+def open_file(pid: int, fd: int) -> str:
+    """What kind of file it is; the path of one that has one."""
+    return os.readlink(f"/proc/{pid}/fd/{fd}").partition(":")[0]
+
+
+def same(pid: int, fd: int, other: int, theirs: int) -> bool:
+    """Whether two descriptors are of one open file description: see ``kcmp(2)``."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    found = libc.syscall(_KCMP[os.uname().machine], pid, other, _KCMP_FILE, fd, theirs)
+    if found < 0:
+        raise OSError(ctypes.get_errno(), "kcmp")
+    return bool(found == 0)
+
+
+def sharers(host: int, fd: int, kind: str) -> set[str]:
+    """Who holds it besides the host: the client, the server, the jail's init, or the zygote."""
+    init, found = psutil.Process(host).ppid(), set()
+    names = {os.getpid(): "client", init: "init", **dict.fromkeys(servers()[1:], "server")}
+    for process in [psutil.Process(), *psutil.Process().children(recursive=True)]:
+        if process.pid == host:
+            continue
+        for theirs in descriptors(process.pid):
+            with contextlib.suppress(FileNotFoundError):  # closed meanwhile
+                if open_file(process.pid, theirs) == kind and same(host, fd, process.pid, theirs):
+                    found.add(names.get(process.pid, "zygote"))
+    return found
+
+
+@pytest.mark.parametrize(
+    "act", ["fill", "block", "block_empty", "truncate", "seek", "shut", "push", "close"]
+)
+def test_nobody_is_held_by_what_a_jail_does_to_its_descriptors(
+    arena: Arena, home: Path, act: str
+) -> None:
+    """To all of them at once: its client steps, closes and ends, and so does its neighbour's."""
+    ended, said = watched(arena, home, act, every=True, steps=[[1], [0]])
+    assert ended, (act, said)
 
 
 @pytest.mark.parametrize(

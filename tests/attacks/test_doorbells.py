@@ -7,162 +7,19 @@ both sides share: the same acts hold its writer for ever.
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
+from tests.attacks.abuser import ABUSE, ANSWERS, DIES, HANGS, watched
 from tests.attacks.harness import Arena
 from tests.support.processes import eventually
-from tests.support.repositories import write_repository
 
 FAMILY = "The client, from inside a jail"
-WATCHDOG_S = 180
-"""Far more than all timeouts of the client together."""
-
-ABUSE = """
-import contextlib, os, socket, stat, threading
-
-ONE = (1).to_bytes(8, "little")
-
-def fill(fd):
-    os.set_blocking(fd, False)
-    with contextlib.suppress(OSError):
-        os.write(fd, (2**64 - 2).to_bytes(8, "little"))
-    with contextlib.suppress(OSError):
-        while True:
-            os.write(fd, ONE)
-
-def block(fd):
-    fill(fd)
-    os.set_blocking(fd, True)
-
-def block_empty(fd):
-    os.set_blocking(fd, False)
-    with contextlib.suppress(OSError):
-        while os.read(fd, 8):
-            pass
-    os.set_blocking(fd, True)
-
-def race(fd):
-    block_empty(fd)
-    def ring():
-        while True:
-            os.write(fd, ONE)
-    def drain():
-        while True:
-            os.read(fd, 8)
-    for act in (ring, drain):
-        threading.Thread(target=act, daemon=True).start()
-
-def close(fd):
-    with contextlib.suppress(OSError):
-        os.close(fd)
-
-def a_socket(fd):
-    with contextlib.suppress(OSError):
-        if stat.S_ISSOCK(os.fstat(fd).st_mode):
-            return socket.socket(fileno=os.dup(fd))
-
-def shut(fd):
-    if ours := a_socket(fd):
-        with contextlib.suppress(OSError):
-            ours.shutdown(socket.SHUT_RDWR)
-
-def push(fd):
-    if ours := a_socket(fd):
-        ours.setblocking(False)
-        with contextlib.suppress(OSError):
-            while True:
-                socket.send_fds(ours, [ONE], [0] * 200)
-"""
 ACTS = ("fill", "block", "block_empty", "race", "close", "shut", "push")
-
-ENV = """
-import gymnasium as gym, numpy as np, os, signal, time
-from envhub_worker.jail import host
-from envhub_worker.protocol import messages as m, slabs
-
-ABUSE_AND_ANSWER, ABUSE_AND_HANG, DIE = 1, 2, 3
-lanes = []
-honest = host.Host.attach
-
-def remember(self, request):
-    reply = honest(self, request)
-    lanes.append(self.lane)
-    return reply
-
-host._HANDLERS[m.Attach] = remember
-
-def answer(lane):
-    lane._told[slabs.OUTCOME], lane._told[slabs.LENGTH] = slabs.DONE, 0
-    lane._told[slabs.PARKED] = 1
-    lane._told[slabs.SEQUENCE] = lane._asked[slabs.SEQUENCE]
-    with contextlib.suppress(OSError):
-        os.set_blocking(lane._client_bell, False)
-        os.write(lane._client_bell, ONE)
-
-def turn_on(bells):
-    for bell in bells:
-        globals()[{act!r}](bell)
-
-class Abuser(gym.Env):
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
-    action_space = gym.spaces.Discrete(4)
-
-    def reset(self, *, seed=None, options=None):
-        return np.zeros(1), {{}}
-
-    def step(self, action):
-        lane = lanes[-1]
-        if action == ABUSE_AND_ANSWER:
-            turn_on([lane.bell])
-            answer(lane)
-            turn_on([lane._client_bell])
-            time.sleep(3600)
-        if action == ABUSE_AND_HANG:
-            turn_on([lane.bell, lane._client_bell])
-            time.sleep(3600)
-        if action == DIE:
-            time.sleep(0.5)
-            os.kill(os.getpid(), signal.SIGKILL)
-        return np.zeros(1), 0.0, False, False, {{}}
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.AsyncVectorEnv([Abuser] * n_envs)
-"""
-ANSWERS, HANGS, DIES = 1, 2, 3
-
-
-def watched(arena: Arena, folder: Path, act: str, **order: Any) -> tuple[bool, list[str]]:
-    """Whether a client whose environment does this came to its end, and what it said."""
-    repository = write_repository(folder / "abuser", ABUSE + ENV.format(act=act))
-    whole = {
-        "policy": {"profile": arena.profile, "crash_history": 0, **order.pop("policy", {})},
-        "options": order.pop("options", {}),
-        "close": "same",
-        "head_start_s": 1.0,
-        **order,
-    }
-    command = [sys.executable, "-m", "tests.attacks.held_client", str(repository)]
-    client = subprocess.Popen(
-        [*command, json.dumps(whole)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        cwd=Path(__file__).parents[2],
-        text=True,
-    )
-    try:
-        said, _ = client.communicate(timeout=WATCHDOG_S)
-    except subprocess.TimeoutExpired:
-        client.kill()
-        said, _ = client.communicate()
-        return False, [*said.splitlines(), "held"]
-    return client.returncode == 0 and said.endswith("closed\n"), said.splitlines()
 
 
 def judge(arena: Arena, title: str, act: str, ended: bool, said: list[str]) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from tests.attacks import table
 from tests.attacks.expectations import MEASURED_ATTACKS, NOT_STOPPED
 from tests.attacks.harness import Row
+from tests.attacks.test_descriptors import SHARED
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -29,6 +30,14 @@ def test_threat_model_lists_what_is_not_stopped() -> None:
     for attack, reasons in NOT_STOPPED.items():
         only_weaker = all(where.startswith("no-userns") for where in reasons)
         assert attack in (weaker if only_weaker else everywhere), attack
+
+
+def test_threat_model_lists_what_a_jail_holds_open() -> None:
+    """Every descriptor, and who else holds its open file description, as the kernel says."""
+    _, _, below = (DOCS / "threat-model.md").read_text().partition("## What a jail holds open")
+    rows = [line.split("|") for line in below.split("\n## ")[0].splitlines() if "|" in line][2:]
+    said = {name.strip(): set(re.findall(r"\w+", who)) - {"nobody"} for _, name, who, *_ in rows}
+    assert said == SHARED
 
 
 def test_table_agrees_with_the_expectations() -> None:
