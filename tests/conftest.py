@@ -1,4 +1,4 @@
-"""What holds for every test: a cache of its own, and in CI no silent skip."""
+"""What holds for every test: a cache of its own, and the plugins that all of them run with."""
 
 from __future__ import annotations
 
@@ -13,14 +13,7 @@ from hypothesis import HealthCheck, settings
 
 from envhub_sandbox import folders
 
-pytest_plugins = ["tests.hub.fixtures"]
-
-# Reasons for which a test may be skipped in CI, each with the variable that permits it there.
-_PERMITTED = {
-    "'torch'": "ENVHUB_CI_WITHOUT_TORCH",
-    "needs torch": "ENVHUB_CI_WITHOUT_TORCH",
-    "may not make control groups": "ENVHUB_CI_WITHOUT_CGROUPS",
-}
+pytest_plugins = ["tests.hub.fixtures", "tests.support.selection", "tests.support.skips"]
 
 # A loaded machine is slow at random; what may be slow is bounded by pytest-timeout instead.
 settings.register_profile("local", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -43,32 +36,6 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ENVHUB_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport() -> Iterator[None]:
-    """In CI a skipped test is a failed one."""
-    report = yield
-    return _no_skips(report)  # type: ignore[return-value]
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_make_collect_report() -> Iterator[None]:
-    """In CI a skipped module is a failed one."""
-    report = yield
-    return _no_skips(report)  # type: ignore[return-value]
-
-
-def _no_skips(report: pytest.TestReport | pytest.CollectReport) -> object:
-    skipped = report.outcome == "skipped" and not hasattr(report, "wasxfail")
-    if not skipped or "ENVHUB_CI" not in os.environ:
-        return report
-    reason = str(report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr)
-    permitted = any(text in reason and name in os.environ for text, name in _PERMITTED.items())
-    if not permitted and not ("needs root" in reason and os.getuid() != 0):
-        report.outcome = "failed"
-        report.longrepr = f"{report.nodeid} must not be skipped in CI: {reason}"
-    return report
 
 
 @pytest.fixture(scope="session")

@@ -10,4 +10,4 @@ export PYTHON
 permit_what_this_machine_lacks
 # The step "container" has those that need an engine.
 export PYTEST_ADDOPTS=--ignore=tests/containers
-with_summary tests ./test
+with_summary tests ./test --full

@@ -17,7 +17,7 @@ class TestCounter(VectorEnvCompliance):
     """Every kind of value in the infos, episodes of two to six steps."""
 
     sample = "counter"
-    cases = cases(n_envs=(1, 3, 4), use_async_envs=(False,)) + cases(use_async_envs=(True,))
+    cases = cases(n_envs=(1, 3), use_async_envs=(False,)) + cases(use_async_envs=(True,))
     steps = 150
 
     def test_options_reach_the_sub_environments(self, pair: Pair) -> None:

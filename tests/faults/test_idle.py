@@ -10,7 +10,8 @@ import pytest
 
 from envhub_sandbox import errors, make_env
 from envhub_worker.protocol.lifecycle import State
-from tests.faults.test_transparent import ALL_LIVE, SEED, SLOW, oracle, pids, state
+from tests.faults.test_transparent import ALL_LIVE, SEED, SLOW, oracle
+from tests.support.inside import pids, state
 from tests.support.processes import eventually
 from tests.support.samples import sample
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -17,8 +18,10 @@ from tests.hub.stub_hub import StubHub
 def olah_python() -> str:
     """The interpreter that has olah; the test is skipped if there is none."""
     python = os.environ.get("ENVHUB_TEST_OLAH_PYTHON", sys.executable)
+    if shutil.which("git") is None:
+        pytest.skip("needs git")
     if subprocess.run([python, "-c", "import olah"], capture_output=True, check=False).returncode:
-        pytest.skip(f"olah is missing from {python}: pip install olah")
+        pytest.skip("needs olah")
     return python
 
 

@@ -37,7 +37,7 @@ def sample(name: str) -> Path:
     for required in requirements.read_text().split() if requirements.exists() else ():
         module = _MODULES.get(required, required.replace("-", "_"))
         if importlib.util.find_spec(module) is None:
-            pytest.skip(f"sample {name} needs {required}: pip install '{required}'")
+            pytest.skip(f"needs {required}")
     return folder
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import stat
 import subprocess
 import sys
@@ -313,6 +314,7 @@ def test_copy_is_what_the_record_says_or_an_error(tmp_path: Path, kind: str) -> 
             copy_verified(source, tmp_path / str(number), record)
 
 
+@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
 def test_git_digest_is_gits_own(tmp_path: Path) -> None:
     """The blob id agrees with the one that git computes."""
     (tmp_path / "x").write_bytes(b"hello\n")
