@@ -1,4 +1,5 @@
 # The image, built on a real engine and driven there: compliance, attacks, and how things end.
+# Proves that the image serves as this checkout does, and that its walls hold.
 # Everything lies in the work folder, and an engine that is started here is stopped here.
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../lib.sh"

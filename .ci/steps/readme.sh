@@ -1,8 +1,27 @@
-# The README's first command, word for word, in a clean copy of the checkout.
+# What a newcomer does: both of the README's commands, word for word, in a clean copy, with the
+# python3 that is first on the PATH; then once more as a plain user, with the system's python3.
+# Proves that they pass for both, whatever root's interpreter is, and that what cannot be tested
+# there is skipped.
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../lib.sh"
-command=$(awk '/^```sh$/ {inside = 1; next} /^```$/ {if (inside) exit} inside' README.md)
-echo "\$ $command"
-mkdir "$CI_WORK/readme" && cp -R . "$CI_WORK/readme/checkout" && cd "$CI_WORK/readme/checkout"
-ENVHUB_CACHE=$CI_WORK/readme/cache bash -euo pipefail -c "$command"
-test -s cartpole.mp4
+unset PYTHON "${!ENVHUB_@}"
+mapfile -t commands < <(awk '/^```sh$/ {inside = 1; next} /^```$/ {inside = 0} inside' README.md | head -2)
+
+# newcomer NAME PREFIX...: both commands, in a copy of the checkout.
+newcomer() {
+  local name=$1
+  shift
+  cp -R . "$CI_WORK/$name"
+  (
+    cd "$CI_WORK/$name"
+    echo "$name, with $("$@" bash -c 'command -v python3')"
+    echo "\$ ${commands[0]}"
+    "$@" bash -euo pipefail -c "${commands[0]}"
+    test -s cartpole.mp4
+    echo "\$ ${commands[1]}"
+    with_summary "$name" "$@" bash -euo pipefail -c "${commands[1]}"
+  )
+}
+
+newcomer readme env ENVHUB_CACHE="$CI_WORK/readme-cache"
+[ "$(id -u)" != 0 ] || newcomer readme-user bash "$CI_STEPS/../as-user.sh" 3

@@ -1,4 +1,5 @@
-# The README's command, with everything installed and no test skipped.
+# Every test, with everything installed and none skipped, as root or as whoever runs this. Proves
+# what the documents say; containers are another step.
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../lib.sh"
 export ENVHUB_CI=1 ENVHUB_TEST_DIR=$CI_WORK/tests

@@ -130,10 +130,24 @@ def test_readme_opens_with_one_command_to_try_and_one_to_test() -> None:
 
 
 def test_ci_runs_the_commands_of_the_readme() -> None:
-    """The first word for word, the second as it stands."""
+    """Both word for word, read off it; and the second for every test."""
     steps = CHECKOUT / ".ci" / "steps"
-    assert "README.md" in (steps / "readme.sh").read_text()
-    assert re.search(r"^with_summary tests \./test$", (steps / "tests.sh").read_text(), re.M)
+    assert "README.md | head -2" in (steps / "readme.sh").read_text()
+    _, second, *_ = fenced(README, "sh")
+    assert second.strip() == "./test"
+    full = r"^with_summary tests \./test --full$"
+    assert re.search(full, (steps / "tests.sh").read_text(), re.M)
+
+
+def test_contributing_names_every_step_and_every_folder_of_tests() -> None:
+    """And no other."""
+    text = (CHECKOUT / "CONTRIBUTING.md").read_text()
+    tables = rows(section(text, "Before you propose a change"))
+    steps = {step.stem for step in (CHECKOUT / ".ci" / "steps").iterdir()}
+    assert {name for row in tables for name in code_words(row[0])} == steps
+    folders = {f"tests/{one.name}" for one in CHECKOUT.glob("tests/*") if one.is_dir()}
+    listed = {name for row in rows(section(text, "Where tests go")) for name in code_words(row[0])}
+    assert listed == {name for name in folders if "__pycache__" not in name}
 
 
 def test_readme_quick_start_runs() -> None:
