@@ -7,11 +7,13 @@ compares every file with the listing.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -20,9 +22,10 @@ from traceback import walk_tb
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl, quote, urlsplit
 
-from envhub_sandbox.errors import HubReferenceError, SnapshotIntegrityError
+from envhub_sandbox.errors import HubReferenceError, SnapshotError, SnapshotIntegrityError
 from envhub_sandbox.hashing import GIT_SHA1, SHA256
-from envhub_sandbox.hub_failures import HubFailure, Subject, explain
+from envhub_sandbox.hub_answers import HostileAnswerError, bounded_body, guarded, streamed
+from envhub_sandbox.hub_failures import HubFailure, Subject, conceal, explain
 from envhub_sandbox.logins import authorization, login_of, without_login
 from envhub_sandbox.reference_rules import is_commit
 from envhub_sandbox.snapshot_records import FileRecord
@@ -30,6 +33,9 @@ from envhub_sandbox.snapshot_records import FileRecord
 _DEFAULT_ENDPOINT = "https://huggingface.co"
 _LIBRARY = {"library_name": "envhub-sandbox"}
 _xet_switch = threading.Lock()
+_WORKERS = 8
+MAX_IDLE_PAGES = 1000
+"""Pages of a listing in a row without a file: folders alone can fill some."""
 
 
 class Repository(NamedTuple):
@@ -103,7 +109,7 @@ class HubClient:
         """Ask which full commit a revision is; None is ``main``, as in huggingface_hub."""
         url = f"{self._api(repo)}/revision/{quote(revision or 'main', safe='')}"
         with self._explained(repo, revision):
-            commit = self._get(url, {}).json()["sha"]
+            commit = self._get(url, {})[0]["sha"]
             if not isinstance(commit, str) or not is_commit(commit):
                 raise ValueError("the answer has no full commit")
         return commit
@@ -112,33 +118,49 @@ class HubClient:
         """Yield the files of a commit with their sizes and digests, page by page."""
         url = f"{self._api(repo)}/tree/{commit}"
         query: dict[str, str] | None = {"recursive": "true", "expand": "false"}
+        idle = 0
         while query is not None:
             with self._explained(repo, commit):
-                response = self._get(url, query)
-                items, query = list(response.json()), _next_page(response, query)
-            for item in items:
-                record = _record_of(item, repo)
-                if record is not None:
-                    yield record
+                items, following = self._get(url, query)
+                records = [_record_of(item, repo) for item in list(items)]
+            found = [record for record in records if record is not None]
+            idle = 0 if found else idle + 1
+            if idle > MAX_IDLE_PAGES:
+                raise SnapshotIntegrityError(
+                    f"{repo.repo_id} on {self.public_endpoint}: its listing has no end: {idle} "
+                    "pages without a file. Check that the endpoint is a Hugging Face Hub"
+                )
+            yield from found
+            query = _next_page(following, query)
 
-    def download(self, repo: Repository, commit: str) -> Path:
-        """Download the whole repository into the Hub cache; its folder there."""
-        from huggingface_hub import snapshot_download
+    def download(self, repo: Repository, commit: str, paths: Sequence[str]) -> Path:
+        """Download these files into the Hub cache; the folder of the commit there.
 
-        with self._explained(repo, commit):
-            return Path(_with_xet_or_without(snapshot_download, **self._arguments(repo, commit)))
+        One by one and not by ``snapshot_download``: that asks for a listing of its own, which may
+        be another than the one that was judged.
+        """
+        with self._explained(repo, commit), ThreadPoolExecutor(_WORKERS) as pool:
+            futures = [pool.submit(self._download, repo, commit, path) for path in paths]
+            try:
+                places = [future.result() for future in futures]
+            finally:
+                for future in futures:
+                    future.cancel()
+        place = places[0]
+        return place.parents[paths[0].count("/")]
 
     def download_again(self, repo: Repository, commit: str, path: str) -> Path:
         """Download one file anew, whatever the Hub cache has of it."""
+        with self._explained(repo, commit):
+            return self._download(repo, commit, path, force_download=True)
+
+    def _download(self, repo: Repository, commit: str, path: str, **more: Any) -> Path:
         from huggingface_hub import hf_hub_download
 
-        arguments = self._arguments(repo, commit)
-        with self._explained(repo, commit):
-            return Path(
-                _with_xet_or_without(
-                    hf_hub_download, filename=path, force_download=True, **arguments
-                )
-            )
+        arguments = {**self._arguments(repo, commit), "filename": path, **more}
+        # a session may be the thread's own
+        with guarded(import_module("huggingface_hub.utils").get_session()):
+            return Path(_with_xet_or_without(hf_hub_download, **arguments))
 
     def _arguments(self, repo: Repository, commit: str) -> dict[str, Any]:
         login = self._login()
@@ -161,24 +183,36 @@ class HubClient:
     def _api(self, repo: Repository) -> str:
         return f"{self.public_endpoint}/api/{repo.repo_type}s/{repo.repo_id}"
 
-    def _get(self, url: str, query: dict[str, str]) -> Any:
+    def _get(self, url: str, query: dict[str, str]) -> tuple[Any, str | None]:
+        """The JSON of an answer, and the address of the next page."""
         # HfApi.list_repo_tree has no timeout, and in 2.x retries a broken Hub for 24 s.
         client: Any = import_module("huggingface_hub.utils")
         timeout = import_module("huggingface_hub.constants").HF_HUB_ETAG_TIMEOUT
         login = self._login()
         token = False if login else self.token
         headers = {**client.build_hf_headers(token=token, **_LIBRARY), **login}
-        response = client.get_session().get(url, headers=headers, params=query, timeout=timeout)
-        client.hf_raise_for_status(response)
-        return response
+        options = {"headers": headers, "params": query, "timeout": timeout}
+        with streamed(client.get_session(), url, options) as response:
+            client.hf_raise_for_status(response)
+            return json.loads(bounded_body(response)), response.links.get("next", {}).get("url")
 
     @contextmanager
     def _explained(self, repo: Repository, revision: str | None) -> Iterator[None]:
         try:
             yield
+        except SnapshotError:
+            raise
         except Exception as error:
+            secrets = self._secrets()
+            conceal(error, secrets)
+            hostile = _in_chain(error, HostileAnswerError)
+            if hostile is not None:
+                raise SnapshotIntegrityError(
+                    f"{'/'.join(repo)}@{revision} on {self.public_endpoint}: {hostile}. Nothing of "
+                    "it was used. Check that the endpoint is a Hugging Face Hub, or use another"
+                ) from error
             subject = Subject(*repo, revision, self.public_endpoint)
-            raise explain(error, subject, self._secrets()) from error
+            raise explain(error, subject, secrets) from error
 
     def _secrets(self) -> tuple[str, ...]:
         from huggingface_hub import get_token
@@ -189,9 +223,16 @@ class HubClient:
         return tuple(secret for secret in secrets if secret)
 
 
-def _next_page(response: Any, query: dict[str, str]) -> dict[str, str] | None:
+def _in_chain(error: BaseException | None, kind: type[Exception]) -> BaseException | None:
+    seen: list[BaseException] = []
+    while error is not None and error not in seen and not isinstance(error, kind):
+        seen.append(error)
+        error = error.__cause__ or error.__context__
+    return error if isinstance(error, kind) else None
+
+
+def _next_page(url: str | None, query: dict[str, str]) -> dict[str, str] | None:
     """The next page's query. Only that: a link to another host would take the token along."""
-    url = response.links.get("next", {}).get("url")
     if url is None:
         return None
     following = dict(parse_qsl(urlsplit(url).query))

@@ -167,6 +167,14 @@ def redact(text: str, secrets: tuple[str, ...]) -> str:
     return text
 
 
+def conceal(error: BaseException, secrets: tuple[str, ...]) -> None:
+    """Take the secrets out of the texts of an exception and its causes: tracebacks show them."""
+    for link in _chain(error):
+        link.args = tuple(
+            redact(value, secrets) if isinstance(value, str) else value for value in link.args
+        )
+
+
 def _classify(error: BaseException) -> tuple[Kind, BaseException]:
     for link in _chain(error):
         kind = _kind_of(link)

