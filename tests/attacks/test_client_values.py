@@ -12,7 +12,7 @@ import pickle
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -232,6 +232,33 @@ def test_seeds_are_numbers(liar: LyingServer, folder: str, lie: Any) -> None:
         assert isinstance(refuses(lambda: suites.env.np_random_seed), RemoteProtocolError)
         liar.lies[m.GetOwn] = relayed(m.Value((3, None)))
         assert suites.env.np_random_seed == (3, None)
+
+
+# --- names of suites and tasks ---------------------------------------------------------------
+
+
+def write_videos(folder: Path, names: Iterable[tuple[str, int]]) -> None:
+    """As LeRobot's evaluation does, for each task."""
+    for suite, task in names:
+        (folder / f"{suite}_{task}").mkdir(parents=True, exist_ok=True)
+
+
+@pytest.mark.parametrize("up", ["absolute", "relative"])
+def test_names_of_suites_write_nothing_elsewhere(
+    liar: LyingServer, folder: str, tmp_path: Path, up: str
+) -> None:
+    """A suite named like a path has no caller write outside of the folder of its results."""
+    elsewhere = tmp_path / "home"
+    suite = str(elsewhere) if up == "absolute" else "../../home"
+    value = manifest()
+    value["envs"][0]["suite"] = suite
+    liar.lies[m.Load] = relayed(m.Loaded(value))
+    assert isinstance(refuses(lambda: opened(liar, folder)), RemoteProtocolError)
+
+    results = tmp_path / "results" / "videos"
+    results.mkdir(parents=True)
+    write_videos(results, [(suite, 0)])
+    assert (tmp_path / "home_0").exists(), "the control failed: nothing was written elsewhere"
 
 
 def test_odd_infos_are_plain_data(liar: LyingServer, folder: str) -> None:

@@ -62,6 +62,22 @@ def test_manifests_load_without_the_names_that_are_not_served() -> None:
     assert made.envs[0].attributes == ("hub_config", "_ensure")
 
 
+@pytest.mark.parametrize("field", ["suite", "task"])
+@pytest.mark.parametrize(
+    "name", ["/etc", "..", "../x", "a/../../x", "a\\..\\x", "\\x", "a/..", "//a"]
+)
+def test_names_of_tasks_lead_into_no_other_folder(field: str, name: str) -> None:
+    """Callers write files under them."""
+    with pytest.raises(RemoteProtocolError, match="as a path"):
+        read(with_env(field, name))
+
+
+@pytest.mark.parametrize("name", ["ALE/Pong-v5", "pick cube", "v1..2", "a.b", "...", "", "~"])
+def test_names_of_tasks_may_be_anything_else(name: str) -> None:
+    """Slashes among it."""
+    assert read(with_env("task", name)).envs[0].task == name
+
+
 # --- metadata and specs ---------------------------------------------------------------------
 
 

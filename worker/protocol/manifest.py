@@ -17,6 +17,7 @@ from envhub_worker.protocol.facts import read_metadata, read_spec
 from envhub_worker.protocol.limits import MAX_NUM_ENVS
 from envhub_worker.protocol.names import (
     MAX_NAMES,
+    checked_key,
     checked_name,
     is_servable,
     optional_name,
@@ -164,7 +165,7 @@ def _decode_env(value: object, reader: SpaceReader) -> EnvManifest:
     if mode is not None and (type(mode) is not str or mode not in AUTORESET_MODES):
         raise RemoteProtocolError(f"autoreset mode {str(mode)[:40]!r} is not one of Gymnasium's")
     return EnvManifest(
-        suite=checked_name(fields["suite"], "suite"),
+        suite=checked_key(fields["suite"], "suite"),
         task=_task(fields["task"]),
         num_envs=num_envs,
         shardable=_typed(fields, "shardable", bool),
@@ -192,7 +193,7 @@ def _typed(fields: Mapping[str, Any], name: str, kind: type) -> Any:
 
 
 def _task(value: object) -> TaskId:
-    return value if type(value) is int else checked_name(value, "task")
+    return value if type(value) is int else checked_key(value, "task")
 
 
 def _attributes(value: object) -> tuple[str, ...]:

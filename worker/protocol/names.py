@@ -70,6 +70,21 @@ def checked_name(value: object, what: str) -> str:
     return value
 
 
+def checked_key(value: object, what: str) -> str:
+    """A name that can be part of a path: callers write videos and results under such names.
+
+    A slash is allowed (``ALE/Pong-v5``), for it leads further down.
+
+    Raises:
+        RemoteProtocolError: It is no name, or leads out of the folder that it is put behind.
+    """
+    name = checked_name(value, what)
+    parts = name.replace("\\", "/").split("/")
+    if ".." in parts or (not parts[0] and len(parts) > 1):
+        raise RemoteProtocolError(f"{what} {name[:80]!r} would lead out of a folder as a path")
+    return name
+
+
 def optional_name(value: object, what: str) -> str | None:
     """The same, or None."""
     return None if value is None else checked_name(value, what)
