@@ -1,0 +1,125 @@
+"""Lies made from what real workers have said: a bounded number here, longer by ``tests.fuzz``.
+
+The seed is drawn anew each time and printed; what fails says how to do it again.
+"""
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from envhub_sandbox import results
+from envhub_worker.protocol import messages as m
+from tests.fuzz import child, traffic
+from tests.fuzz.oracle import WrongError, fits
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = 250
+MANY = 2000
+KINDS = {"Loaded", "Built", "ResetDone", "StepDone", "Value", "Raised", "Relayed", "JailOpened"}
+
+
+@pytest.fixture(scope="module")
+def corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of what real workers say."""
+    file = tmp_path_factory.mktemp("traffic") / "recording"
+    run = [sys.executable, "-m", traffic.__name__, str(file)]
+    subprocess.run(run, cwd=ROOT, check=True, timeout=280)
+    return file
+
+
+def fuzz(corpus: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run the command."""
+    command = [sys.executable, "-m", "tests.fuzz", "--corpus", corpus, *arguments]
+    return subprocess.run(
+        list(map(str, command)), cwd=ROOT, capture_output=True, text=True, check=False, timeout=280
+    )
+
+
+def test_the_recording_has_every_kind(corpus: Path) -> None:
+    """What is spoiled was said by real workers, in all the ways in which they say it."""
+    messages = child.decoded(pickle.loads(corpus.read_bytes()))
+    assert {type(message).__name__ for message in messages} >= KINDS
+
+
+def test_lies_are_taken_rightly_or_refused(corpus: Path) -> None:
+    """Nothing comes out but right values and errors of ours, in bounded memory and time."""
+    run = fuzz(corpus, "--examples", EXAMPLES)
+    print(run.stdout)
+    assert run.returncode == 0, run.stdout + run.stderr
+    lines = [line for line in run.stdout.splitlines() if " lies: " in line]
+    assert [line.split()[0] for line in lines] == list(child.ALL)
+    assert all(line.split()[1] == str(EXAMPLES) and " taken" in line for line in lines), lines
+
+
+@pytest.mark.parametrize(
+    ("control", "says"),
+    [
+        ("control_raises", "KeyError"),
+        ("control_harms", "this is a control"),
+        ("control_eats", "MemoryError"),
+        ("control_hangs", "SIGALRM"),
+        ("control_dies", "SIGSEGV"),
+    ],
+)
+def test_whatever_must_not_come_out_is_noticed(corpus: Path, control: str, says: str) -> None:
+    """The controls: each way of going wrong ends in a failure that names the lie and the seed."""
+    run = fuzz(corpus, "--examples", 1, "--seed", 7, "--patience", 5, control)
+    assert run.returncode == 1
+    assert says in run.stdout
+    assert f"{control} " in run.stdout
+    assert "seed 7" in run.stdout
+
+
+def first_wrong(corpus: Path, target: str) -> str:
+    """What the first lie that does harm does, or nothing."""
+    found: list[traffic.Frames] = pickle.loads(corpus.read_bytes())
+    messages: list[m.Message] = child.decoded(found)
+    for number in range(MANY):
+        try:
+            child.lie(target, number, 1, found, messages)
+        except WrongError as error:
+            return str(error)
+        except Exception:
+            continue
+    return ""
+
+
+def test_observations_that_are_not_checked_are_noticed(
+    corpus: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the check that observations fit their space, the fuzzer says so; with it, nothing."""
+    assert first_wrong(corpus, "results") == ""
+    monkeypatch.setattr(results.batches, "conforms", lambda *_: True)
+    assert "where" in first_wrong(corpus, "results")
+
+
+SPACE = spaces.Dict({"x": spaces.Box(-1, 1, (2,)), "t": spaces.Tuple([spaces.Discrete(3)])})
+GOOD: dict[str, Any] = {
+    "t": (np.zeros(3, np.int64),),
+    "x": np.zeros((3, 2), np.float32),
+}
+MISFITS: dict[str, dict[str, Any]] = {
+    "shape": {"x": np.zeros((3, 3), np.float32)},
+    "dtype": {"x": np.zeros((3, 2))},
+    "count": {"t": (np.zeros(2, np.int64),)},
+    "kind": {"t": [np.zeros(3, np.int64)]},
+    "list": {"x": [[0.0, 0.0]] * 3},
+    "read-only": {"x": np.broadcast_to(np.float32(0), (3, 2))},
+    "key": {"y": None},
+}
+
+
+@pytest.mark.parametrize("what", list(MISFITS))
+def test_a_misfit_is_seen_by_the_judge(what: str) -> None:
+    """Each way of not fitting a space, fed to what judges the others."""
+    fits(SPACE, GOOD, 3)
+    with pytest.raises(WrongError):
+        fits(SPACE, {**GOOD, **MISFITS[what]}, 3)

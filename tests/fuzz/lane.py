@@ -1,0 +1,100 @@
+"""The fast lane's slabs with anything in them: the jail writes what and when it likes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from envhub_sandbox.fast_lane import LaneShard
+from envhub_sandbox.observations import ObservationSlab
+from envhub_sandbox.results import Results
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol import slabs
+from envhub_worker.protocol.stream import pack_packet
+from envhub_worker.protocol.untrusted import UNTRUSTED
+from tests.attacks.lying_server import env_manifest
+from tests.fuzz.oracle import demand, fits, per_env, usable
+from tests.fuzz.targets import Dice, NotSentError, attempt, is_error, parts, spoiled_message
+
+SPACE = spaces.Dict(
+    {"b": spaces.Box(0, 1, (3,), np.bool_), "x": spaces.Box(-1, 1, (2,)), "d": spaces.Discrete(3)}
+)
+COUNT = 2
+
+
+class Slabs:
+    """One shard's slabs, as the client has them, and as the jail can write them."""
+
+    def __init__(self) -> None:
+        observed = slabs.observation_layout(SPACE, COUNT, 1)
+        layout = slabs.layout_of(spaces.Discrete(2), COUNT)
+        assert observed is not None
+        assert layout is not None
+        self.observations = ObservationSlab(SPACE, observed)
+        self.shard = LaneShard(layout, self.observations.fd)
+        self.layout = layout
+        self.reply = memory(self.shard.fds[1], layout.reply_bytes)
+        self.batch = memory(self.observations.fd, observed.total_bytes)
+        self.results = Results(env_manifest(single_observation_space=SPACE), [(0, COUNT)])
+
+
+def memory(fd: int, size: int) -> Any:
+    """The jail's map of a slab."""
+    import mmap
+
+    return np.frombuffer(mmap.mmap(fd, size), np.uint8)
+
+
+_SLABS: list[Slabs] = []
+
+
+def lane(dice: Dice) -> None:
+    """Outcomes, answers, infos, columns, observations and flags: right, or refused."""
+    rng = dice.rng
+    if not _SLABS:
+        _SLABS.append(Slabs())
+    ours, shard = _SLABS[0], _SLABS[0].shard
+    words = ours.reply[: slabs.HEADER_BYTES].view(np.uint64)
+    if rng.random() < 0.3:
+        ours.batch[:] = np.frombuffer(rng.randbytes(ours.batch.nbytes), np.uint8)
+    message = rng.choice([one for one in dice.messages if one.kind >= m.FIRST_HOST_KIND])
+    if rng.random() < 0.4:
+        size = rng.choice((1, COUNT))
+        message = m.Value({"a": np.ones(size), "_a": np.ones(size, bool), "n": np.ones((size, 2))})
+    frames = [bytes(frame) for frame in m.pack(spoiled_message(dice, message), 0)]
+    if rng.random() < 0.3:
+        frames = dice.spoiler.frames(frames, dice.corpus)
+    if len(frames) > 1 and rng.random() < 0.8:
+        raise NotSentError
+    packet = b"".join(bytes(part) for part in pack_packet(0, frames))
+    if rng.random() < 0.2:
+        packet = dice.spoiler.raw(packet)
+    _put(ours, ours.layout.infos, frames[0])
+    _put(ours, ours.layout.answer, packet)
+    words[slabs.OUTCOME] = rng.choice((1, 2, 3, 4, 4, 0, 5, 2**64 - 1))
+    in_answer = rng.random() < 0.4
+    length = len(packet) if in_answer else len(frames[0])
+    words[slabs.LENGTH] = rng.choice((length, length, length, 0, length + 1, 2**16, 2**64 - 1))
+    found = attempt(shard.answer) if in_answer else attempt(shard.outcome)
+    if is_error(found):
+        raise found
+    if in_answer:
+        usable([] if found is None else parts(found))
+        return
+    with UNTRUSTED:
+        infos = ours.results.infos([ours.results.lane_info(found, shard, lambda: m.Value({}))])
+        usable(infos)
+        observation = ours.observations.take()
+    fits(SPACE, observation, COUNT)
+    demand(set(observation["b"].tobytes()) <= {0, 1}, "a boolean that is neither")
+    rewards, over, cut = ours.observations.results()
+    per_env("rewards", rewards, "f", COUNT)
+    per_env("terminations", over, "b", COUNT)
+    per_env("truncations", cut, "b", COUNT)
+
+
+def _put(ours: Slabs, start: int, data: bytes) -> None:
+    room = data[: slabs.INFO_BYTES]
+    ours.reply[start : start + len(room)] = np.frombuffer(room, np.uint8)

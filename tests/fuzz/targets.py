@@ -1,0 +1,416 @@
+"""What is lied to. A target takes one example's dice and says whether the lie was taken.
+
+It raises ``WrongError`` where a lie did harm; errors of this project are refusals, and anything
+else is what must never come out.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from envhub_sandbox import declared
+from envhub_sandbox.client import death, expect
+from envhub_sandbox.deadline import Deadline
+from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.jail import HostsDiedError, RemoteJail, check, open_jail
+from envhub_sandbox.results import Results
+from envhub_worker.protocol import batches, columns
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec import decode
+from envhub_worker.protocol.limits import DEFAULT_LIMITS
+from envhub_worker.protocol.manifest import decode_env, decode_manifest
+from envhub_worker.protocol.stream import PacketReader, pack_packet
+from envhub_worker.protocol.untrusted import UNTRUSTED
+from tests.attacks.lying_server import env_manifest
+from tests.fuzz.mutate import Spoiler, crossing
+from tests.fuzz.oracle import WrongError, alike, demand, fits, per_env, usable
+from tests.fuzz.traffic import Frames
+from tests.unit.test_batches import SINGLE_SPACES, parts_of
+
+ELEMENTS = 2_000_000
+SIZES = ((3,), (1, 2), (2, 2))
+
+
+@dataclass
+class Dice:
+    """One example.
+
+    Attributes:
+        rng: Decides everything.
+        corpus: Messages of real workers.
+        messages: The same, decoded.
+    """
+
+    rng: random.Random
+    corpus: list[Frames]
+    messages: list[m.Message]
+
+    @property
+    def spoiler(self) -> Spoiler:
+        """What spoils with these dice."""
+        donors = [value for one in self.rng.choices(self.messages, k=3) for value in parts(one)]
+        return Spoiler(self.rng, donors)
+
+    def often(self) -> int:
+        """How often something is spoiled."""
+        return self.rng.choice((0, 1, 1, 1, 2, 3))
+
+    def spoiled(self, value: Any) -> Any:
+        """A value, spoiled and sent. Raises ``NotSentError`` where the wire does not carry it."""
+        spoiler = self.spoiler
+        for _ in range(self.often()):
+            value = spoiler.value(value)
+        return self.sent(value)
+
+    def sent(self, value: Any) -> Any:
+        """A value as it arrives. Raises ``NotSentError`` where the wire does not carry it."""
+        crosses, value = crossing(value)
+        if not crosses:
+            raise NotSentError
+        return value
+
+    def inside(self, value: list[Any]) -> list[Any]:
+        """A list of as many values, some of them spoiled."""
+        made, spoiler = list(value), self.spoiler
+        for _ in range(self.often() if made else 0):
+            index = self.rng.randrange(len(made))
+            made[index] = spoiler.value(made[index])
+        return list(self.sent(made))
+
+
+class NotSentError(Exception):
+    """No worker could say that."""
+
+
+def parts(message: m.Message) -> list[Any]:
+    """The fields of a message."""
+    return [getattr(message, name) for name in type(message).__dataclass_fields__]  # type: ignore[attr-defined]
+
+
+# --- messages, with the memory of what recurs ----------------------------------------------------
+
+
+def unpack(dice: Dice) -> None:
+    """A message that comes again, under other ids, is what it was the first time, or refused."""
+    frames = dice.rng.choice(dice.corpus)
+    for _ in range(dice.often()):
+        frames = dice.spoiler.frames(frames, dice.corpus)
+    first = attempt(lambda: m.unpack(frames)[1])
+    for _ in range(3):
+        again = attempt(lambda: m.unpack(frames)[1])
+        demand(type(first) is type(again) or is_error(first) == is_error(again) == 1, "another end")
+        demand(is_error(first) or alike(parts(first), parts(again)), "another message")
+    if is_error(first):
+        raise first
+    plain = decode(frames)
+    demand(alike(parts(first), plain[2:]), "not what the codec says")  # type: ignore[index]
+    usable(parts(first))
+    m.pack(first, 1)
+
+
+def attempt(action: Callable[[], Any]) -> Any:
+    """What it gives, or the error of ours that it raises."""
+    try:
+        return action()
+    except EnvHubError as error:
+        return error
+
+
+def is_error(value: Any) -> bool:
+    """Whether an attempt was refused."""
+    return isinstance(value, EnvHubError)
+
+
+# --- results -------------------------------------------------------------------------------------
+
+
+def results(dice: Dice) -> None:
+    """Accepted observations fit their space, in one shard or two; so do rewards and flags."""
+    rng = dice.rng
+    space = SINGLE_SPACES[rng.choice(sorted(SINGLE_SPACES))]
+    sizes = rng.choice(SIZES)
+    stops = np.cumsum(sizes).tolist()
+    bounds = list(zip([0, *stops], stops, strict=False))
+    shardable = rng.random() < 0.8
+    found = Results(env_manifest(single_observation_space=space, shardable=shardable), bounds)
+    space.seed(rng.randrange(5))
+    members = [space.sample() for _ in range(stops[-1])]
+    observations = parts_of(space, members, bounds)
+    replies = [
+        m.StepDone(
+            observation,
+            np.zeros(size),
+            np.zeros(size, bool),
+            np.zeros(size, bool),
+            {"final_obs": final(members[:size]), "_final_obs": np.ones(size, bool)},
+        )
+        for observation, size in zip(observations, sizes, strict=True)
+    ]
+    fields = [dice.inside(parts(reply)) for reply in replies]
+    if any(type(one[4]) is not dict for one in fields):
+        raise NotSentError
+    with UNTRUSTED:
+        observation, rewards, over, cut, infos = found.step([m.StepDone(*one) for one in fields])
+    count = stops[-1]
+    if shardable:
+        fits(space, observation, count)
+        per_env("rewards", rewards, "biuf", count)
+        per_env("terminations", over, "b", count)
+        per_env("truncations", cut, "b", count)
+    usable((observation, rewards, over, cut, infos))
+
+
+def final(members: list[Any]) -> Any:
+    """Final observations of every sub-environment."""
+    made = np.full(len(members), None, object)
+    for index, member in enumerate(members):
+        made[index] = member
+    return made
+
+
+def infos(dice: Dice) -> None:
+    """One shard's lies do not reach another's rows, and there is one entry each."""
+    rng = dice.rng
+    sizes = rng.choice(SIZES[1:])
+    honest = [_infos(size, rng) for size in sizes]
+    lies = [dice.spoiled(part) for part in honest]
+    if any(type(part) is not dict for part in lies):
+        raise NotSentError
+    given = [honest[0], lies[1]] if rng.random() < 0.5 else lies
+    joined = batches.join_infos(given, sizes)
+    _check_joined(joined, sum(sizes))
+    if given[0] is honest[0]:
+        for key, value in honest[0].items():
+            mine = joined[key]
+            if type(value) is np.ndarray:
+                demand(alike(list(mine[: sizes[0]]), list(value)), f"{key} of the other shard")
+    usable(joined)
+
+
+def _infos(size: int, rng: random.Random) -> dict[Any, Any]:
+    mask = np.ones(size, bool)
+    made: dict[Any, Any] = {
+        "speed": np.arange(size, dtype=float), "_speed": mask,
+        "name": np.array(["a"] * size, object), "_name": mask,
+        "pos": np.ones((size, 3), np.float32), "_pos": mask,
+        "deep": {"x": np.arange(size), "_x": mask, "y": {"z": np.ones(size), "_z": mask}},
+        "_deep": mask, (1, 2): np.zeros(size), "_(1, 2)": mask,
+    }  # fmt: skip
+    return {key: made[key] for key in made if rng.random() < 0.8}
+
+
+def _check_joined(joined: dict[Any, Any], count: int) -> None:
+    for key, value in joined.items():
+        if type(value) is dict:
+            _check_joined(value, count)
+        else:
+            demand(type(value) is np.ndarray and len(value) == count, f"{key!r} of another length")
+
+
+def restore(dice: Dice) -> None:
+    """Members and batches of any space get their classes back, or are refused; the rest is kept."""
+    space = SINGLE_SPACES[dice.rng.choice(sorted(SINGLE_SPACES))]
+    space.seed(dice.rng.randrange(5))
+    members = [space.sample() for _ in range(3)]
+    [batch] = parts_of(space, members, [(0, 3)])
+    value, lie = dice.inside([members[0], batch])
+    with UNTRUSTED:
+        usable(batches.restore(space, value))
+        if batches.conforms(space, lie, 3):
+            fits(space, batches.restore_batch(space, lie), 3)
+
+
+# --- manifests -----------------------------------------------------------------------------------
+
+
+def manifest(dice: Dice) -> None:
+    """What is accepted of a description can be shown, compared, drawn from and stepped."""
+    loaded = [one for one in dice.messages if isinstance(one, m.Loaded)]
+    value = dice.spoiled(dice.rng.choice(loaded).manifest)
+    if dice.rng.random() < 0.2 and type(value) is dict and type(value.get("envs")) is tuple:
+        value["envs"] *= dice.rng.choice((2, 50))
+    found = decode_manifest(value, max_elements=ELEMENTS)
+    usable((found.interpreter, found.packages))
+    for env in found.envs:
+        usable((env.metadata, env.attributes, env.render_mode, env.suite, env.task))
+        declared.metadata(env)
+        spec = declared.spec(env)
+        demand(spec is None or spec.entry_point is None, "an entry point of the worker's")
+        for space in (env.single_observation_space, env.single_action_space):
+            repr(space)
+            demand(space == space, "a space that is not itself")
+        declared.action_reader(replace(env, num_envs=min(env.num_envs, 64)))
+
+
+def built(dice: Dice) -> None:
+    """The same for the answer to ``Build``."""
+    found = [one for one in dice.messages if isinstance(one, m.Built)]
+    decode_env(dice.spoiled(dice.rng.choice(found).manifest), max_elements=ELEMENTS)
+
+
+def generators(dice: Dice) -> None:
+    """A generator that is accepted draws numbers, and ends nobody."""
+    kinds = (np.random.PCG64, np.random.MT19937, np.random.Philox, np.random.SFC64)
+    state = dice.rng.choice(kinds)(7).state
+    lie = dice.spoiled(dict(state))
+    with UNTRUSTED:
+        made = declared.generator(lie)
+    made.random(700)
+    made.integers(0, 2**31, 3, dtype=np.int32)
+    made.standard_normal(3)
+    made.shuffle(np.arange(5))
+    repr(made.bit_generator.state)
+
+
+# --- what the server relays ----------------------------------------------------------------------
+
+
+class _Server:
+    """In the place of a connection: what is to be answered."""
+
+    def __init__(self, answer: Callable[[], tuple[m.Message, list[Any]]]) -> None:
+        self._answer = answer
+
+    def send(self, message: m.Message, payload: object = ()) -> int:
+        """Nothing leaves."""
+        return 1
+
+    def receive(self, request_id: int, deadline: Deadline) -> tuple[m.Message, list[Any]]:
+        """The lie."""
+        return self._answer()
+
+    def request(self, message: m.Message, *, deadline: Deadline) -> tuple[m.Message, list[Any]]:
+        """The lie."""
+        return self._answer()
+
+    def hold(self, jail: int) -> None:
+        """Nothing is held."""
+
+
+def relay(dice: Dice) -> None:
+    """As many messages as hosts were asked, or deaths of some of these; or an error."""
+    rng = dice.rng
+    hosts = rng.choice((1, 2))
+    host_replies = [rng.choice(dice.corpus) for _ in range(hosts)]
+    counts = tuple(map(len, host_replies))
+    died = m.Died(1, "exit", 3, None, "", "", "step")
+    answers: list[m.Message] = [
+        m.Relayed(counts), m.RelayedPartly(counts, (0,)), died,
+        m.Refused("SandboxUnavailableError", "x", "y", "z"),
+        m.JailOpened(1, tuple(range(hosts)), ()),
+    ]  # fmt: skip
+    if rng.random() < 0.3:
+        host_replies[0] = [bytes(frame) for frame in m.pack(died, 1)]
+    reply = spoiled_message(dice, rng.choice(answers))
+    payload = [frame for frames in host_replies for frame in frames]
+    if rng.random() < 0.3:
+        payload = payload[: rng.randrange(len(payload) + 1)]
+    server: Any = _Server(lambda: (reply, payload))
+    jail = RemoteJail(server, 1, range(hosts), [], DEFAULT_LIMITS)
+    jail.kept = rng.random() < 0.5
+    if isinstance(reply, m.JailOpened):
+        asked = m.OpenJail("", "", "", "", {}, hosts)
+        opened = open_jail(server, asked, DEFAULT_LIMITS, Deadline(None))
+        demand(len({*opened.hosts}) == hosts, "other hosts")
+        return
+    request = jail.relay("step", [(host, []) for host in range(hosts)])
+    try:
+        found = jail.receive(request, Deadline(None))
+    except HostsDiedError as error:
+        demand(set(error.deaths) <= set(range(hosts)), "the death of nobody")
+        raise
+    demand(len(found) == hosts, "more answers than hosts")
+    for one in found:
+        check(one)
+
+
+def spoiled_message(dice: Dice, message: m.Message) -> m.Message:
+    """A message, spoiled, as far as its class permits it."""
+    fields = dice.inside(parts(message))
+    frames = attempt(lambda: m.pack(type(message)(*fields), 1))
+    if is_error(frames):
+        raise NotSentError
+    found: m.Message = m.unpack(frames)[1]
+    return found
+
+
+def server(dice: Dice) -> None:
+    """What the server says of deaths and refusals is text, whatever it says."""
+    rng = dice.rng
+    message = spoiled_message(dice, rng.choice(dice.messages))
+    if isinstance(message, m.Died):
+        usable(str(death(message)))
+    wanted = rng.choice((m.Done, m.Relayed, m.JailOpened, m.Output, m.Welcome))
+    usable(str(attempt(lambda: expect(message, wanted))))  # type: ignore[type-abstract]
+    check(message)
+
+
+# --- the stream ----------------------------------------------------------------------------------
+
+
+def stream(dice: Dice) -> None:
+    """However the bytes are cut, the same packets come out, or the stream is refused."""
+    rng = dice.rng
+    whole = b"".join(
+        bytes(part)
+        for number, frames in enumerate(rng.choices(dice.corpus, k=3))
+        for part in pack_packet(number, frames)
+    )
+    for _ in range(dice.often()):
+        whole = dice.spoiler.raw(whole) if rng.random() < 0.9 else rng.randbytes(200)
+    once, cut = _read(whole, [len(whole)]), _read(whole, _cuts(whole, rng))
+    demand(once == cut, "other packets, where the bytes were cut elsewhere")
+    if once[1]:
+        raise once[1][0]
+
+
+def _cuts(data: bytes, rng: random.Random) -> list[int]:
+    return [*sorted(rng.randrange(len(data) + 1) for _ in range(rng.randrange(1, 9))), len(data)]
+
+
+class _Same(EnvHubError):
+    """Two refusals are the same: where in the bytes each came differs."""
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same)
+
+    __hash__ = EnvHubError.__hash__
+
+
+def _read(data: bytes, cuts: list[int]) -> tuple[list[Any], list[_Same]]:
+    reader, found, start = PacketReader(), [], 0
+    try:
+        for stop in cuts:
+            for packet in reader.feed(data[start:stop]):
+                found.append((packet.request_id, [bytes(frame) for frame in packet.frames]))
+            start = stop
+    except EnvHubError as error:
+        return found, [_Same(str(error))]
+    return found, []
+
+
+def column_schemas(dice: Dice) -> None:
+    """Columns never reach outside of their area, whatever infos announced them."""
+    lie = dice.spoiled(_infos(dice.rng.randrange(1, 4), dice.rng))
+    if type(lie) is not dict:
+        raise NotSentError
+    with UNTRUSTED:
+        for column in columns.columns_of(lie) or ():
+            end = column.offset + int(np.prod(column.shape, dtype=object)) * column.dtype.itemsize
+            demand(0 <= column.offset <= end <= columns.INFO_BYTES, "a column outside")
+
+
+TARGETS: dict[str, Callable[[Dice], None]] = {
+    one.__name__: one
+    for one in (
+        unpack, results, infos, restore, manifest, built, generators, relay, server, stream,
+        column_schemas,
+    )
+}  # fmt: skip
+
+__all__ = ["TARGETS", "Dice", "NotSentError", "WrongError"]

@@ -1,0 +1,78 @@
+"""What real workers say: recorded from runs of the samples, over both lanes.
+
+``python -m tests.fuzz.traffic FILE`` makes the recording: the messages as they came in, each of
+another outline, as a list of frames.
+"""
+
+from __future__ import annotations
+
+import pickle
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import EnvHubError
+from envhub_worker.protocol import messages as m
+from tests.support.samples import SAMPLES
+
+Frames = list[bytes]
+_REPOSITORIES = ("counter", "exotic_spaces", "custom_vector", "many_tasks", "faulty")
+_MOST = 400
+_LARGEST = 1 << 16
+
+
+@contextmanager
+def recording(found: dict[tuple[object, ...], Frames]) -> Iterator[None]:
+    """Every message that is unpacked here meanwhile, one of each kind and size."""
+    unpack = m.unpack
+
+    def listen(frames: Sequence[Any], **options: Any) -> Any:
+        copied = [bytes(frame) for frame in frames]
+        number, message = unpack(frames, **options)
+        key = (message.kind, *map(len, copied))
+        if len(found) < _MOST and sum(map(len, copied)) < _LARGEST:
+            found.setdefault(key, copied)
+        return number, message
+
+    m.unpack = listen  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        m.unpack = unpack
+
+
+def record() -> list[Frames]:
+    """The messages of some runs."""
+    found: dict[tuple[object, ...], Frames] = {}
+    with recording(found):
+        for name in _REPOSITORIES:
+            for lane, workers in (("auto", 2), ("frames", 1)):
+                with suppress(EnvHubError):
+                    _run(name, lane, workers)
+    return list(found.values())
+
+
+def _run(name: str, lane: str, workers: int) -> None:
+    options: dict[str, Any] = {"lane": lane, "num_workers": workers, "n_envs": 3}
+    with make_env(str(SAMPLES / name), **options) as suites:
+        env = next(suites.envs())
+        env.action_space.seed(0)
+        asked: list[Callable[[], object]] = [
+            lambda: env.reset(seed=1),
+            *[lambda: env.step(env.action_space.sample())] * 8,
+            lambda: env.call("spec"),
+            env.render,
+            lambda: env.np_random,
+            lambda: env.call("nobody_has_this"),
+            lambda: env.reset(options={"a": {(1, 2): "b"}}),
+        ]
+        for ask in asked:
+            with suppress(EnvHubError, AttributeError):
+                ask()
+
+
+if __name__ == "__main__":
+    Path(sys.argv[1]).write_bytes(pickle.dumps(record()))
