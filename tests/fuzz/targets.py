@@ -17,6 +17,7 @@ from envhub_sandbox import declared
 from envhub_sandbox.client import death, expect
 from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.generators import generator
 from envhub_sandbox.jail import HostsDiedError, RemoteJail, check, open_jail
 from envhub_sandbox.results import Results
 from envhub_worker.protocol import batches, columns
@@ -239,8 +240,9 @@ def manifest(dice: Dice) -> None:
     for env in found.envs:
         usable((env.metadata, env.attributes, env.render_mode, env.suite, env.task))
         declared.metadata(env)
-        spec = declared.spec(env)
-        demand(spec is None or spec.entry_point is None, "an entry point of the worker's")
+        spec = declared.spec(env, "a/b@c")
+        entry = f"{declared.__name__}:{declared.not_here.__name__}"
+        demand(spec is None or spec.entry_point == entry, "an entry point of the worker's")
         for space in (env.single_observation_space, env.single_action_space):
             repr(space)
             demand(space == space, "a space that is not itself")
@@ -258,8 +260,7 @@ def generators(dice: Dice) -> None:
     kinds = (np.random.PCG64, np.random.MT19937, np.random.Philox, np.random.SFC64)
     state = dice.rng.choice(kinds)(7).state
     lie = dice.spoiled(dict(state))
-    with UNTRUSTED:
-        made = declared.generator(lie)
+    made = generator(lie)
     made.random(700)
     made.integers(0, 2**31, 3, dtype=np.int32)
     made.standard_normal(3)
