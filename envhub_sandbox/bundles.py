@@ -25,11 +25,16 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.slabs import DTYPE_CODES
 from envhub_worker.protocol.stream import PacketReader
 from envhub_worker.protocol.text import printable
+from envhub_worker.protocol.untrusted import FAULTS
 
 FORMAT = 1
 MAX_FILE_BYTES = 64 << 20
+MAX_DOCUMENT_BYTES = 16 << 20
+"""``bundle.json``: an empty list takes two bytes there, and forty times as much in memory."""
 MAX_REQUESTS = 1_000_000
 """What is read of a bundle at most: a history takes 8 MiB."""
+
+_UNREADABLE: tuple[type[Exception], ...] = (OSError, EnvHubError, *FAULTS)
 
 T = TypeVar("T")
 
@@ -76,11 +81,11 @@ def load_bundle(folder: Path) -> Bundle:
         BundleError: There is none, or it breaks a rule.
     """
     try:
-        document = json.loads(_read(folder, "bundle.json"))
+        document = json.loads(_read(folder, "bundle.json", MAX_DOCUMENT_BYTES))
         if type(document) is not dict or document.get("format") != FORMAT:
             raise BundleError(f"it is not of format {FORMAT}")
         return _bundle(folder, document)
-    except (OSError, ValueError, RecursionError, EnvHubError) as error:
+    except _UNREADABLE as error:
         raise BundleError(f"{folder} is no crash bundle that can be read: {error}") from error
 
 
@@ -224,17 +229,17 @@ def _array(folder: Path, name: str) -> Any:
     return np.array(array)
 
 
-def _read(folder: Path, name: str) -> bytes:
-    _check_file(folder / name)
+def _read(folder: Path, name: str, most: int = MAX_FILE_BYTES) -> bytes:
+    _check_file(folder / name, most)
     return (folder / name).read_bytes()
 
 
-def _check_file(path: Path) -> None:
+def _check_file(path: Path, most: int = MAX_FILE_BYTES) -> None:
     found = path.lstat()
     if not stat.S_ISREG(found.st_mode):
         raise BundleError(f"{path} is no regular file")
-    if found.st_size > MAX_FILE_BYTES:
-        raise BundleError(f"{path} has {found.st_size} bytes; at most {MAX_FILE_BYTES} are read")
+    if found.st_size > most:
+        raise BundleError(f"{path} has {found.st_size} bytes; at most {most} are read")
 
 
 def _member(mapping: dict[str, Any], name: str, kind: type[T]) -> T:

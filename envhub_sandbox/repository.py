@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -156,8 +156,7 @@ class Repository:
     @property
     def wire_limits(self) -> WireLimits:
         """Bounds on what a jail may send."""
-        size = self.policy.limits.message_bytes
-        return WireLimits(frame_bytes=size, message_bytes=size)
+        return _wire_limits(self.policy.limits.message_bytes)
 
     @contextmanager
     def named(self) -> Iterator[None]:
@@ -433,3 +432,9 @@ def _is_what(value: object, task: EnvManifest) -> bool:
 def _refuse_late(deadline: Deadline) -> None:
     if deadline.passed:
         raise WorkerTimeoutError("the worker's manifest could not be read in time")
+
+
+@cache
+def _wire_limits(size: int) -> WireLimits:
+    # one for all environments: what is remembered of a message is for the limits that it met
+    return WireLimits(frame_bytes=size, message_bytes=size)

@@ -16,7 +16,7 @@ import pytest
 from gymnasium import spaces
 
 from envhub_sandbox import bundles, crashes
-from envhub_sandbox.bundles import load_bundle, replayed_arguments, wishes
+from envhub_sandbox.bundles import MAX_DOCUMENT_BYTES, load_bundle, replayed_arguments, wishes
 from envhub_sandbox.cli.console import safe_line
 from envhub_sandbox.errors import ActionError, BundleError, WorkerDiedError
 from envhub_sandbox.history import History
@@ -325,3 +325,12 @@ def test_what_was_set_before_and_does_not_fit_is_said(tmp_path: Path) -> None:
         assert found.verdict is Verdict.DIFFERENT
         assert f"does not fit this environment: {error}" in found.note
     assert env.asked == []
+
+
+def test_a_document_of_millions_of_lists_is_not_read(tmp_path: Path) -> None:
+    """Its size decides, before any of it is a list."""
+    folder = bundle(tmp_path)
+    with open(folder / "bundle.json", "w") as file:
+        file.write("[" + "[]," * (MAX_DOCUMENT_BYTES // 3) + "[]]")
+    with pytest.raises(BundleError, match="bytes"):
+        load_bundle(folder)
