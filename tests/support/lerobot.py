@@ -19,15 +19,18 @@ import torch
 Policy = Callable[[dict[str, Any]], torch.Tensor]
 
 
-def rollout(env: Any, policy: Policy, seeds: list[int] | None, frames: list[Any]) -> dict[str, Any]:
-    """Step all sub-environments until each has been done once.
+def rollout(
+    env: Any, policy: Policy, seeds: list[int] | None, frames: list[Any] | None
+) -> dict[str, Any]:
+    """Step all sub-environments until each has been done once; None renders nothing.
 
     Returns:
         ``action``, ``reward``, ``success`` and ``done``, stacked as ``(batch, steps, ...)``, the
         observations and the tasks as the policy saw them.
     """
     observation, _ = env.reset(seed=seeds, options={"lerobot_new_rollout": True})
-    frames.append(_render(env))
+    if frames is not None:
+        frames.append(_render(env))
     kept: dict[str, list[Any]] = {key: [] for key in ("action", "reward", "success", "done")}
     observations, tasks = [], []
     done = np.array([False] * env.num_envs)
@@ -44,7 +47,8 @@ def rollout(env: Any, policy: Policy, seeds: list[int] | None, frames: list[Any]
         action_numpy = action.to("cpu").numpy()
         assert action_numpy.ndim == 2
         observation, reward, terminated, truncated, info = env.step(action_numpy)
-        frames.append(_render(env))
+        if frames is not None:
+            frames.append(_render(env))
         done = terminated | truncated | done
         if step + 1 == max_steps:
             done = np.ones_like(done, dtype=bool)
@@ -57,12 +61,14 @@ def rollout(env: Any, policy: Policy, seeds: list[int] | None, frames: list[Any]
     return stacked | {"observation": observations, "task": tasks}
 
 
-def evaluate(env: Any, policy: Policy, n_episodes: int, start_seed: int) -> dict[str, Any]:
+def evaluate(
+    env: Any, policy: Policy, n_episodes: int, start_seed: int, *, render: bool = True
+) -> dict[str, Any]:
     """Metrics of ``n_episodes`` episodes, ``num_envs`` at a time, and the first frames."""
     n_batches = -(-n_episodes // env.num_envs)
     returns: list[float] = []
     successes: list[bool] = []
-    frames: list[Any] = []
+    frames: list[Any] | None = [] if render else None
     for batch in range(n_batches):
         first = start_seed + batch * env.num_envs
         data = rollout(env, policy, list(range(first, first + env.num_envs)), frames)
@@ -75,21 +81,26 @@ def evaluate(env: Any, policy: Policy, n_episodes: int, start_seed: int) -> dict
         "returns": returns[:n_episodes],
         "successes": successes[:n_episodes],
         "fps": env.unwrapped.metadata["render_fps"],
-        "frames": np.stack(frames[:5]),
+        "frames": None if frames is None else np.stack(frames[:5]),
     }
 
 
 def evaluate_all(
-    envs: Mapping[str, Mapping[Any, Any]], policy: Policy, n_episodes: int, max_parallel_tasks: int
+    envs: Mapping[str, Mapping[Any, Any]],
+    policy: Policy,
+    n_episodes: int,
+    max_parallel_tasks: int,
+    *,
+    render: bool = True,
 ) -> dict[tuple[str, Any], dict[str, Any]]:
     """Evaluate every task, one after the other or in a pool of threads; closes each."""
     tasks = [(suite, task, env) for suite, group in envs.items() for task, env in group.items()]
     if max_parallel_tasks <= 1:
-        return _one_by_one(tasks, policy, n_episodes)
+        return _one_by_one(tasks, policy, n_episodes, render)
     results = {}
     with concurrent.futures.ThreadPoolExecutor(max_workers=max_parallel_tasks) as pool:
         futures = {
-            pool.submit(evaluate, env, policy, n_episodes, 7): (suite, task, env)
+            pool.submit(evaluate, env, policy, n_episodes, 7, render=render): (suite, task, env)
             for suite, task, env in tasks
         }
         for future in concurrent.futures.as_completed(futures):
@@ -110,7 +121,7 @@ def close_envs(envs: Mapping[Any, Any]) -> None:
             value.close()
 
 
-def _one_by_one(tasks: Any, policy: Policy, n_episodes: int) -> dict[Any, Any]:
+def _one_by_one(tasks: Any, policy: Policy, n_episodes: int, render: bool) -> dict[Any, Any]:
     results: dict[Any, Any] = {}
     prefetch: threading.Thread | None = None
     for index, (suite, task, env) in enumerate(tasks):
@@ -118,7 +129,7 @@ def _one_by_one(tasks: Any, policy: Policy, n_episodes: int) -> dict[Any, Any]:
             prefetch.join()
             prefetch = None
         try:
-            results[suite, task] = evaluate(env, policy, n_episodes, 7)
+            results[suite, task] = evaluate(env, policy, n_episodes, 7, render=render)
         finally:
             env.close()
             following = tasks[index + 1][2] if index + 1 < len(tasks) else None
