@@ -49,6 +49,8 @@ _NAME = re.compile(r"\d{8}T\d{6}-[0-9a-f]{8}")
 _BUILDING = ".building-"
 _ABANDONED_AFTER_S = 3600.0
 _SHOWN_REQUESTS = 8
+_SHORTEST_SECRET = 6
+"""Characters: what is shorter is a setting, and would be found everywhere."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +123,7 @@ def _write(folder: Path, crash: Crash) -> None:
         "format": FORMAT,
         "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "label": crash.label,
-        "death": death_of(crash.error),
+        "death": {name: _concealed(text, crash) for name, text in death_of(crash.error).items()},
         "provenance": crash.provenance,
         "make_env": _arguments(crash),
         "task": crash.task,
@@ -141,11 +143,22 @@ def _write(folder: Path, crash: Crash) -> None:
         "bundle.json": json.dumps(document, indent=1, default=str).encode(),
         "arguments.bin": _packet(encoded(crash.load).frames),
         "requests.bin": b"".join(map(_packet, packets)),
-        "README.txt": _in_words(crash).encode(),
+        "README.txt": str(_concealed(_in_words(crash), crash)).encode(),
         **{name: _array_file(rows) for name, rows in requests.arrays.items()},
     }
     for name, data in content.items():
         folders.write_private(folder / name, data)
+
+
+def _concealed(value: Any, crash: Crash) -> Any:
+    """A text without the values of variables that the jail was granted and may have printed."""
+    policy = crash.options.get("policy")
+    if isinstance(value, str) and isinstance(policy, Policy):
+        for name in policy.environment:
+            secret = os.environ.get(name, "")
+            if len(secret) >= _SHORTEST_SECRET:
+                value = value.replace(secret, f"<the value of {name}>")
+    return value
 
 
 def _array_file(rows: list[Any]) -> bytes:

@@ -6,7 +6,6 @@ Frames come from the worker, so they are judged before they go to an encoder.
 from __future__ import annotations
 
 import importlib.util
-import math
 import os
 from collections.abc import Generator
 from pathlib import Path
@@ -21,6 +20,8 @@ from envhub_sandbox.errors import EnvHubError
 MAX_SIDE = 4096
 """Pixels: H.264 encoders stop there, and a frame stays below 50 MB."""
 DEFAULT_FPS = 30.0
+MIN_FPS = 0.1
+"""Below, the times of frames are more than some containers can write."""
 MAX_FPS = 240.0
 SUFFIXES = (".mp4", ".mkv", ".mov")
 
@@ -53,7 +54,8 @@ def check_target(path: Path) -> None:
 def fps_of(metadata: Any) -> float:
     """``render_fps`` of an environment's metadata if it is a sensible number, else 30."""
     fps = metadata.get("render_fps") if isinstance(metadata, dict) else None
-    if isinstance(fps, (int, float)) and math.isfinite(fps) and 0 < fps <= MAX_FPS:
+    # compared first: an integer from the wire may be too large for a float
+    if isinstance(fps, (int, float)) and MIN_FPS <= fps <= MAX_FPS:
         return float(fps)
     return DEFAULT_FPS
 

@@ -271,3 +271,24 @@ def test_a_death_that_is_hidden_leaves_a_bundle_too(
     [folder] = tmp_path.iterdir()
     assert str(folder) in caplog.text
     assert replayed(str(folder), code=0)["verdict"] == "same"
+
+
+def test_a_granted_secret_is_not_in_the_bundle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The environment prints it: the error shows it, and no file of the bundle has it."""
+    secret = "s3cr3t-value-of-a-service"
+    monkeypatch.setenv("SERVICE_KEY", secret)
+    (tmp_path / "env").mkdir()
+    (tmp_path / "env" / "env.py").write_text(
+        "import os\nprint('key:', os.environ['SERVICE_KEY'], flush=True)\nos._exit(3)\n"
+    )
+    policy = {"environment": ["SERVICE_KEY"], "crash_folder": str(tmp_path / "crashes")}
+    with pytest.raises(errors.WorkerDiedError) as caught:
+        make_env(tmp_path / "env", policy=policy)
+    assert secret in caught.value.log_tail  # the control: it did print it
+    bundle = Path(str(caught.value.bundle))
+    files = [path for path in bundle.iterdir() if path.is_file()]
+    assert files
+    assert [path.name for path in files if secret.encode() in path.read_bytes()] == []
+    assert b"<the value of SERVICE_KEY>" in (bundle / "README.txt").read_bytes()

@@ -133,3 +133,45 @@ def test_a_missing_encoder_comes_with_the_command(
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(VideoError, match=r"pip install 'envhub-sandbox\[video\]'"):
         check_target(tmp_path / "out.mp4")
+
+
+@pytest.mark.parametrize("fps", [10**400, -(10**400), 1e-300, 0, -1, float("nan"), "30", None])
+def test_rates_that_no_file_has_are_not_taken(tmp_path: Path, fps: object) -> None:
+    """Whatever the metadata says, the video can be written."""
+    with VideoWriter(tmp_path / "x.mp4", fps_of({"render_fps": fps})) as writer:
+        writer.add(first_frame((frame(),), "rgb_array"))
+    assert (tmp_path / "x.mp4").stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        frame(16, 16)[::-1, ::-1],
+        np.broadcast_to(frame(1, 1), (16, 16, 3)),
+        frame(1, 1),
+        np.lib.stride_tricks.as_strided(np.zeros(3, np.uint8), (MAX_SIDE, 2, 3), (0, 0, 1)),
+    ],
+)
+def test_views_of_every_kind_are_frames(tmp_path: Path, picture: Any) -> None:
+    """Negative strides, none at all, one pixel, the tallest."""
+    with VideoWriter(tmp_path / "x.mp4", 30.0) as writer:
+        writer.add(first_frame((picture,), "rgb_array"))
+    assert (tmp_path / "x.mp4").stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    "rendered",
+    [
+        np.lib.stride_tricks.as_strided(np.zeros(1, np.uint8), (1, 10**5, 10**5, 3), (0,) * 4),
+        np.zeros((1, 4, 4, 3), object),
+        np.zeros((0, 4, 4, 3), np.uint8),
+        np.array(3, np.uint8),
+        (),
+        (None,),
+        {},
+    ],
+)
+def test_hostile_frames_are_refused_before_they_are_copied(rendered: Any) -> None:
+    """Ten thousand million pixels, objects, nothing."""
+    with pytest.raises(VideoError):
+        first_frame(rendered, None)
