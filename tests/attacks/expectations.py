@@ -10,17 +10,40 @@ from collections.abc import Collection
 MEASURED = "memory measured by init"
 """The condition of a host that lets us make no control group: a plain user without delegation."""
 
+PLAIN = "a plain user"
+"""The condition of a jail that runs as the user who also runs the caller's other programs."""
+
+_LOCKS = "no control group counts them, and no limit of the kernel's bounds them"
+_FLOCK = "flock takes no more than a descriptor; programs need it on their own files"
+
 # attack: {a profile, or a condition of the host: why}
 NOT_STOPPED: dict[str, dict[str, str]] = {
     "learn that a file exists, and its size": {
         "no-userns": "Landlock does not restrict stat; hiding names takes a mount namespace",
     },
-    "memory bomb: memfd in flight": {
-        MEASURED: "a file that waits in a socket belongs to no process that could be measured",
+    "hold a readable file: flock": {
+        "strict": _FLOCK,
+        "no-userns": _FLOCK,
+    },
+    "use up the user's descriptors under way": {
+        PLAIN: "the kernel counts them per user, and compares with each sender's own limit",
+    },
+    "use up the user's pages of pipes": {
+        PLAIN: "the kernel counts them per user; new pipes of the others hold 8 KiB",
+    },
+    "memory bomb: file locks": {
+        "strict": _LOCKS,
+        "no-userns": _LOCKS,
+    },
+    "memory bomb: epoll watches": {
+        MEASURED: "no process's account shows them; the kernel limits a user to 4% of the memory",
+    },
+    "memory bomb: sockets in flight": {
+        f"no-userns, {MEASURED}": "only a network namespace counts what waits in another socket",
     },
 }
 
-MEASURED_ATTACKS = frozenset({"fork bomb", "thread bomb", "memory bomb: memfd in flight"})
+MEASURED_ATTACKS = frozenset({"fork bomb", "thread bomb"})
 """What init measures now and then under ``no-userns`` without a control group: a burst between two
 looks gets through on a busy machine and is stopped on a quiet one, so neither is asserted there."""
 

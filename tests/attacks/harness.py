@@ -23,13 +23,16 @@ from typing import Any
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError
-from tests.attacks.expectations import MEASURED, depends_on_load, not_stopped
+from tests.attacks.expectations import MEASURED, PLAIN, depends_on_load, not_stopped
 from tests.support.processes import eventually
 
 HOSTILE = Path(__file__).with_name("hostile")
 USER = "root" if os.geteuid() == 0 else "user"
 TIMEOUTS = {"startup_s": 120.0, "call_s": 90.0, "reset_s": 90.0, "step_s": 90.0}
 _DEADLINE_S = 90.0
+
+OUTSIDE, ANSWER = "outside", "by its answer"
+"""Who says whether an attack succeeded: the world around the jail, or the payload."""
 
 Succeeded = Callable[["Run"], object]
 
@@ -71,6 +74,7 @@ class Row:
     control: str
     inside: str
     detail: str
+    judged: str = OUTSIDE
 
 
 @dataclass
@@ -101,6 +105,7 @@ class Arena:
         secret: str = "",
         before: Callable[[], object] = lambda: None,
         impossible: str = "",
+        judged: str = OUTSIDE,
         **arguments: Any,
     ) -> None:
         """Run the payload as a control, where it must succeed, and inside, where it must not.
@@ -115,6 +120,7 @@ class Arena:
             secret: What the control's process holds in its memory.
             before: Runs before each half, to undo what the other one did.
             impossible: Why there is no control here; the attack then counts as no proof.
+            judged: ``ANSWER`` where ``succeeded`` has nothing but the payload's word.
             **arguments: For the payload.
         """
         control = "not possible"
@@ -126,15 +132,22 @@ class Arena:
         before()
         with self.inside(payload, {**arguments, **(inside or {})}, policy, limits) as run:
             through = bool(succeeded(run))
-        self.judge(title, control, through, run.text, impossible)
+        self.judge(title, control, through, run.text, impossible, judged)
 
     def judge(
-        self, title: str, control: str, through: bool, detail: str, impossible: str = ""
+        self,
+        title: str,
+        control: str,
+        through: bool,
+        detail: str,
+        impossible: str = "",
+        judged: str = OUTSIDE,
     ) -> None:
         """Note what an attack did, and fail unless that is what is expected of this profile."""
         verdict = "NOT STOPPED" if through else "no proof" if impossible else "stopped"
         note = impossible or (_brief(detail) if not through else "")
-        self.rows.append(Row(title, self.family, self.profile, USER, control, verdict, note))
+        row = Row(title, self.family, self.profile, USER, control, verdict, note, judged)
+        self.rows.append(row)
         if depends_on_load(title, self.conditions()):
             return
         reason = not_stopped(title, self.conditions())
@@ -147,7 +160,9 @@ class Arena:
         """The profile, and what is true of this host."""
         details = [layer["detail"] for layer in self.report if layer["layer"] == "memory"]
         measured = any("measured by" in detail for detail in details)
-        return [self.profile, *([MEASURED, f"{self.profile}, {MEASURED}"] if measured else [])]
+        plain = [PLAIN] if USER == "user" else []
+        measures = [MEASURED, f"{self.profile}, {MEASURED}"] if measured else []
+        return [self.profile, *plain, *measures]
 
     @contextlib.contextmanager
     def inside(

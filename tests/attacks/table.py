@@ -14,7 +14,9 @@ import pytest
 
 from tests.attacks.harness import Row
 
+JUDGED = "judged"
 COLUMNS = (
+    JUDGED,
     "control, user",
     "control, root",
     "strict, user",
@@ -26,10 +28,13 @@ HEAD = """# Attacks
 
 Written by the attack suite (`ENVHUB_ATTACK_TABLE=docs/attacks.md pytest tests/attacks`, once as a
 plain user and once as root); do not edit by hand. Each attack runs twice in the same test: without
-a sandbox (the *control*), where it must succeed, and inside. Whether it succeeded is judged from
-outside the jail: by a listener, a file, a victim process, the process table, or a random token in
-what the repository returned. `docs/threat-model.md` explains what is not stopped.
+a sandbox (the *control*), where it must succeed, and inside. `docs/threat-model.md` explains what
+is not stopped.
 
+- **judged**: who says whether it succeeded. *Outside*: a listener, a file, a victim process, the
+  process table, the kernel's accounts, or a random token in what the repository returned. *By its
+  answer*: the call leaves no trace, so that the payload's word has to do; outside, where it has no
+  reason to lie, the same call must be answered differently.
 - **succeeds**: the control did what the attack wants.
 - **stopped**: the same payload did not do it inside.
 - **NOT STOPPED**: it did. The suite asserts that it does, except for the bombs that are only
@@ -82,10 +87,11 @@ def update(
     path: Path, rows: Iterable[Row], *, columns: Sequence[str] = COLUMNS, head: str = HEAD
 ) -> None:
     """Write ``rows`` into the page at ``path``, over what they know better."""
-    page = _parse(path.read_text(), columns) if path.exists() else {}
+    page = _parse(path.read_text()) if path.exists() else {}
     notes = _notes(path.read_text()) if path.exists() else {}
     for row in rows:
         cells = page.setdefault(row.family, {}).setdefault(row.attack, {})
+        cells[JUDGED] = row.judged
         cells[f"control, {row.user}"] = row.control
         cells[f"{row.profile}, {row.user}"] = row.inside
         if row.control == "not possible":
@@ -97,7 +103,7 @@ def update(
 
 def attacks_on(page: str) -> set[str]:
     """The titles of all attacks on a page."""
-    return {attack for family in _parse(page, COLUMNS).values() for attack in family}
+    return {attack for family in _parse(page).values() for attack in family}
 
 
 def _page(page: Page, notes: dict[str, str], columns: Sequence[str], head: str) -> str:
@@ -114,14 +120,18 @@ def _page(page: Page, notes: dict[str, str], columns: Sequence[str], head: str) 
     return "\n".join(parts) + "\n"
 
 
-def _parse(text: str, columns: Sequence[str]) -> Page:
+def _parse(text: str) -> Page:
     page: Page = {}
     family = ""
+    columns: list[str] = []
     for line in text.splitlines():
+        cells = [cell.strip() for cell in line.strip().removesuffix("|").split("|")[1:]]
         if line.startswith("## "):
             family = line[3:]
-        elif line.startswith("| ") and not line.startswith(_START):
-            attack, *cells = (cell.strip() for cell in line.strip("|").split("|"))
+        elif line.startswith(_START):
+            columns = cells[1:]
+        elif line.startswith("| "):
+            attack, *cells = cells
             page.setdefault(family, {})[attack] = dict(zip(columns, cells, strict=True))
     return page
 

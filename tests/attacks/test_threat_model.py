@@ -58,7 +58,7 @@ def test_updates_keep_the_other_users_columns(tmp_path: Path) -> None:
     noted = Row("raw", "Network", "strict", "user", "not possible", "no proof", "only root may")
     table.update(page, [noted])
     text = page.read_text()
-    assert "| tcp | succeeds | succeeds | stopped | stopped |  |  |" in text
+    assert "| tcp | outside | succeeds | succeeds | stopped | stopped |  |  |" in text
     assert "- raw, user: only root may" in text
     table.update(page, [noted])
     assert page.read_text() == text

@@ -15,7 +15,7 @@ import sys
 from envhub_worker.lockdown import namespaces
 import os
 namespaces.enter_user_namespace(os.getuid(), os.getgid())
-namespaces.forbid_user_namespaces()
+namespaces.forbid_what_is_counted()
 os.execv(sys.executable, {command!r})
 """
 

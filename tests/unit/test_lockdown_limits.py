@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import mmap
 import os
+import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from envhub_worker.lockdown import cgroups
+from envhub_worker.lockdown import cgroups, watchdog
 from envhub_worker.lockdown.cgroups import Group, Hierarchy, Tree
 from envhub_worker.lockdown.environment import jail_environment, zygote_environment
 from envhub_worker.lockdown.scratch import remove_tree
-from envhub_worker.lockdown.watchdog import MemoryWatch, folder_usage, seconds_to_next_look
+from envhub_worker.lockdown.watchdog import (
+    MemoryWatch,
+    folder_usage,
+    seconds_to_next_look,
+    unlinked_bytes,
+)
 from envhub_worker.protocol.confinement import GIB, MIB, Limits
 from tests.support import inside
 
@@ -151,11 +159,103 @@ def test_memfd_is_measured_without_being_mapped_unless_it_is_the_clients() -> No
     os.close(fd)
 
 
-def test_reserved_shared_memory_counts_only_what_is_in_it_when_it_matters() -> None:
-    """Over the limit by the upper bound, the exact measure decides."""
+def test_reserved_shared_memory_counts_no_more_than_the_machine_has(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Over the limit by the upper bound, what all programs together share decides."""
+    monkeypatch.setattr(watchdog, "shared_of_the_machine", lambda: 64 * MIB)
     with mmap.mmap(-1, 4 * GIB):
         assert look() > 4 * GIB
         assert look(limit=GIB) < GIB
+
+
+def test_shared_memory_out_of_the_page_tables_counts_when_it_matters() -> None:
+    """No account of a process has it; the machine's has."""
+    before = look(limit=0)
+    with mmap.mmap(-1, 256 * MIB) as shared:
+        for at in range(0, len(shared), MIB):
+            shared[at : at + MIB] = bytes(MIB)
+        shared.madvise(mmap.MADV_DONTNEED)
+        assert look(limit=0) - before >= 240 * MIB
+
+
+def test_changed_pages_of_a_mapped_file_count_when_it_matters(tmp_path: Path) -> None:
+    """They are anonymous memory, whatever the mapping is called."""
+    path = tmp_path / "file"
+    path.touch()
+    os.truncate(path, 128 * MIB)
+    before = look(limit=0)
+    with open(path, "r+b") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY) as area:
+        for at in range(0, len(area), mmap.PAGESIZE):
+            area[at] = 1
+        assert look() - before >= 120 * MIB
+        assert look(limit=0) - before >= 120 * MIB
+
+
+def test_page_tables_are_measured() -> None:
+    """Reading the zero page in one place of each table costs a page of it, and no memory."""
+    before = look()
+    private = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
+    with mmap.mmap(-1, 64 * GIB, flags=private, prot=mmap.PROT_READ) as area:
+        area.madvise(mmap.MADV_NOHUGEPAGE)
+        for at in range(0, len(area), 2 * MIB):
+            area[at]
+        assert look() - before >= 100 * MIB
+
+
+def test_small_shared_memory_counts_with_what_may_have_been_unmapped() -> None:
+    """Of a piece that the filter lets be made, all is kept while one page is mapped."""
+    before = look()
+    with mmap.mmap(-1, mmap.PAGESIZE):
+        assert look() - before >= watchdog.SHARED_BYTES
+
+
+def test_sockets_and_pipes_count_with_what_they_may_hold() -> None:
+    """Their buffers are in no process's account."""
+    before = look()
+    pair, pipe = socket.socketpair(), os.pipe()
+    assert look() - before >= 2 * watchdog.socket_bytes() + 64 * 1024
+    for fd in pipe:
+        os.close(fd)
+    for one in pair:
+        one.close()
+    assert look() - before < watchdog.socket_bytes()
+
+
+def test_sockets_that_nobody_has_count_in_a_network_of_their_own() -> None:
+    """The kernel counts them for the network namespace, those under way in a socket included."""
+    script = (
+        "import os, socket\n"
+        "from envhub_worker.lockdown import kernel\n"
+        "from envhub_worker.lockdown.watchdog import MemoryWatch, socket_bytes\n"
+        "kernel.unshare(kernel.CLONE_NEWUSER | kernel.CLONE_NEWNET)\n"
+        "watch = MemoryWatch(2**62, None, own_network=True)\n"
+        "before = watch.look([os.getpid()])[0]\n"
+        "way = socket.socketpair()\n"
+        "for _ in range(20):\n"
+        "    pair = socket.socketpair()\n"
+        "    socket.send_fds(way[0], [b'x'], [one.fileno() for one in pair])\n"
+        "    for one in pair: one.close()\n"
+        "grown = watch.look([os.getpid()])[0] - before\n"
+        "assert grown >= 42 * socket_bytes(), grown\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    if "unshare" in done.stderr and "OSError" in done.stderr:
+        pytest.skip("this host forbids user namespaces")
+    assert done.returncode == 0, done.stderr
+
+
+def test_open_files_without_a_name_are_found(tmp_path: Path) -> None:
+    """They take what they take until the last descriptor goes."""
+    device = os.stat(tmp_path).st_dev
+    before = unlinked_bytes([os.getpid()], device)
+    with open(tmp_path / "file", "wb") as file:
+        file.write(bytes(MIB))
+        file.flush()
+        os.fsync(file.fileno())
+        assert unlinked_bytes([os.getpid()], device) == before
+        os.unlink(file.name)
+        assert unlinked_bytes([os.getpid()], device) - before >= MIB
 
 
 def test_ended_process_measures_nothing() -> None:

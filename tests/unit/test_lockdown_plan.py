@@ -43,7 +43,14 @@ def test_strict_as_a_user_has_every_layer() -> None:
         (
             "memory",
             True,
-            "1024 MiB, measured by the jail's init; bursts between two looks overshoot",
+            "1024 MiB, measured by the jail's init; bursts between two looks overshoot; "
+            "not counted: file locks, epoll watches",
+        ),
+        (
+            "user-quotas",
+            False,
+            "shared with this user's programs: pages of pipes, descriptors under way in sockets, "
+            "epoll watches",
         ),
     ]
 
@@ -52,7 +59,21 @@ def test_root_becomes_somebody_else_first() -> None:
     """The first layer as root; memory by control group where there is one."""
     made = layers(STRICT, replace(USER, root=True, memory="cgroup-v1"))
     assert made[0] == ("unprivileged-user", True, "a user id that owns and runs nothing")
-    assert made[-1] == ("memory", True, "1024 MiB, counted by the kernel (cgroup v1)")
+    assert made[-2:] == [
+        ("memory", True, "1024 MiB, counted by the kernel (cgroup v1); not counted: file locks"),
+        ("user-quotas", True, "its own: no other program runs as this user"),
+    ]
+
+
+def test_memory_that_nobody_counts_is_named() -> None:
+    """It depends on who counts, and on what else there is."""
+    for profile, network, names in (
+        ("strict", "host", "file locks, epoll watches, buffers of network connections"),
+        ("no-userns", "none", "file locks, epoll watches, sockets that wait in sockets"),
+    ):
+        made = layers(replace(STRICT, profile=profile, network=network), USER)
+        [detail] = [detail for layer, _, detail in made if layer == "memory"]
+        assert detail.endswith(f"not counted: {names}")
 
 
 def test_weaker_profile_lists_what_it_goes_without() -> None:
@@ -155,9 +176,10 @@ def test_rlimits_follow_the_limits() -> None:
         resource.RLIMIT_FSIZE: (77, 77),
         resource.RLIMIT_NOFILE: (9, 9),
         resource.RLIMIT_MEMLOCK: (65536, 65536),
-        resource.RLIMIT_MSGQUEUE: (819200, 819200),
+        resource.RLIMIT_MSGQUEUE: (0, 0),
         resource.RLIMIT_NICE: (0, 0),
         resource.RLIMIT_RTPRIO: (0, 0),
+        resource.RLIMIT_SIGPENDING: (512, 512),
         resource.RLIMIT_NPROC: (12, 12),
         resource.RLIMIT_CPU: (5, 6),
     }

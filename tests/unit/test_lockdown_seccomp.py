@@ -14,10 +14,12 @@ from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp_policy import (
     ALLOW,
     ASK,
+    EINVAL,
     ENOSYS,
     EPERM,
     KILL_PROCESS,
     PRETEND,
+    SHARED_BYTES,
     ByArguments,
     table,
 )
@@ -28,6 +30,7 @@ GOLDEN = Path(__file__).parent / "golden"
 ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 I386 = 0x40000003
 NOT_SUPPORTED = 0x00050000 | errno.EAFNOSUPPORT
+NO_MEMORY = 0x00050000 | errno.ENOMEM
 NOT_A_TTY = 0x00050000 | errno.ENOTTY
 VARIANTS = [(True, "none"), (True, "loopback"), (True, "host"), (False, "none"), (False, "host")]
 
@@ -187,7 +190,7 @@ def test_terminal_injection_and_file_flags_are_denied(machine: str) -> None:
     check = Filter(machine, True)
     for request in (0x5412, 0x541C, 0x541D, 0x5423, 1 << 32 | 0x5412):
         assert check("ioctl", 1, request) == EPERM
-    for request in (0x40086602, 0x40806685, 0x401C5820, 0xC0045877):
+    for request in (0x40086602, 0x40806685, 0x401C5820, 0xC0045877, 0x40087602, 0x5000940E):
         assert check("ioctl", 1, request) == NOT_A_TTY
     for request in (0x5401, 0x5451, 0x5421, 0x541B):
         assert check("ioctl", 1, request) == ALLOW
@@ -215,24 +218,80 @@ def test_modes_and_times_are_pretended_without_a_mount_namespace(machine: str) -
     for name in ("fchmod", "fchmodat", "fchmodat2", "fchown", "fchownat", "utimensat"):
         assert bare(name) == PRETEND
         assert namespaced(name) == ALLOW
-    for name in ("setxattr", "fsetxattr", "lremovexattr", "shmget", "semget", "msgget", "mq_open"):
+    for name in ("setxattr", "fsetxattr", "lremovexattr", "shmget"):
         assert bare(name) == EPERM
         assert namespaced(name) == ALLOW
-    for name in ("inotify_init1", "openat2"):
-        assert bare(name) == ENOSYS
+    assert bare("openat2") == ENOSYS
+    assert bare("sched_setaffinity", 0) == ALLOW
+    assert bare("sched_setaffinity", 1) == PRETEND
 
 
 @machines
-def test_signals_by_descriptor_owner_are_denied_without_a_pid_namespace(machine: str) -> None:
-    """F_SETOWN makes the kernel signal any process of the same user."""
-    check = Filter(machine, False)
-    for command in (8, 10, 15, 1024, 1026):
+@pytest.mark.parametrize("namespaced", [True, False])
+def test_what_reaches_others_through_a_readable_file_is_denied(
+    machine: str, namespaced: bool
+) -> None:
+    """Leases, notices, owners, sizes of pipes; commands that nobody knows are invalid."""
+    check = Filter(machine, namespaced)
+    for command in (8, 10, 15, 1024, 1026, 1031, 1036, 1038, 1040, 1 << 32 | 1024):
         assert check("fcntl", 0, command) == EPERM
-    assert check("fcntl", 0, 2) == ALLOW
+    for command in (0, 1, 2, 3, 4, 6, 7, 36, 1030, 1032, 1034):
+        assert check("fcntl", 0, command) == ALLOW
+    for command in (12, 35, 1039, 1041, 1 << 31):
+        assert check("fcntl", 0, command) == EINVAL
     for request in (0x8901, 0x8902):
         assert check("ioctl", 0, request) == EPERM
-    assert check("sched_setaffinity", 0) == ALLOW
-    assert check("sched_setaffinity", 1) == PRETEND
+
+
+@machines
+@pytest.mark.parametrize("namespaced", [True, False])
+def test_what_is_counted_per_user_cannot_be_made(machine: str, namespaced: bool) -> None:
+    """Watches of files, semaphores and queues: programs are told that there is no such call."""
+    check = Filter(machine, namespaced, "host")
+    for name in ("inotify_init1", "inotify_add_watch", "semget", "semtimedop", "msgget", "mq_open"):
+        assert check(name) == ENOSYS
+    for name in ("mbind", "set_mempolicy"):
+        assert check(name) == EPERM
+
+
+@machines
+def test_buffers_of_sockets_keep_their_size(machine: str) -> None:
+    """Init counts a socket with what it may hold; programs that ask for more are told yes."""
+    check = Filter(machine, True, "host")
+    for option in (7, 8, 32, 33):
+        assert check("setsockopt", 3, 1, option) == PRETEND
+        assert check("setsockopt", 3, 6, option) == ALLOW  # TCP's own options
+    for option in (26, 50, 51, 52):
+        assert check("setsockopt", 3, 1, option) == EPERM
+    assert check("setsockopt", 3, 1, 2) == ALLOW  # SO_REUSEADDR
+
+
+@machines
+def test_memory_out_of_sight_is_denied_where_it_is_measured(machine: str) -> None:
+    """Files without a name, and shared memory but for a little; mapped files are what they were."""
+    counted = Filter(machine, True)
+    verdicts = table(namespaced=True, network="none", measured=True)
+    program = seccomp.program(machine, verdicts)
+
+    def measured(name: str, *args: int) -> int:
+        return run(program, ARCH[machine], NUMBERS[machine][name], args)
+
+    shared, private, anonymous, validate, huge = 1, 2, 0x20, 3, 0x40000
+    assert measured("memfd_create") == ENOSYS
+    assert counted("memfd_create") == ALLOW
+    for size, verdict in (
+        (SHARED_BYTES - 1, ALLOW),
+        (SHARED_BYTES, EPERM),
+        (1 << 32, EPERM),
+        (1 << 40 | 4096, EPERM),
+    ):
+        for kind in (shared, validate):
+            assert measured("mmap", 0, size, 3, kind | anonymous) == verdict
+        assert counted("mmap", 0, size, 3, shared | anonymous) == ALLOW
+        assert measured("mmap", 0, size, 3, private | anonymous) == ALLOW
+        assert measured("mmap", 0, size, 3, shared, 5) == ALLOW
+    for filtered in (measured, counted):
+        assert filtered("mmap", 0, 1 << 21, 3, private | anonymous | huge) == NO_MEMORY
 
 
 @machines

@@ -62,7 +62,7 @@ class Common:
         covered: (files, folders) of /proc to hide.
         landlock_abi: 0 where there is none.
         brokered: Whether init sends the jails' signals.
-        program: The compiled system call filter.
+        programs: The compiled system call filters: where memory is counted, where it is measured.
         set_blas_threads: Sets OpenBLAS's threads, if that is what numpy uses.
     """
 
@@ -75,7 +75,7 @@ class Common:
     covered: tuple[list[str], list[str]]
     landlock_abi: int
     brokered: bool
-    program: bytes
+    programs: tuple[bytes, ...]
     set_blas_threads: Callable[[int], None] | None = None
 
 

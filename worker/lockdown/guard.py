@@ -10,7 +10,12 @@ from collections.abc import Collection
 
 from envhub_worker.lockdown import cgroups
 from envhub_worker.lockdown.context import JailContext
-from envhub_worker.lockdown.watchdog import MemoryWatch, folder_usage, seconds_to_next_look
+from envhub_worker.lockdown.watchdog import (
+    MemoryWatch,
+    folder_usage,
+    seconds_to_next_look,
+    unlinked_bytes,
+)
 from envhub_worker.protocol.confinement import MIB
 
 # Counting files may take long; it then happens the more seldom.
@@ -34,7 +39,8 @@ class Guard:
         tmpfs = jail.scratch.temporary if jail.plan.namespaced else None
         self._events = events
         self._seen_kills = 0
-        self._memory = MemoryWatch(self._limits.memory_bytes, tmpfs)
+        own_network = jail.plan.namespaced and jail.common.config.network != "host"
+        self._memory = MemoryWatch(self._limits.memory_bytes, tmpfs, own_network=own_network)
         self._folder = None if jail.plan.namespaced else os.path.dirname(jail.scratch.home)
         self._memory_due = time.monotonic()
         self._disk_due = time.monotonic() if self._folder else float("inf")
@@ -54,7 +60,7 @@ class Guard:
         if now >= self._memory_due:
             verdict = self._look_at_events() if self._events >= 0 else self._look_at_memory(pids)
         if verdict is None and self._folder is not None and now >= self._disk_due:
-            verdict = self._look_at_disk(self._folder)
+            verdict = self._look_at_disk(self._folder, pids)
         return verdict
 
     def killed_by_kernel(self) -> tuple[str, str] | None:
@@ -81,9 +87,10 @@ class Guard:
             return None
         return "out-of-memory", f"{used // MIB} MiB in use, {limit // MIB} MiB permitted"
 
-    def _look_at_disk(self, folder: str) -> tuple[str, str] | None:
+    def _look_at_disk(self, folder: str, pids: Collection[int]) -> tuple[str, str] | None:
         before = time.monotonic()
         size, files = folder_usage(folder, self._limits.disk_files)
+        size += unlinked_bytes(pids, os.stat(folder).st_dev)
         after = time.monotonic()
         self._disk_due = after + max(_DISK_LOOK_S, _DISK_SHARE * (after - before))
         if size > self._limits.disk_bytes:

@@ -62,6 +62,7 @@ def _mount(spec: JailSpec, common: Common) -> str:
     mounts.mount_proc()
     mounts.cover_proc(*common.covered)
     if common.config.network == "loopback":
+        namespaces.shrink_tcp()
         namespaces.raise_loopback()
     return view
 
@@ -104,7 +105,7 @@ def _threads_of(uid: int) -> int:
 def _leave_the_zygote() -> None:
     """Own no namespace any more: the next user namespace is below the one that owns them."""
     namespaces.enter_user_namespace(namespaces.INSIDE_UID, namespaces.INSIDE_UID)
-    namespaces.forbid_user_namespaces()
+    namespaces.forbid_what_is_counted()
     capabilities.drop_all()
     process.set_no_new_privileges()
     process.set_dumpable(False)

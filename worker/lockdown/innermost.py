@@ -53,7 +53,8 @@ def enter(jail: JailContext, descriptors: Iterable[int], init: Channel) -> None:
     if jail.plan.landlock:
         wanted = landlock.ruleset(jail.common.landlock_abi, jail.common.config.network)
         landlock.restrict(wanted, rules(jail, os.getpid()))
-    listener = seccomp.install(jail.common.program, brokered=jail.common.brokered)
+    program = jail.common.programs[jail.plan.measured]
+    listener = seccomp.install(program, brokered=jail.common.brokered)
     if listener >= 0:
         init.send({"broker": True}, [listener])
         os.close(listener)  # whoever holds it may permit anything

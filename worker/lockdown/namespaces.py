@@ -26,6 +26,9 @@ from envhub_worker.lockdown.report import LayerUnavailableError
 #: The user that a jail sees itself as. Not 0: programs treat that one specially.
 INSIDE_UID = 1000
 
+#: The most that a TCP socket buffers in each direction, where the network is the jail's own.
+TCP_BUFFER = 128 * 1024
+
 _SIOCGIFFLAGS = 0x8913
 _SIOCSIFFLAGS = 0x8914
 _IFF_UP = 1
@@ -93,9 +96,21 @@ def fork_in_new_pid_namespace() -> int:
     return pid
 
 
-def forbid_user_namespaces() -> None:
-    """Let nobody make a user namespace below ours, should the system call filter let it by."""
-    _write("/proc/sys/user/max_user_namespaces", "0")
+def forbid_what_is_counted() -> None:
+    """Let nobody below ours make a namespace or watch a file, should the filter let it by.
+
+    The kernel counts these for each user, in each user namespace and all above it; so the user's
+    other programs keep their share.
+    """
+    for name in os.listdir("/proc/sys/user"):
+        _write(f"/proc/sys/user/{name}", "0")
+
+
+def shrink_tcp() -> None:
+    """Let what waits in a connection of our own network namespace stay below ``TCP_BUFFER``."""
+    for name in ("tcp_rmem", "tcp_wmem"):
+        with contextlib.suppress(FileNotFoundError):
+            _write(f"/proc/sys/net/ipv4/{name}", f"4096 65536 {TCP_BUFFER}")
 
 
 def raise_loopback() -> None:

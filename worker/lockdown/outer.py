@@ -45,6 +45,17 @@ def enter(config: ZygoteConfig) -> Common:
         covered = ([], [])
     abi = landlock.version()
     brokered = needs_broker(namespaced=namespaced, landlock_abi=abi)
+    # A driver keeps more out of sight than a filter could deny.
+    programs = tuple(
+        compile_filter(
+            os.uname().machine,
+            namespaced=namespaced,
+            network=config.network,
+            brokered=brokered,
+            measured=measured and not config.gpu,
+        )
+        for measured in (False, True)
+    )
     return Common(
         config=config,
         pid=0 if namespaced else os.getpid(),
@@ -55,9 +66,7 @@ def enter(config: ZygoteConfig) -> Common:
         covered=covered,
         landlock_abi=abi,
         brokered=brokered,
-        program=compile_filter(
-            os.uname().machine, namespaced=namespaced, network=config.network, brokered=brokered
-        ),
+        programs=programs,
     )
 
 

@@ -15,6 +15,9 @@ from envhub_worker.protocol.confinement import MIB, Confinement
 PROFILES = ("strict", "no-userns", "container")
 NETWORKS = ("none", "loopback", "host")
 
+#: What the kernel counts per user and nobody can bound per jail.
+SHARED_QUOTAS = "pages of pipes, descriptors under way in sockets, epoll watches"
+
 # Without a mount namespace Landlock must itself guard truncation, and without a pid namespace
 # signals: from these ABIs on it does. Before the second one, init sends the jail's signals.
 _LANDLOCK_FOR_TRUNCATION = 3
@@ -50,11 +53,13 @@ class Plan:
     Attributes:
         namespaced: Enter namespaces and a private root.
         landlock: Restrict files (and TCP, signals, abstract sockets as the ABI allows).
+        measured: No control group counts memory; init measures it.
         layers: All of it in order, for the report.
     """
 
     namespaced: bool
     landlock: bool
+    measured: bool
     layers: tuple[Layer, ...]
 
 
@@ -85,7 +90,8 @@ def plan(confinement: Confinement, facts: HostFacts) -> Plan:
         Layer("rlimits", True, _rlimits_detail(confinement)),
         *_limit_layers(confinement, facts, namespaced),
     ]
-    return Plan(namespaced=namespaced, landlock=landlock, layers=tuple(layers))
+    measured = facts.memory == "watchdog"
+    return Plan(namespaced=namespaced, landlock=landlock, measured=measured, layers=tuple(layers))
 
 
 def _check_names(confinement: Confinement) -> None:
@@ -195,14 +201,34 @@ def _rlimits_detail(confinement: Confinement) -> str:
     return f"{limits.processes} processes, {limits.open_files} open files{cpu}, no core dumps"
 
 
+def _quota_layer(facts: HostFacts) -> Layer:
+    """What the kernel counts per user, and a jail therefore takes from others' share."""
+    if facts.root:
+        return Layer("user-quotas", True, "its own: no other program runs as this user")
+    return Layer("user-quotas", False, f"shared with this user's programs: {SHARED_QUOTAS}")
+
+
+def _uncounted(confinement: Confinement, facts: HostFacts, namespaced: bool) -> str:
+    """What of a jail's memory nothing counts here, named for the report."""
+    names = ["file locks"]
+    if facts.memory == "watchdog":
+        names.append("epoll watches")
+        if not namespaced:
+            names.append("sockets that wait in sockets")
+        if confinement.network == "host":
+            names.append("buffers of network connections")
+    return ", ".join(names)
+
+
 def _limit_layers(confinement: Confinement, facts: HostFacts, namespaced: bool) -> list[Layer]:
+    uncounted = f"; not counted: {_uncounted(confinement, facts, namespaced)}"
     amount = f"{confinement.limits.memory_bytes // MIB} MiB"
     detail = {
         "cgroup-v2": f"{amount}, counted by the kernel (cgroup v2)",
         "cgroup-v1": f"{amount}, counted by the kernel (cgroup v1)",
         "watchdog": f"{amount}, measured by the jail's init; bursts between two looks overshoot",
     }
-    layers = [Layer("memory", True, detail[facts.memory])]
+    layers = [Layer("memory", True, detail[facts.memory] + uncounted), _quota_layer(facts)]
     if not namespaced:
         disk = f"{confinement.limits.disk_bytes // MIB} MiB, measured by the jail's init"
         layers.append(Layer("scratch", True, disk))

@@ -7,6 +7,10 @@ from collections.abc import Mapping
 
 from envhub_worker.protocol.confinement import Limits
 
+# Signals in the queue and armed timers: the kernel counts them per user, and answers the user's
+# other programs EAGAIN at their own limit, some tens of thousands.
+_SIGNALS = 512
+
 # The kernel sends SIGXCPU at the soft limit and SIGKILL at the hard one; the second in between
 # lets the process print where it was.
 _CPU_GRACE_S = 1
@@ -25,8 +29,9 @@ def wanted(limits: Limits, processes: int | None) -> dict[int, tuple[int, int]]:
         resource.RLIMIT_FSIZE: (file_bytes, file_bytes),
         resource.RLIMIT_NOFILE: (limits.open_files, limits.open_files),
         resource.RLIMIT_MEMLOCK: (64 * 1024, 64 * 1024),
-        resource.RLIMIT_MSGQUEUE: (819200, 819200),
+        resource.RLIMIT_MSGQUEUE: (0, 0),
         resource.RLIMIT_NICE: (0, 0),
+        resource.RLIMIT_SIGPENDING: (_SIGNALS, _SIGNALS),
         resource.RLIMIT_RTPRIO: (0, 0),
     }
     if processes is not None:

@@ -28,7 +28,8 @@ _NETWORK_FOLDERS = ("/etc/ssl", "/etc/pki", "/etc/ca-certificates")
 _SYS_FOLDERS = ("/sys/devices/system/cpu", "/sys/devices/system/node")
 # Drivers look devices up here; the rest of /sys is left out.
 _GPU_SYS_FOLDERS = ("/sys/bus/pci", "/sys/class/drm", "/sys/dev/char", "/sys/devices")
-_DEVICES = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom")
+# Not /dev/zero: mapped, it is shared memory that can be kept out of sight (see the filter).
+_DEVICES = ("/dev/null", "/dev/full", "/dev/random", "/dev/urandom")
 
 _TEXTS = {
     "/etc/passwd": f"sandbox:x:{INSIDE_UID}:{INSIDE_UID}:sandbox:{HOME}:/bin/sh\n"
@@ -125,7 +126,7 @@ def plan_root(
         folders=OWN_FOLDERS,
         trees=real(trees),
         roots=real(roots),
-        devices=(*_DEVICES, *(gpu_devices(host) if gpu else ())),
+        devices=(*_DEVICES, *(("/dev/zero", *gpu_devices(host)) if gpu else ())),
         copies=tuple(path for path in copies if host.exists(path)),
         links={path: target for path, target in links.items() if path not in ("/proc", "/")},
         texts=texts,

@@ -16,6 +16,7 @@ KILL_PROCESS = 0x80000000
 ASK = 0x7FC00000
 EPERM = _ERRNO | errno.EPERM
 ENOSYS = _ERRNO | errno.ENOSYS
+EINVAL = _ERRNO | errno.EINVAL
 #: Says that it worked and does nothing: libraries abort, or give up a copy, over an error.
 PRETEND = _ERRNO | 0
 
@@ -41,9 +42,8 @@ class ByArguments:
 Verdict = int | ByArguments
 
 _MEMORY = """
-    brk mmap munmap mremap mprotect madvise mincore msync mlock mlock2 munlock mlockall munlockall
-    membarrier pkey_alloc pkey_free pkey_mprotect memfd_create mseal get_mempolicy set_mempolicy
-    mbind
+    brk munmap mremap mprotect madvise mincore msync mlock mlock2 munlock mlockall munlockall
+    membarrier pkey_alloc pkey_free pkey_mprotect memfd_create mseal get_mempolicy
 """
 _FILES = """
     read write pread64 pwrite64 readv writev preadv pwritev preadv2 pwritev2 open openat creat
@@ -73,21 +73,21 @@ _SIGNALS = """
     rt_sigtimedwait rt_sigqueueinfo rt_tgsigqueueinfo sigaltstack pidfd_send_signal
 """
 _CONNECTED_SOCKETS = """
-    getsockname getpeername sendmsg sendmmsg recvfrom recvmsg recvmmsg setsockopt getsockopt
-    shutdown
+    getsockname getpeername sendmsg sendmmsg recvfrom recvmsg recvmmsg getsockopt shutdown
 """
 _OTHER_SOCKETS = "bind listen accept accept4 connect"
 # These reach beyond what Landlock guards, so they need a mount and an IPC namespace.
 _NAMESPACED = """
     chmod fchmod fchmodat fchmodat2 chown fchown lchown fchownat utime utimes utimensat futimesat
-    setxattr lsetxattr fsetxattr removexattr lremovexattr fremovexattr openat2 inotify_init
-    inotify_init1 inotify_add_watch inotify_rm_watch shmget shmat shmctl shmdt semget semop
-    semtimedop semctl msgget msgsnd msgrcv msgctl mq_open mq_unlink mq_timedsend mq_timedreceive
-    mq_notify mq_getsetattr sched_setaffinity
+    setxattr lsetxattr fsetxattr removexattr lremovexattr fremovexattr openat2 shmget shmat shmctl
+    shmdt sched_setaffinity
 """
 _MODES_AND_TIMES = """
     chmod fchmod fchmodat fchmodat2 chown fchown lchown fchownat utime utimes utimensat futimesat
 """
+
+#: Below it shared memory without a name may be made where init measures memory.
+SHARED_BYTES = 1 << 20
 
 _NAMESPACES = 0x7E020000  # every CLONE_NEW* that clone takes
 _S_IFMT, _S_IFIFO, _S_IFREG = 0o170000, 0o010000, 0o100000
@@ -95,14 +95,26 @@ _AF_UNIX, _AF_INET, _AF_INET6 = 1, 2, 10
 _SOCK_STREAM, _SOCK_DGRAM, _SOCK_SEQPACKET, _SOCK_TYPE = 1, 2, 5, 0xF
 _EAFNOSUPPORT = _ERRNO | errno.EAFNOSUPPORT
 _ENOTTY = _ERRNO | errno.ENOTTY
+_ENOMEM = _ERRNO | errno.ENOMEM
 _TIOCSTI, _TIOCLINUX, _TIOCCONS, _TIOCSETD = 0x5412, 0x541C, 0x541D, 0x5423
 _FIOSETOWN, _SIOCSPGRP = 0x8901, 0x8902
+# Duplicates, flags, locks, whose signals they are, the size of a pipe, seals, hints to be read.
+_FCNTLS = (*range(8), 9, 11, 16, 36, 37, 38, 1025, 1027, 1028, 1030, 1032, 1033, 1034, 1035, 1037)
 _F_SETOWN, _F_SETSIG, _F_SETOWN_EX, _F_SETLEASE, _F_NOTIFY = 8, 10, 15, 1024, 1026
+_F_SETPIPE_SZ, _F_SET_RW_HINT, _F_SET_FILE_RW_HINT, _F_SETDELEG = 1031, 1036, 1038, 1040
+_MAP_SHARED, _MAP_ANONYMOUS, _MAP_HUGETLB = 0x1, 0x20, 0x40000
+# Huge pages that the administrator set aside are nobody's memory in any account.
+_HUGE = (((Check(3, _MAP_HUGETLB, _MAP_HUGETLB),), _ENOMEM),)
+_SOL_SOCKET = 1
+_SO_SNDBUF, _SO_RCVBUF, _SO_SNDBUFFORCE, _SO_RCVBUFFORCE = 7, 8, 32, 33
+_SO_ATTACH_FILTER, _SO_ATTACH_BPF, _SO_ATTACH_CBPF, _SO_ATTACH_EBPF = 26, 50, 51, 52
 _PR_SET_DUMPABLE = 4
 _PERSONALITY_QUERY = 0xFFFFFFFF
 
 
-def table(*, namespaced: bool, network: str, brokered: bool = False) -> dict[str, Verdict]:
+def table(
+    *, namespaced: bool, network: str, brokered: bool = False, measured: bool = False
+) -> dict[str, Verdict]:
     """System call to verdict; what is missing is denied.
 
     Args:
@@ -110,11 +122,14 @@ def table(*, namespaced: bool, network: str, brokered: bool = False) -> dict[str
             IPC objects of the host are out of reach anyway.
         network: ``"none"``, ``"loopback"`` or ``"host"``.
         brokered: Init sends the jail's signals: see ``broker``.
+        measured: No control group counts the jail's memory: see ``watchdog``.
     """
     verdicts: dict[str, Verdict] = {}
     for group in (_MEMORY, _FILES, _PROCESSES, _SIGNALS, _CONNECTED_SOCKETS):
         verdicts |= dict.fromkeys(group.split(), ALLOW)
-    verdicts |= _filtered() | _pretended()
+    verdicts |= _filtered() | _pretended() | _of_the_user()
+    if measured:
+        verdicts |= _unmeasurable()
     verdicts |= _sockets(namespaced, network)
     verdicts |= dict.fromkeys(_NAMESPACED.split(), ALLOW) if namespaced else _without_namespaces()
     if brokered:
@@ -140,9 +155,60 @@ def _filtered() -> dict[str, Verdict]:
         ),
         "mknod": _mknod(1),
         "mknodat": _mknod(2),
-        "ioctl": ByArguments(_ioctls(_TIOCSTI, _TIOCLINUX, _TIOCCONS, _TIOCSETD), ALLOW),
-        "fcntl": ALLOW,
+        "ioctl": ByArguments(_ioctls(), ALLOW),
+        "fcntl": _fcntls(),
+        "setsockopt": _socket_options(),
+        "mmap": ByArguments(_HUGE, ALLOW),
     }
+
+
+def _fcntls() -> ByArguments:
+    """What reaches others through a file that is only open for reading is denied.
+
+    A lease makes everybody else wait who opens it, a delegation of a folder too; notices tell
+    what others do in a folder; an owner is whom the kernel signals. The pages of pipes are
+    counted per user: a few large ones leave tiny ones to the user's other programs.
+    """
+    owners = (_F_SETOWN, _F_SETSIG, _F_SETOWN_EX)
+    others = (_F_SETPIPE_SZ, _F_SET_RW_HINT, _F_SET_FILE_RW_HINT)
+    denied = (*owners, _F_SETLEASE, _F_NOTIFY, _F_SETDELEG, *others)
+    rules = tuple(((Check(1, one),), ALLOW) for one in _FCNTLS)
+    return ByArguments((*rules, *(((Check(1, one),), EPERM) for one in denied)), EINVAL)
+
+
+def _socket_options() -> ByArguments:
+    """Buffers keep the size that init counts them with; filters take the kernel's own memory."""
+
+    def rules(verdict: int, *options: int) -> tuple[tuple[tuple[Check, ...], int], ...]:
+        return tuple(((Check(1, _SOL_SOCKET), Check(2, one)), verdict) for one in options)
+
+    sizes = rules(PRETEND, _SO_SNDBUF, _SO_RCVBUF, _SO_SNDBUFFORCE, _SO_RCVBUFFORCE)
+    filters = (_SO_ATTACH_FILTER, _SO_ATTACH_BPF, _SO_ATTACH_CBPF, _SO_ATTACH_EBPF)
+    return ByArguments(sizes + rules(EPERM, *filters), ALLOW)
+
+
+def _of_the_user() -> dict[str, Verdict]:
+    """What lies in the kernel's memory, counted per user if at all: programs fall back.
+
+    Watches of files also tell what others open. (Memory policies of shared files, ``mbind``, are
+    not in the table either.)
+    """
+    names = "inotify_init inotify_init1 inotify_add_watch inotify_rm_watch"
+    names += " semget semop semtimedop semctl msgget msgsnd msgrcv msgctl"
+    names += " mq_open mq_unlink mq_timedsend mq_timedreceive mq_notify mq_getsetattr"
+    return dict.fromkeys(names.split(), ENOSYS)
+
+
+def _unmeasurable() -> dict[str, Verdict]:
+    """Memory that no process need have open or mapped, so that init could not find it.
+
+    A file without a name waits in a socket; of shared memory all but a page is unmapped. Programs
+    fall back to files in the scratch, whose size is bounded.
+    """
+    anonymous = Check(3, _MAP_SHARED | _MAP_ANONYMOUS, _MAP_SHARED | _MAP_ANONYMOUS)
+    small = Check(1, 0, 0xFFFFFFFF & ~(SHARED_BYTES - 1), wide=True)
+    rules = (*_HUGE, ((anonymous, small), ALLOW), ((anonymous,), EPERM))
+    return {"memfd_create": ENOSYS, "mmap": ByArguments(rules, ALLOW)}
 
 
 def _mknod(mode: int) -> ByArguments:
@@ -153,9 +219,13 @@ def _mknod(mode: int) -> ByArguments:
     )
 
 
-def _ioctls(*denied: int) -> tuple[tuple[tuple[Check, ...], int], ...]:
-    # Types 'f' and 'X' change flags, encryption and verity of a file that is open for reading.
-    families = tuple(((Check(1, kind << 8, 0xFF00),), _ENOTTY) for kind in (ord("f"), ord("X")))
+def _ioctls() -> tuple[tuple[tuple[Check, ...], int], ...]:
+    # File systems' own calls, which Landlock does not see: 'f', 'v' and 'X' change flags,
+    # versions, encryption and verity of a file that is open for reading, 0x94 (btrfs) and 0xf5
+    # (f2fs) also volumes.
+    kinds = (ord("f"), ord("v"), ord("X"), 0x94, 0xF5)
+    families = tuple(((Check(1, kind << 8, 0xFF00),), _ENOTTY) for kind in kinds)
+    denied = (_TIOCSTI, _TIOCLINUX, _TIOCCONS, _TIOCSETD, _FIOSETOWN, _SIOCSPGRP)
     return families + tuple(((Check(1, request),), EPERM) for request in denied)
 
 
@@ -204,15 +274,9 @@ def _utimensat() -> ByArguments:
 
 
 def _without_namespaces() -> dict[str, Verdict]:
-    fcntls = (_F_SETOWN, _F_SETSIG, _F_SETOWN_EX, _F_SETLEASE, _F_NOTIFY)
-    owners = _ioctls(_TIOCSTI, _TIOCLINUX, _TIOCCONS, _TIOCSETD, _FIOSETOWN, _SIOCSPGRP)
     return {
         **dict.fromkeys(_MODES_AND_TIMES.split(), PRETEND),
         "utimensat": _utimensat(),
-        "fcntl": ByArguments(tuple(((Check(1, one),), EPERM) for one in fcntls), ALLOW),
-        "inotify_init": ENOSYS,
-        "inotify_init1": ENOSYS,
-        "ioctl": ByArguments(owners, ALLOW),
         "openat2": ENOSYS,
         "sched_setaffinity": ByArguments((((Check(0, 0),), ALLOW),), PRETEND),
     }

@@ -1,0 +1,33 @@
+"""Be what another jail attacks: hold a secret everywhere, count signals. Not an attack itself."""
+
+import ctypes
+import os
+import signal
+import tempfile
+
+kept = {"signals": 0}
+
+
+def attack(secret):
+    if secret is None:
+        return {"signals": kept["signals"], "text": kept["buffer"].raw.decode("ascii", "replace")}
+    ctypes.CDLL(None).prctl(0x59616D61, ctypes.c_ulong(-1), 0, 0, 0)  # PR_SET_PTRACER
+    signal.signal(signal.SIGURG, _count)
+    os.environ["SECRET"] = secret
+    kept["buffer"] = ctypes.create_string_buffer(secret.encode())
+    folder = os.path.expanduser("~")
+    kept["file"] = tempfile.NamedTemporaryFile(dir=folder)  # noqa: SIM115
+    kept["file"].write(secret.encode())
+    kept["file"].flush()
+    os.chmod(kept["file"].name, 0o644)
+    os.chmod(folder, 0o755)
+    return {
+        "address": ctypes.addressof(kept["buffer"]),
+        "size": len(secret),
+        "fd": kept["file"].fileno(),
+        "path": kept["file"].name,
+    }
+
+
+def _count(*_):
+    kept["signals"] += 1
