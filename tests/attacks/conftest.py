@@ -50,6 +50,15 @@ def home(_open_ground: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
+@pytest.fixture
+def other_cache(_open_ground: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Another store, and so another worker server. Not in a home that everybody may write."""
+    folder = Path(tempfile.mkdtemp(prefix="cache-", dir=_open_ground))
+    folder.chmod(0o755)
+    monkeypatch.setenv("ENVHUB_CACHE", str(folder))
+    return folder
+
+
 @pytest.fixture(params=profiles("strict", "no-userns"))
 def arena(request: pytest.FixtureRequest) -> Iterator[Arena]:
     """Where a test attacks, once for each profile."""

@@ -17,7 +17,7 @@ from typing import Any
 import psutil
 import pytest
 
-from envhub_sandbox import make_env, snapshot_store
+from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.sandboxes.process import PROCESS
 from tests.attacks.abuser import watched
@@ -90,14 +90,13 @@ _KCMP_FILE = 0
 
 
 @pytest.fixture
-def inherited(home: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+def inherited(home: Path, other_cache: Path) -> Iterator[str]:
     """A secret file that is open here, and marked for children to inherit; a server since then."""
     secret = token()
     (home / "private").write_text(secret)
     fd = os.open(home / "private", os.O_RDONLY)
     os.set_inheritable(fd, True)
-    monkeypatch.setenv("ENVHUB_CACHE", str(home / "cache"))
-    server = PROCESS.acquire(snapshot_store.cache_root() / "snapshots")
+    server = PROCESS.acquire(other_cache / "snapshots")
     yield secret
     PROCESS.release(server)
     os.close(fd)

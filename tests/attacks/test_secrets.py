@@ -9,7 +9,6 @@ from pathlib import Path
 import psutil
 import pytest
 
-from envhub_sandbox import snapshot_store
 from envhub_sandbox.sandboxes.process import PROCESS
 from tests.attacks.harness import Arena, token
 from tests.attacks.hostile.payloads import kernel
@@ -29,10 +28,9 @@ def hub_token(monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 @pytest.fixture
-def fresh_server(hub_token: str, home: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def fresh_server(hub_token: str, home: Path, other_cache: Path) -> Iterator[None]:
     """A worker server that is started while the token is in the client's environment."""
-    monkeypatch.setenv("ENVHUB_CACHE", str(home / "cache"))
-    server = PROCESS.acquire(snapshot_store.cache_root() / "snapshots")
+    server = PROCESS.acquire(other_cache / "snapshots")
     yield
     PROCESS.release(server)
 

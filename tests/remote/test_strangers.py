@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import resource
 import socket
+import struct
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,7 +29,7 @@ from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import key_text
 from envhub_worker.quotas import Permissions, Quotas, RefusedError
-from envhub_worker.refusals import Log
+from envhub_worker.refusals import LINES, PERIOD_S, Log
 from envhub_worker.sessions import Sessions
 from envhub_worker.uploads import Uploads
 from tests.remote.listening import Listening, listening
@@ -35,6 +38,7 @@ from tests.support import inside
 from tests.support.processes import eventually
 
 _MIB = 1 << 20
+_PATIENCE_S = 120.0
 # ZMTP 3.1, as a client that has no keys: signature, version, mechanism NULL, no server, filler
 _GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x01" + b"NULL".ljust(20, b"\0") + b"\0" + bytes(31)
 
@@ -195,7 +199,8 @@ def test_a_port_scan_is_a_few_lines_in_the_log(server: Listening, good: Any) -> 
             connection.sendall([b"", b"GET / HTTP/1.0\r\n\r\n", bytes(range(256))][number % 3])
     good.call("count")
     assert server.memory() - before < 64 * _MIB
-    assert server.said().count("a handshake failed") <= 10
+    periods = 1 + int((time.time() - psutil.Process(server.process.pid).create_time()) / PERIOD_S)
+    assert server.said().count("a handshake failed") <= LINES * periods < 300
 
 
 def test_slow_strangers_are_shown_the_door(server: Listening, good: Any) -> None:
@@ -211,6 +216,23 @@ def test_slow_strangers_are_shown_the_door(server: Listening, good: Any) -> None
             connection.close()
 
 
+def may_filter() -> bool:
+    """Whether this user may have the kernel drop who knocks: some kernels ask for privilege."""
+    program = ctypes.create_string_buffer(struct.pack("=HBBI", 0x06, 0, 0, 0xFFFF))
+    with socket.socket() as door:
+        try:
+            door.setsockopt(socket.SOL_SOCKET, 26, struct.pack("@HP", 1, ctypes.addressof(program)))
+        except PermissionError:
+            return False
+    return True
+
+
+needs_a_filter = pytest.mark.skipif(
+    not may_filter(), reason="this user may not filter what a TCP socket gets"
+)
+
+
+@needs_a_filter
 def test_too_many_connections_stay_outside(tmp_path: Path, repository: Path) -> None:
     """Who is in goes on, descriptors are left for jails, and afterwards the door is open again."""
     with (
@@ -223,11 +245,11 @@ def test_too_many_connections_stay_outside(tmp_path: Path, repository: Path) -> 
             stranger = crowd.enter_context(socket.socket())
             stranger.setblocking(False)
             stranger.connect_ex(("127.0.0.1", server.port))
-        assert eventually(lambda: "no more for the moment" in server.said())
+        assert eventually(lambda: "no more for the moment" in server.said(), _PATIENCE_S)
         assert suites.env.step(np.array([0]))[0].tolist() == [[1.0]]
         assert psutil.Process(server.process.pid).num_fds() < 300
         crowd.close()
-        assert eventually(lambda: _gets_in(server, repository))
+        assert eventually(lambda: _gets_in(server, repository), _PATIENCE_S)
 
 
 def _gets_in(server: Listening, repository: Path) -> bool:
@@ -239,6 +261,7 @@ def _gets_in(server: Listening, repository: Path) -> bool:
     return True
 
 
+@needs_a_filter
 def test_a_door_that_cannot_be_shut_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a descriptor left the server goes on, says so, and tries again."""
     said = list[str]()
