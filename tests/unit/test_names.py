@@ -20,6 +20,7 @@ from envhub_worker.protocol.codec import decode, encode
 from envhub_worker.protocol.facts import MAX_METADATA, read_metadata, read_spec
 from envhub_worker.protocol.inert import RemoteEnum, RemoteObject
 from envhub_worker.protocol.names import GYMNASIUMS, PROBED, is_servable
+from tests.support.curious import names_asked_for
 from tests.support.protocol_names import names_that_libraries_call
 from tests.unit.test_manifest import an_env, read, with_env
 
@@ -37,6 +38,13 @@ def test_no_name_that_a_library_calls_is_served() -> None:
     names = names_that_libraries_call()
     assert {"__deepcopy__", "__array_interface__", "_repr_mimebundle_", "__rich__"} <= set(names)
     assert [name for name in names if is_servable(name)] == []
+
+
+def test_no_name_that_is_looked_for_in_any_object_is_served() -> None:
+    """Found out by doing it: copying, converting, showing and inspecting an object that listens."""
+    asked = names_asked_for()
+    assert {"__deepcopy__", "__array_interface__", "__array__"} <= asked
+    assert {name for name in asked if is_servable(name)} == set()
 
 
 @given(st.text())

@@ -28,7 +28,7 @@ PROBED = frozenset(
         # of files, mappings, classes and numbers; by the interpreter and the standard library
         *("fileno", "keys", "mro", "as_integer_ratio", "getvalue", "conjugate"),
         # of arrays and tensors; by numpy, pandas, torch and who wants to be polite to them
-        *("toarray", "to_numpy", "tolist", "numpy", "detach", "pin_memory", "dtype"),
+        *("toarray", "to_numpy", "tolist", "numpy", "detach", "pin_memory", "dtype", "flat"),
         # by notebooks: IPython's help and completion
         *("getdoc", "trait_names"),
     }
