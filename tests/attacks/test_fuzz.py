@@ -19,6 +19,7 @@ from envhub_sandbox import results
 from envhub_worker.protocol import messages as m
 from tests.fuzz import child, traffic
 from tests.fuzz.oracle import WrongError, fits
+from tests.support import inside
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = 250
@@ -78,13 +79,21 @@ def test_whatever_must_not_come_out_is_noticed(corpus: Path, control: str, says:
     assert "seed 7" in run.stdout
 
 
-def first_wrong(corpus: Path, target: str) -> str:
-    """What the first lie that does harm does, or nothing."""
+Recorded = tuple[list[traffic.Frames], list[m.Message]]
+
+
+@pytest.fixture(scope="module")
+def recorded(corpus: Path) -> Recorded:
+    """The recording, and the same decoded."""
     found: list[traffic.Frames] = pickle.loads(corpus.read_bytes())
-    messages: list[m.Message] = child.decoded(found)
+    return found, child.decoded(found)
+
+
+def first_wrong(recorded: Recorded, target: str) -> str:
+    """What the first lie that does harm does, or nothing."""
     for number in range(MANY):
         try:
-            child.lie(target, number, 1, found, messages)
+            child.lie(target, number, 1, *recorded)
         except WrongError as error:
             return str(error)
         except Exception:
@@ -93,12 +102,28 @@ def first_wrong(corpus: Path, target: str) -> str:
 
 
 def test_observations_that_are_not_checked_are_noticed(
-    corpus: Path, monkeypatch: pytest.MonkeyPatch
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without the check that observations fit their space, the fuzzer says so; with it, nothing."""
-    assert first_wrong(corpus, "results") == ""
+    assert first_wrong(recorded, "results") == ""
     monkeypatch.setattr(results.batches, "conforms", lambda *_: True)
-    assert "where" in first_wrong(corpus, "results")
+    assert "where" in first_wrong(recorded, "results")
+
+
+def test_a_memory_that_fails_is_noticed(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is read once and never again is noticed; so it was with keys that are no text."""
+    assert first_wrong(recorded, "unpack") == ""
+    for spot in inside.FORMS:
+        monkeypatch.setattr(*spot, m.recurring.Forms())
+    monkeypatch.setattr(m.recurring, "Incoming", forgetful)
+    assert first_wrong(recorded, "unpack") == "another end"
+
+
+def forgetful(*_: object) -> None:
+    """In the place of what reads a document that is known."""
+    raise TypeError("unhashable type: 'list'")
 
 
 SPACE = spaces.Dict({"x": spaces.Box(-1, 1, (2,)), "t": spaces.Tuple([spaces.Discrete(3)])})

@@ -23,8 +23,9 @@ from envhub_sandbox.results import Results
 from envhub_worker.protocol import batches, columns
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec import decode
-from envhub_worker.protocol.limits import DEFAULT_LIMITS
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.manifest import decode_env, decode_manifest
+from envhub_worker.protocol.packing import pack_frames, unpack_frames
 from envhub_worker.protocol.stream import PacketReader, pack_packet
 from envhub_worker.protocol.untrusted import UNTRUSTED
 from tests.attacks.lying_server import env_manifest
@@ -395,6 +396,25 @@ def _read(data: bytes, cuts: list[int]) -> tuple[list[Any], list[_Same]]:
     return found, []
 
 
+def packed(dice: Dice) -> None:
+    """Compressed frames come back as they were, or within the limits, or not at all."""
+    rng, limits = dice.rng, WireLimits(frame_bytes=1 << 20, message_bytes=2 << 20)
+    frames = [*rng.choice(dice.corpus), bytes(40_000), rng.randbytes(20_000)]
+    travelling = [bytes(frame) for frame in pack_frames(frames, "lz4")]
+    spoilt = dice.often()
+    for _ in range(spoilt):
+        if rng.random() < 0.5:
+            travelling = dice.spoiler.frames(travelling, dice.corpus)
+        else:
+            index = rng.randrange(len(travelling))
+            travelling[index] = dice.spoiler.raw(travelling[index])
+    with UNTRUSTED:
+        found = unpack_frames(travelling, limits)
+    demand(spoilt or list(map(bytes, found)) == frames, "other frames")
+    inflated = len(found) != len(travelling)
+    demand(not inflated or sum(map(len, found)) <= limits.message_bytes, "more than the limit")
+
+
 def column_schemas(dice: Dice) -> None:
     """Columns never reach outside of their area, whatever infos announced them."""
     lie = dice.spoiled(_infos(dice.rng.randrange(1, 4), dice.rng))
@@ -409,7 +429,7 @@ def column_schemas(dice: Dice) -> None:
 TARGETS: dict[str, Callable[[Dice], None]] = {
     one.__name__: one
     for one in (
-        unpack, results, infos, restore, manifest, built, generators, relay, server, stream,
+        unpack, results, infos, restore, manifest, built, generators, relay, server, stream, packed,
         column_schemas,
     )
 }  # fmt: skip
