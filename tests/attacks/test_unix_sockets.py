@@ -51,6 +51,16 @@ def test_abstract_sockets_cannot_be_connected_to(arena: Arena) -> None:
         sends(arena, "connect to an abstract socket", "unix_stream", listener, path=f"@{name}")
 
 
+@pytest.mark.parametrize("payload", ["unix_stream", "unix_datagram"])
+def test_abstract_sockets_are_not_part_of_the_hosts_network(arena: Arena, payload: str) -> None:
+    """Whoever grants the network grants TCP and UDP, and no service that has only a name."""
+    name = f"envhub-{token()}"
+    kind = socket.SOCK_STREAM if payload == "unix_stream" else socket.SOCK_DGRAM
+    with listening(socket.AF_UNIX, kind, f"\0{name}") as listener:
+        title = f"reach an abstract socket on the host's network: {payload}"
+        sends(arena, title, payload, listener, policy={"network": "host"}, path=f"@{name}")
+
+
 def test_abstract_datagrams_do_not_arrive(arena: Arena) -> None:
     """A datagram to a socket that has a name and no file."""
     name = f"envhub-{token()}"

@@ -148,6 +148,21 @@ def test_socket_families_without_network(machine: str, namespaced: bool) -> None
 
 
 @machines
+def test_local_sockets_end_where_the_hosts_abstract_names_begin(machine: str) -> None:
+    """On the host's network, with a Landlock that does not keep them out of reach."""
+    verdicts = table(namespaced=True, network="host", scoped=False)
+    program = seccomp.program(machine, verdicts)
+
+    def verdict(name: str, *args: int) -> int:
+        return run(program, ARCH[machine], NUMBERS[machine][name], args)
+
+    assert verdict("socket", 1, 1) == verdict("socket", 1, 2) == NOT_SUPPORTED
+    assert verdict("socketpair", 1, 2) == NOT_SUPPORTED
+    assert verdict("socketpair", 1, 1) == verdict("socket", 2, 1) == ALLOW
+    assert Filter(machine, True, "host")("socket", 1, 1) == ALLOW
+
+
+@machines
 @pytest.mark.parametrize("namespaced", [True, False])
 def test_internet_sockets_are_tcp_and_udp_only(machine: str, namespaced: bool) -> None:
     """No raw, no MPTCP, no SCTP, no netlink, even on the host's network."""

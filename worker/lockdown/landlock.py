@@ -70,8 +70,13 @@ def ruleset(abi: int, network: str) -> Ruleset:
     return Ruleset(
         files=(1 << bits) - 1,
         tcp=_BIND_TCP | _CONNECT_TCP if abi >= 4 and network == "none" else 0,
-        scope=_SCOPE_ABSTRACT_UNIX_SOCKET | _SCOPE_SIGNAL if abi >= 6 else 0,
+        scope=_SCOPE_ABSTRACT_UNIX_SOCKET | _SCOPE_SIGNAL if scopes(abi) else 0,
     )
+
+
+def scopes(abi: int) -> bool:
+    """Whether signals and abstract sockets end at the domain."""
+    return abi >= 6
 
 
 def version() -> int:

@@ -53,6 +53,7 @@ def enter(config: ZygoteConfig) -> Common:
             network=config.network,
             brokered=brokered,
             measured=measured and not config.gpu,
+            scoped=landlock.scopes(abi),
         )
         for measured in (False, True)
     )

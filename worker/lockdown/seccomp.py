@@ -35,14 +35,26 @@ _NUMBER, _ARCHITECTURE, _ARGUMENTS = 0, 4, 16
 
 
 def compile_filter(
-    machine: str, *, namespaced: bool, network: str, brokered: bool = False, measured: bool = False
+    machine: str,
+    *,
+    namespaced: bool,
+    network: str,
+    brokered: bool = False,
+    measured: bool = False,
+    scoped: bool = True,
 ) -> bytes:
     """The program for ``machine`` as bytes; see ``seccomp_policy.table``.
 
     Raises:
         LayerUnavailableError: No table for this machine.
     """
-    verdicts = table(namespaced=namespaced, network=network, brokered=brokered, measured=measured)
+    verdicts = table(
+        namespaced=namespaced,
+        network=network,
+        brokered=brokered,
+        measured=measured,
+        scoped=scoped,
+    )
     return bpf.to_bytes(program(machine, verdicts))
 
 

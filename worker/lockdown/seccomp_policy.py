@@ -113,7 +113,12 @@ _PERSONALITY_QUERY = 0xFFFFFFFF
 
 
 def table(
-    *, namespaced: bool, network: str, brokered: bool = False, measured: bool = False
+    *,
+    namespaced: bool,
+    network: str,
+    brokered: bool = False,
+    measured: bool = False,
+    scoped: bool = True,
 ) -> dict[str, Verdict]:
     """System call to verdict; what is missing is denied.
 
@@ -123,6 +128,7 @@ def table(
         network: ``"none"``, ``"loopback"`` or ``"host"``.
         brokered: Init sends the jail's signals: see ``broker``.
         measured: No control group counts the jail's memory: see ``watchdog``.
+        scoped: Landlock keeps the abstract sockets of the network namespace out of reach.
     """
     verdicts: dict[str, Verdict] = {}
     for group in (_MEMORY, _FILES, _PROCESSES, _SIGNALS, _CONNECTED_SOCKETS):
@@ -130,7 +136,7 @@ def table(
     verdicts |= _filtered() | _pretended() | _of_the_user()
     if measured:
         verdicts |= _unmeasurable()
-    verdicts |= _sockets(namespaced, network)
+    verdicts |= _sockets(namespaced and (scoped or network != "host"), network)
     verdicts |= dict.fromkeys(_NAMESPACED.split(), ALLOW) if namespaced else _without_namespaces()
     if brokered:
         verdicts |= dict.fromkeys(("kill", "tkill", "tgkill"), ASK)
@@ -235,21 +241,22 @@ def _pretended() -> dict[str, Verdict]:
     return dict.fromkeys(names.split(), PRETEND)
 
 
-def _sockets(namespaced: bool, network: str) -> dict[str, Verdict]:
+def _sockets(local: bool, network: str) -> dict[str, Verdict]:
+    """Local sockets by name only where nobody but the jail has such names (``local``)."""
     internet = network != "none"
     verdicts: dict[str, Verdict] = {
-        "socket": ByArguments(_families(namespaced, internet), _EAFNOSUPPORT),
-        "socketpair": ByArguments(_pairs(namespaced), _EAFNOSUPPORT),
+        "socket": ByArguments(_families(local, internet), _EAFNOSUPPORT),
+        "socketpair": ByArguments(_pairs(local), _EAFNOSUPPORT),
         "sendto": ByArguments((((Check(4, 0, wide=True),), ALLOW),), EPERM),
     }
-    if namespaced or internet:
+    if local or internet:
         verdicts |= dict.fromkeys([*_OTHER_SOCKETS.split(), "sendto"], ALLOW)
     return verdicts
 
 
-def _families(namespaced: bool, internet: bool) -> tuple[tuple[tuple[Check, ...], int], ...]:
+def _families(local: bool, internet: bool) -> tuple[tuple[tuple[Check, ...], int], ...]:
     rules: list[tuple[tuple[Check, ...], int]] = []
-    if namespaced:
+    if local:
         rules.append(((Check(0, _AF_UNIX),), ALLOW))
     if internet:
         for family in (_AF_INET, _AF_INET6):
@@ -261,9 +268,9 @@ def _families(namespaced: bool, internet: bool) -> tuple[tuple[tuple[Check, ...]
     return tuple(rules)
 
 
-def _pairs(namespaced: bool) -> tuple[tuple[tuple[Check, ...], int], ...]:
+def _pairs(local: bool) -> tuple[tuple[tuple[Check, ...], int], ...]:
     # Without a mount namespace a datagram pair would send to any socket file of the host.
-    kinds = [_SOCK_STREAM, _SOCK_SEQPACKET, *([_SOCK_DGRAM] if namespaced else [])]
+    kinds = [_SOCK_STREAM, _SOCK_SEQPACKET, *([_SOCK_DGRAM] if local else [])]
     return tuple(((Check(0, _AF_UNIX), Check(1, kind, _SOCK_TYPE)), ALLOW) for kind in kinds)
 
 
