@@ -506,7 +506,7 @@ def test_close_does_not_wait_for_who_is_coming_back() -> None:
 
 def test_coming_back_has_a_deadline() -> None:
     """A fresh process that does not load in time is a timeout; a reset starts afresh."""
-    timeouts = {"startup_s": 1.0}
+    timeouts = {"startup_s": 5.0}
     with made(env_kwargs={"form": "slow"}, shards=1, timeouts=timeouts) as suites:
         env = suites.env
         env.reset(seed=SEED)
@@ -543,7 +543,7 @@ def test_the_dead_leave_nothing_in_their_jail() -> None:
         for _ in range(20):
             env.step(LAST_DIES)
             env.step(ALL_LIVE)
-        assert len(os.listdir("/proc/self/fd")) == held
+        assert len(os.listdir("/proc/self/fd")) <= held  # what others left may be closed meanwhile
         init = psutil.Process(inside.pids(env)[0]).parent()
         assert init is not None
         assert eventually(lambda: len(init.children(recursive=True)) == 2)

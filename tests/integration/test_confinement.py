@@ -612,7 +612,7 @@ def test_grants_are_readable_and_no_more(outside: Path, profile: str) -> None:
 def test_host_network_is_there_by_explicit_choice(profile: str) -> None:
     """And is reported as a layer that is not enforced."""
     with closing(socket.create_server(("127.0.0.1", 0))) as listener:
-        listener.settimeout(20)
+        listener.settimeout(60)
         source = f"""
 import socket
 socket.create_connection({listener.getsockname()!r}).sendall(b"hello")

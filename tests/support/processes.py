@@ -14,7 +14,7 @@ def descendants() -> set[int]:
     return {child.pid for child in children if _alive(child)}
 
 
-def eventually(claim: Callable[[], bool], deadline_s: float = 30.0) -> bool:
+def eventually(claim: Callable[[], bool], deadline_s: float = 90.0) -> bool:
     """Whether a claim comes true before a generous deadline."""
     end = time.monotonic() + deadline_s
     while not claim():
