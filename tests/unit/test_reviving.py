@@ -17,6 +17,8 @@ from envhub_worker.protocol.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 
 DIED = m.Died(2, "exit", 3, None, "", "last words", "step")
+ASKED = [(1, m.Render(1)), (2, m.Render(1))]
+"""What the two hosts of a jail are asked."""
 
 
 class Told:
@@ -47,22 +49,23 @@ def test_deaths_come_with_the_answers_of_the_others() -> None:
     """Each in its place: what lived has answered, and of the dead one knows how."""
     said = jail(m.RelayedPartly((1, 1), (1,)), m.Value(7), DIED)
     with pytest.raises(HostsDiedError) as caught:
-        said.receive(1, Deadline(1))
+        said.receive(said.send("step", ASKED), Deadline(1))
     assert caught.value.replies == [m.Value(7), None]
     assert list(caught.value.deaths) == [1]
     assert (caught.value.first.exit_code, caught.value.first.log_tail) == (3, "last words")
     with pytest.raises(WorkerDiedError, match="exit code 3") as told:
-        said.exchange("step", [(1, m.Render(1)), (2, m.Render(1))], Deadline(1))
+        said.exchange("step", ASKED, Deadline(1))
     assert type(told.value) is WorkerDiedError
 
 
 def test_a_hosts_word_is_no_death() -> None:
     """A ``Died`` in the place of a living host is an answer, and an illegal one."""
+    said = jail(m.RelayedPartly((1, 1), (1,)), DIED, DIED)
     with pytest.raises(HostsDiedError) as caught:
-        jail(m.RelayedPartly((1, 1), (1,)), DIED, DIED).receive(1, Deadline(1))
+        said.receive(said.send("step", ASKED), Deadline(1))
     assert list(caught.value.deaths) == [1]
     with pytest.raises(RemoteProtocolError, match="a host sent Died"):
-        jail(m.Relayed((1, 1)), m.Value(7), DIED).exchange("step", [], Deadline(1))
+        jail(m.Relayed((1, 1)), m.Value(7), DIED).exchange("step", ASKED, Deadline(1))
 
 
 @pytest.mark.parametrize(
@@ -80,14 +83,16 @@ def test_deaths_that_do_not_add_up_are_refused(
     reply: m.RelayedPartly, parts: tuple[m.Message, ...]
 ) -> None:
     """Nobody dead, nobody asked, no ``Died``, frames too many or too few."""
+    said = jail(reply, *parts)
     with pytest.raises(RemoteProtocolError):
-        jail(reply, *parts).receive(1, Deadline(1))
+        said.receive(said.send("step", ASKED), Deadline(1))
 
 
 def test_a_jail_that_is_not_kept_has_no_partial_answers() -> None:
     """What was not asked for is not taken."""
+    said = jail(m.RelayedPartly((1, 1), (1,)), m.Value(7), DIED, kept=False)
     with pytest.raises(RemoteProtocolError, match="RelayedPartly"):
-        jail(m.RelayedPartly((1, 1), (1,)), m.Value(7), DIED, kept=False).receive(1, Deadline(1))
+        said.receive(said.send("step", ASKED), Deadline(1))
 
 
 def test_derived_seeds_are_documented_and_all_different() -> None:
