@@ -23,7 +23,7 @@ from envhub_sandbox.sharding import bounds_for
 from envhub_sandbox.snapshot import named
 from envhub_sandbox.suites import EnvSuites
 from envhub_sandbox.vector_env import SandboxVectorEnv
-from envhub_worker.protocol.manifest import Manifest
+from envhub_worker.protocol.manifest import EnvManifest, Manifest
 
 
 def make_env(
@@ -203,7 +203,7 @@ class _Maker:
     def _suites(self, manifest: Manifest, loaded: LoadedJail | None) -> EnvSuites:
         repository = self._repository
         shared = None if manifest.lazy or len(manifest.envs) == 1 else self._shared(loaded)
-        remotes = [self._remote(Known(manifest, env), shared) for env in manifest.envs]
+        remotes = [self._remote(manifest, env, shared) for env in manifest.envs]
         if loaded is not None and shared is None:
             self._use(loaded, remotes)
         envs: dict[str, dict[Any, Any]] = {}
@@ -223,11 +223,12 @@ class _Maker:
             shared.provide(loaded)
         return shared
 
-    def _remote(self, known: Known, shared: SharedJail | None) -> RemoteEnv:
-        env, own = known.task, OwnJails(self._repository, self._cache.forget, known)
-        source: JailSource = own if shared is None else shared
+    def _remote(self, manifest: Manifest, env: EnvManifest, shared: SharedJail | None) -> RemoteEnv:
         paces = self._cache.paces
         bounds = bounds_for(env, self._num_workers, paces.of(env))
+        known = Known(manifest, env, len(bounds))
+        own = OwnJails(self._repository, self._cache.forget, known)
+        source: JailSource = own if shared is None else shared
         return RemoteEnv(source, env, bounds, paces)
 
     def _use(self, loaded: LoadedJail, remotes: list[RemoteEnv]) -> None:

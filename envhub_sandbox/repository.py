@@ -74,10 +74,12 @@ class Known:
     Attributes:
         manifest: All of it.
         task: The environment that a jail is wanted for.
+        shards: Over how many hosts it is going to be spread.
     """
 
     manifest: Manifest
     task: EnvManifest
+    shards: int = 1
 
 
 @dataclass
@@ -261,7 +263,10 @@ class Repository:
             client.hello(deadline)
             if isinstance(server, FarServer):
                 server.bring(client, deadline)
-            jail = open_jail(client, self._order(server), self.wire_limits, deadline)
+            # all at once, where they will load what is known: else it is asked for, and then again
+            known = known if client.version >= _FIRST_WITH_LOAD_TASK else None
+            order = replace(self._order(server), hosts=known.shards if known else 1)
+            jail = open_jail(client, order, self.wire_limits, deadline)
         except BaseException:
             client.close()
             wanted.close()
@@ -273,10 +278,10 @@ class Repository:
                 jail.before_end = follower.stop
             around = server.layers if isinstance(server, EnclosedServer) else ()
             self.report = [*map(dict, around), *jail.report]
-            if known is None or client.version < _FIRST_WITH_LOAD_TASK:
+            if known is None:
                 return self._load(jail, server, deadline)
             loaded = LoadedJail(jail, known.manifest, {}, set(), server)
-            self.load(loaded, jail.hosts[:1], deadline, known.task)
+            self.load(loaded, jail.hosts, deadline, known.task)
             return loaded
         except BaseException:
             jail.close(Deadline(_CLOSE_S))
