@@ -14,6 +14,7 @@ from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.jail_sources import JailSource, OwnJails, SharedJail
 from envhub_sandbox.manifest_cache import ManifestCache, manifest_key
 from envhub_sandbox.policy import Limits, Policy, Timeouts, limits_from, policy_from, timeouts_from
+from envhub_sandbox.prewarming import Prewarming
 from envhub_sandbox.provenance import provenance_of
 from envhub_sandbox.recipe import Recipe, pinned
 from envhub_sandbox.remote_env import RemoteEnv
@@ -42,6 +43,7 @@ def make_env(
     endpoint: str | None = None,
     python: str | Path | None = None,
     num_workers: int | None = None,
+    prewarm: int | None = None,
     lane: str = "auto",
     copy: bool = True,
     validate: bool = False,
@@ -70,6 +72,10 @@ def make_env(
             gymnasium, msgpack, numpy and pyzmq beside the repository's own packages.
         num_workers: Processes over which the sub-environments are spread; by default one, or with
             ``use_async_envs`` as many as are useful for the cores there are.
+        prewarm: How many of a suite's next tasks are started in the background when a task is first
+            reset, and so how many jails there are at most that nobody has used yet. By default one,
+            once tasks are seen to be closed before the next is reset, on this machine and without
+            a GPU; else none.
         lane: ``"auto"`` steps over shared memory where that is possible, ``"frames"`` never does.
         copy: False lends observations instead of copying them, as in Gymnasium; still no later
             step changes an array that somebody holds, but the worker could.
@@ -97,6 +103,7 @@ def make_env(
     n_envs = arguments.sub_environments(n_envs)
     use_async_envs = arguments.flag("use_async_envs", use_async_envs)
     num_workers = arguments.workers(num_workers)
+    prewarm = arguments.ahead(prewarm)
     further = arguments.keyword_arguments(env_kwargs)
     if sandbox is None:
         if not trust_remote_code:
@@ -108,6 +115,7 @@ def make_env(
                 "limits": limits,
                 "python": python,
                 "num_workers": num_workers,
+                "prewarm": prewarm,
                 "validate": validate,
                 "server_key": server_key,
             }
@@ -153,13 +161,18 @@ def make_env(
             "endpoint": endpoint,
             "python": python,
             "num_workers": num_workers,
+            "prewarm": prewarm,
             "lane": lane,
             "copy": copy,
             "validate": validate,
             "server_key": server_key,
         },
     )
-    return _Maker(repository, num_workers, _face(validate)).make()
+    if prewarm is None and (sandbox != "process" or chosen_policy.gpu):
+        prewarm = (
+            0  # a container's memory is all its jails', a quota all a key's, a GPU everybody's
+        )
+    return _Maker(repository, num_workers, prewarm, _face(validate)).make()
 
 
 def _face(validate: bool) -> type[SandboxVectorEnv]:
@@ -177,11 +190,16 @@ class _Maker:
     """Makes the proxies, from the remembered manifest or from a first jail."""
 
     def __init__(
-        self, repository: Repository, num_workers: int | None, face: type[SandboxVectorEnv]
+        self,
+        repository: Repository,
+        num_workers: int | None,
+        prewarm: int | None,
+        face: type[SandboxVectorEnv],
     ) -> None:
         self._face = face
         self._repository = repository
         self._num_workers = num_workers
+        self._prewarm = prewarm
         load = repository.arguments.message()
         key = manifest_key(repository.snapshot, load, repository.policy, repository.interpreter)
         self._cache = ManifestCache(snapshot_store.cache_root() / "manifests", key)
@@ -207,9 +225,13 @@ class _Maker:
         if loaded is not None and shared is None:
             self._use(loaded, remotes)
         envs: dict[str, dict[Any, Any]] = {}
+        suites: dict[str, list[RemoteEnv]] = {}
         for remote in remotes:
             env = remote.manifest
             envs.setdefault(env.suite, {})[env.task] = self._face(remote)
+            suites.setdefault(env.suite, []).append(remote)
+        if shared is None and self._prewarm != 0:
+            Prewarming(list(suites.values()), self._prewarm)
         return EnvSuites(
             envs,
             lambda: provenance_of(repository.snapshot, manifest, repository.report),

@@ -42,6 +42,16 @@ def workers(num_workers: SupportsIndex | None) -> int | None:
     return count
 
 
+def ahead(prewarm: SupportsIndex | None) -> int | None:
+    """How many tasks are started before they are used; raises as ``sub_environments`` does."""
+    if prewarm is None:
+        return None
+    count = _whole("prewarm", prewarm)
+    if count < 0:
+        raise ValueError("`prewarm` must be 0 or more, or None for what suits the way of use")
+    return count
+
+
 def _whole(name: str, value: SupportsIndex) -> int:
     try:
         return operator.index(value)

@@ -19,6 +19,9 @@ class Deadline:
 
     __slots__ = ("_at", "timeout_s")
 
+    unasked = False
+    """Whether it is for something that nobody has asked for yet, or not any more."""
+
     def __init__(self, timeout_s: float | None) -> None:
         self.timeout_s = timeout_s
         self._at = None if timeout_s is None else monotonic() + timeout_s
@@ -41,10 +44,15 @@ class Deadline:
 class StartupDeadline(Deadline):
     """A deadline that another thread can bring forward: its waits are short."""
 
-    __slots__ = ()
+    __slots__ = ("unasked",)
+
+    def __init__(self, timeout_s: float | None, *, unasked: bool = False) -> None:
+        super().__init__(timeout_s)
+        self.unasked = unasked
 
     def give_up(self) -> None:
         """It has come."""
+        self.unasked = True
         self._at = 0.0
 
     def left_ms(self) -> int:

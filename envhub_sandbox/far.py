@@ -11,7 +11,6 @@ from time import monotonic
 
 import zmq
 from zmq.utils import z85
-from zmq.utils.monitor import parse_monitor_message
 
 from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError, WorkerDiedError
 
@@ -91,6 +90,8 @@ class Link:
             SandboxUnavailableError: The server does not let us in, or is another one.
             WorkerDiedError: The same, after it had let us in before.
         """
+        from zmq.utils.monitor import parse_monitor_message  # brings asyncio, and that ssl
+
         while True:
             try:
                 frames = self.monitor.recv_multipart(zmq.NOBLOCK)

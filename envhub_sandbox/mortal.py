@@ -240,7 +240,7 @@ class Mortal(Tenant):
         dead = sorted(deaths.deaths)
         deadline = self._startup = StartupDeadline(self.repository.timeouts.startup_s)
         try:
-            with self.repository.starting():
+            with self.repository.starting(deadline):
                 self._rebuild(None if deaths.jail_gone else dead, deadline)
         finally:
             self._startup = None

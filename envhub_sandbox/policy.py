@@ -41,6 +41,10 @@ class Timeouts:
         close_s: The environment's own ``close``; afterwards its processes are killed.
         idle_s: Between two requests; then its processes are ended, and the next ``reset`` starts
             others (a step says so). None, the default, leaves them alone.
+        server_idle_s: For how long the worker server, or the container, is kept for the next
+            environment after the last one was closed; 0 ends it at once, and at the end of this
+            process it ends in any case. What is kept is one server and its warm interpreter, in
+            which no repository's code has run, and no jail.
     """
 
     startup_s: float | None = 300.0
@@ -49,10 +53,13 @@ class Timeouts:
     call_s: float | None = 300.0
     close_s: float | None = 5.0
     idle_s: float | None = None
+    server_idle_s: float | None = 30.0
 
     def __post_init__(self) -> None:
         for item in fields(self):
             value = getattr(self, item.name)
+            if item.name == "server_idle_s" and _is_number(value) and value == 0:
+                continue
             if value is not None and not (_is_number(value) and value > 0):
                 raise PolicyError(
                     f"timeouts: {item.name} is {value!r}; it takes seconds above 0, or None"

@@ -68,6 +68,7 @@ class RemoteEnv(Mortal):
             sent = self._send(operation, requests)
             self._remember(message_for, requests[0][1], sent)
             self.history.requested(message_for)
+            self._note_first_use()
 
     def collect(self, timeout_s: float | None) -> list[m.Message]:
         """The shards' replies to the last ``submit``; the environment is usable afterwards.
@@ -212,6 +213,8 @@ class RemoteEnv(Mortal):
         a fresh jail is started only if the policy says ``restart="on_reset"``.
         """
         with self._turn("reset"):
+            if self._warm:
+                self._look_whether_warm_lives()
             if self.lifecycle.state is State.PENDING:
                 self.lifecycle.on(Event.INTERRUPT)
             if self.lifecycle.state is State.READY and self.repository.timeouts.idle_s is not None:

@@ -34,6 +34,7 @@ from envhub_sandbox.sandboxes.base import (
     Sandbox,
     WorkerServer,
 )
+from envhub_sandbox.server_hold import ServerHold
 from envhub_sandbox.snapshot import Snapshot
 from envhub_sandbox.snapshot_store import cache_root
 from envhub_sandbox.worker_output import OutputFollower, Wanted
@@ -144,6 +145,7 @@ class Repository:
             own = sandbox.for_repository(snapshot.root, policy, python)
             self._sandbox, self.interpreter = own, own.interpreter
         self._store = store
+        self._hold = ServerHold(self._acquire, self._release)
         self._jail_numbers = count(1)
 
     @property
@@ -170,15 +172,16 @@ class Repository:
             raise
 
     @contextmanager
-    def starting(self) -> Iterator[None]:
-        """Say what it was that took too long, and keep what led to a death."""
+    def starting(self, deadline: Deadline) -> Iterator[None]:
+        """Say what it was that took too long, and keep what led to a death that matters."""
         try:
             yield
         except WorkerDiedError as error:
-            self.keep_crash(error)
+            if not deadline.unasked:
+                self.keep_crash(error)
             raise
         except WorkerTimeoutError as error:
-            if error.request is not None:
+            if error.request is not None or deadline.unasked:
                 raise
             startup_s = self.timeouts.startup_s
             late = WorkerTimeoutError(
@@ -234,7 +237,17 @@ class Repository:
 
     def hold(self) -> Callable[[], None]:
         """Keep the server between two jails; returns what gives it back."""
-        return partial(self._sandbox.release, self._sandbox.acquire(self._store))
+        return partial(self._release, self._acquire())
+
+    def stay(self) -> Callable[[], None]:
+        """An environment may need the server again; returns what says that it is closed."""
+        return self._hold.enter()
+
+    def _acquire(self) -> WorkerServer:
+        return self._sandbox.acquire(self._store)
+
+    def _release(self, server: WorkerServer) -> None:
+        self._sandbox.release(server, self.timeouts.server_idle_s)
 
     def open(self, deadline: Deadline, known: Known | None = None) -> LoadedJail:
         """Fork a jail and have its first host call ``make_env``.
@@ -248,12 +261,14 @@ class Repository:
             LoadError: The repository failed to load, or returned something unusable.
             WorkerError: The jail did not come up, died, or took too long.
         """
-        server = self._sandbox.acquire(self._store)
+        server = self._acquire()
         try:
-            with self.starting():
+            if self.timeouts.server_idle_s != 0 and not isinstance(server, FarServer):
+                self._hold.keep()
+            with self.starting(deadline):
                 return self._open(server, deadline, known)
         except BaseException:
-            self._sandbox.release(server)
+            self._release(server)
             raise
 
     def _open(self, server: WorkerServer, deadline: Deadline, known: Known | None) -> LoadedJail:
@@ -364,13 +379,13 @@ class Repository:
 
     def connect(self, loaded: LoadedJail, deadline: Deadline) -> LoadedJail:
         """A further connection to an open jail; environments that share one wait apart."""
-        server = self._sandbox.acquire(self._store)
+        server = self._acquire()
         client = self._client(server)
         try:
             client.hello(deadline)
         except BaseException:
             client.close()
-            self._sandbox.release(server)
+            self._release(server)
             raise
         jail = loaded.jail.through(client)
         return LoadedJail(jail, loaded.manifest, loaded.value, loaded.loaded, server)
@@ -378,7 +393,7 @@ class Repository:
     def disconnect(self, loaded: LoadedJail) -> None:
         """Drop a further connection."""
         loaded.jail.client.close()
-        self._sandbox.release(loaded.server)
+        self._release(loaded.server)
 
     def close(self, loaded: LoadedJail) -> None:
         """End a jail and give its server back. Idempotent."""
@@ -389,7 +404,7 @@ class Repository:
         try:
             loaded.jail.close(Deadline(_CLOSE_S))
         finally:
-            self._sandbox.release(loaded.server)
+            self._release(loaded.server)
 
     def states(self, loaded: LoadedJail) -> tuple[str, ...]:
         """What a jail's hosts are doing, one word each; asked over a connection of its own.

@@ -14,7 +14,7 @@ from typing import Any
 
 from envhub_sandbox.building import Builder, Place
 from envhub_sandbox.deadline import Deadline, StartupDeadline
-from envhub_sandbox.errors import EnvHubError, WorkerDiedError
+from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError
 from envhub_sandbox.fast_lane import FastLane
 from envhub_sandbox.history import History
 from envhub_sandbox.jail_sources import JailSource
@@ -72,6 +72,12 @@ class Tenant:
         self._pending: tuple[int, str] | None = None  # a request's id, and what was asked
         self._release_server: Callable[[], None] = _nothing
         self._startup: StartupDeadline | None = None
+        self._warm = False  # started ahead, and not used yet
+        self._warming: StartupDeadline | None = None
+        self._first_use: Callable[[], None] | None = None
+        self._make_room: Callable[[], bool] = _no_room
+        self._departs = weakref.finalize(self, jails.repository.stay())
+        self._departs.atexit = False
         labels = Labels(self.repository.label, manifest.suite, str(manifest.task))
         LEDGER.add(self, labels, self._restarts)
         _living.add(self)
@@ -80,6 +86,11 @@ class Tenant:
     def repository(self) -> Repository:
         """The repository that it comes from."""
         return self._jails.repository
+
+    @property
+    def closed(self) -> bool:
+        """Whether it is closed for good."""
+        return self.lifecycle.state is State.CLOSED
 
     def stats(self) -> dict[str, Any]:
         """Counters, and where it is in its life."""
@@ -129,18 +140,64 @@ class Tenant:
     def prewarm(self) -> None:
         """Start its processes in a thread of their own, unless they are there."""
         if self.lifecycle.state is State.IDLE:
-            threading.Thread(target=self._prewarm, name="envhub-prewarm", daemon=True).start()
+            threading.Thread(target=self.warm_up, name="envhub-prewarm", daemon=True).start()
 
-    def _prewarm(self) -> None:
+    def warm_up(self) -> None:
+        """Start its processes, unless they are there, although nobody has asked for them yet."""
+        deadline = StartupDeadline(self.repository.timeouts.startup_s, unasked=True)
         # whatever goes wrong: the first request meets it again, and somebody hears of it there
         with contextlib.suppress(Exception), self._turn("make_env"):
             if self.lifecycle.state is State.IDLE:
-                self._start()
+                self._warming = deadline
+                try:
+                    self._start(deadline)
+                    self._warm = True
+                finally:
+                    self._warming = None
 
-    def _start(self) -> None:
-        deadline = self._startup = StartupDeadline(self.repository.timeouts.startup_s)
+    def cool_down(self) -> bool:
+        """Give up what was started ahead, if nobody has used it yet; whether it was so."""
+        warming = self._warming
+        if warming is not None:
+            warming.give_up()
+        if not self._lock.acquire(timeout=0 if warming is None else _INTERRUPT_S):
+            return False  # somebody uses it
         try:
-            self._build(self._jails.take(deadline), deadline)
+            loaded, used = self._loaded, self.counters.requests or self.counters.lane_steps
+            if not self._warm or used or loaded is None or self.lifecycle.state is not State.READY:
+                return warming is not None
+            with self._turn("make_env"):
+                self._warm = False
+                self._close_politely(loaded)
+                self._give_back()
+                self._moved(Event.FORGET)
+            return True
+        finally:
+            self._lock.release()
+
+    def on_first_use(self, used: Callable[[], None], make_room: Callable[[], bool]) -> None:
+        """Whom to tell that it is used, and whom to ask where a server has no place left."""
+        self._first_use, self._make_room = used, make_room
+
+    def _note_first_use(self) -> None:
+        if self._first_use is not None:
+            tell, self._first_use = self._first_use, None
+            tell()
+
+    def _look_whether_warm_lives(self) -> None:
+        """What was started ahead and has died unused is started again, as if it never had been."""
+        self._warm = False
+        if self._loaded is None or self.lifecycle.state is not State.READY:
+            return
+        try:
+            self._loaded.jail.output("make_env", Deadline(_INTERRUPT_S))
+        except EnvHubError:
+            self._forget()
+
+    def _start(self, deadline: StartupDeadline | None = None) -> None:
+        deadline = self._startup = deadline or StartupDeadline(self.repository.timeouts.startup_s)
+        try:
+            self._build(self._take_jail(deadline), deadline)
         except EnvHubError:
             if self.lifecycle.state is State.CLOSED:
                 raise self._closed("make_env") from None
@@ -149,8 +206,17 @@ class Tenant:
             self._startup = None
             self._let_server_go()
 
+    def _take_jail(self, deadline: Deadline) -> LoadedJail:
+        try:
+            return self._jails.take(deadline)
+        except WorkerError as error:
+            # of this very type: the server's refusal, which may be for want of room
+            if type(error) is not WorkerError or deadline.unasked or not self._make_room():
+                raise
+        return self._jails.take(deadline)
+
     def _build(self, loaded: LoadedJail, deadline: Deadline) -> None:
-        with self.repository.starting():
+        with self.repository.starting(deadline):
             self._build_in(loaded, deadline)
 
     def _build_in(self, loaded: LoadedJail, deadline: Deadline) -> None:
@@ -217,6 +283,7 @@ class Tenant:
             self._give_back()
         finally:
             self._let_server_go()
+            self._departs()
 
     # --- the end -------------------------------------------------------------------------------
 
@@ -302,3 +369,8 @@ os.register_at_fork(after_in_child=_abandon_all)
 
 def _nothing() -> None:
     """There is nothing to give back."""
+
+
+def _no_room() -> bool:
+    """Nothing was started ahead that could be given up."""
+    return False

@@ -49,6 +49,8 @@ from envhub_worker.zygote_process import ZygoteProcess
 
 MAX_HOSTS = 64
 """Hosts of one jail: one per useful core, not one per sub-environment."""
+MAX_IDLE_ZYGOTES = 2
+"""Without a jail, when another is started. A client mostly has one policy, or two in turns."""
 ATTACH = "attach"
 """The operation that brings a host its descriptors."""
 MAX_JAILS = 256
@@ -172,10 +174,11 @@ class Jails:
         self._loop.watch(fd, guarded)
 
     def _spawner(self, key: tuple[object, ...], confinement: Confinement) -> Spawner:
-        spawner = self._spawners.get(key)
+        spawner = self._spawners.pop(key, None)
         if spawner is None:
+            self._end_idle_zygotes()
             ahead, self._ahead = self._ahead, None
-            spawner = self._spawners[key] = Spawner(
+            spawner = Spawner(
                 confinement,
                 runtime_dir=self._runtime_dir,
                 readable_roots=self._readable_roots,
@@ -183,7 +186,17 @@ class Jails:
                 ahead=ahead,
             )
             self._loop.watch(spawner.fileno(), lambda: self._spawner_events(key))
+        self._spawners[key] = spawner  # the one that was used last is the last
         return spawner
+
+    def _end_idle_zygotes(self) -> None:
+        """A client with ever new policies does not fill the machine with warm interpreters."""
+        used = {entry.spawner for entry in self._jails.values() if not entry.released}
+        idle = [key for key in self._spawners if key not in used]
+        for key in idle[: max(0, len(idle) - MAX_IDLE_ZYGOTES)]:
+            spawner = self._spawners.pop(key)
+            self._loop.unwatch(spawner.fileno())
+            spawner.close()
 
     def relay(self, asker: Asker, request: m.Relay, payload: list[bytes]) -> None:
         """Hand the payload to hosts; the reply goes out once all of them have answered."""

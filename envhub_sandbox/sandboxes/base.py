@@ -43,8 +43,14 @@ class Sandbox(Protocol):
             WorkerStartupError: The server did not come up.
         """
 
-    def release(self, server: WorkerServer) -> None:
-        """Give a server back; the last one who does ends it."""
+    def release(self, server: WorkerServer, idle_s: float | None = 0.0) -> None:
+        """Give a server back; the last one who does gives it up.
+
+        Args:
+            server: What ``acquire`` gave.
+            idle_s: For how long it may be kept for whoever asks next; 0 ends it at once, None
+                keeps it for as long as this process lives.
+        """
 
 
 @runtime_checkable

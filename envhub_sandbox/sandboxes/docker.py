@@ -37,6 +37,7 @@ from envhub_sandbox.sandboxes.engines import (
     own_limits,
 )
 from envhub_sandbox.sandboxes.identity import identity_of
+from envhub_sandbox.sandboxes.lingering import Lingering
 from envhub_sandbox.sandboxes.sharing import Sharing
 
 _KEEPER = Path(__file__).with_name("keeper.py")
@@ -111,7 +112,7 @@ class DockerSandbox:
         """Not without a repository: a container sees the files of one only."""
         raise SandboxUnavailableError("a container is started for a repository, not for a store")
 
-    def release(self, server: WorkerServer) -> None:
+    def release(self, server: WorkerServer, idle_s: float | None = 0.0) -> None:
         """Nothing was acquired here."""
 
 
@@ -168,6 +169,9 @@ class ContainerServer:
             os.close(self.process_fd)
 
 
+_IDLE: Lingering[ContainerServer] = Lingering()
+
+
 class RepositoryContainer:
     """The sandbox of one repository: one container, which its environments share."""
 
@@ -179,16 +183,18 @@ class RepositoryContainer:
         self.interpreter = f"{image} in {engine.kind}"
         self._options, self._engine, self._image = options, engine, image
         self._snapshot, self._policy = snapshot, policy
-        self._servers: Sharing[ContainerServer] = Sharing()
+        # of one make_env, whose limits are for it alone; only one that nobody uses changes hands
+        self._servers: Sharing[ContainerServer] = Sharing(_IDLE)
+        self._key = repr((options, engine, image, str(snapshot), policy))
 
     def acquire(self, store: Path) -> ContainerServer:
         """The repository's container, started if there is none."""
-        return self._servers.acquire(None, self._start)
+        return self._servers.acquire(self._key, self._start)
 
-    def release(self, server: WorkerServer) -> None:
-        """Give it back; the last one who does ends the container."""
+    def release(self, server: WorkerServer, idle_s: float | None = 0.0) -> None:
+        """Give it back; the last one who does gives the container up."""
         assert isinstance(server, ContainerServer)
-        self._servers.release(server)
+        self._servers.release(server, idle_s)
 
     def _start(self) -> ContainerServer:
         folder = Path(tempfile.mkdtemp(prefix=_PREFIX))

@@ -21,6 +21,7 @@ from pathlib import Path
 import envhub_worker.protocol
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.sandboxes.base import WorkerServer
+from envhub_sandbox.sandboxes.lingering import Lingering
 from envhub_sandbox.sandboxes.sharing import Sharing
 
 BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
@@ -71,7 +72,7 @@ class ProcessSandbox:
     name = "process"
 
     def __init__(self) -> None:
-        self._servers: Sharing[ProcessServer] = Sharing()
+        self._servers: Sharing[ProcessServer] = Sharing(Lingering())
 
     def acquire(self, store: Path) -> ProcessServer:
         """The server for this process, started if there is none."""
@@ -82,10 +83,10 @@ class ProcessSandbox:
             )
         return self._servers.acquire(store, partial(_start, store))
 
-    def release(self, server: WorkerServer) -> None:
-        """Give a server back; the last one who does ends it."""
+    def release(self, server: WorkerServer, idle_s: float | None = 0.0) -> None:
+        """Give a server back; the last one who does gives it up."""
         assert isinstance(server, ProcessServer)
-        self._servers.release(server)
+        self._servers.release(server, idle_s)
 
 
 def _start(store: Path) -> ProcessServer:

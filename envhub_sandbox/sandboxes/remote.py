@@ -101,7 +101,7 @@ class RemoteSandbox:
         """Not without a repository: its files have to be brought there."""
         raise SandboxUnavailableError("a remote server is asked for a repository, not for a store")
 
-    def release(self, server: WorkerServer) -> None:
+    def release(self, server: WorkerServer, idle_s: float | None = 0.0) -> None:
         """Nothing was acquired here."""
 
 
@@ -245,8 +245,8 @@ class RemoteRepository:
         host = HOSTS.acquire(where, partial(Host, *where))
         return RemoteServer(host, self, self._policy.profile)
 
-    def release(self, server: WorkerServer) -> None:
-        """Give it back; after the last one who does, nobody tells it that we live."""
+    def release(self, server: WorkerServer, idle_s: float | None = 0.0) -> None:
+        """Give it back; after the last one who does, nobody tells it that we live. It stays."""
         assert isinstance(server, RemoteServer)
         HOSTS.release(server.host)
 

@@ -1,4 +1,7 @@
-"""What the environments of this process share: started for the first of them, ended by the last."""
+"""What the environments of this process share: started for the first of them, given up by the last.
+
+What is given up is ended, or kept for a while if its last user asked for that.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,8 @@ import threading
 import weakref
 from collections.abc import Callable, Hashable
 from typing import Any, Generic, Protocol, TypeVar
+
+from envhub_sandbox.sandboxes.lingering import Lingering, stop_idle
 
 
 class Shared(Protocol):
@@ -32,16 +37,21 @@ S = TypeVar("S", bound=Shared)
 
 
 class Sharing(Generic[S]):
-    """Counts who uses what. Thread-safe; a fork starts its own."""
+    """Counts who uses what. Thread-safe; a fork starts its own.
 
-    def __init__(self) -> None:
+    Args:
+        lingering: Where what nobody uses is kept, if its last user asks for it.
+    """
+
+    def __init__(self, lingering: Lingering[S] | None = None) -> None:
+        self._lingering = lingering
         # reentrant: the garbage collector may close an environment in the middle of acquire()
         self._lock = threading.RLock()
         self._shared: dict[tuple[int, Hashable], S] = {}
         _all.add(self)
 
     def acquire(self, key: Hashable, start: Callable[[], S]) -> S:
-        """The one with this key, started if there is none, or none that runs."""
+        """The one with this key, in use or lingering; started if there is none that runs."""
         mine = os.getpid(), key
         with self._lock:
             shared = self._shared.get(mine)
@@ -50,12 +60,19 @@ class Sharing(Generic[S]):
                 if shared.runs:
                     return shared
                 self.release(shared)
-            shared = self._shared[mine] = start()
+            lingering = None if self._lingering is None else self._lingering.take(mine)
+            shared = self._shared[mine] = lingering or start()
             shared.users += 1
             return shared
 
-    def release(self, shared: S) -> None:
-        """Give it back; the last one who does ends it, unless it has been ended."""
+    def release(self, shared: S, idle_s: float | None = 0.0) -> None:
+        """Give it back; the last one who does gives it up, unless it has been ended.
+
+        Args:
+            shared: What ``acquire`` gave.
+            idle_s: For how long it is kept for the next; 0 ends it, None keeps it until the end
+                of this process.
+        """
         with self._lock:
             if not shared.users:
                 return
@@ -65,7 +82,15 @@ class Sharing(Generic[S]):
             for key, known in list(self._shared.items()):
                 if known is shared:
                     del self._shared[key]
+                    if self._kept(key, shared, idle_s):
+                        return
         shared.stop()
+
+    def _kept(self, key: tuple[int, Hashable], shared: S, idle_s: float | None) -> bool:
+        """Whether it lingers from here on; what is a parent's cannot."""
+        if self._lingering is None or idle_s == 0 or key[0] != os.getpid() or not shared.runs:
+            return False
+        return self._lingering.put(key, shared, idle_s)
 
     def stop_all(self) -> None:
         """End all that this process has started, as at its exit."""
@@ -87,6 +112,7 @@ _all: weakref.WeakSet[Sharing[Any]] = weakref.WeakSet()
 
 def _stop_all() -> None:
     with contextlib.ExitStack() as stack:  # whatever interrupts one of them, the others follow
+        stack.callback(stop_idle, for_good=True)
         for sharing in list(_all):
             stack.callback(sharing.stop_all)
 

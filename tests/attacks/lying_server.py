@@ -126,7 +126,7 @@ class LyingSandbox:
         """The liar."""
         return self._server
 
-    def release(self, server: object) -> None:
+    def release(self, server: object, idle_s: float | None = 0.0) -> None:
         """The test ends it."""
 
 

@@ -16,6 +16,7 @@ from envhub_sandbox.sandboxes.containers import CLIENT_LABEL, SNAPSHOT
 from envhub_sandbox.sandboxes.docker import DockerSandbox
 from envhub_sandbox.sandboxes.engines import Engine
 from envhub_sandbox.sandboxes.identity import identity_of
+from envhub_sandbox.sandboxes.lingering import stop_idle
 from tests.attacks.harness import Arena, Run, answered, new_alias
 from tests.support.processes import eventually
 
@@ -48,7 +49,12 @@ def folders(identity: str | None = None) -> list[Path]:
 
 
 def nothing_left(engine: Engine, identity: str | None = None) -> bool:
-    """Whether no container of a client is left, ours by default; waits for it."""
+    """Whether no container of a client is left, ours by default; waits for it.
+
+    Of ours one may linger until its time comes; that is ended first.
+    """
+    if identity is None:
+        stop_idle()
     wanted = identity or identity_of(os.getpid())
     return eventually(lambda: not containers_of(engine, wanted), 60.0)
 

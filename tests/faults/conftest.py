@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import make_env
+from envhub_sandbox.sandboxes.lingering import stop_idle
 from tests.faults.traces import Traces, temporary_root
 from tests.support.processes import eventually
 from tests.support.samples import sample
@@ -35,6 +36,7 @@ def place() -> Iterator[Path]:
     with temporary_root() as folder:
         before = Traces.of(folder)
         yield folder
+        stop_idle()  # servers that linger; they are all that a closed environment leaves
         gone = eventually(lambda: not _left(folder, before))
         assert gone, _left(folder, before)
 

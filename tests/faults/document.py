@@ -29,7 +29,8 @@ In every cell:
   [crash bundle](crashes.md), with which `envhub replay` does the same again.
 - Another environment of the same client, and the other tasks of a suite, go on undisturbed.
 - After `close()` no process, zombie, descriptor, mapped slab, socket, file, mount or control group
-  is there that was not there before. This is read from `/proc` and the file system.
+  of a jail is there that was not there before. This is read from `/proc` and the file system. The
+  worker server lingers (see below).
 
 "In seconds" is the median of a row's six cells, on two busy cores, from the request to the error
 or the answer. Timeouts were 1 second for requests, 5 for starting and 1 for closing. `reset()`
@@ -96,6 +97,13 @@ Each task of a suite has its own clock, unless `make_env` has built them all at 
 an answer is not idle.
 
 ## However the client ends
+
+**After the last `close()`** the worker server, or the container, is kept for the next environment,
+for `timeouts={"server_idle_s": 30}` seconds; 0 ends it at once. It holds no jail, and nothing that
+has executed a repository's code: one server at most, and a warm interpreter for each kind of policy
+that was used last, at most three (a server and one of these are three processes, whose own memory
+was 60 MB when this was written). It ends with the client at the latest, however that ends;
+`tests/integration/test_lingering.py` looks from outside.
 
 `tests/faults/test_nothing_left.py` ends clients: by return without `close()`, exceptions,
 `sys.exit`, `os._exit`, a crash, and by SIGINT, SIGTERM, SIGHUP and SIGKILL while idle, in a step

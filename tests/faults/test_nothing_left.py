@@ -298,7 +298,9 @@ def test_close_under_a_starting_worker_returns(folder: Path) -> None:
         """
         from gymnasium.error import ClosedEnvironmentError
         fails = {"moment": "init", "fault": "hang", "tasks": 2}
-        suites = make_env(REPOSITORY, n_envs=2, env_kwargs=fails)
+        suites = make_env(
+            REPOSITORY, n_envs=2, env_kwargs=fails, timeouts={"server_idle_s": 0}
+        )
         env = suites["suite"][0]
         threading.Timer(1.0, env.close).start()
         try:

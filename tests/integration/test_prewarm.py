@@ -46,7 +46,7 @@ def test_closed_in_the_midst_it_leaves_nothing() -> None:
     """Whenever that comes."""
     before = descendants()
     for _ in range(5):
-        suites = make_env(sample("counter"), n_envs=2)
+        suites = make_env(sample("counter"), n_envs=2, timeouts={"server_idle_s": 0})
         suites.env.prewarm()
         suites.close()
         assert suites.env.stats()["state"] == "CLOSED"

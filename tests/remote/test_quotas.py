@@ -26,6 +26,7 @@ from envhub_worker.quotas import (
 from envhub_worker.sessions import MAX_HELD, Sessions
 from tests.remote.listening import Listening, listening
 from tests.support.processes import eventually
+from tests.support.samples import sample
 
 
 def order(python: str = "", **policy: Any) -> tuple[m.OpenJail, Confinement]:
@@ -166,4 +167,24 @@ def test_a_second_jail_over_the_quota_is_refused_and_the_first_goes_on(
             second.env.reset(seed=1)
         with pytest.raises(PolicyError, match="--allow-network"):
             make_env(repository, n_envs=3, sandbox=sandbox, policy={"network": "host"})
+        assert eventually(lambda: server.jails() == 0)
+
+
+def test_what_was_started_ahead_makes_room_under_a_quota(tmp_path: Path) -> None:
+    """A task that somebody uses comes first; where there is no room nothing is started ahead."""
+    options: dict[str, Any] = {"env_kwargs": {"tasks": 4}, "prewarm": 1}
+    with listening(tmp_path / "server", "--max-jails", "2") as server:
+        with make_env(sample("many_tasks"), sandbox=server.sandbox(), **options) as suites:
+            envs = list(suites.envs())
+            envs[0].reset(seed=0)
+            assert eventually(lambda: envs[1].stats()["state"] == "READY")
+            envs[3].reset(seed=0)  # would be the third jail
+            assert envs[1].stats()["state"] == "IDLE"
+            with pytest.raises(WorkerError, match="3 jails"):
+                envs[1].reset(seed=0)
+            envs[3].close()
+            envs[1].reset(seed=0)
+            for env in (envs[0], envs[1]):
+                env.step(np.zeros(1, int))
+            assert envs[2].stats()["state"] == "IDLE"
         assert eventually(lambda: server.jails() == 0)

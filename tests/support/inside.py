@@ -195,6 +195,10 @@ DECODING: Spot = (m, "_decode")
 """What makes a message of a document that has no form yet."""
 FORMS: tuple[Spot, Spot] = ((m, "_OUTGOING"), (m, "_INCOMING"))
 """What is remembered of the shape of messages, each way."""
+IDLE_CONTAINERS: Spot = (docker, "_IDLE")
+"""Where a container is that nobody uses."""
+CONTAINER_STARTS: Spot = (docker.RepositoryContainer, "_start")
+"""What starts one."""
 
 
 def building(env: Any) -> Spot:

@@ -382,9 +382,22 @@ def test_the_protocol_loads_neither_zeromq_nor_the_hub() -> None:
 
 
 def test_the_command_line_helps_without_loading_anything_heavy() -> None:
-    """``envhub --help`` answers at once."""
-    loaded = loaded_by("import envhub_sandbox.cli")
-    assert not loaded & {"zmq", "huggingface_hub", "gymnasium", "numpy", "torch"}
+    """``envhub --help`` answers at once: it needs its own texts, typer and rich."""
+    loaded = loaded_by(
+        "import sys; from envhub_sandbox.cli import main; sys.argv = ['envhub', '--help']\n"
+        "try: main()\nexcept SystemExit as end: assert not end.code"
+    )
+    assert {"typer", "rich", "envhub_sandbox"} <= loaded
+    assert not loaded & (CLIENTS_OWN - {"typer", "rich", "envhub_sandbox", "envhub_worker"})
+    assert not loaded & {"torch", "httpx", "requests", "asyncio", "email", "prometheus_client"}
+
+
+def test_make_env_loads_neither_the_hub_nor_what_others_need() -> None:
+    """Of ZeroMQ no asyncio; the Hub's client, the engines and other hosts once they are asked."""
+    loaded = loaded_by("from envhub_sandbox import make_env")
+    assert {"zmq", "gymnasium", "numpy"} <= loaded
+    assert not loaded & {"huggingface_hub", "asyncio", "ssl", "typer", "rich", "psutil", "torch"}
+    assert not loaded & {"platformdirs", "packaging", "imageio_ffmpeg", "httpx", "requests"}
 
 
 def test_a_repository_leaves_no_module_in_the_client() -> None:

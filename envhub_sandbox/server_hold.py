@@ -1,0 +1,59 @@
+"""A suite's hold on its worker server, between two of its jails."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+
+from envhub_sandbox.sandboxes.base import WorkerServer
+
+
+class ServerHold:
+    """Keeps a server from the first jail on until the last environment is closed. Thread-safe.
+
+    An evaluation closes each task before it opens the next, and may think in between for longer
+    than a server lingers.
+
+    Args:
+        acquire: Asks for the server.
+        release: Gives it back.
+    """
+
+    def __init__(
+        self, acquire: Callable[[], WorkerServer], release: Callable[[WorkerServer], None]
+    ) -> None:
+        self._acquire, self._release = acquire, release
+        # reentrant: the garbage collector may close an environment in the midst of this
+        self._lock = threading.RLock()
+        self._owner = os.getpid()
+        self._open: set[object] = set()
+        self._server: WorkerServer | None = None
+
+    def enter(self) -> Callable[[], None]:
+        """There is one environment more; returns what says that it is closed. Idempotent."""
+        ticket = object()
+        with self._lock:
+            self._open.add(ticket)
+        return lambda: self._leave(ticket)
+
+    def keep(self) -> None:
+        """A jail has been opened: keep its server, if there are environments to come."""
+        before = None
+        with self._lock:
+            if not self._open:
+                return
+            server = self._acquire()
+            before, self._server = self._server, server
+        if before is not None:
+            self._release(before)  # the same, mostly; or one that has died
+
+    def _leave(self, ticket: object) -> None:
+        if os.getpid() != self._owner:
+            return  # a fork: the server is the parent's, and somebody may have held the lock
+        with self._lock:
+            self._open.discard(ticket)
+            if self._open or self._server is None:
+                return
+            server, self._server = self._server, None
+        self._release(server)

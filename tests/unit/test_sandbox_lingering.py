@@ -1,0 +1,276 @@
+"""Servers that nobody uses: kept for their time, handed on, and ended whatever comes."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox.policy import Policy, timeouts_from
+from envhub_sandbox.sandboxes import docker
+from envhub_sandbox.sandboxes.engines import Engine
+from envhub_sandbox.sandboxes.lingering import Lingering
+from envhub_sandbox.sandboxes.sharing import Sharing
+from envhub_sandbox.server_hold import ServerHold
+from tests.support import inside
+from tests.support.processes import eventually
+
+
+@dataclass(eq=False)
+class Server:
+    """Remembers what was done with it; its end can be made to last."""
+
+    users: int = 0
+    runs: bool = True
+    ends: list[str] = field(default_factory=list)
+    ending: threading.Event = field(default_factory=threading.Event)
+    may_end: threading.Event = field(default_factory=threading.Event)
+
+    def __post_init__(self) -> None:
+        self.may_end.set()
+
+    def stop(self) -> None:
+        """Note who ended it."""
+        self.ending.set()
+        assert self.may_end.wait(60)
+        self.runs = False
+        self.ends.append(threading.current_thread().name)
+
+
+def given_up(sharing: Sharing[Server], key: str, idle_s: float | None) -> Server:
+    """One that was used once."""
+    server = sharing.acquire(key, Server)
+    sharing.release(server, idle_s)
+    return server
+
+
+@pytest.fixture
+def lingering() -> Iterator[Lingering[Server]]:
+    """At the end of a test nothing lingers, and nobody waits."""
+    made: Lingering[Server] = Lingering()
+    yield made
+    made.stop_all()
+    assert eventually(lambda: not _waiting())
+
+
+@pytest.fixture
+def sharing(lingering: Lingering[Server]) -> Sharing[Server]:
+    """What is given up in it lingers, if it is asked to."""
+    return Sharing(lingering)
+
+
+def test_the_next_gets_the_one_that_lingers(sharing: Sharing[Server]) -> None:
+    """However often it changes hands; nobody has ended it."""
+    first = given_up(sharing, "key", 600)
+    for _ in range(100):
+        assert given_up(sharing, "key", 600) is first
+    assert not first.ends
+
+
+def test_without_a_time_it_ends_at_once(sharing: Sharing[Server]) -> None:
+    """By whoever gives it back, in his own thread."""
+    assert given_up(sharing, "key", 0).ends == [threading.current_thread().name]
+
+
+def test_its_time_comes(sharing: Sharing[Server]) -> None:
+    """It is ended once, in the background, and the thread that did it ends, too."""
+    server = given_up(sharing, "key", 0.01)
+    assert eventually(lambda: server.ends == ["envhub-idle"])
+    assert eventually(lambda: not _waiting())
+    assert given_up(sharing, "key", 0) is not server
+
+
+def test_one_lingers_at_most(sharing: Sharing[Server]) -> None:
+    """With the next its time has come, however long it was."""
+    first, second = given_up(sharing, "one", None), given_up(sharing, "two", None)
+    assert eventually(lambda: bool(first.ends))
+    assert not second.ends
+
+
+def test_one_that_has_died_is_not_handed_on(sharing: Sharing[Server]) -> None:
+    """The next gets a fresh one, and the dead one is cleaned up after."""
+    dead = given_up(sharing, "key", None)
+    dead.runs = False
+    fresh = given_up(sharing, "key", None)
+    assert fresh is not dead
+    assert eventually(lambda: len(dead.ends) == 1)
+
+
+def test_one_that_has_died_in_use_does_not_linger(sharing: Sharing[Server]) -> None:
+    """It is ended by the one who gives it back."""
+    server = sharing.acquire("key", Server)
+    server.runs = False
+    sharing.release(server, None)
+    assert server.ends
+
+
+def test_who_asks_while_it_ends_gets_a_fresh_one_at_once(sharing: Sharing[Server]) -> None:
+    """From the moment on that its time has come it is nobody's, and nobody waits for its end."""
+    old = sharing.acquire("key", Server)
+    old.may_end.clear()
+    sharing.release(old, 0.01)
+    assert old.ending.wait(60)
+    fresh = sharing.acquire("key", Server)
+    assert fresh is not old
+    old.may_end.set()
+    assert eventually(lambda: bool(old.ends))
+    assert not fresh.ends
+
+
+def test_taken_or_ended_but_never_both(sharing: Sharing[Server]) -> None:
+    """Whoever comes in the moment in which the time comes: nobody has one that was ended."""
+    for attempt in range(300):
+        given_up(sharing, "key", (attempt % 10) * 1e-4)
+        taken = sharing.acquire("key", Server)
+        assert taken.runs
+        assert not taken.ends
+        sharing.release(taken, 1e-4)
+    assert eventually(lambda: not _waiting())
+
+
+def test_many_at_once_share_what_lingers(sharing: Sharing[Server]) -> None:
+    """Threads that open and close with times around nothing never meet an ended one."""
+    wrong: list[Server] = []
+
+    def use() -> None:
+        for attempt in range(100):
+            server = sharing.acquire("key", Server)
+            if server.ends:
+                wrong.append(server)
+            sharing.release(server, (attempt % 3) * 1e-4)
+
+    threads = [threading.Thread(target=use) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+
+
+def test_at_the_end_of_the_process_all_end_and_none_is_kept(
+    lingering: Lingering[Server], sharing: Sharing[Server]
+) -> None:
+    """Those that linger, and what is given up afterwards."""
+    idle, used = given_up(sharing, "idle", 600), sharing.acquire("used", Server)
+    lingering.stop_all(for_good=True)
+    assert idle.ends == [threading.current_thread().name]
+    sharing.release(used, 600)
+    assert used.ends == [threading.current_thread().name]
+
+
+def test_the_end_waits_for_what_is_ending(
+    lingering: Lingering[Server], sharing: Sharing[Server]
+) -> None:
+    """So that nothing is left half ended."""
+    server = sharing.acquire("key", Server)
+    server.may_end.clear()
+    sharing.release(server, 0.01)
+    assert server.ending.wait(60)
+    threading.Timer(0.1, server.may_end.set).start()
+    lingering.stop_all()
+    assert server.ends == ["envhub-idle"]
+
+
+def test_a_fork_has_none_and_ends_none(sharing: Sharing[Server]) -> None:
+    """Also if another thread was about to end it at that moment."""
+    ours = given_up(sharing, "key", 600)
+    child = os.fork()
+    if child == 0:  # pragma: no cover
+        code = 1
+        try:
+            own = given_up(sharing, "key", 0.01)
+            assert own is not ours
+            assert eventually(lambda: bool(own.ends))
+            assert not ours.ends
+            code = 0
+        finally:
+            os._exit(code)
+    assert os.waitpid(child, 0)[1] == 0
+    assert sharing.acquire("key", Server) is ours
+
+
+def test_a_hold_lasts_from_the_first_jail_to_the_last_environment(
+    sharing: Sharing[Server],
+) -> None:
+    """However many jails come and go in between; to leave twice is to leave once."""
+    hold: ServerHold = ServerHold(
+        lambda: sharing.acquire("key", Server),  # type: ignore[arg-type, return-value]
+        sharing.release,  # type: ignore[arg-type]
+    )
+    leave_one, leave_two = hold.enter(), hold.enter()
+    server = sharing.acquire("key", Server)
+    for _ in range(3):
+        hold.keep()
+    sharing.release(server)
+    assert server.users == 1
+    leave_one()
+    leave_one()
+    assert not server.ends
+    leave_two()
+    assert server.ends
+    hold.keep()  # nobody is left who could need it
+    assert server.users == 0
+
+
+def test_a_hold_moves_on_from_a_server_that_has_died(sharing: Sharing[Server]) -> None:
+    """It keeps the one that the next jail was opened in."""
+    hold: ServerHold = ServerHold(
+        lambda: sharing.acquire("key", Server),  # type: ignore[arg-type, return-value]
+        sharing.release,  # type: ignore[arg-type]
+    )
+    leave = hold.enter()
+    hold.keep()
+    dead = sharing.acquire("key", Server)
+    sharing.release(dead)
+    dead.runs = False
+    hold.keep()
+    assert dead.ends
+    fresh = sharing.acquire("key", Server)
+    assert fresh.users == 2
+    sharing.release(fresh)
+    leave()
+    assert fresh.ends
+
+
+def test_a_container_changes_hands_only_when_nobody_uses_it(
+    monkeypatch: pytest.MonkeyPatch, lingering: Lingering[Server]
+) -> None:
+    """Its memory is one ``make_env``'s; another policy, or another repository, has its own."""
+    monkeypatch.setattr(*inside.IDLE_CONTAINERS, lingering)
+    monkeypatch.setattr(*inside.CONTAINER_STARTS, lambda self: Server())
+    monkeypatch.setattr(docker, "ContainerServer", Server)
+    engine = Engine("docker", "/usr/bin/docker", "1", rootless=False)
+
+    def sandbox(snapshot: str = "/one", **policy: Any) -> docker.RepositoryContainer:
+        options, made = docker.DockerSandbox(), Policy(**policy)
+        return docker.RepositoryContainer(options, engine, "sha256:0", Path(snapshot), made)
+
+    first, second = sandbox(), sandbox()
+    one, two = first.acquire(Path("/")), second.acquire(Path("/"))
+    assert one is not two
+    second.release(two, 0)
+    first.release(one, 600)
+    assert sandbox().acquire(Path("/")) is one
+    first = sandbox()
+    other = first.acquire(Path("/"))
+    first.release(other, 600)
+    assert sandbox("/two").acquire(Path("/")) is not other
+    assert sandbox(network="loopback").acquire(Path("/")) is not other
+    assert sandbox().acquire(Path("/")) is other
+
+
+def test_the_setting_takes_nothing_and_for_ever() -> None:
+    """The only time that may be 0."""
+    assert timeouts_from({"server_idle_s": 0}).server_idle_s == 0
+    assert timeouts_from({"server_idle_s": None}).server_idle_s is None
+    with pytest.raises(ValueError, match="server_idle_s is -1"):
+        timeouts_from({"server_idle_s": -1})
+
+
+def _waiting() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name == "envhub-idle"]
