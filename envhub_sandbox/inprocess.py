@@ -52,6 +52,8 @@ def _import(snapshot: Snapshot) -> Any:
         raise LoadError(f"{snapshot.repo_id}:{snapshot.path} cannot be imported")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses with postponed annotations look it up
+    # root could write it into the store, where the next use would find an extra file
+    before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
     try:
         spec.loader.exec_module(module)
     except ModuleNotFoundError as error:
@@ -63,6 +65,8 @@ def _import(snapshot: Snapshot) -> Any:
     except BaseException:
         del sys.modules[name]
         raise
+    finally:
+        sys.dont_write_bytecode = before
     return module
 
 
