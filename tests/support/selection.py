@@ -44,7 +44,6 @@ SHORT = (
     "tests/compliance/test_join_infos.py::",
     "tests/compliance/test_parity.py::TestCounterInUnevenShards::",
     "tests/compliance/test_parity.py::TestCartPole::",
-    "tests/compliance/test_parity.py::TestExoticSpaces::",
     "tests/compliance/test_parity.py::TestLeRobotPendulum::",
     # one of each family of attacks, and what a client is told by a liar
     *(f"tests/attacks/test_{start}" for start in _ATTACKS),
@@ -74,6 +73,7 @@ SHORT = (
     # another host: keys, the same results, strangers
     "tests/remote/test_keys.py::",
     "tests/remote/test_parity.py::TestCounter::",
+    "tests/remote/test_parity.py::TestExoticSpaces::",
     "tests/remote/test_strangers.py::test_another_clients_key_is_refused_at_once",
     "tests/remote/test_strangers.py::test_no_key_is_refused_at_once",
 )
