@@ -20,7 +20,7 @@ from envhub_sandbox.sandboxes.engines import Engine
 from envhub_sandbox.snapshot import local
 from tests.attacks.harness import HOSTILE, Run, token
 from tests.attacks.listeners import Listener, listening
-from tests.attacks.test_bombs import memory, tasks
+from tests.attacks.test_bombs import of_processes, tasks
 from tests.attacks.victim import victim
 from tests.containers.kit import Walls, container_of, pids_in
 
@@ -146,7 +146,7 @@ def test_memory_stops_at_the_containers_limit(walls: Walls) -> None:
     walls.attack(
         "memory bomb",
         "memory_bomb",
-        lambda run: memory(run) > MEMORY + 64 * MIB,
+        lambda run: of_processes(run, "Pss") > MEMORY + 64 * MIB,
         limits={"memory_bytes": 8 << 30},
         kind="heap",
         size=BOMB,

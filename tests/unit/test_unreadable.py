@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from envhub_worker import unreadable
+from tests.support.interpreter import needs
 
 _LOOK = """
 import json, sys
@@ -47,6 +48,9 @@ def packages() -> Iterator[Path]:
             (root / place).chmod(0o700)
 
 
+needs_another_user = needs("no-userns")
+
+
 def look(packages: Path, path: Path, *names: str) -> dict[str, str | None]:
     """Import these as a plain user, and what is said of the ones that are not found."""
     command = [sys.executable, "-I", "-S", "-c", _LOOK, packages, path, *names]
@@ -55,6 +59,7 @@ def look(packages: Path, path: Path, *names: str) -> dict[str, str | None]:
     return dict(json.loads(done.stdout))
 
 
+@needs_another_user
 def test_closed_packages_are_told_from_missing_ones(packages: Path) -> None:
     """Each with its owner and mode; what is there is imported, what is not is just missing."""
     found = look(packages, packages, "open", "closed", "half.inner", "nowhere")
@@ -66,6 +71,7 @@ def test_closed_packages_are_told_from_missing_ones(packages: Path) -> None:
         assert "mode 0000" in str(found[name])
 
 
+@needs_another_user
 def test_closed_folder_of_the_path_is_named(packages: Path) -> None:
     """Nothing in it can be seen, so anything may be there."""
     found = look(packages, packages / "closed", "numpy")
