@@ -57,7 +57,7 @@ def reason_of(report: pytest.TestReport | pytest.CollectReport) -> str:
     told = report.longrepr
     text = str(told[2] if isinstance(told, tuple) else told).removeprefix("Skipped: ")
     missing = _NOT_INSTALLED.search(text)
-    return f"needs {missing[1]}" if missing else text
+    return f"needs {missing[1]}" if missing else " ".join(text.split())
 
 
 def _no_skips(report: pytest.TestReport | pytest.CollectReport) -> object:
