@@ -1,0 +1,64 @@
+"""``python -m tests.compliance.differential``: random cases, for as long as it is told.
+
+::
+
+    python -m tests.compliance.differential --seconds 3600 --seed 1   # an hour
+    python -m tests.compliance.differential --only 1234               # one case again
+
+Each case has a number, and is the same in each run. What differs is cut down to the fewest calls
+that show it. The exit code is 1 if anything did.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import sys
+import tempfile
+import time
+
+import pytest
+
+from tests.compliance.differential.cases import Case, case, difference
+
+
+def main() -> int:
+    """Runs cases until the time is over; prints what differs."""
+    parser = argparse.ArgumentParser(prog="python -m tests.compliance.differential")
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--seed", type=int, default=None, help="the number of the first case")
+    parser.add_argument("--only", type=int, default=None, help="the number of a single case")
+    parser.add_argument("--calls", type=int, default=12, help="in each case")
+    options = parser.parse_args()
+    seed = random.SystemRandom().randrange(2**31) if options.seed is None else options.seed
+    first = seed if options.only is None else options.only
+    print(f"from case {first} on, {options.calls} calls each", flush=True)
+    done, failed, until = 0, 0, time.monotonic() + options.seconds
+    with (
+        tempfile.TemporaryDirectory(prefix="envhub-cases-") as cache,
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        patch.setenv("ENVHUB_CACHE", cache)
+        while time.monotonic() < until and (options.only is None or not done):
+            failed += not agrees(case(first + done), options.calls)
+            done += 1
+    print(f"{done} cases, {failed} of them differ")
+    return int(failed > 0)
+
+
+def agrees(drawn: Case, calls: int) -> bool:
+    """Whether there is no difference; what there is is printed, with the fewest calls."""
+    found = difference(drawn, calls)
+    if found is None:
+        return True
+    for fewer in range(calls):
+        shorter = difference(drawn, fewer)
+        if shorter is not None:
+            found, calls = shorter, fewer
+            break
+    print(f"{drawn}\n    {found}\n    again: --only {drawn.number} --calls {calls}", flush=True)
+    return False
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,128 @@
+"""An environment that does what a random generator says. It travels to the sandbox by value."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+KEYS = ("a", "b", "speed", "episode", "is_success", "nothing", 7)
+DTYPES = (np.int8, np.uint8, np.int32, np.int64, np.float16, np.float32, np.float64, np.bool_)
+
+
+class Scripted(gym.Env[Any, Any]):
+    """Observations are samples; what is told in infos, and when episodes end, is drawn.
+
+    Args:
+        observation_space, action_space: Its spaces.
+        number: Of the case: decides all that is drawn, together with ``index``.
+        index: Which of the sub-environments it is.
+        variety: How often a key's value is of a kind that only this sub-environment has.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012
+
+    def __init__(
+        self,
+        observation_space: gym.Space[Any],
+        action_space: gym.Space[Any],
+        number: int,
+        index: int,
+        variety: float,
+    ) -> None:
+        self.observation_space = observation_space
+        self.action_space = action_space
+        self.render_mode = "rgb_array"
+        self.variety = variety
+        self.note: Any = None
+        self.number = number
+        self.draw = random.Random(f"{number} {index}")
+        self.observation_space.seed(1000 * number % 2**31 + index)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        """A sample, and how it was asked for."""
+        super().reset(seed=seed)
+        info = self.info()
+        if options is not None and self.draw.random() < 0.5:
+            info["options"] = said(options)
+        return self.observation_space.sample(), info
+
+    def step(self, action: Any) -> Any:
+        """A sample; what the action was is told now and then."""
+        info = self.info()
+        if self.draw.random() < 0.5:
+            info["action"] = said(action)
+        reward = self.draw.choice([0, 1.5, True, np.float32(0.1), self.np_random.random()])
+        ends = self.draw.random()
+        return self.observation_space.sample(), reward, ends < 0.1, 0.1 < ends < 0.2, info
+
+    def render(self) -> Any:
+        """Noise."""
+        return np.full((2, 3, 3), self.draw.randrange(256), np.uint8)
+
+    def told(self, *args: Any, **kwargs: Any) -> Any:
+        """What it was given, and a value of any kind."""
+        return said((args, kwargs)), self.value(self.draw.choice(KINDS), 0)
+
+    def fails(self, kind: str) -> None:
+        """Raises one of Python's own exceptions."""
+        raise {"value": ValueError, "key": KeyError, "zero": ZeroDivisionError}[kind](self.number)
+
+    def info(self) -> dict[Any, Any]:
+        """Some of the keys, some with values of a kind of this sub-environment's own."""
+        same = random.Random(self.number)  # for all sub-environments, in each step
+        kinds = {key: same.choice(KINDS) for key in KEYS}
+        found = {}
+        for key in self.draw.sample(KEYS, self.draw.randrange(len(KEYS) + 1)):
+            own = self.draw.random() < self.variety
+            found[key] = self.value(self.draw.choice(KINDS) if own else kinds[key], 0)
+        return found
+
+    def value(self, kind: str, depth: int) -> Any:
+        """A value of a kind."""
+        draw = self.draw
+        if kind == "scalar":
+            return draw.choice(DTYPES)(draw.randrange(100))
+        if kind == "array":
+            # one shape for all sub-environments, most of the time
+            shape = (2,) if draw.random() > self.variety / 4 else (3,)
+            return np.full(shape, draw.randrange(100), DTYPES[self.number % len(DTYPES)])
+        if kind == "objects":
+            return np.array([draw.randrange(9), None, "x"], dtype=object)
+        if kind in ("list", "tuple", "dict"):
+            inner = SIMPLE if depth > 1 else KINDS
+            items = [self.value(draw.choice(inner), depth + 1) for _ in range(draw.randrange(3))]
+            if kind == "dict":
+                return dict(zip(draw.sample(KEYS, len(items)), items, strict=True))
+            return items if kind == "list" else tuple(items)
+        simple: dict[str, Any] = {
+            "int": draw.randrange(-(2**40), 2**40),
+            "large": 2**70 + draw.randrange(9),
+            "float": draw.choice([draw.random(), float("nan"), float("-inf"), -0.0]),
+            "bool": draw.random() < 0.5,
+            "text": draw.choice(["", "héllo", "word"]),
+            "bytes": bytes([draw.randrange(256)]),
+            "complex": complex(draw.random(), 1),
+            "none": None,
+            "set": frozenset({draw.randrange(3)}),
+        }
+        return simple[kind]
+
+
+SIMPLE = ("int", "float", "bool", "text", "bytes", "complex", "none", "scalar", "set")
+KINDS = (*SIMPLE, "array", "objects", "list", "tuple", "dict", "dict", "large")
+
+
+def said(value: Any) -> str:
+    """A value in words: its classes, dtypes and numbers."""
+    if isinstance(value, dict):
+        inner = ", ".join(f"{key!r}: {said(item)}" for key, item in value.items())
+    elif isinstance(value, (list, tuple)):
+        inner = ", ".join(map(said, value))
+    elif isinstance(value, np.ndarray):
+        inner = f"{value.dtype}{value.shape} {value.tolist()}"
+    else:
+        inner = repr(value)
+    return f"{type(value).__name__}({inner})"

@@ -1,0 +1,1 @@
+"""Other people's tests of vector environments, run through the sandbox."""

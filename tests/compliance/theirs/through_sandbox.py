@@ -1,0 +1,119 @@
+"""``SyncVectorEnv(env_fns)`` that lives in a sandbox; as a pytest plugin, in Gymnasium's place.
+
+Imports nothing of our tests: where somebody else's tests run, ``tests`` is their package.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+import gymnasium as gym
+import pytest
+
+from envhub_sandbox import RemoteSandbox, SandboxVectorEnv, make_env
+
+REPOSITORY = Path(__file__).resolve().parents[2] / "samples" / "given"
+VARIANTS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "subclass": {"env_kwargs": {"subclass": True}},
+    "frames": {"lane": "frames"},
+    "workers": {"num_workers": 2},
+    "tcp": {},
+}
+"""What else ``make_env`` is told; ``"tcp"`` is told where its server is, too."""
+SERVER = "ENVHUB_THEIRS_SERVER"
+
+
+def vector(
+    env_fns: Sequence[Callable[[], gym.Env[Any, Any]]],
+    *,
+    use_async_envs: bool = False,
+    options: dict[str, Any] | None = None,
+    **kwargs: Any,
+) -> SandboxVectorEnv:
+    """A vector environment of these functions, which are called in a sandbox.
+
+    Args:
+        env_fns: One for each sub-environment; they travel by cloudpickle.
+        use_async_envs: ``AsyncVectorEnv`` takes them there.
+        options: What else ``make_env`` is told; its ``env_kwargs`` are the repository's.
+        kwargs: What else Gymnasium's class is told.
+    """
+    env_fns = list(env_fns)
+    options = dict(options or {})
+    with _by_value():
+        pickled = cloudpickle.dumps((env_fns, kwargs))
+    suites = make_env(
+        REPOSITORY,
+        n_envs=len(env_fns),
+        use_async_envs=use_async_envs,
+        env_kwargs={**options.pop("env_kwargs", {}), "pickled": pickled},
+        **options,
+    )
+    env = suites.env
+    assert isinstance(env, SandboxVectorEnv)
+    return env
+
+
+@contextlib.contextmanager
+def _by_value() -> Iterator[None]:
+    """The tests' own modules are not to be had in the sandbox: what is in them travels along."""
+    named = [name for name in sys.modules if name.partition(".")[0] in ("tests", "conftest")]
+    modules = [sys.modules[name] for name in named if hasattr(sys.modules[name], "__file__")]
+    for module in modules:
+        cloudpickle.register_pickle_by_value(module)
+    try:
+        yield
+    finally:
+        for module in modules:
+            cloudpickle.unregister_pickle_by_value(module)
+
+
+def options_of(variant: str) -> dict[str, Any]:
+    """What ``make_env`` is told for a variant."""
+    options = dict(VARIANTS[variant])
+    if variant == "tcp":
+        server = json.loads(os.environ[SERVER])
+        endpoint = server.pop("endpoint")
+        options["sandbox"] = RemoteSandbox(endpoint, **server)
+    return options
+
+
+def replacement(variant: str, use_async_envs: bool) -> type:
+    """A class that makes sandboxed environments, and that they are instances of."""
+    options = options_of(variant)
+
+    class Meta(type):
+        def __call__(cls, env_fns: Any, *args: Any, **kwargs: Any) -> SandboxVectorEnv:
+            names = _POSITIONS[use_async_envs]
+            kwargs |= dict(zip(names, args, strict=False))
+            return vector(env_fns, use_async_envs=use_async_envs, options=options, **kwargs)
+
+        def __instancecheck__(cls, instance: object) -> bool:
+            return isinstance(instance, SandboxVectorEnv)
+
+    return Meta("AsyncVectorEnv" if use_async_envs else "SyncVectorEnv", (), {})
+
+
+_POSITIONS = {
+    False: ("copy", "observation_mode", "autoreset_mode"),
+    True: ("shared_memory", "copy", "context", "daemon", "worker", "observation_mode"),
+}
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """``--variant``."""
+    parser.addoption("--variant", choices=VARIANTS, default="plain", help="how it is sandboxed")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Gymnasium's classes make sandboxed environments from now on, before a test is imported."""
+    for name, use_async_envs in (("SyncVectorEnv", False), ("AsyncVectorEnv", True)):
+        setattr(gym.vector, name, replacement(config.option.variant, use_async_envs))
