@@ -166,7 +166,7 @@ class RemoteEnv(Mortal):
                 self.counters.stepped(perf_counter_ns() - self._asked_ns)
                 for reply in replies:
                     check(reply)
-                return self.results.step([typed(reply, m.StepDone) for reply in replies])
+                return self._stepped([typed(reply, m.StepDone) for reply in replies], deadline)
             except HostsDiedError as deaths:
                 with self._turn("step"), self._judging():
                     return self._survive_step(deaths, deadline)
@@ -184,8 +184,40 @@ class RemoteEnv(Mortal):
             assert self._place is not None
             fetch = partial(self._fetch_infos, deadline=deadline)
             parts = lane_requests.infos(self._place, outcomes, self.results, fetch)
-            infos = self.results.infos(parts)
+            try:
+                infos = self.results.infos(parts)
+            except batches.Misfit:
+                infos = self._infos_apart(deadline)
         return (lane.observation(), *lane.flags(), infos)
+
+    def _stepped(self, replies: list[m.StepDone], deadline: Deadline) -> StepResult:
+        try:
+            return self.results.step(replies)
+        except batches.Misfit:
+            return self.results.step(replies, self._infos_apart(deadline))
+
+    def finish_reset(
+        self, replies: list[m.ResetDone], timeout_s: float | None
+    ) -> tuple[Any, dict[Any, Any]]:
+        """What ``VectorEnv.reset`` returns, of the replies to one; raises as ``collect`` does."""
+        with self.handling():
+            try:
+                return self.results.reset(replies)
+            except batches.Misfit:
+                return self.results.reset(replies, self._infos_apart(Deadline(timeout_s)))
+
+    def _infos_apart(self, deadline: Deadline) -> dict[Any, Any]:
+        """The last infos, of shards that do not agree about them."""
+        self._send("step", [(host, m.FetchInfosApart(self._number)) for host in self._hosts])
+        try:
+            replies = self._collect(deadline)
+        except HostsDiedError as deaths:
+            self._pending = None  # the next request meets the deaths
+            self._moved(Event.REPLY)
+            raise deaths.first from None
+        for reply in replies:
+            check(reply)
+        return self.results.apart([typed(reply, m.Value) for reply in replies])
 
     def _wait_on_lane(self, deadline: Deadline) -> list[Outcome]:
         assert self._lane is not None

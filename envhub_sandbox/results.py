@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from envhub_sandbox.errors import RemoteProtocolError
+from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, remote_error
 from envhub_sandbox.fast_lane import LaneShard, Outcome
 from envhub_sandbox.jail import check, typed
 from envhub_worker.protocol import batches, slabs
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.inert import one_line
+from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.untrusted import FAULTS
 
+_SHOWN = 500
 StepResult = tuple[Any, Any, Any, Any, dict[Any, Any]]
 
 
@@ -31,20 +35,47 @@ class Results:
         self._sizes = [stop - start for start, stop in bounds]
         self._restores = batches.restores(self._space)
 
-    def step(self, replies: list[m.StepDone]) -> StepResult:
-        """What ``VectorEnv.step`` returns."""
+    def step(self, replies: list[m.StepDone], infos: dict[Any, Any] | None = None) -> StepResult:
+        """What ``VectorEnv.step`` returns; with these infos, if there are other ones.
+
+        Raises:
+            Misfit: The shards' infos do not go together; the others are what ``apart`` makes.
+        """
         return (
             self._observation([reply.observation for reply in replies]),
             self._per_env("rewards", [reply.rewards for reply in replies]),
             self._per_env("terminations", [reply.terminations for reply in replies]),
             self._per_env("truncations", [reply.truncations for reply in replies]),
-            self.infos([reply.info for reply in replies]),
+            self.infos([reply.info for reply in replies]) if infos is None else infos,
         )
 
-    def reset(self, replies: list[m.ResetDone]) -> tuple[Any, dict[Any, Any]]:
-        """What ``VectorEnv.reset`` returns."""
+    def reset(
+        self, replies: list[m.ResetDone], infos: dict[Any, Any] | None = None
+    ) -> tuple[Any, dict[Any, Any]]:
+        """What ``VectorEnv.reset`` returns; as ``step``."""
         observation = self._observation([reply.observation for reply in replies])
-        return observation, self.infos([reply.info for reply in replies])
+        if infos is None:
+            infos = self.infos([reply.info for reply in replies])
+        return observation, infos
+
+    def apart(self, replies: list[m.Value]) -> dict[Any, Any]:
+        """One mapping of the sub-environments' own infos, joined here as Gymnasium does it.
+
+        Raises:
+            RemoteEnvError: It would raise in Gymnasium, too.
+        """
+        pairs, start = [], 0
+        for reply, size in zip(replies, self._sizes, strict=True):
+            pairs += [(start + index, info) for index, info in _own_infos(reply.value, size)]
+            start += size
+        try:
+            infos = batches.join_pairs(pairs, start, DEFAULT_LIMITS.message_bytes)
+        except FAULTS as error:
+            if isinstance(error, (EnvHubError, MemoryError)):
+                raise
+            name = type(error).__name__
+            raise remote_error(name, name, one_line(str(error), _SHOWN)) from error
+        return self._restored(infos)
 
     def reset_done(self, observation: Any, reply: m.Message) -> m.ResetDone:
         """A shard's reply to a reset by the fast lane."""
@@ -53,7 +84,10 @@ class Results:
 
     def infos(self, parts: list[dict[Any, Any]]) -> dict[Any, Any]:
         """One mapping of the shards' infos."""
-        infos = parts[0] if len(parts) == 1 else batches.join_infos(parts, self._sizes)
+        whole = len(parts) == 1
+        return self._restored(parts[0] if whole else batches.join_infos(parts, self._sizes))
+
+    def _restored(self, infos: dict[Any, Any]) -> dict[Any, Any]:
         final = infos.get("final_obs") if self._restores else None
         # one that is something else is the repository's own, who has a step of its own
         if type(final) is np.ndarray and final.dtype == object and final.ndim == 1:
@@ -114,6 +148,17 @@ class Results:
         if type(part) is not dict:
             raise RemoteProtocolError("the worker's infos are not a mapping")
         return part
+
+
+def _own_infos(value: Any, size: int) -> Sequence[tuple[int, dict[Any, Any]]]:
+    """Trust: input from the worker."""
+    pairs: Any = value if type(value) is tuple else (None,)
+    for pair in pairs:
+        if type(pair) is not tuple or list(map(type, pair)) != [int, dict]:
+            raise RemoteProtocolError("the worker's infos are not one mapping each")
+        if not 0 <= pair[0] < size:
+            raise RemoteProtocolError("the worker's infos are of nobody")
+    return cast("Sequence[tuple[int, dict[Any, Any]]]", pairs)
 
 
 def _numeric(part: Any) -> bool:

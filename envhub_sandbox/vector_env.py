@@ -125,8 +125,9 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
         """The results of ``reset_async``; ``timeout`` in seconds, else ``Timeouts.reset_s``."""
         replies = self._collect("reset", timeout, self._timeouts.reset_s, m.ResetDone)
-        with self._remote.handling():
-            return self._remote.results.reset(replies)
+        return self._remote.finish_reset(
+            replies, self._timeouts.reset_s if timeout is None else timeout
+        )
 
     def step(self, actions: Any) -> StepResult:
         """Step every sub-environment.

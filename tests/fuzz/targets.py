@@ -194,6 +194,20 @@ def infos(dice: Dice) -> None:
     usable(joined)
 
 
+def apart(dice: Dice) -> None:
+    """Infos that are joined one by one are of those who said them, or an error of ours."""
+    sizes = dice.rng.choice(SIZES)
+    stops = np.cumsum(sizes).tolist()
+    found = Results(env_manifest(), list(zip([0, *stops], stops, strict=False)))
+    honest = [tuple((index, {"a": 1, "b": {"c": "x"}}) for index in range(size)) for size in sizes]
+    with UNTRUSTED:
+        joined = found.apart([m.Value(dice.spoiled(part)) for part in honest])
+    for key, value in joined.items():
+        told = type(value) is dict or (type(value) is np.ndarray and len(value) == stops[-1])
+        demand(told, f"{key!r} of another length")
+    usable(joined)
+
+
 def _infos(size: int, rng: random.Random) -> dict[Any, Any]:
     mask = np.ones(size, bool)
     made: dict[Any, Any] = {
@@ -429,8 +443,8 @@ def column_schemas(dice: Dice) -> None:
 TARGETS: dict[str, Callable[[Dice], None]] = {
     one.__name__: one
     for one in (
-        unpack, results, infos, restore, manifest, built, generators, relay, server, stream, packed,
-        column_schemas,
+        unpack, results, infos, apart, restore, manifest, built, generators, relay, server, stream,
+        packed, column_schemas,
     )
 }  # fmt: skip
 

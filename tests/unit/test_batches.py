@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_worker.protocol import batches
-from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
 from tests.support.compare import assert_same
 
 NODES = spaces.Graph(spaces.Box(-1, 1, (2,)), spaces.Discrete(3))
@@ -239,8 +239,22 @@ class TestJoinedInfos:
             with pytest.raises(RemoteProtocolError, match="do not fit together"):
                 batches.join_infos(parts, [1, 1])
 
-    def test_another_type_without_a_mask_is_the_workers_fault(self) -> None:
-        """Values that have to be placed one by one need a mask that says which are there."""
-        parts = [{"a": np.array([1.0]), "_a": np.array([True])}, {"a": np.array(["text"])}]
-        with pytest.raises(RemoteProtocolError, match="do not fit together"):
-            batches.join_infos(parts, [1, 1])
+    @pytest.mark.parametrize(
+        "other",
+        [np.array(["text"]), np.array([1]), np.zeros((1, 2)), {"b": np.array([1.0])}, None],
+        ids=["text", "another dtype", "another shape", "nested", "apart"],
+    )
+    def test_shards_that_do_not_agree_are_to_be_asked_apart(self, other: Any) -> None:
+        """Which dtype a key has is not decided by its arrays: the values have been cast."""
+        one = {"a": np.array([1.0]), "_a": np.array([True])}
+        another = batches.APART if other is None else {"a": other, "_a": np.array([True])}
+        for parts in ([one, another], [another, one]):
+            with pytest.raises(batches.Misfit):
+                batches.join_infos(parts, [1, 1])
+
+    def test_few_bytes_make_no_large_column(self) -> None:
+        """One value of each sub-environment is as long as the first one's, and is counted so."""
+        pairs = [(0, {"a": np.zeros(1000, np.uint8)}), (1, {"a": np.uint8(1)})]
+        assert batches.join_pairs(pairs, 2, 2000)["a"].nbytes == 2000
+        with pytest.raises(MessageTooLargeError):
+            batches.join_pairs(pairs, 3, 2000)

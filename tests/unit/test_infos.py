@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_worker.jail.infos import InfoWriter, join
+from envhub_worker.protocol import batches, slabs
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol import slabs
 from envhub_worker.protocol.columns import columns_of
 from tests.support.compare import assert_same
 
@@ -62,13 +62,21 @@ def test_infos_are_joined_as_gymnasium_joins_them(infos: list[dict[str, Any]]) -
     assert_same(expected, join(pairs, len(infos)))
 
 
+def test_a_slice_says_what_it_cannot_join() -> None:
+    """What is no array by itself may be one among others: those are to be asked apart."""
+    pairs: list[tuple[int, dict[Any, Any]]] = [(0, {"a": 1}), (1, {"a": "text"})]
+    with pytest.raises(ValueError, match="info 'a' of sub-environment 1"):
+        join(pairs, 2)
+    assert join(pairs, 2, sliced=True) == batches.APART
+
+
 class Slab:
     """The info area of a slab with both of its sides."""
 
     def __init__(self, count: int) -> None:
         self.count = count
         self.memory = bytearray(slabs.INFO_BYTES)
-        self.writer = InfoWriter(self.memory, 0, count)
+        self.writer = InfoWriter(self.memory, 0, count, sliced=False)
         self.columns: Any = None
         self.outcomes: list[int] = []
 

@@ -25,6 +25,7 @@ from envhub_worker.jail.standins import standing_in
 from envhub_worker.jail.subenvs import SubEnvs
 from envhub_worker.jail.tasks import ResultError, Task, tasks_of
 from envhub_worker.jailspec import JailSpec
+from envhub_worker.protocol import batches
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest import encode_env, encode_manifest
 from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
@@ -148,7 +149,9 @@ class Host:
         env = self._envs[request.env]
         if isinstance(env, SubEnvs):
             pairs = env.run_reset(request.seeds, request.options, request.mask)
-            return m.ResetDone(env.batch.observation(), join(pairs, env.num_envs))
+            return m.ResetDone(
+                env.batch.observation(), join(pairs, env.num_envs, sliced=env.sliced)
+            )
         options = request.options
         if request.mask is not None:
             options = {**(options or {}), "reset_mask": request.mask}
@@ -159,8 +162,11 @@ class Host:
         """``VectorEnv.step``."""
         env = self._envs[request.env]
         if not isinstance(env, SubEnvs):
-            return m.StepDone(*env.step(request.actions))
-        infos = join(env.run_step(request.actions), env.num_envs)
+            actions, space = request.actions, getattr(env, "single_action_space", None)
+            if space is not None and batches.restores(space):
+                actions = batches.restore_batch(space, actions)
+            return m.StepDone(*env.step(actions))
+        infos = join(env.run_step(request.actions), env.num_envs, sliced=env.sliced)
         batch = env.batch
         flags = (batch.rewards, batch.terminations, batch.truncations)
         return m.StepDone(batch.observation(), *flags, infos)
@@ -169,7 +175,7 @@ class Host:
         """Begin anew in the place of sub-environments that died: see ``m.Revive``."""
         env = self._envs[request.env]
         if isinstance(env, SubEnvs):
-            infos = join(env.run_revive(request.seeds), env.num_envs)
+            infos = join(env.run_revive(request.seeds), env.num_envs, sliced=env.sliced)
             batch = env.batch
             flags = (batch.rewards, batch.terminations, batch.truncations)
             return m.StepDone(batch.observation(), *flags, infos)
@@ -188,6 +194,11 @@ class Host:
     def fetch_infos(self, request: m.FetchInfos) -> m.Message:
         """The last step's infos, which did not fit the slab."""
         return m.Value({} if self.lane is None else self.lane.infos())
+
+    def fetch_infos_apart(self, request: m.FetchInfosApart) -> m.Message:
+        """The last reset's or step's infos, as each sub-environment gave them."""
+        env = self._envs[request.env]
+        return m.Value(tuple(env.pairs) if isinstance(env, SubEnvs) else ())
 
     def call(self, request: m.Call) -> m.Message:
         """``VectorEnv.call``."""
@@ -267,4 +278,5 @@ _HANDLERS: dict[type[m.Message], Callable[[Host, Any], m.Message]] = {
     m.Close: Host.close,
     m.Attach: Host.attach,
     m.FetchInfos: Host.fetch_infos,
+    m.FetchInfosApart: Host.fetch_infos_apart,
 }

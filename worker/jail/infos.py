@@ -4,60 +4,29 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
+from envhub_worker.protocol import batches, slabs
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol import slabs
 from envhub_worker.protocol.columns import Column, columns_of
 
 Pairs = list[tuple[int, dict[Any, Any]]]
 """Infos with the index of their sub-environment, in the order in which they came."""
-_SCALARS = frozenset({int, float, bool})
 
 
-def join(pairs: Pairs, count: int) -> dict[Any, Any]:
-    """The infos of ``count`` sub-environments."""
-    infos: dict[Any, Any] = {}
-    for index, info in pairs:
-        add_info(infos, info, index, count)
-    return infos
+def join(pairs: Pairs, count: int, *, sliced: bool = False) -> dict[Any, Any]:
+    """The infos of ``count`` sub-environments.
 
-
-def add_info(infos: dict[Any, Any], info: dict[Any, Any], index: int, count: int) -> dict[Any, Any]:
-    """``VectorEnv._add_info``, without its allocations."""
-    for key, value in info.items():
-        array: Any
-        if key == "final_obs":
-            array = infos.get(key)
-            if array is None:
-                array = np.full(count, None, dtype=object)
-            array[index] = value
-        elif isinstance(value, dict):
-            array = add_info(infos.get(key, {}), value, index, count)
-        else:
-            array = infos[key] if key in infos else _column(value, count)
-            array[index] = value
-        mask_key = f"_{key}"
-        mask = infos.get(mask_key)
-        if mask is None:
-            mask = np.zeros(count, np.bool_)
-        mask[index] = True
-        infos[key], infos[mask_key] = array, mask
-    return infos
-
-
-def _column(value: Any, count: int) -> Any:
-    """The array for a key that is seen first: its dtype is decided by this value."""
-    kind = type(value)
-    if _is_scalar(kind):
-        return np.zeros(count, dtype=kind)
-    if isinstance(value, np.ndarray):
-        return np.zeros((count, *value.shape), dtype=value.dtype)
-    return np.full(count, None, dtype=object)
-
-
-def _is_scalar(kind: type) -> bool:
-    return kind in _SCALARS or issubclass(kind, np.number)
+    Args:
+        pairs: Each one's own.
+        count: How many there are here.
+        sliced: Whether there are others elsewhere. What does not go together here may do so there,
+            where another sub-environment is the first: then they have to be asked for one by one.
+    """
+    try:
+        return batches.join_pairs(pairs, count)
+    except Exception:
+        if not sliced:
+            raise
+        return dict(batches.APART)
 
 
 class InfoWriter:
@@ -67,12 +36,14 @@ class InfoWriter:
         reply: The mapped reply slab.
         start: Offset of its info area.
         count: Sub-environments of the shard.
+        sliced: Whether there are other shards.
     """
 
-    def __init__(self, reply: Any, start: int, count: int) -> None:
+    def __init__(self, reply: Any, start: int, count: int, *, sliced: bool) -> None:
         self._reply = reply
         self._start = start
         self._count = count
+        self._sliced = sliced
         self._keys: list[Any] | None = None
         self._types: list[type] = []
         self._rows: list[Any] = []
@@ -87,7 +58,7 @@ class InfoWriter:
         """
         if self._keys is not None and self._write_columns(pairs):
             return slabs.COLUMNS, 0
-        infos = join(pairs, self._count)
+        infos = join(pairs, self._count, sliced=self._sliced)
         frames = m.pack(m.Value(infos), 0)
         if len(frames) > 1 or memoryview(frames[0]).nbytes > slabs.INFO_BYTES:
             return slabs.FETCH, 0
@@ -123,7 +94,11 @@ class InfoWriter:
         columns = columns_of(infos)
         first = pairs[0][1]
         types = list(map(type, first.values()))
-        if columns is None or len(columns) != 2 * len(first) or not all(map(_is_scalar, types)):
+        if (
+            columns is None
+            or len(columns) != 2 * len(first)
+            or not all(map(batches.is_scalar, types))
+        ):
             return
         by_key = {column.key: column for column in columns}
         self._rows = [self._view(by_key[key]) for key in first]

@@ -78,7 +78,7 @@ class Lane:
         self._codes: list[int] = []
         self._views: list[Any] = []
         self._pairs: Pairs = []
-        self._writer = InfoWriter(self._reply, layout.infos, layout.count)
+        self._writer = InfoWriter(self._reply, layout.infos, layout.count, sliced=env.sliced)
         self._changes = self._cpu = self._spin_ns = 0
         self._move(attach.start, observed)
 
@@ -204,7 +204,7 @@ class Lane:
 
     def infos(self) -> dict[Any, Any]:
         """The last step's infos."""
-        return join(self._pairs, self._layout.count)
+        return join(self._pairs, self._layout.count, sliced=self._env.sliced)
 
 
 def _raised_frame(error: BaseException) -> Any:

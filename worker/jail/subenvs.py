@@ -18,7 +18,7 @@ from gymnasium.vector import SyncVectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from envhub_worker.jail.infos import Pairs
-from envhub_worker.protocol import slabs
+from envhub_worker.protocol import batches, slabs
 from envhub_worker.protocol.spaces import ARRAY_SPACES
 
 Store = Callable[[int, Any], None]
@@ -98,10 +98,17 @@ class SubEnvs(SyncVectorEnv):
     Attributes:
         batch: Where ``reset`` and ``step`` leave their results.
         reward_shape: Of one sub-environment's reward; ``()`` but for multi-objective ones.
+        sliced: Whether there are others elsewhere, in other processes.
+        pairs: The infos of the last reset or step, as each sub-environment gave them.
     """
 
     def __init__(
-        self, env_fns: Sequence[Callable[[], Any]], autoreset_mode: str, sync: bool
+        self,
+        env_fns: Sequence[Callable[[], Any]],
+        autoreset_mode: str,
+        sync: bool,
+        *,
+        sliced: bool = False,
     ) -> None:
         super().__init__(env_fns, copy=False, autoreset_mode=autoreset_mode)
         # AsyncVectorEnv stacks vector rewards, SyncVectorEnv refuses them
@@ -110,6 +117,9 @@ class SubEnvs(SyncVectorEnv):
         self._done = [False] * self.num_envs
         self._flagged: list[int] = []  # whose flags are not both False
         self._mode = autoreset_mode
+        self.sliced = sliced
+        self.pairs: Pairs = []
+        self._restores = batches.restores(self.single_action_space)
         self._plain_actions = isinstance(self.single_action_space, ARRAY_SPACES)
 
     def run_reset(self, seeds: Any, options: dict[str, Any] | None, mask: Any) -> Pairs:
@@ -125,6 +135,7 @@ class SubEnvs(SyncVectorEnv):
             self._done[index] = False
             self.batch.terminations[index] = self.batch.truncations[index] = False
         infos: Pairs = []
+        self.pairs = infos
         for index in chosen:
             seed = None if seeds is None else seeds[index]
             observation, info = self.envs[index].reset(seed=seed, options=options)
@@ -145,7 +156,8 @@ class SubEnvs(SyncVectorEnv):
         if self._mode == "SameStep":
             fresh = iterate(self.observation_space, self.batch.observation())
             finals = [(i, {"final_obs": row, "final_info": {}}) for i, row in enumerate(fresh)]
-            return sorted([*finals, *infos], key=itemgetter(0))
+            self.pairs = sorted([*finals, *infos], key=itemgetter(0))
+            return self.pairs
         self._done = [True] * self.num_envs
         return infos
 
@@ -167,6 +179,7 @@ class SubEnvs(SyncVectorEnv):
         flagged = self._flagged = []
         done = [False] * count
         infos: Pairs = []
+        self.pairs = infos
         index = 0
         each = zip(range(count), self._each(actions), self.envs, self._done, rows, strict=True)
         try:
@@ -204,6 +217,8 @@ class SubEnvs(SyncVectorEnv):
         return infos
 
     def _each(self, actions: Any) -> Iterator[Any]:
+        if self._restores:
+            actions = batches.restore_batch(self.single_action_space, actions)
         return iter(actions) if self._plain_actions else iterate(self.action_space, actions)
 
 

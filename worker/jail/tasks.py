@@ -51,7 +51,8 @@ class Task:
         if start == 0 and self.probe is not None:
             first, self.probe = self.probe, None
             env_fns[0] = lambda: first
-        return SubEnvs(env_fns, self.recording.autoreset_mode, self.recording.sync)
+        sliced = stop - start < len(self.recording.env_fns)
+        return SubEnvs(env_fns, self.recording.autoreset_mode, self.recording.sync, sliced=sliced)
 
     def learn_spaces(self) -> Any:
         """A vector environment, or one sub-environment, to read spaces and metadata from."""

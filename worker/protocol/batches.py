@@ -7,7 +7,7 @@ custom space, a tuple of members. Followed: ``gymnasium.vector.utils.iterate`` a
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import singledispatch
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.spaces.graph import GraphInstance
 
-from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
 from envhub_worker.protocol.spaces import ARRAY_SPACES
 from envhub_worker.protocol.untrusted import FAULTS
 
@@ -94,12 +94,22 @@ def _conforms_tuple(space: spaces.Tuple[Any], batch: Any, count: int) -> bool:
     return all(conforms(sub, item, count) for sub, item in zip(space.spaces, batch, strict=True))
 
 
+class Misfit(RemoteProtocolError):
+    """Shards' infos that are no parts of one mapping: they have to be joined one by one."""
+
+
+APART: dict[Any, Any] = {None: None}
+"""What a shard says in place of infos that it cannot join without knowing the other shards'."""
+
+
 def join_infos(parts: Sequence[dict[Any, Any]], sizes: Sequence[int]) -> dict[Any, Any]:
     """The infos of all shards as ``VectorEnv._add_info`` would have built them in one go.
 
+    The first sub-environment that has a key decides about its dtype, and each shard has a first
+    one of its own. Where these agree the shards' arrays are parts of the whole.
+
     Raises:
-        RemoteProtocolError: They are not what a vector environment's infos look like, or cannot
-            be one: one shard has numbers where another has text.
+        Misfit: They do not agree, or are not what infos look like; ask for each one's own.
     """
     joined: dict[Any, Any] = {}
     if not any(parts):
@@ -109,12 +119,14 @@ def join_infos(parts: Sequence[dict[Any, Any]], sizes: Sequence[int]) -> dict[An
         try:
             _join_part(joined, part, slice(start, start + size), starts[-1])
         except FAULTS as error:
-            raise RemoteProtocolError(f"the shards' infos do not fit together: {error}") from error
+            raise Misfit(f"the shards' infos do not fit together: {error}") from error
     return joined
 
 
 def _join_part(joined: dict[Any, Any], part: dict[Any, Any], window: slice, count: int) -> None:
     for key, value in part.items():
+        if type(key) is int and f"_{key}" not in part:
+            raise ValueError("an entry has no mask")
         if isinstance(value, dict):
             _join_part(joined.setdefault(key, {}), value, window, count)
             continue
@@ -122,13 +134,9 @@ def _join_part(joined: dict[Any, Any], part: dict[Any, Any], window: slice, coun
         if len(value) != size:  # or its other dimensions cost nothing
             raise ValueError("an entry does not have one value per sub-environment")
         array = joined.setdefault(key, _blank(value, count))
-        if (array.dtype, array.shape[1:]) == (value.dtype, value.shape[1:]):
-            array[window] = value
-        else:  # the first sub-environment that has the key decides, as in Gymnasium
-            mask = part[f"_{key}"]
-            if mask.shape != (size,):
-                raise ValueError("a mask does not have one value per sub-environment")
-            _place(array, value, mask, window.start)
+        if (array.dtype, array.shape[1:]) != (value.dtype, value.shape[1:]):
+            raise ValueError("an entry is of another dtype or shape in another shard")
+        array[window] = value
 
 
 def _blank(value: Any, count: int) -> Any:
@@ -137,9 +145,82 @@ def _blank(value: Any, count: int) -> Any:
     return np.zeros((count, *value.shape[1:]), dtype=value.dtype)
 
 
-def _place(array: Any, value: Any, mask: Any, start: int) -> None:
-    for index in np.flatnonzero(mask).tolist():
-        array[start + index] = value[index]
+Pairs = Sequence[tuple[int, dict[Any, Any]]]
+"""Infos with the index of their sub-environment, in the order in which they came."""
+Column = Callable[[Any, int], Any]
+_SCALARS = frozenset({int, float, bool})
+
+
+def join_pairs(pairs: Pairs, count: int, max_bytes: int | None = None) -> dict[Any, Any]:
+    """The infos of ``count`` sub-environments, as ``VectorEnv._add_info`` joins them.
+
+    Args:
+        pairs: Each sub-environment's own.
+        count: Number of sub-environments.
+        max_bytes: What all columns together may take: a few bytes make a large column.
+
+    Raises:
+        Exception: Whatever Gymnasium would raise, with the key in front.
+        MessageTooLargeError: They take more than that.
+    """
+    left = max_bytes
+
+    def column(value: Any, count: int) -> Any:
+        nonlocal left
+        if left is not None:
+            left -= count * max(np.dtype(np.float64).itemsize, getattr(value, "nbytes", 0))
+            if left < 0:
+                raise MessageTooLargeError(f"joined infos take more than {max_bytes} bytes")
+        return blank_column(value, count)
+
+    infos: dict[Any, Any] = {}
+    for index, info in pairs:
+        add_info(infos, info, index, count, blank_column if max_bytes is None else column)
+    return infos
+
+
+def add_info(
+    infos: dict[Any, Any], info: dict[Any, Any], index: int, count: int, column: Column
+) -> dict[Any, Any]:
+    """``VectorEnv._add_info``, without its allocations."""
+    for key, value in info.items():
+        array: Any
+        try:
+            if key == "final_obs":
+                array = infos.get(key)
+                if array is None:
+                    array = np.full(count, None, dtype=object)
+                array[index] = value
+            elif isinstance(value, dict):
+                array = add_info(infos.get(key, {}), value, index, count, column)
+            else:
+                array = infos[key] if key in infos else column(value, count)
+                array[index] = value
+            mask_key = f"_{key}"
+            mask = infos.get(mask_key)
+            if mask is None:
+                mask = np.zeros(count, np.bool_)
+            mask[index] = True
+            infos[key], infos[mask_key] = array, mask
+        except FAULTS as error:
+            error.args = (f"info {key!r} of sub-environment {index}: {error}",)
+            raise
+    return infos
+
+
+def blank_column(value: Any, count: int) -> Any:
+    """The array for a key that is seen first: its dtype is decided by this value."""
+    kind = type(value)
+    if is_scalar(kind):
+        return np.zeros(count, dtype=kind)
+    if isinstance(value, np.ndarray):
+        return np.zeros((count, *value.shape), dtype=value.dtype)
+    return np.full(count, None, dtype=object)
+
+
+def is_scalar(kind: type) -> bool:
+    """Whether values of this class are kept in an array of their dtype."""
+    return kind in _SCALARS or issubclass(kind, np.number)
 
 
 def restores(space: gym.Space[Any]) -> bool:
@@ -202,8 +283,21 @@ def _restore_tuple(space: spaces.Tuple[Any], member: Any) -> Any:
     return tuple(restore(sub, item) for sub, item in zip(space.spaces, member, strict=True))
 
 
+@restore.register(spaces.OneOf)
+def _restore_one_of(space: Any, member: Any) -> Any:
+    if not isinstance(member, tuple):
+        return member
+    try:
+        index, chosen = member
+        return (index, restore(space.spaces[index], chosen))
+    except FAULTS:
+        return member
+
+
 @restore.register(spaces.Sequence)
 def _restore_sequence(space: spaces.Sequence, member: Any) -> Any:
-    if not isinstance(member, tuple) or space.stack:
+    if not isinstance(member, tuple):
         return member
+    if space.stack:
+        return restore_batch(space.feature_space, member)
     return tuple(restore(space.feature_space, item) for item in member)

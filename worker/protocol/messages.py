@@ -25,10 +25,11 @@ from envhub_worker.protocol.kinds import DOCUMENT_BYTES
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
-VERSION = 3
+VERSION = 4
 """The newest version of the protocol: ``Hello`` offers a range, ``Welcome`` agrees to one.
 
-Version 2 added kinds 17 to 31, version 3 kind 53; nothing that there was changed.
+Version 2 added kinds 17 to 31, version 3 kind 53, version 4 kind 54; nothing that there was
+changed.
 """
 OLDEST_VERSION = 1
 """The oldest version that this code still speaks."""
@@ -586,6 +587,18 @@ class Revive(Message):
 
     env: int
     seeds: object
+
+
+@_message(54)
+@dataclass(frozen=True, slots=True)
+class FetchInfosApart(Message):
+    """Ask for the last reset's or step's infos as each sub-environment gave them.
+
+    For shards that do not agree about a key: the first sub-environment of all decides.
+    Reply: ``Value`` of ``((index in the slice, info), ...)``.
+    """
+
+    env: int
 
 
 @_message(53)
