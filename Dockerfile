@@ -15,10 +15,10 @@ RUN cd /build \
     && /opt/envhub-worker/bin/python -m pip install --no-cache-dir --quiet 'pip>=25.1' \
     && /opt/envhub-worker/bin/python -m pip install --no-cache-dir --only-binary :all: --group worker \
     && find /opt/envhub-worker -type d -name tests -prune -exec rm -r {} +
-COPY worker /build/worker
+COPY worker/envhub_worker /build/envhub_worker
 # Compiled here: nobody can write bytecode into a read-only container.
 RUN site=$(/opt/envhub-worker/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))') \
-    && cp -r /build/worker "$site/envhub_worker" \
+    && cp -r /build/envhub_worker "$site/envhub_worker" \
     && printf '%s\n' '#!/opt/envhub-worker/bin/python -I' 'import sys' \
         'from envhub_worker.__main__ import main' 'sys.exit(main())' \
         >/opt/envhub-worker/bin/envhub-worker \

@@ -8,12 +8,7 @@ from enum import Enum
 from typing import Any
 
 from envhub_sandbox.bundles import Bundle
-from envhub_sandbox.errors import (
-    ActionError,
-    RemoteEnvError,
-    WorkerDiedError,
-    WorkerTimeoutError,
-)
+from envhub_sandbox.errors import ActionError, RemoteEnvError, WorkerDiedError, WorkerTimeoutError
 from envhub_worker.protocol import messages as m
 
 _UNFIT = (ActionError, TypeError, ValueError)

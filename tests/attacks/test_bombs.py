@@ -20,15 +20,7 @@ import psutil
 import pytest
 
 from envhub_sandbox.errors import WorkerDiedError
-from tests.attacks.harness import (
-    USER,
-    Arena,
-    Run,
-    call,
-    control_run,
-    new_alias,
-    start_control,
-)
+from tests.attacks.harness import USER, Arena, Run, call, control_run, new_alias, start_control
 from tests.support.processes import eventually
 
 FAMILY = "Bombs"

@@ -11,16 +11,7 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox import snapshot, snapshot_store
-from tests.attacks.harness import (
-    HOSTILE,
-    USER,
-    Arena,
-    Run,
-    call,
-    control_run,
-    new_alias,
-    token,
-)
+from tests.attacks.harness import HOSTILE, USER, Arena, Run, call, control_run, new_alias, token
 
 FAMILY = "Changing files"
 

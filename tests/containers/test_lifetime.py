@@ -23,14 +23,7 @@ from envhub_sandbox.sandboxes.containers import CLIENT_LABEL, USER_LABEL
 from envhub_sandbox.sandboxes.docker import DockerSandbox
 from envhub_sandbox.sandboxes.engines import Engine
 from envhub_sandbox.sandboxes.identity import identity_of
-from tests.containers.kit import (
-    IMAGE,
-    container_of,
-    containers_of,
-    folders,
-    nothing_left,
-    pids_in,
-)
+from tests.containers.kit import IMAGE, container_of, containers_of, folders, nothing_left, pids_in
 from tests.support.processes import descendants, eventually
 from tests.support.samples import sample
 

@@ -268,9 +268,8 @@ def test_named_files_exist(document: Path) -> None:
         path = word.partition(" ")[0].rstrip("/")
         if not path.startswith(tops) or re.search(r"[*{<(]", path):
             continue
-        package = {"worker": "envhub_worker", "envhub_sandbox": "envhub_sandbox"}
-        top, _, rest = path.partition("/")
-        root = folder(package[top]) if top in package else CHECKOUT / top
+        top, _, rest = path.removeprefix("worker/").partition("/")
+        root = folder(top) if top in ("envhub_worker", "envhub_sandbox") else CHECKOUT / top
         assert (root / rest).exists(), word
 
 

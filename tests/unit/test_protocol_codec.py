@@ -19,10 +19,7 @@ from hypothesis.extra import numpy as hnp
 
 from envhub_worker.protocol.arrays import INLINE_BYTES
 from envhub_worker.protocol.codec import Buffer, RemoteEnum, RemoteObject, decode, encode
-from envhub_worker.protocol.errors import (
-    LocalProtocolError,
-    RemoteProtocolError,
-)
+from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from tests.support.compare import assert_same
 from tests.support.wire import deep, ext, packed

@@ -11,12 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
-from envhub_sandbox.snapshot_records import (
-    FileRecord,
-    SnapshotLimits,
-    check_names,
-    within_limits,
-)
+from envhub_sandbox.snapshot_records import FileRecord, SnapshotLimits, check_names, within_limits
 
 DIGEST = "sha256:" + "0" * 64
 

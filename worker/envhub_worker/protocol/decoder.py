@@ -11,11 +11,7 @@ import msgpack  # type: ignore[import-untyped]
 import numpy as np
 
 from envhub_worker.protocol.arrays import Array, ArrayReader, read_scalar, unpack_shape
-from envhub_worker.protocol.errors import (
-    MessageTooLargeError,
-    ProtocolError,
-    RemoteProtocolError,
-)
+from envhub_worker.protocol.errors import MessageTooLargeError, ProtocolError, RemoteProtocolError
 from envhub_worker.protocol.inert import (
     MAX_NAME_CHARS,
     MAX_REPR_CHARS,

@@ -37,14 +37,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.limits import WireLimits
-from envhub_worker.spawner import (
-    Failed,
-    HostExited,
-    HostStarted,
-    JailExited,
-    Spawner,
-    ZygoteDied,
-)
+from envhub_worker.spawner import Failed, HostExited, HostStarted, JailExited, Spawner, ZygoteDied
 from envhub_worker.zygote_process import ZygoteProcess
 
 MAX_HOSTS = 64
