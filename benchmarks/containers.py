@@ -26,7 +26,7 @@ from typing import Any
 from benchmarks.driver import ROOT
 from benchmarks.machine import machine
 from envhub_sandbox import make_env
-from envhub_sandbox.sandboxes.engines import find_engine
+from envhub_sandbox.sandboxes.docker.engines import find_engine
 from tests.support.samples import make_env_of
 
 REPOSITORIES = ROOT / "benchmarks" / "repositories"

@@ -19,7 +19,7 @@ from pathlib import Path
 from time import perf_counter_ns
 from typing import Any
 
-from envhub_sandbox.doorbell import HostBell, OwnBell, Watch
+from envhub_sandbox.transport.shared_memory.doorbell import HostBell, OwnBell, Watch
 
 _RING = (1).to_bytes(8, "little")
 _FLAGS = socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL

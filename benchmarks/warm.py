@@ -7,9 +7,9 @@ from typing import Any
 
 from benchmarks.load import Patience
 from envhub_sandbox import make_env
-from envhub_sandbox.client import WorkerClient
-from envhub_sandbox.deadline import Deadline
-from envhub_sandbox.jail import open_jail
+from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.jail import open_jail
 from tests.support import inside
 
 _LONG_S = 60.0

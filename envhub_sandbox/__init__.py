@@ -15,25 +15,25 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from envhub_sandbox import errors as errors
     from envhub_sandbox.api import make_env as make_env
+    from envhub_sandbox.hub.reference import HubRef as HubRef
     from envhub_sandbox.policy import Limits as Limits
     from envhub_sandbox.policy import Policy as Policy
     from envhub_sandbox.policy import Timeouts as Timeouts
-    from envhub_sandbox.reference import HubRef as HubRef
-    from envhub_sandbox.sandboxes.docker import DockerSandbox as DockerSandbox
+    from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox as DockerSandbox
     from envhub_sandbox.sandboxes.remote import RemoteSandbox as RemoteSandbox
-    from envhub_sandbox.suites import EnvSuites as EnvSuites
-    from envhub_sandbox.vector_env import SandboxVectorEnv as SandboxVectorEnv
+    from envhub_sandbox.vector.suites import EnvSuites as EnvSuites
+    from envhub_sandbox.vector.vector_env import SandboxVectorEnv as SandboxVectorEnv
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "DockerSandbox": "sandboxes.docker",
-    "EnvSuites": "suites",
-    "HubRef": "reference",
+    "DockerSandbox": "sandboxes.docker.sandbox",
+    "EnvSuites": "vector.suites",
+    "HubRef": "hub.reference",
     "Limits": "policy",
     "Policy": "policy",
     "RemoteSandbox": "sandboxes.remote",
-    "SandboxVectorEnv": "vector_env",
+    "SandboxVectorEnv": "vector.vector_env",
     "Timeouts": "policy",
     "errors": "errors",
     "make_env": "api",

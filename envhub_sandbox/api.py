@@ -7,23 +7,25 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox import arguments, inprocess, snapshot_store
+from envhub_sandbox import arguments
 from envhub_sandbox.config import plain_config
-from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import PolicyError
-from envhub_sandbox.jail_sources import JailSource, OwnJails, SharedJail
-from envhub_sandbox.manifest_cache import ManifestCache, manifest_key
+from envhub_sandbox.hub import store
+from envhub_sandbox.hub.snapshot import named
 from envhub_sandbox.policy import Limits, Policy, Timeouts, limits_from, policy_from, timeouts_from
-from envhub_sandbox.prewarming import Prewarming
-from envhub_sandbox.provenance import provenance_of
-from envhub_sandbox.recipe import Recipe, pinned
-from envhub_sandbox.remote_env import RemoteEnv
-from envhub_sandbox.repository import Known, LoadArguments, LoadedJail, Repository
+from envhub_sandbox.sandboxes import inprocess
 from envhub_sandbox.sandboxes.base import Sandbox
-from envhub_sandbox.sharding import bounds_for
-from envhub_sandbox.snapshot import named
-from envhub_sandbox.suites import EnvSuites
-from envhub_sandbox.vector_env import SandboxVectorEnv
+from envhub_sandbox.session.env_session import RemoteEnv
+from envhub_sandbox.session.jail_sources import JailSource, OwnJails, SharedJail
+from envhub_sandbox.session.launcher import Known, LoadArguments, LoadedJail, Repository
+from envhub_sandbox.session.manifest_cache import ManifestCache, manifest_key
+from envhub_sandbox.session.prewarming import Prewarming
+from envhub_sandbox.session.provenance import provenance_of
+from envhub_sandbox.session.recipe import Recipe, pinned
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.shared_memory.sharding import bounds_for
+from envhub_sandbox.vector.suites import EnvSuites
+from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.manifest import EnvManifest, Manifest
 
 
@@ -142,7 +144,7 @@ def make_env(
         chosen_timeouts,
         place,
         runs_on,
-        snapshot_store.cache_root() / "snapshots",
+        store.cache_root() / "snapshots",
         lane,
         copy,
     )
@@ -178,7 +180,7 @@ def make_env(
 def _face(validate: bool) -> type[SandboxVectorEnv]:
     if not validate:
         return SandboxVectorEnv
-    from envhub_sandbox.validation import ValidatedVectorEnv
+    from envhub_sandbox.vector.validated import ValidatedVectorEnv
 
     return ValidatedVectorEnv
 
@@ -202,7 +204,7 @@ class _Maker:
         self._prewarm = prewarm
         load = repository.arguments.message()
         key = manifest_key(repository.snapshot, load, repository.policy, repository.interpreter)
-        self._cache = ManifestCache(snapshot_store.cache_root() / "manifests", key)
+        self._cache = ManifestCache(store.cache_root() / "manifests", key)
 
     def make(self) -> EnvSuites:
         repository = self._repository
@@ -298,7 +300,7 @@ def _sandbox(sandbox: str | Sandbox, server_key: str | None) -> Sandbox:
         return PROCESS
     kind, _, image = sandbox.partition(":")
     if kind == "docker":
-        from envhub_sandbox.sandboxes.docker import DockerSandbox
+        from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 
         return DockerSandbox(image=image) if image else DockerSandbox()
     raise _unknown(sandbox)

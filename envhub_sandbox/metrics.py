@@ -16,7 +16,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from envhub_sandbox.errors import DependencyError
-from envhub_sandbox.stats import LEDGER, Row
+from envhub_sandbox.session.counters import LEDGER, Row
 from envhub_worker.protocol.text import printable
 
 try:

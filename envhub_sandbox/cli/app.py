@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from envhub_sandbox.cli import cache, doctor, gc, image, inspect, replay, run, version
-from envhub_sandbox.cli.exits import EXIT_CODES
+from envhub_sandbox.cli.shared.exits import EXIT_CODES
 
 app = typer.Typer(
     name="envhub",

@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli.console import console, print_json, safe_line, say
-from envhub_sandbox.cli.exits import UsageError, reported
+from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say
+from envhub_sandbox.cli.shared.exits import UsageError, reported
 
 app = typer.Typer(
     help="List and remove what was downloaded.", no_args_is_help=True, rich_markup_mode="rich"
@@ -50,9 +50,9 @@ class Stored:
 
 def stored_snapshots() -> list[Stored]:
     """Everything in the store, the latest used first. Nothing is verified."""
-    from envhub_sandbox import snapshot_store
+    from envhub_sandbox.hub import store
 
-    folder = snapshot_store.cache_root() / "snapshots"
+    folder = store.cache_root() / "snapshots"
     records = [*folder.glob("local/*/record.json"), *folder.glob("*/*/*/record.json")]
     found = [_read(record) for record in records]
     return sorted((one for one in found if one is not None), key=lambda one: -one.used)
@@ -81,17 +81,17 @@ def list_(
     json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """List snapshots, the latest used first."""
-    from envhub_sandbox import snapshot_store
+    from envhub_sandbox.hub import store
 
     with reported(debug=False):
         found = stored_snapshots()
         if json:
-            print_json({"folder": str(snapshot_store.cache_root()), "snapshots": _data(found)})
+            print_json({"folder": str(store.cache_root()), "snapshots": _data(found)})
             return
         if found:
             _print(found)
         total = sum(one.size for one in found)
-        say(f"{len(found)} snapshots, {_size(total)}, in {snapshot_store.cache_root()}")
+        say(f"{len(found)} snapshots, {_size(total)}, in {store.cache_root()}")
 
 
 def _data(found: list[Stored]) -> list[dict[str, Any]]:
@@ -147,17 +147,17 @@ def remove(
     ] = None,
 ) -> None:
     """Remove snapshots. Not while an environment of theirs runs."""
-    from envhub_sandbox import snapshot_store
+    from envhub_sandbox.hub import store
 
     with reported(debug=False):
         found = stored_snapshots()
         if everything:
             chosen = found
-            shutil.rmtree(snapshot_store.cache_root() / "manifests", ignore_errors=True)
+            shutil.rmtree(store.cache_root() / "manifests", ignore_errors=True)
         else:
             chosen = _chosen(found, names or [], unused_for)
         for one in chosen:
-            snapshot_store.remove_tree(one.home)
+            store.remove_tree(one.home)
         say(f"Removed {len(chosen)} snapshots, {_size(sum(one.size for one in chosen))}.")
 
 

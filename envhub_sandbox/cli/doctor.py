@@ -20,9 +20,9 @@ from typing import Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli.console import console, print_json, safe_line, safe_text
-from envhub_sandbox.cli.exits import Exit, describe, reported
-from envhub_sandbox.cli.progress import Bar
+from envhub_sandbox.cli.shared.console import console, print_json, safe_line, safe_text
+from envhub_sandbox.cli.shared.exits import Exit, describe, reported
+from envhub_sandbox.cli.shared.progress import Bar
 from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError
 
 _ENV_PY = '''"""Does nothing: `envhub doctor` runs it to see what confines it."""

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from envhub_sandbox.cli.console import console, print_json, safe_line, say
-from envhub_sandbox.cli.exits import reported
+from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say
+from envhub_sandbox.cli.shared.exits import reported
 
 if TYPE_CHECKING:
-    from envhub_sandbox.sandboxes.leftovers import Leftover
+    from envhub_sandbox.sandboxes.docker.prune import Leftover
 
 
 def gc(
@@ -29,9 +29,9 @@ def gc(
     of another user, but root removes every user's containers and control groups.
     """
     with reported(debug=debug):
-        from envhub_sandbox.sandboxes import leftovers
+        from envhub_sandbox.sandboxes.docker import prune
 
-        found = leftovers.find()
+        found = prune.find()
         removed = [] if dry_run else [one for one in found if one.remove()]
         if json:
             items = [

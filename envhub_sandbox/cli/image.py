@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli import options as opt
-from envhub_sandbox.cli.console import console, print_json, safe_line, say
-from envhub_sandbox.cli.exits import reported
-from envhub_sandbox.cli.progress import Bar
+from envhub_sandbox.cli.shared import options as opt
+from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say
+from envhub_sandbox.cli.shared.exits import reported
+from envhub_sandbox.cli.shared.progress import Bar
 
 if TYPE_CHECKING:
-    from envhub_sandbox.snapshot import Snapshot
+    from envhub_sandbox.hub.snapshot import Snapshot
 
 app = typer.Typer(
     help="Container images for repositories.", no_args_is_help=True, rich_markup_mode="rich"
@@ -60,7 +60,7 @@ def build(
     with reported(debug=debug):
         with Bar(quiet=json) as bar:
             bar.begin(f"reading {ref}")
-            from envhub_sandbox.snapshot import named
+            from envhub_sandbox.hub.snapshot import named
 
             snapshot = named(ref, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
             bar.begin("resolving and building")
@@ -81,10 +81,10 @@ def _build(
     exclude_newer: str | None,
     network: str | None,
 ) -> dict[str, Any]:
-    from envhub_sandbox import requirements
     from envhub_sandbox.errors import DependencyError
-    from envhub_sandbox.sandboxes import images
-    from envhub_sandbox.sandboxes.engines import find_engine, find_image
+    from envhub_sandbox.hub import requirements
+    from envhub_sandbox.sandboxes.docker import image
+    from envhub_sandbox.sandboxes.docker.engines import find_engine, find_image
 
     wanted = snapshot.root / requirements.FILE
     if not wanted.is_file() and not system:
@@ -95,14 +95,14 @@ def _build(
     asked = requirements.read(wanted) if wanted.is_file() else []
     engine = find_engine(engine_name)
     identity = find_image(engine, base)
-    target = images.target_of(engine, base)
+    target = image.target_of(engine, base)
     lock = requirements.resolve(
         asked, python=target.python, machine=target.machine, exclude_newer=exclude_newer
     )
     is_local = snapshot.repo_type == "local"
     name = Path(snapshot.repo_id).name if is_local else snapshot.repo_id
-    tag = images.tag_for(name, identity, lock, system)
-    known = images.exists(engine, tag)
+    tag = image.tag_for(name, identity, lock, system)
+    known = image.exists(engine, tag)
     if not known:
-        images.build(engine, images.dockerfile(base, lock, system), lock, tag, network)
+        image.build(engine, image.dockerfile(base, lock, system), lock, tag, network)
     return {"image": tag, "built": not known, "lock": lock.digest, "packages": lock.packages}

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from envhub_sandbox.cli import options as opt
-from envhub_sandbox.cli.console import console, print_json, safe_line
-from envhub_sandbox.cli.exits import reported
-from envhub_sandbox.cli.progress import Bar
-from envhub_sandbox.cli.report import print_provenance
-from envhub_sandbox.cli.select import select
+from envhub_sandbox.cli.shared import options as opt
+from envhub_sandbox.cli.shared.console import console, print_json, safe_line
+from envhub_sandbox.cli.shared.exits import reported
+from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.report import print_provenance
+from envhub_sandbox.cli.shared.select import select
 
 _SPACES = ("single_observation_space", "single_action_space", "observation_space", "action_space")
 _SPACE_TEXT = 2000
@@ -91,7 +91,7 @@ def _inspect(
 
 def describe_env(suite: str, task: Any, env: Any) -> dict[str, Any]:
     """One environment as data. Trust: all of it is input from the worker."""
-    from envhub_sandbox.rollout import autoreset_mode
+    from envhub_sandbox.cli.rollout.episodes import autoreset_mode
 
     metadata = dict(getattr(env, "metadata", None) or {})
     metadata.pop("autoreset_mode", None)

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli import options as opt
-from envhub_sandbox.cli.console import console, print_json, safe_line, safe_text, say
-from envhub_sandbox.cli.exits import Exit, UsageError, reported
-from envhub_sandbox.cli.progress import Bar
+from envhub_sandbox.cli.shared import options as opt
+from envhub_sandbox.cli.shared.console import console, print_json, safe_line, safe_text, say
+from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
+from envhub_sandbox.cli.shared.progress import Bar
 
 if TYPE_CHECKING:
-    from envhub_sandbox.bundles import Bundle
-    from envhub_sandbox.replay import Replayed
+    from envhub_sandbox.crash.reader import Bundle
+    from envhub_sandbox.crash.replay import Replayed
 
 BundleFolder = Annotated[
     Path,
@@ -78,8 +78,8 @@ class _Replay:
 
     def execute(self) -> None:
         """Read, check, repeat, print; the exit code is the verdict."""
-        from envhub_sandbox.bundles import load_bundle
-        from envhub_sandbox.replay import Verdict
+        from envhub_sandbox.crash.reader import load_bundle
+        from envhub_sandbox.crash.replay import Verdict
 
         if self._sandbox == "none":
             raise UsageError("a replay without a sandbox would take this process along")
@@ -97,7 +97,7 @@ class _Replay:
         raise typer.Exit(codes.get(replayed.verdict, Exit.SURVIVED))
 
     def _refuse_wishes(self, bundle: Bundle) -> None:
-        from envhub_sandbox.bundles import wishes
+        from envhub_sandbox.crash.reader import wishes
 
         wanted = [wish for wish in wishes(bundle) if wish.partition("=")[0] not in self._given]
         if wanted and not self._grant:
@@ -107,7 +107,7 @@ class _Replay:
             )
 
     def _run(self, bundle: Bundle, bar: Bar) -> Replayed:
-        from envhub_sandbox.replay import replay
+        from envhub_sandbox.crash.replay import replay
 
         bar.begin(f"loading {safe_line(bundle.label)}")
         made: list[Any] = []
@@ -120,8 +120,8 @@ class _Replay:
     def _make(self, bundle: Bundle, bar: Bar, made: list[Any]) -> Any:
         """The environment that the bundle is about; None if it is about ``make_env`` alone."""
         from envhub_sandbox.api import make_env
-        from envhub_sandbox.recipe import Recipe
-        from envhub_sandbox.replay import changed_files
+        from envhub_sandbox.crash.replay import changed_files
+        from envhub_sandbox.session.recipe import Recipe
 
         envs = Recipe(
             make_env=make_env,
@@ -150,7 +150,7 @@ class _Replay:
         return env
 
     def _options(self, bundle: Bundle) -> dict[str, Any]:
-        from envhub_sandbox.bundles import replayed_arguments
+        from envhub_sandbox.crash.reader import replayed_arguments
 
         options = replayed_arguments(bundle, granted=self._grant)
         given = dict(self._given)

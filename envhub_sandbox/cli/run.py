@@ -10,18 +10,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli import logs
-from envhub_sandbox.cli import options as opt
-from envhub_sandbox.cli.console import console, print_json, safe_line, say
-from envhub_sandbox.cli.exits import code_for, describe, reported
-from envhub_sandbox.cli.progress import Bar
-from envhub_sandbox.cli.report import TaskResult, print_provenance, print_results, task_document
-from envhub_sandbox.cli.select import select
+from envhub_sandbox.cli.shared import logs
+from envhub_sandbox.cli.shared import options as opt
+from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say
+from envhub_sandbox.cli.shared.exits import code_for, describe, reported
+from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.report import (
+    TaskResult,
+    print_provenance,
+    print_results,
+    task_document,
+)
+from envhub_sandbox.cli.shared.select import select
 from envhub_sandbox.errors import EnvHubError
 
 if TYPE_CHECKING:
-    from envhub_sandbox.rollout import EpisodeCounter, Rollout
-    from envhub_sandbox.video import VideoWriter
+    from envhub_sandbox.cli.rollout.episodes import EpisodeCounter, Rollout
+    from envhub_sandbox.cli.rollout.video import VideoWriter
 
 
 class PolicyName(str, Enum):
@@ -162,7 +167,7 @@ class _Run:
 
     def _check_video(self) -> None:
         if self._play.video is not None:
-            from envhub_sandbox.video import check_target
+            from envhub_sandbox.cli.rollout.video import check_target
 
             check_target(self._play.video)
 
@@ -186,12 +191,12 @@ class _Run:
     def _play_task(
         self, bar: Bar, suite: str, task: int | str, env: Any, video: Path | None
     ) -> TaskResult:
-        from envhub_sandbox.rollout import autoreset_mode
+        from envhub_sandbox.cli.rollout.episodes import autoreset_mode
 
         if video is None:
             rollout = self._roll_out(env, bar, None)
         else:
-            from envhub_sandbox.video import VideoWriter, fps_of
+            from envhub_sandbox.cli.rollout.video import VideoWriter, fps_of
 
             with VideoWriter(video, fps_of(env.metadata)) as writer:
                 rollout = self._roll_out(env, bar, writer)
@@ -205,8 +210,8 @@ class _Run:
         )
 
     def _roll_out(self, env: Any, bar: Bar, writer: VideoWriter | None) -> Rollout:
-        from envhub_sandbox.rollout import rollout
-        from envhub_sandbox.video import first_frame
+        from envhub_sandbox.cli.rollout.episodes import rollout
+        from envhub_sandbox.cli.rollout.video import first_frame
 
         filming = writer is not None
 

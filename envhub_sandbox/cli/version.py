@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from envhub_sandbox.cli.console import print_json
-from envhub_sandbox.cli.exits import reported
+from envhub_sandbox.cli.shared.console import print_json
+from envhub_sandbox.cli.shared.exits import reported
 
 _PACKAGES = ("gymnasium", "numpy", "huggingface_hub", "pyzmq", "msgpack", "imageio-ffmpeg")
 

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
-    from envhub_sandbox.client import WorkerClient
-    from envhub_sandbox.deadline import Deadline
-    from envhub_sandbox.far import Far
     from envhub_sandbox.policy import Policy
+    from envhub_sandbox.transport.connection import WorkerClient
+    from envhub_sandbox.transport.deadline import Deadline
+    from envhub_sandbox.transport.tcp import Far
 
 
 class WorkerServer(Protocol):

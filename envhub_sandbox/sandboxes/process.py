@@ -22,7 +22,7 @@ import envhub_worker.protocol
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.sandboxes.base import WorkerServer
 from envhub_sandbox.sandboxes.lingering import Lingering
-from envhub_sandbox.sandboxes.sharing import Sharing
+from envhub_sandbox.sandboxes.refcount import Sharing
 
 BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
 _STARTUP_S = 60.0

@@ -18,15 +18,15 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from envhub_sandbox import upload
-from envhub_sandbox.client import WorkerClient
-from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import EnvHubError, PolicyError, SandboxUnavailableError
-from envhub_sandbox.far import Far
-from envhub_sandbox.logins import without_login
+from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.policy import Policy
+from envhub_sandbox.sandboxes import upload
 from envhub_sandbox.sandboxes.base import WorkerServer
-from envhub_sandbox.sandboxes.sharing import Sharing
+from envhub_sandbox.sandboxes.refcount import Sharing
+from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.tcp import Far
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import parse_key
 

@@ -23,7 +23,7 @@ from gymnasium import spaces
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerError, WorkerTimeoutError
-from envhub_sandbox.suites import EnvSuites
+from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest import encode_env
 from envhub_worker.protocol.opaque import MAX_SPACE_DEPTH

@@ -23,8 +23,8 @@ import pytest
 from gymnasium.vector import VectorWrapper
 
 from envhub_sandbox import make_env
-from envhub_sandbox.suites import EnvSuites
-from envhub_sandbox.vector_env import SandboxVectorEnv
+from envhub_sandbox.vector.suites import EnvSuites
+from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol import messages as m
 from tests.attacks.harness import Arena
 from tests.attacks.lying_server import NUM_ENVS, Asked, Frames, LyingServer, lying, manifest

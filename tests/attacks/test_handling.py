@@ -18,14 +18,15 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
-from envhub_sandbox import make_env, results
+from envhub_sandbox import make_env
 from envhub_sandbox.errors import (
     EnvHubError,
     MessageTooLargeError,
     RemoteProtocolError,
     WorkerDiedError,
 )
-from envhub_sandbox.suites import EnvSuites
+from envhub_sandbox.session import results
+from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol import batches, untrusted
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest import Manifest, encode_env, encode_manifest

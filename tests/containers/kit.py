@@ -12,11 +12,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.sandboxes.containers import CLIENT_LABEL, SNAPSHOT
-from envhub_sandbox.sandboxes.docker import DockerSandbox
-from envhub_sandbox.sandboxes.engines import Engine
-from envhub_sandbox.sandboxes.identity import identity_of
+from envhub_sandbox.sandboxes.docker.engines import Engine
+from envhub_sandbox.sandboxes.docker.run_arguments import CLIENT_LABEL, SNAPSHOT
+from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from envhub_sandbox.sandboxes.lingering import stop_idle
+from envhub_sandbox.sandboxes.owner import identity_of
 from tests.attacks.harness import Arena, Run, answered, new_alias
 from tests.support.processes import eventually
 

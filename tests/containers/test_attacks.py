@@ -15,9 +15,9 @@ import psutil
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.sandboxes.docker import DockerSandbox
-from envhub_sandbox.sandboxes.engines import Engine
-from envhub_sandbox.snapshot import local
+from envhub_sandbox.hub.snapshot import local
+from envhub_sandbox.sandboxes.docker.engines import Engine
+from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from tests.attacks.harness import HOSTILE, Run, token
 from tests.attacks.listeners import Listener, listening
 from tests.attacks.test_bombs import of_processes, tasks

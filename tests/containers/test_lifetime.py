@@ -18,11 +18,11 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import WorkerDiedError
-from envhub_sandbox.sandboxes import leftovers
-from envhub_sandbox.sandboxes.containers import CLIENT_LABEL, USER_LABEL
-from envhub_sandbox.sandboxes.docker import DockerSandbox
-from envhub_sandbox.sandboxes.engines import Engine
-from envhub_sandbox.sandboxes.identity import identity_of
+from envhub_sandbox.sandboxes.docker import prune
+from envhub_sandbox.sandboxes.docker.engines import Engine
+from envhub_sandbox.sandboxes.docker.run_arguments import CLIENT_LABEL, USER_LABEL
+from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
+from envhub_sandbox.sandboxes.owner import identity_of
 from tests.containers.kit import IMAGE, container_of, containers_of, folders, nothing_left, pids_in
 from tests.support.processes import descendants, eventually
 from tests.support.samples import sample
@@ -145,7 +145,7 @@ def test_client_and_keeper_killed_together_leave_no_container(engine: Engine) ->
         keeper.kill()
         assert nothing_left(engine, made.identity)
         [folder] = folders(made.identity)
-        found = [one for one in leftovers.find() if one.name == str(folder)]
+        found = [one for one in prune.find() if one.name == str(folder)]
         assert [one.remove() for one in found] == [True]
         assert not folder.exists()
 
@@ -225,7 +225,7 @@ def test_gc_removes_what_is_ours_and_dead_and_nothing_else(engine: Engine) -> No
                 "stranger": {"org.example": dead},
             }.items()
         }
-        for found in leftovers.stale_containers(engine):
+        for found in prune.stale_containers(engine):
             assert found.remove()
         listed = engine.run("ps", "--all", "--no-trunc", "--format", "{{.ID}}").split()
         assert {who for who, name in made.items() if name in listed} == set(made) - {"dead"}

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from gymnasium.error import ClosedEnvironmentError
 
-from envhub_sandbox import errors, make_env, restarts
+from envhub_sandbox import errors, make_env
+from envhub_sandbox.session import restart_policy
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from tests.support import inside
 from tests.support.processes import descendants
@@ -179,7 +180,7 @@ def test_close_ends_the_wait_before_a_restart(
         if restart == "on_reset":
             with pytest.raises(errors.WorkerDiedError):
                 env.step([0, 1])
-        monkeypatch.setattr(restarts, "backoff_s", waiting)
+        monkeypatch.setattr(restart_policy, "backoff_s", waiting)
         loaded = inside.loaded(env)
         assert loaded is not None
         thread, raised = told(env.reset if restart == "on_reset" else lambda: env.step([0, 1]))

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_sandbox import errors
-from envhub_sandbox.client import WorkerClient
-from envhub_sandbox.deadline import Deadline
+from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import messages as m
 
 _SOON_S = 0.02

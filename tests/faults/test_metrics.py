@@ -13,9 +13,10 @@ prometheus_client = pytest.importorskip("prometheus_client")
 
 from prometheus_client.parser import text_string_to_metric_families  # noqa: E402
 
-from envhub_sandbox import errors, make_env, stats  # noqa: E402
+from envhub_sandbox import errors, make_env  # noqa: E402
 from envhub_sandbox.metrics import EnvHubCollector  # noqa: E402
-from envhub_sandbox.stats import Counters, Labels, Ledger, lane_step_bytes  # noqa: E402
+from envhub_sandbox.session import counters  # noqa: E402
+from envhub_sandbox.session.counters import Counters, Labels, Ledger, lane_step_bytes  # noqa: E402
 from tests.support import inside  # noqa: E402
 from tests.support.samples import sample  # noqa: E402
 
@@ -180,4 +181,4 @@ def test_names_of_the_worker_cannot_break_the_exposition(
     assert all("\x1b" not in value for _, labels in found for _, value in labels)
     suites = {dict(labels)["suite"] for _, labels in found}
     assert suites == {'a"b\\c\nd} 5\\x1b[31m'}
-    assert stats.LEDGER is not ledger
+    assert counters.LEDGER is not ledger

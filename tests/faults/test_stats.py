@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from envhub_sandbox import errors, make_env
-from envhub_sandbox.stats import KEPT, Counters
+from envhub_sandbox.session.counters import KEPT, Counters
 from tests.support.samples import sample
 
 

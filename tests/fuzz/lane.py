@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from envhub_sandbox.fast_lane import LaneShard
-from envhub_sandbox.observations import ObservationSlab
-from envhub_sandbox.results import Results
+from envhub_sandbox.session.results import Results
+from envhub_sandbox.transport.shared_memory.lane import LaneShard
+from envhub_sandbox.transport.shared_memory.observations import ObservationSlab
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol import slabs
 from envhub_worker.protocol.stream import pack_packet

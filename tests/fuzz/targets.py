@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from envhub_sandbox import declared
-from envhub_sandbox.client import death, expect
-from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.generators import generator
-from envhub_sandbox.jail import HostsDiedError, RemoteJail, check, open_jail
-from envhub_sandbox.results import Results
+from envhub_sandbox.session.results import Results
+from envhub_sandbox.transport.connection import death, expect
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.jail import HostsDiedError, RemoteJail, check, open_jail
+from envhub_sandbox.vector import from_manifest
+from envhub_sandbox.vector.generators import generator
 from envhub_worker.protocol import batches, columns
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec import decode
@@ -254,14 +254,14 @@ def manifest(dice: Dice) -> None:
     usable((found.interpreter, found.packages))
     for env in found.envs:
         usable((env.metadata, env.attributes, env.render_mode, env.suite, env.task))
-        declared.metadata(env)
-        spec = declared.spec(env, "a/b@c")
-        entry = f"{declared.__name__}:{declared.not_here.__name__}"
+        from_manifest.metadata(env)
+        spec = from_manifest.spec(env, "a/b@c")
+        entry = f"{from_manifest.__name__}:{from_manifest.not_here.__name__}"
         demand(spec is None or spec.entry_point == entry, "an entry point of the worker's")
         for space in (env.single_observation_space, env.single_action_space):
             repr(space)
             demand(space == space, "a space that is not itself")
-        declared.action_reader(replace(env, num_envs=min(env.num_envs, 64)))
+        from_manifest.action_reader(replace(env, num_envs=min(env.num_envs, 64)))
 
 
 def built(dice: Dice) -> None:

@@ -10,10 +10,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from envhub_sandbox import __version__, snapshot
+from envhub_sandbox import __version__
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.cache import stored_snapshots
-from envhub_sandbox.snapshot_store import cache_root
+from envhub_sandbox.hub import snapshot
+from envhub_sandbox.hub.store import cache_root
 from tests.support.repositories import write_repository
 
 RUNNER = CliRunner()

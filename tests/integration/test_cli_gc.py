@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from envhub_sandbox.sandboxes.identity import identity_of
+from envhub_sandbox.sandboxes.owner import identity_of
 
 
 def gc(temporary: Path, *options: str) -> subprocess.CompletedProcess[str]:

@@ -22,9 +22,9 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import HubReferenceError, RepositoryUnavailableError
-from envhub_sandbox.hub import HubClient, Repository
-from envhub_sandbox.reference import HubRef
-from envhub_sandbox.snapshot import Snapshot, fetch
+from envhub_sandbox.hub.client import HubClient, Repository
+from envhub_sandbox.hub.reference import HubRef
+from envhub_sandbox.hub.snapshot import Snapshot, fetch
 from tests.hub.stub_hub import StubHub
 from tests.support.repositories import CARTPOLES
 
@@ -183,8 +183,8 @@ def test_offline_mode_fails_by_its_own_name(
     """HF_HUB_OFFLINE makes a branch fail with its name, without a request; a pin still loads."""
     commit = stub_hub.add("org/repo", {"env.py": "1"}).commit
     code = (
-        "import sys; from envhub_sandbox.snapshot import fetch; "
-        "from envhub_sandbox.reference import HubRef\n"
+        "import sys; from envhub_sandbox.hub.snapshot import fetch; "
+        "from envhub_sandbox.hub.reference import HubRef\n"
         "try: print(fetch(HubRef.parse(sys.argv[1]), hub_cache_dir=sys.argv[2], token=False,"
         " endpoint=sys.argv[3]).commit)\n"
         "except Exception as error: print(type(error).__name__, error)"

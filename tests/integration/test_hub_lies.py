@@ -19,8 +19,8 @@ from envhub_sandbox.errors import (
     SnapshotIntegrityError,
     SnapshotTooLargeError,
 )
-from envhub_sandbox.reference import HubRef
-from envhub_sandbox.snapshot import Snapshot, SnapshotLimits, fetch
+from envhub_sandbox.hub.reference import HubRef
+from envhub_sandbox.hub.snapshot import Snapshot, SnapshotLimits, fetch
 from tests.hub.stub_hub import StubHub, StubRepository
 
 Fetch = Callable[..., Snapshot]
@@ -274,7 +274,7 @@ def test_headers_do_not_write_outside_the_hub_cache(
     with pytest.raises(SnapshotIntegrityError, match=r"header (ETag|X-Repo-Commit) .*evil"):
         get()
     assert outside(tmp_path) == []
-    monkeypatch.setattr("envhub_sandbox.hub.guarded", lambda _: contextlib.nullcontext())
+    monkeypatch.setattr("envhub_sandbox.hub.client.guarded", lambda _: contextlib.nullcontext())
     with contextlib.suppress(SnapshotError):
         get()
     assert "evil" in outside(tmp_path)
@@ -328,7 +328,7 @@ def test_endless_pages_without_files_are_left(
 ) -> None:
     """They count for no limit of ours, and each names a next one."""
     folders = [{"type": "directory", "oid": "d" * 40, "size": 0, "path": "a"}] * 1000
-    monkeypatch.setattr("envhub_sandbox.hub.MAX_IDLE_PAGES", 20)
+    monkeypatch.setattr("envhub_sandbox.hub.client.MAX_IDLE_PAGES", 20)
     monkeypatch.setattr(repository, "tree", lambda: folders)
     stub_hub.page_size = 1
     with pytest.raises(SnapshotIntegrityError, match="listing has no end"):
@@ -403,7 +403,7 @@ def test_a_login_in_a_bad_endpoint_is_not_shown() -> None:
 
 
 def _remove_store(store: Path) -> None:
-    from envhub_sandbox.snapshot_store import remove_tree
+    from envhub_sandbox.hub.store import remove_tree
 
     remove_tree(store)
 

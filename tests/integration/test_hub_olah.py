@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.errors import RepositoryUnavailableError
-from envhub_sandbox.reference import HubRef
-from envhub_sandbox.snapshot import Snapshot, fetch
+from envhub_sandbox.hub.reference import HubRef
+from envhub_sandbox.hub.snapshot import Snapshot, fetch
 from tests.hub.fixtures import olah_python
 from tests.hub.olah_server import GitRepository, OlahServer
 from tests.hub.stub_hub import git_blob_id
@@ -208,8 +208,8 @@ def test_processes_share_one_snapshot(
     """Concurrent processes all succeed and leave one copy."""
     commit = make(olah, "processes").commit(FILES)
     code = (
-        "import sys; from envhub_sandbox.snapshot import fetch; "
-        "from envhub_sandbox.reference import HubRef; "
+        "import sys; from envhub_sandbox.hub.snapshot import fetch; "
+        "from envhub_sandbox.hub.reference import HubRef; "
         "print(fetch(HubRef.parse('org/processes'), hub_cache_dir=sys.argv[1], token=False,"
         " endpoint=sys.argv[2]).commit)"
     )

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import RemoteEnvError
+from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import slabs
 from tests.support.compare import assert_same
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.client import WorkerClient
+from envhub_sandbox.transport.connection import WorkerClient
 from tests.support.samples import sample
 
 

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envhub_sandbox import make_env, snapshot_store
+from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvError
+from envhub_sandbox.hub import store
 from envhub_sandbox.sandboxes.lingering import stop_idle
 from tests.support.processes import descendants, eventually
 from tests.support.repositories import write_repository
@@ -290,5 +291,5 @@ def test_it_takes_a_whole_number_or_none() -> None:
 
 
 def _bundles() -> list[Path]:
-    folder = snapshot_store.cache_root() / "crashes"
+    folder = store.cache_root() / "crashes"
     return list(folder.iterdir()) if folder.is_dir() else []

@@ -14,7 +14,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import ActionError, ObservationError, PolicyError
-from envhub_sandbox.validation import holds
+from envhub_sandbox.vector.validated import holds
 from envhub_worker.protocol.lifecycle import State
 from envhub_worker.protocol.spaces import OpaqueSpace
 from tests.support import inside

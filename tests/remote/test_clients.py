@@ -13,8 +13,8 @@ import pytest
 import zmq
 
 from envhub_sandbox import make_env
-from envhub_sandbox.client import far_session
-from envhub_sandbox.deadline import Deadline
+from envhub_sandbox.transport.connection import far_session
+from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker import keys
 from envhub_worker.keys import KeyPair
 from envhub_worker.protocol import messages as m

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envhub_sandbox import make_env, upload
-from envhub_sandbox.client import WorkerClient
-from envhub_sandbox.deadline import Deadline
+from envhub_sandbox import make_env
+from envhub_sandbox.sandboxes import upload
+from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import messages as m
 from envhub_worker.quotas import Quotas, RefusedError
 from envhub_worker.stores import BLOCK_BYTES

@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 import zmq
 
-from envhub_sandbox.client import WorkerClient
-from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import VersionMismatchError
-from envhub_sandbox.far import Far
 from envhub_sandbox.sandboxes.process import PROCESS
+from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.tcp import Far
 from envhub_worker.protocol import messages as m
 
 # Taken from version 1 as it was released; never to be written anew.

@@ -16,16 +16,18 @@ from typing import Any
 
 import zmq
 
-from envhub_sandbox import api, crashes, folders, remote_env, tenant
-from envhub_sandbox.client import WorkerClient
-from envhub_sandbox.deadline import Deadline
-from envhub_sandbox.fast_lane import FastLane
-from envhub_sandbox.jail import RemoteJail
-from envhub_sandbox.recipe import Recipe
-from envhub_sandbox.remote_env import RemoteEnv
-from envhub_sandbox.repository import LoadedJail, Repository
-from envhub_sandbox.sandboxes import docker
-from envhub_sandbox.stats import Ledger
+from envhub_sandbox import api, folders
+from envhub_sandbox.crash import writer
+from envhub_sandbox.sandboxes.docker import sandbox
+from envhub_sandbox.session import env_session, lease
+from envhub_sandbox.session.counters import Ledger
+from envhub_sandbox.session.env_session import RemoteEnv
+from envhub_sandbox.session.launcher import LoadedJail, Repository
+from envhub_sandbox.session.recipe import Recipe
+from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.jail import RemoteJail
+from envhub_sandbox.transport.shared_memory.lane import FastLane
 from envhub_worker import listen
 from envhub_worker.doorman import Doorman
 from envhub_worker.gate import RemoteGate
@@ -181,9 +183,9 @@ def send_half(connection: WorkerClient, frames: Sequence[Buffer]) -> None:
 
 # --- spots -------------------------------------------------------------------------------------
 
-LATE_REPLY_GRACE: Spot = (remote_env, "_GRACE_S")
+LATE_REPLY_GRACE: Spot = (env_session, "_GRACE_S")
 """For how long ``reset`` waits for a late reply."""
-CLOSE_PATIENCE: Spot = (tenant, "_INTERRUPT_S")
+CLOSE_PATIENCE: Spot = (lease, "_INTERRUPT_S")
 """For how long ``close`` waits for another thread."""
 MAKER: Spot = (api, "_Maker")
 """What ``make_env`` starts to work with when its arguments have been checked."""
@@ -195,9 +197,9 @@ DECODING: Spot = (m, "_decode")
 """What makes a message of a document that has no form yet."""
 FORMS: tuple[Spot, Spot] = ((m, "_OUTGOING"), (m, "_INCOMING"))
 """What is remembered of the shape of messages, each way."""
-IDLE_CONTAINERS: Spot = (docker, "_IDLE")
+IDLE_CONTAINERS: Spot = (sandbox, "_IDLE")
 """Where a container is that nobody uses."""
-CONTAINER_STARTS: Spot = (docker.RepositoryContainer, "_start")
+CONTAINER_STARTS: Spot = (sandbox.RepositoryContainer, "_start")
 """What starts one."""
 
 
@@ -253,12 +255,12 @@ def living(ledger: Ledger) -> Any:
 
 def packet(frames: Sequence[Buffer]) -> bytes:
     """A message as a crash bundle keeps it."""
-    return crashes._packet(frames)
+    return writer._packet(frames)
 
 
 def keeper_script() -> Path:
     """The script that ends a container after its client."""
-    return docker._KEEPER
+    return sandbox._KEEPER
 
 
 def is_own_group(path: Path) -> bool:

@@ -13,8 +13,8 @@ from gymnasium.vector.utils import batch_space
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envhub_sandbox.actions import batch_of
 from envhub_sandbox.errors import ActionError
+from envhub_sandbox.vector.actions import batch_of
 from tests.support.compare import assert_same
 
 DISCRETE = spaces.Discrete(3)

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from envhub_sandbox import bundles, crashes
-from envhub_sandbox.bundles import MAX_DOCUMENT_BYTES, load_bundle, replayed_arguments, wishes
-from envhub_sandbox.cli.console import safe_line
+from envhub_sandbox.cli.shared.console import safe_line
+from envhub_sandbox.crash import reader, writer
+from envhub_sandbox.crash.history import History
+from envhub_sandbox.crash.reader import MAX_DOCUMENT_BYTES, load_bundle, replayed_arguments, wishes
+from envhub_sandbox.crash.replay import Verdict, replay
 from envhub_sandbox.errors import ActionError, BundleError, WorkerDiedError
-from envhub_sandbox.history import History
 from envhub_sandbox.policy import Limits, Policy, Timeouts
-from envhub_sandbox.replay import Verdict, replay
 from envhub_worker.protocol import messages as m
 from tests.support import inside
 
@@ -36,7 +36,7 @@ def bundle(folder: Path, **options: Any) -> Path:
     for number in range(3):
         history.step(np.array([number, number]))
     given = {"policy": Policy(), "timeouts": Timeouts(), "python": None, "endpoint": None}
-    crash = crashes.Crash(
+    crash = writer.Crash(
         error=WorkerDiedError("it died", exit_code=7, request="step"),
         label="org/repo",
         provenance={
@@ -52,7 +52,7 @@ def bundle(folder: Path, **options: Any) -> Path:
         shared=False,
         recording=history.recording(),
     )
-    return crashes.keep(folder, crash)
+    return writer.keep(folder, crash)
 
 
 def edit(folder: Path, *path: Any, value: Any) -> None:
@@ -129,7 +129,7 @@ def _nested(folder: Path) -> None:
 
 def _huge(folder: Path) -> None:
     with open(folder / "requests.bin", "r+b") as file:
-        file.truncate(bundles.MAX_FILE_BYTES + 1)
+        file.truncate(reader.MAX_FILE_BYTES + 1)
 
 
 def _noise(folder: Path) -> None:
@@ -206,7 +206,7 @@ def test_nothing_in_a_bundle_is_executed(tmp_path: Path) -> None:
 
 def test_repetition_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A small file cannot stand for an endless number of steps."""
-    monkeypatch.setattr(bundles, "MAX_REQUESTS", 100)
+    monkeypatch.setattr(reader, "MAX_REQUESTS", 100)
     folder = bundle(tmp_path)
     again = {"steps": [0, 3], "of": "actions-int64.npy"}
     edit(folder, "history", "requests", value=[{"operation": "reset"}, *[again] * 33])

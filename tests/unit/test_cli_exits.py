@@ -14,12 +14,19 @@ import pytest
 import typer
 
 from envhub_sandbox import errors
-from envhub_sandbox.cli.console import plain, print_json, safe_line, say
-from envhub_sandbox.cli.exits import EXIT_CODES, Exit, UsageError, code_for, describe, reported
-from envhub_sandbox.cli.report import TaskResult, returns_of, statistics, task_document
+from envhub_sandbox.cli.rollout.episodes import Episode, Rollout, RolloutError
+from envhub_sandbox.cli.rollout.video import VideoError
+from envhub_sandbox.cli.shared.console import plain, print_json, safe_line, say
+from envhub_sandbox.cli.shared.exits import (
+    EXIT_CODES,
+    Exit,
+    UsageError,
+    code_for,
+    describe,
+    reported,
+)
+from envhub_sandbox.cli.shared.report import TaskResult, returns_of, statistics, task_document
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.rollout import Episode, Rollout, RolloutError
-from envhub_sandbox.video import VideoError
 
 CODES = {
     errors.HubReferenceError: 2,

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.cli.exits import ForeignError, UsageError
-from envhub_sandbox.cli.options import MakeOptions, read_env_kwargs, read_size
-from envhub_sandbox.cli.select import select
+from envhub_sandbox.cli.shared.exits import ForeignError, UsageError
+from envhub_sandbox.cli.shared.options import MakeOptions, read_env_kwargs, read_size
+from envhub_sandbox.cli.shared.select import select
 from envhub_sandbox.errors import RemoteEnvError
 
 NOTHING: dict[str, Any] = dict.fromkeys(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 
-from envhub_sandbox.rollout import (
+from envhub_sandbox.cli.rollout.episodes import (
     MAX_COMPONENTS,
     EpisodeCounter,
     RolloutError,

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from envhub_sandbox import api
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.errors import WorkerDiedError
-from envhub_sandbox.suites import EnvSuites
+from envhub_sandbox.vector.suites import EnvSuites
 
 PROVENANCE = {"repository": "r", "repo_type": "model", "commit": "c", "path": "env.py"}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from envhub_sandbox.cores import place
+from envhub_sandbox.transport.shared_memory.affinity import place
 
 
 @pytest.mark.parametrize("client", [0, 1, 2, 3])

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from envhub_sandbox.deadline import Deadline
+from envhub_sandbox.transport.deadline import Deadline
 
 
 def test_no_timeout_never_comes() -> None:

@@ -25,19 +25,24 @@ CLIENTS_OWN = {
 OPTIONAL = {
     "envhub_worker.protocol.packing": {"lz4"},
     "envhub_sandbox.metrics": {"prometheus_client"},
-    "envhub_sandbox.tensors": {"torch"},
-    "envhub_sandbox.video": {"imageio_ffmpeg"},
+    "envhub_sandbox.transport.tensors": {"torch"},
+    "envhub_sandbox.cli.rollout.video": {"imageio_ffmpeg"},
 }
 DESERIALISERS = {"_pickle", "copyreg", "dill", "joblib", "marshal", "pickle", "shelve"}
 
 # module: what it must know nothing of
 IGNORANT = {
-    "envhub_sandbox.vector_env": {"zmq", "socket", "subprocess", "envhub_sandbox.client"},
-    "envhub_sandbox.client": {"gymnasium"},
-    "envhub_sandbox.suites": {"zmq", "envhub_sandbox.client"},
+    "envhub_sandbox.vector.vector_env": {
+        "zmq",
+        "socket",
+        "subprocess",
+        "envhub_sandbox.transport.connection",
+    },
+    "envhub_sandbox.transport.connection": {"gymnasium"},
+    "envhub_sandbox.vector.suites": {"zmq", "envhub_sandbox.transport.connection"},
     "envhub_sandbox.policy": {"zmq", "gymnasium", "subprocess"},
-    "envhub_sandbox.reference": {"huggingface_hub", "zmq", "gymnasium"},
-    "envhub_sandbox.snapshot": {"zmq", "gymnasium", "importlib", "runpy"},
+    "envhub_sandbox.hub.reference": {"huggingface_hub", "zmq", "gymnasium"},
+    "envhub_sandbox.hub.snapshot": {"zmq", "gymnasium", "importlib", "runpy"},
 }
 # what a jail is for, what it is permitted, and the way to tell its init
 LOCKDOWN_KNOWS = {
@@ -46,7 +51,12 @@ LOCKDOWN_KNOWS = {
 }
 WITHOUT_IO = {"asyncio", "multiprocessing", "os", "select", "socket", "subprocess", "zmq"}
 ZEROMQ = {
-    *("envhub_sandbox.client", "envhub_sandbox.far", "envhub_worker.loop", "envhub_worker.server"),
+    *(
+        "envhub_sandbox.transport.connection",
+        "envhub_sandbox.transport.tcp",
+        "envhub_worker.loop",
+        "envhub_worker.server",
+    ),
     "envhub_worker.multipart",
     # sockets, keys and handshakes of clients on other hosts
     *(
@@ -60,7 +70,7 @@ ZEROMQ = {
 # who runs code by a name that is not written in its source, and whose code that is
 IMPORTERS = {
     "envhub_sandbox": "our own public names",
-    "envhub_sandbox.inprocess": "the repository's, with sandbox=None and trust_remote_code=True",
+    "envhub_sandbox.sandboxes.inprocess": "the repository's, where sandbox=None trusts it",
     "envhub_worker.bootstrap": "our own programs",
     "envhub_worker.jail.loader": "the repository's",
     "envhub_worker.launch": "the program of a host, which the server names",
@@ -282,7 +292,7 @@ def test_no_deserialiser_is_imported() -> None:
     ]
     assert found == []
     users = {name for name in modules() if "cloudpickle" in imported(name)}
-    assert users == {"envhub_sandbox.jail", "envhub_worker.jail.host"}
+    assert users == {"envhub_sandbox.transport.jail", "envhub_worker.jail.host"}
 
 
 def test_only_the_loader_imports_by_computed_names() -> None:

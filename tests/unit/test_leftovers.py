@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.sandboxes import leftovers
-from envhub_sandbox.sandboxes.containers import CLIENT_LABEL, USER_LABEL
-from envhub_sandbox.sandboxes.identity import identity_of
+from envhub_sandbox.sandboxes.docker import prune
+from envhub_sandbox.sandboxes.docker.run_arguments import CLIENT_LABEL, USER_LABEL
+from envhub_sandbox.sandboxes.owner import identity_of
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def folder(root: Path, name: str, files: dict[str, str], mode: int = 0o700) -> P
 
 def found(root: Path) -> set[str]:
     """Names of the folders that would be removed."""
-    return {Path(one.name).name for one in leftovers.stale_folders(root)}
+    return {Path(one.name).name for one in prune.stale_folders(root)}
 
 
 def bound(path: Path) -> socket.socket:
@@ -85,7 +85,7 @@ def test_removing_removes_the_folder_and_nothing_beside(tmp_path: Path, dead: st
     """And says that it did."""
     folder(tmp_path, "envhub-docker-dead0000", {"client": dead, "seccomp.json": "{}"})
     beside = folder(tmp_path, "envhub-docker-alive000", {"client": identity_of(os.getpid())})
-    [one] = leftovers.stale_folders(tmp_path)
+    [one] = prune.stale_folders(tmp_path)
     assert one.remove()
     assert list(tmp_path.iterdir()) == [beside]
 
@@ -96,7 +96,7 @@ def test_control_groups_of_ended_servers_are_left_behind(tmp_path: Path, dead: s
     names = {f"memory/envhub-{pid}-zygote-1", f"envhub-{os.getpid()}-zygote-1", "envhub-x-y"}
     for name in names | {f"user-{pid}-zygote-1"}:
         (tmp_path / name / "jail-1").mkdir(parents=True)
-    groups = list(leftovers.stale_groups(tmp_path))
+    groups = list(prune.stale_groups(tmp_path))
     assert [Path(one.name).name for one in groups] == [f"envhub-{pid}-zygote-1"]
     assert groups[0].remove()
     assert not Path(groups[0].name).exists()
@@ -132,4 +132,4 @@ def test_what_runs_for_a_client_of_another_machine_is_left_alone(
     """An engine may be reached from many machines: whether their processes live nobody knows."""
     pid, start, ours, namespace = dead.split(":")
     engine: Any = OneContainer(":".join([pid, start, boot or ours, namespace]), status)
-    assert [one.name for one in leftovers.stale_containers(engine)] == ["it"] * stale
+    assert [one.name for one in prune.stale_containers(engine)] == ["it"] * stale

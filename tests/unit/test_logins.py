@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from envhub_sandbox.errors import HubReferenceError, PolicyError
-from envhub_sandbox.hub import HubClient, checked_endpoint
-from envhub_sandbox.logins import authorization, login_of, without_login
-from envhub_sandbox.recipe import Recipe
+from envhub_sandbox.hub.client import HubClient, checked_endpoint
+from envhub_sandbox.hub.logins import authorization, login_of, without_login
 from envhub_sandbox.sandboxes.remote import RemoteSandbox
+from envhub_sandbox.session.recipe import Recipe
 
 SECRET = "s3cret"
 HUB = f"https://me@there:{SECRET}@hub.example/x"

@@ -13,9 +13,9 @@ from gymnasium.envs.registration import EnvSpec
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envhub_sandbox import declared, generators
 from envhub_sandbox.errors import RemoteEnvError, RemoteProtocolError, remote_error
-from envhub_sandbox.vector_env import SandboxVectorEnv
+from envhub_sandbox.vector import from_manifest, generators
+from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.codec import decode, encode
 from envhub_worker.protocol.facts import MAX_METADATA, read_metadata, read_spec
 from envhub_worker.protocol.inert import RemoteEnum, RemoteObject
@@ -179,14 +179,14 @@ def test_specs_of_wrong_types_are_refused(lie: object) -> None:
 
 def test_specs_name_the_repository_that_makes_them() -> None:
     """As text, JSON, a pickle and a copy; whoever makes one is told."""
-    made = declared.spec(an_env(), "org/repo@0123")
+    made = from_manifest.spec(an_env(), "org/repo@0123")
     assert made is not None
     for spec in (made, copy.deepcopy(made), pickle.loads(pickle.dumps(made))):
         assert EnvSpec.from_json(spec.to_json()) == made
         with pytest.raises(gym.error.Error, match="org/repo@0123"):
             gym.make(spec)
-    assert declared.spec(an_env(spec=None), "x") is None
-    assert declared.spec(an_env(spec={"id": "not an id!"}), "x") is None
+    assert from_manifest.spec(an_env(spec=None), "x") is None
+    assert from_manifest.spec(an_env(spec={"id": "not an id!"}), "x") is None
 
 
 # --- generators, stand-ins, errors ----------------------------------------------------------

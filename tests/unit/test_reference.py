@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_sandbox.errors import HubReferenceError
-from envhub_sandbox.reference import HubRef, is_local
+from envhub_sandbox.hub.reference import HubRef, is_local
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 SITE = "https://huggingface.co"
@@ -249,7 +249,7 @@ def test_any_text_is_read_or_refused_with_our_error(text: str) -> None:
 def test_reading_a_reference_imports_nothing_heavy() -> None:
     """A command line can refuse a typo before huggingface_hub, numpy or gymnasium are loaded."""
     code = (
-        "import sys; from envhub_sandbox.reference import HubRef; HubRef.parse('org/repo');"
+        "import sys; from envhub_sandbox.hub.reference import HubRef; HubRef.parse('org/repo');"
         "print([m for m in ('huggingface_hub', 'numpy', 'gymnasium', 'requests', 'httpx')"
         " if m in sys.modules])"
     )

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import errors
-from envhub_sandbox.client import death, expect, refusal
-from envhub_sandbox.jail import check, raised
+from envhub_sandbox.transport.connection import death, expect, refusal
+from envhub_sandbox.transport.jail import check, raised
 from envhub_worker.protocol import messages as m
 
 ESCAPE = "\x1b]0;owned\x07\x1b[2J\r"

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox import requirements
 from envhub_sandbox.errors import DependencyError
-from envhub_sandbox.requirements import Lock
-from envhub_sandbox.sandboxes import images
+from envhub_sandbox.hub import requirements
+from envhub_sandbox.hub.requirements import Lock
+from envhub_sandbox.sandboxes.docker import image
 from tests.unit.test_image import project
 
 __all__ = ["project"]
@@ -80,7 +80,7 @@ def test_what_jails_import_is_what_the_image_installs(project: dict[str, Any]) -
 def test_the_tag_is_the_hash_of_all_that_an_image_is_made_of() -> None:
     """Another base, another package or another library is another image."""
     tags = {
-        images.tag_for("org/repo", base, lock, system)
+        image.tag_for("org/repo", base, lock, system)
         for base in ("sha256:1", "sha256:2")
         for lock in (LOCK, Lock(LOCK.text + "x==1 \\\n"))
         for system in ((), ("libgl1",))
@@ -92,7 +92,7 @@ def test_the_tag_is_the_hash_of_all_that_an_image_is_made_of() -> None:
 @pytest.mark.parametrize("name", ["org/Repo.Name_1", "datasets/x/--y--", "../..", "Ünïcode/env"])
 def test_a_repositorys_name_makes_a_tag(name: str) -> None:
     """Whatever it has in it."""
-    repository, _, tag = images.tag_for(name, "sha256:1", LOCK, ()).partition(":")
+    repository, _, tag = image.tag_for(name, "sha256:1", LOCK, ()).partition(":")
     assert set(repository) <= set("abcdefghijklmnopqrstuvwxyz0123456789-")
     assert not repository.endswith("-")
     assert len(tag) == 16
@@ -100,7 +100,7 @@ def test_a_repositorys_name_makes_a_tag(name: str) -> None:
 
 def test_the_recipe_is_this_one() -> None:
     """Wheels by their hashes, into an interpreter of their own; then nobody's again."""
-    recipe = images.dockerfile("envhub-worker", LOCK, ["libgl1"])
+    recipe = image.dockerfile("envhub-worker", LOCK, ["libgl1"])
     assert recipe.startswith("FROM envhub-worker\nUSER root\nRUN apt-get update")
     for words in ("--require-hashes", "--no-deps", "--only-binary :all:", "'*.pth'"):
         assert words in recipe
@@ -111,4 +111,4 @@ def test_the_recipe_is_this_one() -> None:
 def test_a_system_package_is_a_name(name: str) -> None:
     """It stands in a shell's command line."""
     with pytest.raises(DependencyError, match="Debian"):
-        images.dockerfile("envhub-worker", LOCK, [name])
+        image.dockerfile("envhub-worker", LOCK, [name])

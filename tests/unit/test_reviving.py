@@ -7,11 +7,11 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from envhub_sandbox.client import WorkerClient
-from envhub_sandbox.deadline import Deadline
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
-from envhub_sandbox.jail import HostsDiedError, RemoteJail
-from envhub_sandbox.reviving import SeedBook, derived_seed, resets, truncated
+from envhub_sandbox.session.reseed import SeedBook, derived_seed, resets, truncated
+from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.jail import HostsDiedError, RemoteJail
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS

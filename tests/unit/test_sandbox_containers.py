@@ -15,10 +15,11 @@ import pytest
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.policy import Limits, Policy
-from envhub_sandbox.sandboxes import containers, enclosure, engines, identity, seccomp
-from envhub_sandbox.sandboxes.containers import Container
-from envhub_sandbox.sandboxes.docker import DockerSandbox
-from envhub_sandbox.sandboxes.engines import Engine
+from envhub_sandbox.sandboxes import owner
+from envhub_sandbox.sandboxes.docker import attestation, engines, run_arguments, seccomp_profile
+from envhub_sandbox.sandboxes.docker.engines import Engine
+from envhub_sandbox.sandboxes.docker.run_arguments import Container
+from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from envhub_worker.lockdown import seccomp_policy
 from tests.unit.test_imports import folder, modules
 
@@ -58,9 +59,9 @@ SAID: dict[str, Any] = {
 }
 
 
-def found(**changes: Any) -> enclosure.Surroundings:
+def found(**changes: Any) -> attestation.Surroundings:
     """What a container's server said, with changes."""
-    return enclosure.parse(json.dumps({**SAID, **changes}).encode())
+    return attestation.parse(json.dumps({**SAID, **changes}).encode())
 
 
 def pairs(words: list[str]) -> set[tuple[str, str]]:
@@ -70,7 +71,7 @@ def pairs(words: list[str]) -> set[tuple[str, str]]:
 
 def test_the_command_line_is_this_one() -> None:
     """Word for word: what stands here is what confines."""
-    assert containers.run_arguments(DOCKER, WANTED) == [
+    assert run_arguments.run_arguments(DOCKER, WANTED) == [
         *("run", "--rm", "--interactive", "--pull", "never", "--log-driver", "none"),
         *("--no-healthcheck", "--name", "envhub-0", "--hostname", "sandbox", "--workdir", "/"),
         *("--label", "dev.envhub.client=1:2:3:4"),
@@ -92,7 +93,7 @@ def test_the_command_line_is_this_one() -> None:
 
 def test_podman_gets_its_own_words() -> None:
     """The same walls; a plain user keeps the id, and no writable folder is added."""
-    words = containers.run_arguments(PODMAN, WANTED)
+    words = run_arguments.run_arguments(PODMAN, WANTED)
     assert ("--userns", "keep-id") in pairs(words)
     assert ("--security-opt", "unmask=ALL") in pairs(words)
     assert "--read-only-tmpfs=false" in words
@@ -100,28 +101,28 @@ def test_podman_gets_its_own_words() -> None:
 
 def test_an_engine_that_maps_users_does_not_map_ours() -> None:
     """The socket folder is the caller's, and nobody else's."""
-    words = containers.run_arguments(replace(DOCKER, remapped=True), WANTED)
+    words = run_arguments.run_arguments(replace(DOCKER, remapped=True), WANTED)
     assert ("--userns", "host") in pairs(words)
 
 
 def test_a_comma_in_a_path_is_no_separator() -> None:
     """A folder's name cannot add an option to a mount."""
     wanted = replace(WANTED, snapshot='/store/a,dst=/etc,"b"')
-    words = containers.run_arguments(DOCKER, wanted)
+    words = run_arguments.run_arguments(DOCKER, wanted)
     assert '"type=bind","src=/store/a,dst=/etc,""b""","dst=/snapshots/this","readonly"' in words
 
 
 def test_runtime_and_gpus_are_handed_on() -> None:
     """In each engine's own words."""
     wanted = replace(WANTED, runtime="runsc", gpus="all")
-    docker, podman = (containers.run_arguments(one, wanted) for one in (DOCKER, PODMAN))
+    docker, podman = (run_arguments.run_arguments(one, wanted) for one in (DOCKER, PODMAN))
     assert {("--runtime", "runsc"), ("--gpus", "all")} <= pairs(docker)
     assert {("--runtime", "runsc"), ("--device", "nvidia.com/gpu=all")} <= pairs(podman)
 
 
 def test_without_control_groups_there_are_no_limits() -> None:
     """They are left out altogether, by explicit choice."""
-    words = containers.run_arguments(PODMAN, replace(WANTED, memory=None, pids=None, cpus=None))
+    words = run_arguments.run_arguments(PODMAN, replace(WANTED, memory=None, pids=None, cpus=None))
     assert "--cgroups=disabled" in words
     assert not {"--memory", "--pids-limit", "--cpus"} & set(words)
 
@@ -129,20 +130,20 @@ def test_without_control_groups_there_are_no_limits() -> None:
 def test_limits_leave_room_for_the_server() -> None:
     """One jail may use what its policy permits."""
     policy = Policy(limits=Limits(memory_bytes=1 << 30, processes=10))
-    assert containers.memory_for(policy) == 2 << 30
-    assert containers.pids_for(policy) == 266
+    assert run_arguments.memory_for(policy) == 2 << 30
+    assert run_arguments.pids_for(policy) == 266
 
 
 @pytest.mark.parametrize("path", ["/", "/usr", "/proc/", "//etc", "/data/../etc"])
 def test_a_containers_own_folders_cannot_be_replaced(path: str) -> None:
     """A path that is granted would cover the interpreter, or worse."""
     with pytest.raises(PolicyError, match="readable"):
-        containers.check_readable((path,))
+        run_arguments.check_readable((path,))
 
 
 def test_every_wall_is_in_the_report() -> None:
     """One line each, all of them enforced."""
-    report = enclosure.layers(WANTED, found(), "docker 28")
+    report = attestation.layers(WANTED, found(), "docker 28")
     assert all(layer["enforced"] for layer in report)
     assert [layer["layer"] for layer in report] == [
         *("container", "container-user", "container-capabilities", "container-privileges"),
@@ -170,13 +171,13 @@ def test_every_wall_is_in_the_report() -> None:
 def test_a_wall_that_does_not_stand_is_refused(changes: dict[str, Any], layer: str) -> None:
     """Whatever the engine's command line said."""
     with pytest.raises(SandboxUnavailableError, match=f"container-{layer} does not hold"):
-        enclosure.layers(WANTED, found(**changes), "docker 28")
+        attestation.layers(WANTED, found(**changes), "docker 28")
 
 
 def test_what_the_caller_goes_without_is_in_the_report() -> None:
     """Not enforced, and said so."""
     wanted = replace(WANTED, network="host", runtime="runsc", memory=None, pids=None, cpus=None)
-    report = enclosure.layers(wanted, found(devices=["eth0"], seccomp=False, memory=None), "x")
+    report = attestation.layers(wanted, found(devices=["eth0"], seccomp=False, memory=None), "x")
     absent = {layer["layer"] for layer in report if not layer["enforced"]}
     assert absent == {"container-network", "container-seccomp", "container-memory"}
 
@@ -196,7 +197,7 @@ def test_jails_get_the_strongest_profile_that_can_be_had(
     wanted: str, profiles: list[str], landlock: int, chosen: str
 ) -> None:
     """The weaker ones by name only."""
-    assert enclosure.profile_for(wanted, found(profiles=profiles, landlock=landlock)) == chosen
+    assert attestation.profile_for(wanted, found(profiles=profiles, landlock=landlock)) == chosen
 
 
 @pytest.mark.parametrize(
@@ -209,14 +210,14 @@ def test_a_jail_that_nothing_parts_from_the_server_is_refused(
 ) -> None:
     """Unless the policy says that the container's walls are enough."""
     with pytest.raises(SandboxUnavailableError):
-        enclosure.profile_for(wanted, found(profiles=profiles, landlock=landlock))
+        attestation.profile_for(wanted, found(profiles=profiles, landlock=landlock))
 
 
 @pytest.mark.parametrize("line", [b"", b"{}", b"[]", b"hello", b'{"profiles": 3}'])
 def test_an_announcement_that_is_none_is_refused(line: bytes) -> None:
     """Another program, or another version."""
     with pytest.raises(WorkerStartupError, match="build the image"):
-        enclosure.parse(line)
+        attestation.parse(line)
 
 
 def test_the_profile_permits_what_jails_may_call() -> None:
@@ -230,7 +231,9 @@ def test_the_profile_permits_what_jails_may_call() -> None:
         ).items()
         if verdict not in (seccomp_policy.EPERM, seccomp_policy.ENOSYS)
     }
-    outer = {name for rule in seccomp.profile("x86_64")["syscalls"] for name in rule["names"]}
+    outer = {
+        name for rule in seccomp_profile.profile("x86_64")["syscalls"] for name in rule["names"]
+    }
     assert len(inner) > 200
     assert inner <= outer
 
@@ -245,12 +248,12 @@ def test_the_profile_permits_what_lockdown_calls() -> None:
             words = path.read_text().split('number("') if path.exists() else []
             called |= {word.partition('"')[0] for word in words[1:]}
     assert {"landlock_create_ruleset", "open_tree", "seccomp"} <= called
-    assert called - tried <= seccomp.ALLOWED
+    assert called - tried <= seccomp_profile.ALLOWED
 
 
 def test_the_profile_denies_what_reaches_the_kernels_innards() -> None:
     """And everything that it does not name."""
-    assert seccomp.profile("aarch64")["defaultAction"] == "SCMP_ACT_ERRNO"
+    assert seccomp_profile.profile("aarch64")["defaultAction"] == "SCMP_ACT_ERRNO"
     denied = """
         acct add_key bpf delete_module fanotify_init finit_module init_module io_uring_enter
         io_uring_setup ioperm iopl kcmp kexec_file_load kexec_load keyctl lookup_dcookie modify_ldt
@@ -258,22 +261,22 @@ def test_the_profile_denies_what_reaches_the_kernels_innards() -> None:
         process_vm_readv process_vm_writev ptrace quotactl reboot request_key setdomainname swapoff
         swapon syslog userfaultfd vhangup
     """
-    assert not set(denied.split()) & seccomp.ALLOWED
+    assert not set(denied.split()) & seccomp_profile.ALLOWED
 
 
 def test_only_the_native_word_size_is_permitted() -> None:
     """The 32-bit calls have other numbers, which nothing here has looked at."""
-    assert seccomp.profile("x86_64")["architectures"] == ["SCMP_ARCH_X86_64"]
+    assert seccomp_profile.profile("x86_64")["architectures"] == ["SCMP_ARCH_X86_64"]
     with pytest.raises(SandboxUnavailableError, match="riscv64"):
-        seccomp.profile("riscv64")
+        seccomp_profile.profile("riscv64")
 
 
 def test_the_profile_for_ones_own_containers_is_the_same() -> None:
     """The file that the documents name, for either machine."""
     path = Path(__file__).resolve().parents[2] / "examples" / "deployment" / "seccomp.json"
-    architectures = sorted(seccomp.ARCHITECTURES.values())
+    architectures = sorted(seccomp_profile.ARCHITECTURES.values())
     assert json.loads(path.read_text()) == {
-        **seccomp.profile("x86_64"),
+        **seccomp_profile.profile("x86_64"),
         "architectures": architectures,
     }
 
@@ -296,26 +299,26 @@ def test_what_is_no_name_of_an_image_reaches_no_engine(
 
 def test_a_process_is_known_by_more_than_its_pid() -> None:
     """Its start, the boot and the namespace; what cannot be told is not said to have ended."""
-    me = identity.identity_of(os.getpid())
+    me = owner.identity_of(os.getpid())
     pid, start, boot, namespace = me.split(":")
-    assert identity.has_ended(me) is False
-    assert identity.has_ended(f"{pid}:{int(start) - 1}:{boot}:{namespace}") is True
-    assert identity.has_ended(f"{pid}:{start}:another-boot:{namespace}") is True
-    assert identity.has_ended(f"{pid}:{start}:{boot}:1") is None
-    assert identity.has_ended("nonsense") is None
+    assert owner.has_ended(me) is False
+    assert owner.has_ended(f"{pid}:{int(start) - 1}:{boot}:{namespace}") is True
+    assert owner.has_ended(f"{pid}:{start}:another-boot:{namespace}") is True
+    assert owner.has_ended(f"{pid}:{start}:{boot}:1") is None
+    assert owner.has_ended("nonsense") is None
 
 
 def test_a_process_that_was_not_reaped_has_ended() -> None:
     """Nobody comes back from that."""
     child = subprocess.Popen([sys.executable, "-S", "-c", "input()"], stdin=subprocess.PIPE)
-    name = identity.identity_of(child.pid)
-    assert identity.has_ended(name) is False
+    name = owner.identity_of(child.pid)
+    assert owner.has_ended(name) is False
     assert child.stdin is not None
     child.stdin.close()
     os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
-    assert identity.has_ended(name) is True
+    assert owner.has_ended(name) is True
     child.wait()
-    assert identity.has_ended(name) is True
+    assert owner.has_ended(name) is True
 
 
 @pytest.mark.parametrize(

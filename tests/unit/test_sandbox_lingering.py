@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 
 from envhub_sandbox.policy import Policy, timeouts_from
-from envhub_sandbox.sandboxes import docker
-from envhub_sandbox.sandboxes.engines import Engine
+from envhub_sandbox.sandboxes.docker import sandbox as docker
+from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.lingering import Lingering
-from envhub_sandbox.sandboxes.sharing import Sharing
-from envhub_sandbox.server_hold import ServerHold
+from envhub_sandbox.sandboxes.refcount import Sharing
+from envhub_sandbox.session.server_hold import ServerHold
 from tests.support import inside
 from tests.support.processes import eventually
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from envhub_sandbox.sandboxes.sharing import Sharing
+from envhub_sandbox.sandboxes.refcount import Sharing
 
 
 @dataclass(eq=False)

@@ -13,8 +13,15 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envhub_sandbox import sharding
-from envhub_sandbox.sharding import Cost, Pace, PaceBook, Sample, bounds_for, pace_of
+from envhub_sandbox.transport.shared_memory import sharding
+from envhub_sandbox.transport.shared_memory.sharding import (
+    Cost,
+    Pace,
+    PaceBook,
+    Sample,
+    bounds_for,
+    pace_of,
+)
 from envhub_worker.protocol.manifest import EnvManifest
 
 SHORT = Pace(Cost(10_000, 3_000), Cost(25_000, 3_000))

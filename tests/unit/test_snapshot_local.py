@@ -14,7 +14,7 @@ from envhub_sandbox.errors import (
     SnapshotIntegrityError,
     SnapshotTooLargeError,
 )
-from envhub_sandbox.snapshot import Snapshot, SnapshotLimits, local
+from envhub_sandbox.hub.snapshot import Snapshot, SnapshotLimits, local
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
-from envhub_sandbox.snapshot_records import FileRecord, SnapshotLimits, check_names, within_limits
+from envhub_sandbox.hub.listing import FileRecord, SnapshotLimits, check_names, within_limits
 
 DIGEST = "sha256:" + "0" * 64
 
@@ -110,7 +110,7 @@ def test_accepted_names_stay_below_the_root(names: list[str]) -> None:
 def test_snapshot_module_imports_nothing_heavy() -> None:
     """A pinned, stored snapshot needs neither the Hub client nor an HTTP library."""
     code = (
-        "import sys, envhub_sandbox.snapshot;"
+        "import sys, envhub_sandbox.hub.snapshot;"
         "print([m for m in ('huggingface_hub', 'requests', 'httpx', 'httpx2', 'numpy',"
         " 'platformdirs') if m in sys.modules])"
     )

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox import snapshot_store as store
 from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
-from envhub_sandbox.hashing import Mismatch, copy_verified, digest_of
-from envhub_sandbox.snapshot_records import FileRecord
+from envhub_sandbox.hub import store as store
+from envhub_sandbox.hub.hashing import Mismatch, copy_verified, digest_of
+from envhub_sandbox.hub.listing import FileRecord
 from tests.hub.stub_hub import git_blob_id
 
 CONTENT = {"env.py": b"print(1)\n", "pkg/deep/data.bin": b"\x00" * 3000, "empty": b""}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from envhub_sandbox.spinning import SpinChooser
+from envhub_sandbox.transport.shared_memory.spin import SpinChooser
 
 
 def run(chooser: SpinChooser, steps: int, awake_ns: int, asleep_ns: int) -> int:

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envhub_sandbox import worker_output
-from envhub_sandbox.worker_output import Lines, OutputFile, Wanted
+from envhub_sandbox.transport import output
+from envhub_sandbox.transport.output import Lines, OutputFile, Wanted
 from envhub_worker.output import OutputTail
 
 
@@ -51,7 +51,7 @@ def test_a_line_without_end_is_cut() -> None:
 
 def test_a_file_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The rest is left out, and the file says so; what was in it before counts."""
-    monkeypatch.setattr(worker_output, "FILE_BYTES", 100)
+    monkeypatch.setattr(output, "FILE_BYTES", 100)
     path = tmp_path / "out.log"
     path.write_text("before\n")
     file = OutputFile(path)
@@ -66,7 +66,7 @@ def test_a_file_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_a_file_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     """Whoever asked for it hears of it before anything runs."""
-    with pytest.raises(worker_output.PolicyError, match="output"):
+    with pytest.raises(output.PolicyError, match="output"):
         Wanted("label", tmp_path)
 
 

@@ -1,0 +1,1 @@
+"""Episodes played and filmed, for ``envhub run``."""

@@ -1,0 +1,315 @@
+"""Plays episodes in a vector environment, and counts them right whatever its autoreset mode.
+
+Each sub-environment has a fixed quota of episodes. Taking the first N that finish anywhere would
+favour short ones.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
+
+from envhub_sandbox.cli.rollout.zero_action import zero_action
+from envhub_sandbox.errors import EnvHubError
+from envhub_worker.protocol.manifest import AUTORESET_MODES
+
+MAX_COMPONENTS = 64
+"""Components of a vector reward: more cannot be reported one by one."""
+_FINAL_KEYS = ("final_obs", "final_observation", "final_info")
+
+Bools = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+
+
+class RolloutError(EnvHubError):
+    """The environment answered in a way that no episode can be counted with."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episode:
+    """One finished episode.
+
+    Attributes:
+        sub_env: Index of the sub-environment that played it.
+        returns: The sum of rewards, one per component; just one unless rewards are vectors.
+        length: Steps.
+        terminated: It terminated; otherwise it was truncated.
+        success: ``is_success`` of the last step's info, if there was one.
+    """
+
+    sub_env: int
+    returns: tuple[float, ...]
+    length: int
+    terminated: bool
+    success: bool | None
+
+
+@dataclass
+class Rollout:
+    """What a rollout gave.
+
+    Attributes:
+        episodes: Finished and within the quota, in the order in which they ended.
+        steps: Steps of all sub-environments together; resets are no steps.
+        step_s: Seconds spent in ``step``.
+        first_step_s: Seconds from the call of ``reset`` to the first step's result.
+        complete: Every quota was met.
+    """
+
+    episodes: list[Episode] = field(default_factory=list)
+    steps: int = 0
+    step_s: float = 0.0
+    first_step_s: float = 0.0
+    complete: bool = False
+
+    @property
+    def steps_per_s(self) -> float:
+        """Steps of sub-environments per second spent in ``step``."""
+        return self.steps / self.step_s if self.step_s > 0 else 0.0
+
+
+def quotas(num_envs: int, episodes: int) -> list[int]:
+    """Episodes of each sub-environment: even, the first ones take the rest."""
+    return [(episodes + num_envs - 1 - index) // num_envs for index in range(num_envs)]
+
+
+def autoreset_mode(env: VectorEnv[Any, Any, Any]) -> str | None:
+    """``"NextStep"``, ``"SameStep"``, ``"Disabled"``, or None where the metadata does not say."""
+    mode = (env.metadata or {}).get("autoreset_mode")
+    mode = getattr(mode, "value", mode)
+    return mode if mode in AUTORESET_MODES else None
+
+
+class EpisodeCounter:
+    """Turns the results of vector steps into episodes. Steps nothing itself.
+
+    Where the metadata does not state the autoreset mode, the first step that ends an episode
+    tells: infos with the final observation mean SAME_STEP, otherwise NEXT_STEP is assumed, which
+    is what Gymnasium's own wrappers assume.
+
+    Args:
+        num_envs: Number of sub-environments.
+        episodes: How many to count.
+        mode: See ``autoreset_mode``.
+
+    Attributes:
+        counted: Finished episodes within the quota.
+        steps: Steps of sub-environments so far.
+        reset_mask: Sub-environments that must be reset before the next step, bool
+            ``(num_envs,)``, or None.
+    """
+
+    def __init__(self, num_envs: int, episodes: int, mode: str | None) -> None:
+        self.counted: list[Episode] = []
+        self.steps = 0
+        self.reset_mask: Bools | None = None
+        self._left = np.array(quotas(num_envs, episodes))
+        self._mode = mode
+        self._resetting: Bools = np.zeros(num_envs, np.bool_)
+        self._lengths = np.zeros(num_envs, np.int64)
+        self._returns: Floats | None = None
+
+    @property
+    def finished(self) -> bool:
+        """Whether every quota is met."""
+        return not self._left.any()
+
+    def wants(self, sub_env: int) -> bool:
+        """Whether a sub-environment still has episodes to play."""
+        return bool(self._left[sub_env] > 0)
+
+    def step(self, rewards: Any, terminations: Any, truncations: Any, infos: Any) -> None:
+        """Count one vector step.
+
+        Raises:
+            RolloutError: Rewards or flags have another shape than ``(num_envs, ...)``.
+        """
+        played = ~self._resetting
+        terminated = self._flags("terminations", terminations)
+        done = (terminated | self._flags("truncations", truncations)) & played
+        self._add(rewards, played)
+        self.steps += int(played.sum())
+        for index in np.flatnonzero(done):
+            self._end(int(index), bool(terminated[index]), infos)
+        self._prepare_next(done, infos)
+
+    def _add(self, rewards: Any, played: Bools) -> None:
+        numbers = self._numbers(rewards)
+        if self._returns is None:
+            self._returns = np.zeros_like(numbers)
+        if numbers.shape != self._returns.shape:
+            raise RolloutError(
+                f"rewards changed their shape from {self._returns.shape} to {numbers.shape}"
+            )
+        self._returns[played] += numbers[played]
+        self._lengths[played] += 1
+
+    def _end(self, index: int, terminated: bool, infos: Any) -> None:
+        assert self._returns is not None
+        if self._left[index] > 0:
+            self._left[index] -= 1
+            self.counted.append(
+                Episode(
+                    sub_env=index,
+                    returns=tuple(float(value) for value in np.atleast_1d(self._returns[index])),
+                    length=int(self._lengths[index]),
+                    terminated=terminated,
+                    success=success_of(infos, index),
+                )
+            )
+        self._returns[index] = 0
+        self._lengths[index] = 0
+
+    def _prepare_next(self, done: Bools, infos: Any) -> None:
+        if self._mode is None and done.any():
+            final = isinstance(infos, Mapping) and any(key in infos for key in _FINAL_KEYS)
+            self._mode = "SameStep" if final else "NextStep"
+        self.reset_mask = done if self._mode == "Disabled" and done.any() else None
+        self._resetting = done if self._mode == "NextStep" else np.zeros_like(done)
+
+    def _numbers(self, rewards: Any) -> Floats:
+        count = len(self._left)
+        try:
+            numbers = np.array(_on_cpu(rewards), np.float64)
+        except (TypeError, ValueError) as error:
+            raise RolloutError(f"rewards are not numbers: {error}") from error
+        if numbers.ndim not in (1, 2) or numbers.shape[0] != count:
+            raise RolloutError(f"rewards have the shape {numbers.shape}, not ({count},)")
+        if numbers.ndim == 2 and not 1 <= numbers.shape[1] <= MAX_COMPONENTS:
+            raise RolloutError(
+                f"rewards have {numbers.shape[1]} components; 1 to {MAX_COMPONENTS} are reported"
+            )
+        return numbers
+
+    def _flags(self, name: str, values: Any) -> Bools:
+        flags = np.asarray(_on_cpu(values))
+        if flags.shape != self._left.shape or flags.dtype.kind not in "biu":
+            raise RolloutError(f"{name} are {flags.dtype} {flags.shape}, not bool (num_envs,)")
+        return flags.astype(np.bool_)
+
+
+def success_of(infos: Any, index: int) -> bool | None:
+    """``is_success`` of one sub-environment, from the final infos if there are any.
+
+    Trust: infos are input from the worker; what has an unexpected form counts as not stated.
+    """
+    if not isinstance(infos, Mapping):
+        return None
+    final = infos.get("final_info")
+    for source in (final, infos):
+        found = _entry(source, "is_success", index)
+        if found is None and source is final:
+            found = _of_member(source, index)  # Gymnasium before 1.0: an array of dicts
+        if isinstance(found, (bool, int, float, np.bool_, np.number)):
+            return bool(found)
+    return None
+
+
+def _entry(infos: Any, key: str, index: int) -> Any:
+    if not isinstance(infos, Mapping) or key not in infos:
+        return None
+    try:
+        mask = infos.get(f"_{key}")
+        if mask is not None and not mask[index]:
+            return None
+        return np.asarray(_on_cpu(infos[key]))[index].item()
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError):
+        return None
+
+
+def _of_member(infos: Any, index: int) -> Any:
+    try:
+        return infos[index].get("is_success")
+    except (AttributeError, IndexError, KeyError, TypeError):
+        return None
+
+
+def _on_cpu(values: Any) -> Any:
+    """A tensor on another device as numpy can read it; everything else as it is."""
+    return values.cpu() if callable(getattr(values, "cpu", None)) else values
+
+
+def chooser(policy: str, space: gym.Space[Any], seed: int) -> Callable[[], Any]:
+    """A function that gives the next batch of actions.
+
+    Args:
+        policy: ``"random"`` samples from the space, seeded; ``"zero"`` does as little as the
+            space allows.
+        space: The batched action space.
+        seed: For ``"random"``.
+    """
+    if policy == "zero":
+        action = zero_action(space)
+        return lambda: action
+    space.seed(seed)
+    return space.sample
+
+
+def rollout(
+    env: VectorEnv[Any, Any, Any],
+    *,
+    episodes: int,
+    seed: int,
+    policy: str = "random",
+    max_steps: int | None = None,
+    observe: Callable[[EpisodeCounter], None] = lambda counter: None,
+) -> Rollout:
+    """Play until every sub-environment has met its quota, which makes ``episodes`` in all.
+
+    Args:
+        env: Is left open.
+        episodes: How many to count.
+        seed: For ``reset`` and the policy: the same seed gives the same result.
+        policy: ``"random"`` or ``"zero"``.
+        max_steps: Vector steps after which to give up; None for no bound.
+        observe: Called after the reset and after every step.
+
+    Raises:
+        RolloutError: The environment's answers cannot be counted, or its space is unknown.
+    """
+    counter = EpisodeCounter(env.num_envs, episodes, autoreset_mode(env))
+    result = Rollout(episodes=counter.counted)
+    begun = time.perf_counter()
+    with _known_space(env):
+        choose = chooser(policy, env.action_space, seed)
+        env.reset(seed=seed)
+        observe(counter)
+        taken = 0
+        while not counter.finished and (max_steps is None or taken < max_steps):
+            _step(env, choose(), counter, result)
+            taken += 1
+            if taken == 1:
+                result.first_step_s = time.perf_counter() - begun
+            observe(counter)
+    result.steps, result.complete = counter.steps, counter.finished
+    return result
+
+
+def _step(
+    env: VectorEnv[Any, Any, Any], action: Any, counter: EpisodeCounter, result: Rollout
+) -> None:
+    if counter.reset_mask is not None:
+        env.reset(options={"reset_mask": counter.reset_mask})
+    begun = time.perf_counter()
+    _, rewards, terminations, truncations, infos = env.step(action)
+    result.step_s += time.perf_counter() - begun
+    counter.step(rewards, terminations, truncations, infos)
+
+
+@contextmanager
+def _known_space(env: VectorEnv[Any, Any, Any]) -> Iterator[None]:
+    try:
+        yield
+    except gym.error.CustomSpaceError as error:
+        raise RolloutError(
+            f"its action space is its own ({str(env.single_action_space)[:200]}), and no policy of "
+            "ours can make actions for it; drive it from Python"
+        ) from error

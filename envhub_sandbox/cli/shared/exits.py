@@ -1,0 +1,136 @@
+"""Exit codes, and how errors reach the user: one paragraph on stderr, no traceback."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import traceback
+from collections.abc import Iterator
+from enum import IntEnum
+
+import typer
+
+from envhub_sandbox import errors
+from envhub_sandbox.cli.shared.console import safe_text, say
+from envhub_sandbox.errors import EnvHubError
+
+_TAIL_LINES = 10
+_TRACE_MARK = "\nRemote traceback:\n"
+
+
+class Exit(IntEnum):
+    """What the command's exit code says."""
+
+    OK = 0
+    ENVIRONMENT = 1
+    USAGE = 2
+    SNAPSHOT = 3
+    LOAD = 4
+    WORKER = 5
+    SANDBOX = 6
+    DIFFERENT = 7
+    SURVIVED = 8
+    BUG = 70
+    INTERRUPTED = 130
+    PIPE = 141
+    TERMINATED = 143
+
+
+EXIT_CODES = (
+    "Exit codes: 0 done; 1 the environment raised, or broke the rules; 2 usage, a bad reference, "
+    "policy or limit; 3 the files could not be had, or are not what the commit says; 4 the "
+    "repository did not load, or a package is missing; 5 the worker died or took too long; "
+    "6 this host cannot enforce the policy; 7 a replay that ended in another way, or elsewhere; "
+    "8 a replay in which nothing died; 70 a bug of ours; 130 interrupted; 141 broken pipe; "
+    "143 terminated."
+)
+
+_CODES: tuple[tuple[type[EnvHubError], Exit], ...] = (
+    (errors.HubReferenceError, Exit.USAGE),
+    (errors.PolicyError, Exit.USAGE),
+    (errors.BundleError, Exit.USAGE),
+    (errors.SnapshotError, Exit.SNAPSHOT),
+    (errors.LoadError, Exit.LOAD),
+    (errors.DependencyError, Exit.LOAD),
+    (errors.WorkerError, Exit.WORKER),
+    (errors.ProtocolError, Exit.WORKER),
+    (errors.SandboxUnavailableError, Exit.SANDBOX),
+)
+
+
+class UsageError(EnvHubError):
+    """What was asked for cannot be; the text says what to ask for instead."""
+
+
+class ForeignError(EnvHubError):
+    """The repository's code, run in this process, raised what is in ``__cause__``."""
+
+
+def code_for(error: BaseException) -> Exit:
+    """The exit code for an error."""
+    if isinstance(error, KeyboardInterrupt):
+        return Exit.INTERRUPTED
+    if not isinstance(error, EnvHubError):
+        return Exit.BUG
+    from envhub_sandbox.cli.rollout.video import VideoError  # numpy, which only a failure may cost
+
+    if isinstance(error, (UsageError, VideoError)):
+        return Exit.USAGE
+    return next((code for kind, code in _CODES if isinstance(error, kind)), Exit.ENVIRONMENT)
+
+
+def describe(error: BaseException) -> str:
+    """An error as text for a terminal: escaped, without tracebacks, with the end of the output."""
+    if not isinstance(error, EnvHubError):
+        return safe_text(f"a bug in envhub: {type(error).__name__}: {error}")
+    text = str(error)
+    tail = getattr(error, "log_tail", "")
+    before, found, after = text.rpartition(tail) if tail else (text, "", "")
+    if found:
+        kept = tail.rstrip().splitlines()[-_TAIL_LINES:]
+        text = before + "\n".join(f"  {line}" for line in kept) + after
+    return safe_text(text.partition(_TRACE_MARK)[0])
+
+
+def _has_traceback(error: BaseException) -> bool:
+    remote = (error, error.__cause__)
+    return any(getattr(one, "traceback", "") for one in remote) or not isinstance(
+        error, EnvHubError
+    )
+
+
+@contextlib.contextmanager
+def reported(*, debug: bool) -> Iterator[None]:
+    """Turn whatever ends a command into a message on stderr and an exit code."""
+    try:
+        yield
+        sys.stdout.flush()
+    except (typer.Exit, SystemExit):
+        raise
+    except BrokenPipeError:
+        _discard_output()
+        raise typer.Exit(Exit.PIPE) from None
+    except KeyboardInterrupt:
+        say("Interrupted.")
+        raise typer.Exit(Exit.INTERRUPTED) from None
+    except Exception as error:
+        _explain(error, debug)
+        raise typer.Exit(code_for(error)) from None
+
+
+def _explain(error: Exception, debug: bool) -> None:
+    if debug:
+        say(safe_text("".join(traceback.format_exception(error)), limit=200_000))
+        for one in (error, error.__cause__):
+            if remote := getattr(one, "traceback", ""):
+                say(f"In the worker:\n{safe_text(remote, limit=200_000)}")
+    say(f"Error: {describe(error)}", style="red")
+    if not debug and _has_traceback(error):
+        say("(--debug shows the traceback)")
+
+
+def _discard_output() -> None:
+    """Nobody reads: what is still buffered must not fail again when the interpreter ends."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,0 +1,182 @@
+"""What a rollout gave, as data for ``--json`` and as text for people."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from envhub_sandbox.cli.shared.console import safe_line
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from envhub_sandbox.cli.rollout.episodes import Rollout
+
+_SHOWN_DIGITS = 12
+_SHOWN_PACKAGES = ("gymnasium", "numpy")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskResult:
+    """One task's rollout.
+
+    Attributes:
+        suite, task: Its keys. Trust: input from the worker.
+        num_envs: Sub-environments.
+        autoreset_mode: ``"NextStep"``, ``"SameStep"``, ``"Disabled"`` or None.
+        rollout: What was played.
+        video: The file that was written, or None.
+    """
+
+    suite: str
+    task: int | str
+    num_envs: int
+    autoreset_mode: str | None
+    rollout: Rollout
+    video: str | None
+
+
+def statistics(values: Sequence[float]) -> dict[str, float] | None:
+    """Mean, population standard deviation, minimum and maximum; None of nothing."""
+    import numpy as np
+
+    if not values:
+        return None
+    with np.errstate(all="ignore"):  # infinite returns are the environment's own business
+        numbers = np.array(values, np.float64)
+        return {name: float(getattr(numbers, name)()) for name in ("mean", "std", "min", "max")}
+
+
+def returns_of(rollout: Rollout) -> list[dict[str, float] | None]:
+    """Statistics of the returns, one per component of the reward."""
+    components = zip(*(episode.returns for episode in rollout.episodes), strict=True)
+    return [statistics(values) for values in components] or [None]
+
+
+def success_rate(rollout: Rollout) -> float | None:
+    """The share of successes among the episodes that state it; None if none does."""
+    stated = [episode.success for episode in rollout.episodes if episode.success is not None]
+    return sum(stated) / len(stated) if stated else None
+
+
+def task_document(result: TaskResult) -> dict[str, Any]:
+    """One task as data; ``return`` is a list where rewards are vectors."""
+    rollout = result.rollout
+    returns = returns_of(rollout)
+    return {
+        "suite": safe_line(result.suite),
+        "task": result.task if isinstance(result.task, int) else safe_line(result.task),
+        "num_envs": result.num_envs,
+        "autoreset_mode": result.autoreset_mode,
+        "complete": rollout.complete,
+        "return": returns[0] if len(returns) == 1 else returns,
+        "length": statistics([episode.length for episode in rollout.episodes]),
+        "success_rate": success_rate(rollout),
+        "steps": rollout.steps,
+        "steps_per_s": rollout.steps_per_s,
+        "first_step_s": rollout.first_step_s,
+        "video": result.video,
+        "episodes": [
+            {
+                "sub_env": episode.sub_env,
+                "return": episode.returns[0] if len(returns) == 1 else episode.returns,
+                "length": episode.length,
+                "terminated": episode.terminated,
+                "success": episode.success,
+            }
+            for episode in rollout.episodes
+        ],
+    }
+
+
+def print_results(out: Console, results: Sequence[TaskResult]) -> None:
+    """A table with a row per task, and per component where rewards are vectors."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    with_success = any(success_rate(result.rollout) is not None for result in results)
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    table.add_column("suite / task", overflow="fold")
+    for title in ("episodes", "return", "min", "max", "length", "steps/s"):
+        table.add_column(title, justify="right", no_wrap=True)
+    if with_success:
+        table.add_column("success", justify="right", no_wrap=True)
+    for result in results:
+        for row in _rows(result, with_success):
+            table.add_row(*row)
+    out.print(table)
+
+
+def _rows(result: TaskResult, with_success: bool) -> list[list[str]]:
+    rollout = result.rollout
+    name = f"{safe_line(result.suite, 60)} / {safe_line(result.task, 60)}"
+    count = str(len(rollout.episodes)) + ("" if rollout.complete else " (stopped)")
+    length = _mean(statistics([episode.length for episode in rollout.episodes]))
+    rows = []
+    for index, stats in enumerate(returns := returns_of(rollout)):
+        first = index == 0
+        label = name if first else ""
+        if len(returns) > 1:
+            label += f" [{index}]"
+        row = [label, count if first else "", _mean(stats, spread=True)]
+        row += ["-", "-"] if stats is None else [f"{stats['min']:.2f}", f"{stats['max']:.2f}"]
+        row += [length, f"{rollout.steps_per_s:,.0f}"] if first else ["", ""]
+        rows.append([*row, _percent(success_rate(rollout)) if first else ""])
+    return rows if with_success else [row[:-1] for row in rows]
+
+
+def _mean(stats: dict[str, float] | None, *, spread: bool = False) -> str:
+    if stats is None:
+        return "-"
+    if spread:
+        return f"{stats['mean']:.2f} ± {stats['std']:.2f}"
+    return f"{stats['mean']:.1f}"
+
+
+def _percent(rate: float | None) -> str:
+    return "-" if rate is None else f"{rate:.0%}"
+
+
+def print_provenance(out: Console, provenance: dict[str, Any], *, in_process: bool) -> None:
+    """Where the code came from, what ran it, and what confined it."""
+    from rich.table import Table
+
+    grid = Table.grid(padding=(0, 2))
+    grid.add_column(style="bold", no_wrap=True)
+    grid.add_column(overflow="fold")
+    grid.add_row("repository", _repository(provenance))
+    interpreter = provenance.get("interpreter") or {}
+    if interpreter:
+        grid.add_row("ran on", _interpreter(interpreter, provenance.get("packages") or {}))
+    for title, text in _confinement(provenance.get("layers") or [], in_process):
+        grid.add_row(title, text)
+    out.print(grid)
+
+
+def _repository(provenance: dict[str, Any]) -> str:
+    kind = provenance["repo_type"]
+    commit = provenance["commit"]
+    if kind == "local":
+        commit = commit[: len("local-") + _SHOWN_DIGITS]
+    return safe_line(f"{provenance['repository']} ({kind}) at {commit}, {provenance['path']}", 400)
+
+
+def _interpreter(interpreter: dict[str, str], packages: dict[str, str]) -> str:
+    shown = [f"{name} {packages[name]}" for name in _SHOWN_PACKAGES if name in packages]
+    version, executable = interpreter.get("version", ""), interpreter.get("executable", "")
+    return safe_line(", ".join([f"{version} ({executable})", *shown]), 400)
+
+
+def _confinement(layers: list[dict[str, Any]], in_process: bool) -> list[tuple[str, str]]:
+    if in_process:
+        return [("confined by", "nothing: the code ran in this process")]
+    held = [safe_line(layer.get("layer", "?"), 40) for layer in layers if layer.get("enforced")]
+    if not layers:
+        return [("confined by", "nothing ran")]
+    rows = [("confined by", ", ".join(held) or "nothing")]
+    for layer in layers:
+        if not layer.get("enforced"):
+            text = f"{layer.get('layer', '?')}: {layer.get('detail', '')}"
+            rows.append(("not enforced", safe_line(text, 300)))
+    return rows

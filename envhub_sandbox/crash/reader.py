@@ -1,0 +1,332 @@
+"""Reads crash bundles. Trust: a bundle is a stranger's input, who would like us to run something.
+
+Only regular files of bounded size are read, nothing is unpickled, and every value is checked for
+its type before it is used. What a bundle asks of this machine beyond what an ordinary run gets
+is told by ``wishes`` and granted only by the user.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from envhub_sandbox.errors import BundleError, EnvHubError
+from envhub_sandbox.hub.reference import HubRef
+from envhub_sandbox.policy import Limits, Policy
+from envhub_sandbox.transport.tensors import to_tensor
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.slabs import DTYPE_CODES
+from envhub_worker.protocol.stream import PacketReader
+from envhub_worker.protocol.text import printable
+from envhub_worker.protocol.untrusted import FAULTS
+
+FORMAT = 1
+MAX_FILE_BYTES = 64 << 20
+MAX_DOCUMENT_BYTES = 16 << 20
+"""``bundle.json``: an empty list takes two bytes there, and forty times as much in memory."""
+MAX_REQUESTS = 1_000_000
+"""What is read of a bundle at most: a history takes 8 MiB."""
+
+_UNREADABLE: tuple[type[Exception], ...] = (OSError, EnvHubError, *FAULTS)
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bundle:
+    """A crash bundle, checked.
+
+    Attributes:
+        label: Repository, commit and entry file.
+        reference: The same, pinned, as ``make_env`` takes it.
+        files: Digest by path.
+        death: ``reason``, ``exit_code``, ``signal``, ``request``, ``message``.
+        load: The arguments of the repository's ``make_env``.
+        arguments: The other arguments that were used.
+        task: ``suite``, ``task``, ``num_envs``, ``shards``, ``lane``; None before ``make_env``
+            had returned.
+        doubts: Why the same requests may not have the same effect, one sentence each.
+        before: What had been set before the requests.
+        requests: What was asked, in order; the last one was never answered.
+    """
+
+    label: str
+    reference: str
+    files: dict[str, str]
+    death: dict[str, Any]
+    load: m.Load
+    arguments: dict[str, Any]
+    task: dict[str, Any] | None
+    doubts: tuple[str, ...]
+    before: tuple[m.Message, ...]
+    requests: tuple[m.Message, ...]
+
+    @property
+    def steps(self) -> int:
+        """How many of the requests are steps."""
+        return sum(isinstance(request, m.Step) for request in self.requests)
+
+
+def load_bundle(folder: Path) -> Bundle:
+    """The bundle in a folder.
+
+    Raises:
+        BundleError: There is none, or it breaks a rule.
+    """
+    try:
+        document = json.loads(_read(folder, "bundle.json", MAX_DOCUMENT_BYTES))
+        if type(document) is not dict or document.get("format") != FORMAT:
+            raise BundleError(f"it is not of format {FORMAT}")
+        return _bundle(folder, document)
+    except _UNREADABLE as error:
+        raise BundleError(f"{folder} is no crash bundle that can be read: {error}") from error
+
+
+def _bundle(folder: Path, document: dict[str, Any]) -> Bundle:
+    provenance = _member(document, "provenance", dict)
+    history = _member(document, "history", dict)
+    arguments = _member(document, "make_env", dict)
+    packets = _packets(folder, "requests.bin")
+    before = tuple(_requests(folder, _member(history, "before", list), packets))
+    requests = tuple(_requests(folder, _member(history, "requests", list), packets))
+    task = document.get("task")
+    return Bundle(
+        label=printable(_member(document, "label", str), 1000),
+        reference=_reference(provenance),
+        files=_texts(_member(provenance, "files", dict)),
+        death=_death(_member(document, "death", dict)),
+        load=_load(folder),
+        arguments=arguments,
+        task=None if task is None else _task(task),
+        doubts=tuple(_doubts(document, history, arguments)),
+        before=before,
+        requests=requests,
+    )
+
+
+def _doubts(
+    document: dict[str, Any], history: dict[str, Any], arguments: dict[str, Any]
+) -> Iterator[str]:
+    dropped = _member(history, "dropped", int)
+    if dropped:
+        yield f"{dropped} requests had been forgotten before it died (crash_history of the policy)"
+    elif history.get("mixed"):
+        yield "what was set or called before a transparent restart need not hold everywhere"
+    elif not _member(history, "exact", bool):
+        yield "some requests held objects that only pickle could carry, and are not repeated"
+    if not _member(arguments, "exact", bool):
+        yield "make_env was given objects that only pickle could carry"
+    if document.get("task") is not None and not _member(history, "seeded", bool):
+        yield "no reset had seeded every sub-environment, so chance may decide otherwise"
+    if document.get("shared_jail"):
+        yield "other environments lived in the same process; what was asked of them is not known"
+
+
+def _reference(provenance: dict[str, Any]) -> str:
+    repository, path = _member(provenance, "repository", str), _member(provenance, "path", str)
+    kind = _member(provenance, "repo_type", str)
+    if kind == "local":
+        if not os.path.isabs(repository):
+            raise BundleError("a local folder's path is not absolute")
+        return f"{repository}:{path}"
+    ref = HubRef(repository, _member(provenance, "commit", str), path, kind)
+    if not ref.is_pinned:
+        raise BundleError(f"{ref} names no commit")
+    return str(ref)
+
+
+def _death(death: dict[str, Any]) -> dict[str, Any]:
+    code, signal = death.get("exit_code"), death.get("signal")
+    return {
+        "reason": printable(_member(death, "reason", str), 100),
+        "exit_code": code if type(code) is int else None,
+        "signal": printable(signal, 100) if type(signal) is str else None,
+        "request": printable(str(death.get("request")), 100),
+        "message": printable(_member(death, "message", str)),
+    }
+
+
+def _task(task: Any) -> dict[str, Any]:
+    if type(task) is not dict or type(task.get("task")) not in (int, str):
+        raise BundleError("its task is not one")
+    return {
+        "suite": _member(task, "suite", str),
+        "task": task["task"],
+        "num_envs": _member(task, "num_envs", int),
+        "shards": _member(task, "shards", int),
+        "lane": "frames" if task.get("lane") == "frames" else "auto",
+    }
+
+
+def _load(folder: Path) -> m.Load:
+    [message] = list(_packets(folder, "arguments.bin"))
+    if not isinstance(message, m.Load):
+        raise BundleError("its arguments are not those of make_env")
+    return message
+
+
+def _packets(folder: Path, name: str) -> Iterator[m.Message]:
+    for packet in PacketReader().feed(_read(folder, name)):
+        yield m.unpack(packet.frames, tensors=to_tensor)[1]
+
+
+def _requests(folder: Path, index: list[Any], packets: Iterator[m.Message]) -> Iterator[m.Message]:
+    arrays: dict[str, Any] = {}
+    left = MAX_REQUESTS
+    for entry in index:
+        if type(entry) is not dict:
+            raise BundleError("a request is not a mapping")
+        if "steps" not in entry:
+            left -= 1
+            yield _next(packets)
+            continue
+        name = _member(entry, "of", str)
+        if name not in arrays:
+            arrays[name] = _array(folder, name)
+        rows = arrays[name][_slice(entry["steps"], len(arrays[name]))]
+        left -= len(rows)
+        if left < 0:
+            raise BundleError(f"it has more than {MAX_REQUESTS} requests")
+        for actions in rows:
+            yield m.Step(0, actions)
+
+
+def _next(packets: Iterator[m.Message]) -> m.Message:
+    found = next(packets, None)
+    if found is None:
+        raise BundleError("it has fewer requests than it says")
+    return found
+
+
+def _slice(value: Any, length: int) -> slice:
+    if type(value) is not list or [type(item) for item in value] != [int, int]:
+        raise BundleError("the bounds of its steps are not two numbers")
+    start, stop = value
+    if not 0 <= start < stop <= length:
+        raise BundleError("it has fewer steps than it says")
+    return slice(start, stop)
+
+
+def _array(folder: Path, name: str) -> Any:
+    """A file of actions, mapped: a size that is claimed and not there costs nothing."""
+    dtypes = {f"actions-{dtype.name}.npy": dtype for dtype in DTYPE_CODES}
+    if name not in dtypes:
+        raise BundleError(f"{printable(name, 100)!r} is no file of actions")
+    _check_file(folder / name)
+    try:
+        array = np.lib.format.open_memmap(folder / name, mode="r")
+    except Exception as error:  # numpy reads the header with Python's own tokenizer and parser
+        raise BundleError(f"{name} is no file of actions: {error}") from error
+    if array.dtype != dtypes[name] or not array.ndim:
+        raise BundleError(f"{name} does not hold what it says")
+    return np.array(array)
+
+
+def _read(folder: Path, name: str, most: int = MAX_FILE_BYTES) -> bytes:
+    _check_file(folder / name, most)
+    return (folder / name).read_bytes()
+
+
+def _check_file(path: Path, most: int = MAX_FILE_BYTES) -> None:
+    found = path.lstat()
+    if not stat.S_ISREG(found.st_mode):
+        raise BundleError(f"{path} is no regular file")
+    if found.st_size > most:
+        raise BundleError(f"{path} has {found.st_size} bytes; at most {most} are read")
+
+
+def _member(mapping: dict[str, Any], name: str, kind: type[T]) -> T:
+    value = mapping.get(name)
+    if type(value) is not kind:
+        raise BundleError(f"its {name} is not of type {kind.__name__}")
+    return value
+
+
+def _texts(mapping: dict[str, Any]) -> dict[str, str]:
+    if not all(type(value) is str for value in mapping.values()):
+        raise BundleError("its file hashes are not text")
+    return dict(mapping)
+
+
+# --- what it asks of this machine --------------------------------------------------------------
+
+_GRANTED = ("profile", "network", "readable", "gpu", "environment")
+_CARRIED = ("hub_cache_dir", "endpoint", "python")
+
+
+def wishes(bundle: Bundle) -> list[str]:
+    """What it asks for beyond an ordinary run, one ``name=value`` each: for the user to grant."""
+    asked, usual = _policy(bundle), Policy()
+    found = [
+        f"{name}={asked[name]!r}"
+        for name in _GRANTED
+        if name in asked and _comparable(asked[name]) != _comparable(getattr(usual, name))
+    ]
+    limits = asked.get("limits")
+    if isinstance(limits, dict):
+        found += [f"limits.{n}={v!r}" for n, v in limits.items() if _is_more(n, v)]
+    found += [f"{name}={v!r}" for name in _CARRIED if (v := bundle.arguments.get(name)) is not None]
+    return [printable(wish, 300) for wish in found]
+
+
+def _policy(bundle: Bundle) -> dict[str, Any]:
+    policy = bundle.arguments.get("policy")
+    return policy if isinstance(policy, dict) else {}
+
+
+def _comparable(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _is_more(name: str, value: Any) -> bool:
+    usual = getattr(Limits(), name, 0)
+    if usual is None or value is None:  # no cap of its own: the other limits are the cap
+        return usual is not None
+    return not isinstance(value, (int, float)) or value > usual
+
+
+def replayed_arguments(bundle: Bundle, *, granted: bool) -> dict[str, Any]:
+    """The arguments of ``make_env`` that make the environment again.
+
+    Args:
+        bundle: The bundle.
+        granted: Whether the user permits what ``wishes`` tells; otherwise it is left out.
+    """
+    policy = _known(Policy, _policy(bundle))
+    usable = {name: policy[name] for name in _GRANTED if granted and name in policy}
+    limits = _known(Limits, policy.get("limits"))
+    usable["limits"] = {n: v for n, v in limits.items() if granted or not _is_more(n, v)}
+    usable |= {"crash_history": 0}
+    made: dict[str, Any] = {
+        "n_envs": bundle.load.n_envs,
+        "use_async_envs": bundle.load.use_async_envs,
+        "env_kwargs": bundle.load.env_kwargs,
+        "policy": usable,
+        "timeouts": _timeouts(bundle),
+    }
+    if bundle.task is not None:
+        made |= {"num_workers": bundle.task["shards"], "lane": bundle.task["lane"]}
+    if granted:
+        carried = {name: bundle.arguments.get(name) for name in _CARRIED}
+        made |= {name: value for name, value in carried.items() if type(value) is str}
+    return made
+
+
+def _known(cls: type[Any], value: Any) -> dict[str, Any]:
+    names = {item.name for item in fields(cls)}
+    return {n: v for n, v in value.items() if n in names} if isinstance(value, Mapping) else {}
+
+
+def _timeouts(bundle: Bundle) -> dict[str, Any]:
+    """Those that were used, except that nobody waits for ever."""
+    timeouts = bundle.arguments.get("timeouts")
+    names = ("startup_s", "reset_s", "step_s", "call_s")
+    found = timeouts if isinstance(timeouts, dict) else {}
+    return {name: found[name] for name in names if isinstance(found.get(name), (int, float))}

@@ -1,0 +1,161 @@
+"""Asks an environment again what was asked of one that died, and says whether this one does too."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from envhub_sandbox.crash.reader import Bundle
+from envhub_sandbox.errors import ActionError, RemoteEnvError, WorkerDiedError, WorkerTimeoutError
+from envhub_worker.protocol import messages as m
+
+_UNFIT = (ActionError, TypeError, ValueError)
+"""What another environment than it was raises before it is asked."""
+
+
+class Verdict(str, Enum):
+    """How a replay ended."""
+
+    SAME = "same"
+    DIFFERENT = "different"
+    SURVIVED = "survived"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replayed:
+    """What a replay did.
+
+    Attributes:
+        verdict: How it ended.
+        requests: Requests of the bundle that were asked, the last one included.
+        steps: Steps among them.
+        death: What ended it: ``reason``, ``exit_code``, ``signal``, ``message``; None if nothing.
+        note: What else there is to say, or "".
+    """
+
+    verdict: Verdict
+    requests: int
+    steps: int
+    death: dict[str, Any] | None = None
+    note: str = ""
+
+
+def replay(
+    make: Callable[[], Any], bundle: Bundle, tick: Callable[[int], None] = lambda done: None
+) -> Replayed:
+    """Make the environment and repeat a bundle's requests.
+
+    Args:
+        make: Makes the environment: what ``make_env`` raises, it may raise.
+        bundle: What was asked.
+        tick: Told how many requests have been repeated.
+    """
+    try:
+        env = make()
+    except (WorkerDiedError, WorkerTimeoutError) as error:
+        return _ended(error, bundle, 0, 0)
+    if env is None:
+        return Replayed(verdict=Verdict.SURVIVED, requests=0, steps=0)
+    for message in bundle.before:
+        try:
+            ended = _ask(env, message)
+        except _UNFIT as error:
+            note = f"what had been set before does not fit this environment: {error}"
+            return Replayed(verdict=Verdict.DIFFERENT, requests=0, steps=0, note=note)
+        if ended is not None:
+            return _ended(ended, bundle, 0, 0)
+    return _repeat(env, bundle, tick)
+
+
+def _repeat(env: Any, bundle: Bundle, tick: Callable[[int], None]) -> Replayed:
+    steps = 0
+    for done, message in enumerate(bundle.requests, start=1):
+        steps += isinstance(message, m.Step)
+        try:
+            ended = _ask(env, message)
+        except _UNFIT as error:
+            note = f"request {done} does not fit this environment: {error}"
+            return Replayed(verdict=Verdict.DIFFERENT, requests=done, steps=steps, note=note)
+        if ended is not None:
+            return _ended(ended, bundle, done, steps)
+        tick(done)
+    return Replayed(verdict=Verdict.SURVIVED, requests=len(bundle.requests), steps=steps)
+
+
+def _ask(env: Any, message: m.Message) -> WorkerDiedError | WorkerTimeoutError | None:
+    """Repeat one request; what the repository raises is its answer, as it was before."""
+    try:
+        _REPEATED.get(type(message), _skip)(env, message)
+    except (WorkerDiedError, WorkerTimeoutError) as error:
+        return error
+    except (RemoteEnvError, AttributeError):
+        pass
+    return None
+
+
+def _ended(
+    error: WorkerDiedError | WorkerTimeoutError, bundle: Bundle, requests: int, steps: int
+) -> Replayed:
+    died = isinstance(error, WorkerDiedError)
+    how = {
+        "reason": error.reason if isinstance(error, WorkerDiedError) else "timeout",
+        "exit_code": getattr(error, "exit_code", None) if died else None,
+        "signal": getattr(error, "signal", None) if died else None,
+    }
+    there = requests == len(bundle.requests)
+    same = there and all(how[name] == bundle.death[name] for name in how)
+    return Replayed(
+        verdict=Verdict.SAME if same else Verdict.DIFFERENT,
+        requests=requests,
+        steps=steps,
+        death={**how, "message": str(error)},
+    )
+
+
+def _reset(env: Any, message: m.Reset) -> None:
+    options = None if message.options is None else dict(message.options)
+    if message.mask is not None:
+        options = {**(options or {}), "reset_mask": message.mask}
+    env.reset(seed=message.seeds, options=options)
+
+
+def _set_attr(env: Any, message: m.SetAttr) -> None:
+    env.set_attr(message.name, list(message.values))
+
+
+def _call_own(env: Any, message: m.CallOwn) -> None:
+    if _is_remote(env, message.name):
+        getattr(env, message.name)(*message.args, **message.kwargs)
+
+
+def _get_own(env: Any, message: m.GetOwn) -> None:
+    if _is_remote(env, message.name) or message.name == "np_random_seed":
+        getattr(env, message.name)
+
+
+def _is_remote(env: Any, name: str) -> bool:
+    """Whether a name means the repository's: a bundle has no business with the proxy's own."""
+    return not name.startswith("_") and name not in vars(env) and not hasattr(type(env), name)
+
+
+def _skip(env: Any, message: Any) -> None:
+    """It is no request that was ever recorded."""
+
+
+_REPEATED: dict[type[m.Message], Callable[[Any, Any], object]] = {
+    m.Reset: _reset,
+    m.Step: lambda env, message: env.step(message.actions),
+    m.Call: lambda env, message: env.call(message.name, *message.args, **message.kwargs),
+    m.SetAttr: _set_attr,
+    m.Render: lambda env, message: env.render(),
+    m.CallOwn: _call_own,
+    m.GetOwn: _get_own,
+    m.GetRandom: lambda env, message: env.np_random,
+}
+
+
+def changed_files(recorded: dict[str, str], found: dict[str, str]) -> Sequence[str]:
+    """The paths of files that were changed, added or removed since."""
+    return sorted(path for path in {*recorded, *found} if recorded.get(path) != found.get(path))

@@ -1,0 +1,277 @@
+"""Crash bundles: what led to the death of a jail, written down so that it can be done again.
+
+::
+
+    <cache>/crashes/20261121T081500-5f3a9c01/
+        README.txt            in words: what died, and how to try again
+        bundle.json           everything but the values below
+        arguments.bin         make_env's own arguments: one packet of the wire
+        requests.bin          requests that are no plain steps: a packet each
+        actions-<dtype>.npy   (steps, num_envs, ...), one file a dtype
+
+Nothing in it is pickled. It is built under another name and renamed into place; only its owner
+may read it; the oldest give way to the newest. ``bundles`` reads it.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import secrets
+import shutil
+import tempfile
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from envhub_sandbox import folders
+from envhub_sandbox.crash.history import Recording, Requested, Steps, encoded
+from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
+from envhub_sandbox.hub.logins import without_login
+from envhub_sandbox.policy import Policy, Timeouts
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.inert import describe, one_line
+from envhub_worker.protocol.stream import pack_packet
+from envhub_worker.protocol.text import printable
+
+FORMAT = 1
+KEPT = 20
+"""Bundles in one folder; older ones are removed."""
+_NAME = re.compile(r"\d{8}T\d{6}-[0-9a-f]{8}")
+_BUILDING = ".building-"
+_ABANDONED_AFTER_S = 3600.0
+_SHOWN_REQUESTS = 8
+_SHORTEST_SECRET = 6
+"""Characters: what is shorter is a setting, and would be found everywhere."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Crash:
+    """What is known of one death.
+
+    Attributes:
+        error: What the user is told.
+        label: Repository, commit and entry file.
+        provenance: As ``provenance_of`` returns it.
+        load: The arguments of the repository's ``make_env``.
+        options: The other arguments of ours: plain data, ``Policy`` and ``Timeouts``.
+        task: ``suite``, ``task``, ``num_envs``, ``shards``, ``lane``; None before ``make_env`` has
+            returned.
+        shared: Whether other environments lived in the same jail.
+        recording: What was asked of the environment.
+    """
+
+    error: WorkerDiedError | WorkerTimeoutError
+    label: str
+    provenance: dict[str, Any]
+    load: m.Load
+    options: dict[str, Any]
+    task: dict[str, Any] | None
+    shared: bool
+    recording: Recording
+
+
+def keep(folder: Path, crash: Crash) -> Path:
+    """Write a bundle; returns its folder.
+
+    Raises:
+        OSError: It cannot be written; nothing is left of it.
+    """
+    folders.make(folder, folders.PRIVATE_MODE)
+    building = Path(tempfile.mkdtemp(prefix=_BUILDING, dir=folder))  # 0700
+    try:
+        _write(building, crash)
+        home = folder / f"{time.strftime('%Y%m%dT%H%M%S', time.gmtime())}-{secrets.token_hex(4)}"
+        building.rename(home)
+    except BaseException:
+        shutil.rmtree(building, ignore_errors=True)
+        raise
+    _remove_oldest(folder, home.name)
+    return home
+
+
+def _remove_oldest(folder: Path, newest: str) -> None:
+    names = os.listdir(folder)
+    # its name alone does not tell the newest from others of the same second
+    bundles = sorted(filter(_NAME.fullmatch, names), key=lambda name: (name == newest, name))
+    abandoned = [name for name in names if name.startswith(_BUILDING) and _is_old(folder / name)]
+    for name in [*bundles[:-KEPT], *abandoned]:
+        shutil.rmtree(folder / name, ignore_errors=True)
+
+
+def _is_old(path: Path) -> bool:
+    try:
+        return time.time() - path.stat().st_mtime > _ABANDONED_AFTER_S
+    except OSError:
+        return False
+
+
+def _write(folder: Path, crash: Crash) -> None:
+    before, requests = _Requests(), _Requests()
+    recording = crash.recording
+    before.add_all(recording.before)
+    requests.add_all(recording.requests)
+    document = {
+        "format": FORMAT,
+        "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "label": crash.label,
+        "death": {name: _concealed(text, crash) for name, text in death_of(crash.error).items()},
+        "provenance": crash.provenance,
+        "make_env": _arguments(crash),
+        "task": crash.task,
+        "shared_jail": crash.shared,
+        "history": {
+            "exact": recording.exact,
+            "seeded": recording.seeded,
+            "dropped": recording.dropped,
+            "mixed": recording.mixed,
+            "steps": requests.steps,
+            "before": before.index,
+            "requests": requests.index,
+        },
+    }
+    packets = [*before.packets, *requests.packets]
+    content = {
+        "bundle.json": json.dumps(document, indent=1, default=str).encode(),
+        "arguments.bin": _packet(encoded(crash.load).frames),
+        "requests.bin": b"".join(map(_packet, packets)),
+        "README.txt": str(_concealed(_in_words(crash), crash)).encode(),
+        **{name: _array_file(rows) for name, rows in requests.arrays.items()},
+    }
+    for name, data in content.items():
+        folders.write_private(folder / name, data)
+
+
+def _concealed(value: Any, crash: Crash) -> Any:
+    """A text without the values of variables that the jail was granted and may have printed."""
+    policy = crash.options.get("policy")
+    if isinstance(value, str) and isinstance(policy, Policy):
+        for name in policy.environment:
+            secret = os.environ.get(name, "")
+            if len(secret) >= _SHORTEST_SECRET:
+                value = value.replace(secret, f"<the value of {name}>")
+    return value
+
+
+def _array_file(rows: list[Any]) -> bytes:
+    file = io.BytesIO()
+    np.lib.format.write_array(file, np.concatenate(rows), allow_pickle=False)
+    return file.getvalue()
+
+
+class _Requests:
+    """An index of requests, and what it points to."""
+
+    def __init__(self) -> None:
+        self.index: list[dict[str, Any]] = []
+        self.packets: list[Sequence[Buffer]] = []
+        self.arrays: dict[str, list[Any]] = {}
+        self._lengths: dict[str, int] = {}
+        self.steps = 0
+
+    def add_all(self, requests: Iterable[Steps | Requested]) -> None:
+        """Add requests, in order."""
+        for request in requests:
+            if isinstance(request, Steps):
+                self._add_steps(request.actions)
+            else:
+                self._add(request)
+
+    def _add_steps(self, actions: Any) -> None:
+        name = f"actions-{actions.dtype.name}.npy"
+        self.arrays.setdefault(name, []).append(actions)
+        start = self._lengths.get(name, 0)
+        self._lengths[name] = start + len(actions)
+        self.index.append({"steps": [start, start + len(actions)], "of": name})
+        self.steps += len(actions)
+
+    def _add(self, request: Requested) -> None:
+        self.packets.append(request.frames)
+        self.index.append(
+            {"operation": request.operation, "exact": request.exact, "text": _text(request)}
+        )
+        self.steps += request.operation == "step"
+
+
+def _text(request: Requested) -> str:
+    return one_line(repr(m.unpack(request.frames)[1]), 200)
+
+
+def _packet(frames: Sequence[Buffer]) -> bytes:
+    return b"".join(map(bytes, pack_packet(1, frames)))
+
+
+def death_of(error: WorkerDiedError | WorkerTimeoutError) -> dict[str, Any]:
+    """How it ended, as data."""
+    if isinstance(error, WorkerTimeoutError):
+        how: dict[str, Any] = {"reason": "timeout", "exit_code": None, "signal": None}
+        how |= {"detail": f"{error.timeout_s} s" if error.timeout_s else "", "output": ""}
+    else:
+        how = {"reason": error.reason, "exit_code": error.exit_code, "signal": error.signal}
+        how |= {"detail": error.detail, "output": error.log_tail}
+    return {**how, "request": error.request, "message": str(error)}
+
+
+def _arguments(crash: Crash) -> dict[str, Any]:
+    """``make_env``'s arguments; those of the repository also in words, for people."""
+    options = {name: _plain(value) for name, value in crash.options.items()}
+    return {
+        **options,
+        "n_envs": crash.load.n_envs,
+        "use_async_envs": crash.load.use_async_envs,
+        "exact": encoded(crash.load).exact,
+        "env_kwargs": {name: describe(value).text for name, value in crash.load.env_kwargs.items()},
+        "cfg": None if crash.load.cfg is None else describe(crash.load.cfg).text,
+    }
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, (Policy, Timeouts)):
+        return asdict(value)
+    if isinstance(value, str):
+        return without_login(value)
+    if value is None or isinstance(value, (bool, int, float)):
+        return value
+    return os.fspath(value) if isinstance(value, os.PathLike) else type(value).__name__
+
+
+def _in_words(crash: Crash) -> str:
+    recording = crash.recording
+    task = crash.task
+    lines = [
+        f"A worker process of {crash.label} died.",
+        "",
+        printable(str(crash.error)),
+        "",
+        "To do the same again:  envhub replay <this folder>",
+        "",
+    ]
+    if task is not None:
+        lines.append(
+            f"Environment: suite {task['suite']!r}, task {task['task']!r}, {task['num_envs']} "
+            f"sub-environments in {task['shards']} processes, steps by {task['lane']}."
+        )
+    lines += [f"Seeded: {'yes' if recording.seeded else 'no, so chance may decide otherwise'}."]
+    if recording.dropped:
+        lines.append(f"{recording.dropped} requests were forgotten: a replay cannot be exact.")
+    lines += ["", "The last requests, the last one unanswered:", *_last_requests(recording), ""]
+    return "\n".join(lines)
+
+
+def _last_requests(recording: Recording) -> list[str]:
+    shown = []
+    for request in recording.requests[-_SHOWN_REQUESTS:]:
+        if isinstance(request, Steps):
+            last = printable(repr(request.actions[-1]), 400)
+            shown.append(f"  {len(request.actions)} steps, the last with {last}")
+        else:
+            shown.append(f"  {_text(request)}")
+    return shown or ["  none: it died in make_env"]

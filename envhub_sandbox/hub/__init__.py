@@ -1,0 +1,1 @@
+"""From a hub reference to a verified, read-only snapshot on this machine's disk."""

@@ -1,0 +1,300 @@
+"""The Hub, through huggingface_hub 0.34 to 2.x: resolve, list, download.
+
+The client library is imported inside the functions: a pinned snapshot that is in the store
+needs none of it. What it downloads lies in its own cache and is not trusted here: the caller
+compares every file with the listing.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from traceback import walk_tb
+from typing import Any, NamedTuple
+from urllib.parse import parse_qsl, quote, urlsplit
+
+from envhub_sandbox.errors import HubReferenceError, SnapshotError, SnapshotIntegrityError
+from envhub_sandbox.hub.answers import HostileAnswerError, bounded_body, guarded, streamed
+from envhub_sandbox.hub.failures import HubFailure, Subject, conceal, explain
+from envhub_sandbox.hub.grammar import is_commit
+from envhub_sandbox.hub.hashing import GIT_SHA1, SHA256
+from envhub_sandbox.hub.listing import FileRecord
+from envhub_sandbox.hub.logins import authorization, login_of, without_login
+
+_DEFAULT_ENDPOINT = "https://huggingface.co"
+_LIBRARY = {"library_name": "envhub-sandbox"}
+_xet_switch = threading.Lock()
+_WORKERS = 8
+MAX_IDLE_PAGES = 1000
+"""Pages of a listing in a row without a file: folders alone can fill some."""
+
+
+class Repository(NamedTuple):
+    """A repository's type and name."""
+
+    repo_type: str
+    repo_id: str
+
+
+def default_endpoint() -> str:
+    """The endpoint that huggingface_hub uses, without importing it."""
+    constants = sys.modules.get("huggingface_hub.constants")
+    chosen = getattr(constants, "ENDPOINT", None) or os.environ.get("HF_ENDPOINT")
+    return str(chosen or _DEFAULT_ENDPOINT).rstrip("/")
+
+
+def checked_endpoint(endpoint: str | None) -> str:
+    """The endpoint without a trailing slash.
+
+    Raises:
+        HubReferenceError: It is not an http(s) URL.
+    """
+    chosen = default_endpoint() if endpoint is None else endpoint.rstrip("/")
+    shown = without_login(chosen)
+    if "@" in shown:
+        raise HubReferenceError(
+            "endpoint: it has an @ behind the host; write a user or password with such characters "
+            "percent-encoded, as in https://user:p%2Fw@hub.example"
+        )
+    if not re.match(r"https?://[^/]", shown):
+        raise HubReferenceError(
+            f"endpoint: {shown!r} is not an http(s) URL such as {_DEFAULT_ENDPOINT!r}"
+        )
+    return chosen
+
+
+def checked_token(token: str | bool | None) -> str | bool | None:
+    """The token, stripped; the text of an error never shows it.
+
+    Raises:
+        HubReferenceError: It cannot be sent in an HTTP header, whose error would print it.
+    """
+    if not isinstance(token, str):
+        return token
+    stripped = token.strip()
+    if not re.fullmatch(r"[!-~]+", stripped):
+        raise HubReferenceError("token: it is empty or has characters that no token has")
+    return stripped
+
+
+@dataclass(frozen=True)
+class HubClient:
+    """One endpoint, one token, one Hub cache. Every method raises ``HubFailure``.
+
+    Attributes:
+        endpoint: Without a trailing slash; a login in it goes into a header, and into no URL.
+        token: As in huggingface_hub: None for the stored one, False for none.
+        cache_dir: huggingface_hub's ``cache_dir``; None for its default.
+    """
+
+    endpoint: str = field(repr=False)
+    token: str | bool | None = field(default=None, repr=False)
+    cache_dir: str | Path | None = None
+
+    @property
+    def public_endpoint(self) -> str:
+        """The endpoint without a user and password, for errors and as a key."""
+        return without_login(self.endpoint)
+
+    def resolve(self, repo: Repository, revision: str | None) -> str:
+        """Ask which full commit a revision is; None is ``main``, as in huggingface_hub."""
+        url = f"{self._api(repo)}/revision/{quote(revision or 'main', safe='')}"
+        with self._explained(repo, revision):
+            commit = self._get(url, {})[0]["sha"]
+            if not isinstance(commit, str) or not is_commit(commit):
+                raise ValueError("the answer has no full commit")
+        return commit
+
+    def listing(self, repo: Repository, commit: str) -> Iterator[FileRecord]:
+        """Yield the files of a commit with their sizes and digests, page by page."""
+        url = f"{self._api(repo)}/tree/{commit}"
+        query: dict[str, str] | None = {"recursive": "true", "expand": "false"}
+        idle = 0
+        while query is not None:
+            with self._explained(repo, commit):
+                items, following = self._get(url, query)
+                records = [_record_of(item, repo) for item in list(items)]
+            found = [record for record in records if record is not None]
+            idle = 0 if found else idle + 1
+            if idle > MAX_IDLE_PAGES:
+                raise SnapshotIntegrityError(
+                    f"{repo.repo_id} on {self.public_endpoint}: its listing has no end: {idle} "
+                    "pages without a file. Check that the endpoint is a Hugging Face Hub"
+                )
+            yield from found
+            query = _next_page(following, query)
+
+    def download(self, repo: Repository, commit: str, paths: Sequence[str]) -> Path:
+        """Download these files into the Hub cache; the folder of the commit there.
+
+        One by one and not by ``snapshot_download``: that asks for a listing of its own, which may
+        be another than the one that was judged.
+        """
+        with self._explained(repo, commit), ThreadPoolExecutor(_WORKERS) as pool:
+            futures = [pool.submit(self._download, repo, commit, path) for path in paths]
+            try:
+                places = [future.result() for future in futures]
+            finally:
+                for future in futures:
+                    future.cancel()
+        place = places[0]
+        return place.parents[paths[0].count("/")]
+
+    def download_again(self, repo: Repository, commit: str, path: str) -> Path:
+        """Download one file anew, whatever the Hub cache has of it."""
+        with self._explained(repo, commit):
+            return self._download(repo, commit, path, force_download=True)
+
+    def _download(self, repo: Repository, commit: str, path: str, **more: Any) -> Path:
+        from huggingface_hub import hf_hub_download
+
+        arguments = {**self._arguments(repo, commit), "filename": path, **more}
+        # a session may be the thread's own
+        with guarded(import_module("huggingface_hub.utils").get_session()):
+            return Path(_with_xet_or_without(hf_hub_download, **arguments))
+
+    def _arguments(self, repo: Repository, commit: str) -> dict[str, Any]:
+        login = self._login()
+        return {
+            **repo._asdict(),
+            "revision": commit,
+            # Not every version expands "~" itself; one would make a folder of that name.
+            "cache_dir": None if self.cache_dir is None else os.path.expanduser(self.cache_dir),
+            "token": False if login else self.token,
+            "headers": login,
+            "endpoint": self.public_endpoint,
+            **_LIBRARY,
+        }
+
+    def _login(self) -> dict[str, str]:
+        """The header of a login, which goes before a token, as in a URL."""
+        login = login_of(self.endpoint)
+        return {} if login is None else {"authorization": authorization(login)}
+
+    def _api(self, repo: Repository) -> str:
+        return f"{self.public_endpoint}/api/{repo.repo_type}s/{repo.repo_id}"
+
+    def _get(self, url: str, query: dict[str, str]) -> tuple[Any, str | None]:
+        """The JSON of an answer, and the address of the next page."""
+        # HfApi.list_repo_tree has no timeout, and in 2.x retries a broken Hub for 24 s.
+        client: Any = import_module("huggingface_hub.utils")
+        timeout = import_module("huggingface_hub.constants").HF_HUB_ETAG_TIMEOUT
+        login = self._login()
+        token = False if login else self.token
+        headers = {**client.build_hf_headers(token=token, **_LIBRARY), **login}
+        options = {"headers": headers, "params": query, "timeout": timeout}
+        with streamed(client.get_session(), url, options) as response:
+            client.hf_raise_for_status(response)
+            return json.loads(bounded_body(response)), response.links.get("next", {}).get("url")
+
+    @contextmanager
+    def _explained(self, repo: Repository, revision: str | None) -> Iterator[None]:
+        try:
+            yield
+        except SnapshotError:
+            raise
+        except Exception as error:
+            secrets = self._secrets()
+            conceal(error, secrets)
+            hostile = _in_chain(error, HostileAnswerError)
+            if hostile is not None:
+                raise SnapshotIntegrityError(
+                    f"{'/'.join(repo)}@{revision} on {self.public_endpoint}: {hostile}. Nothing of "
+                    "it was used. Check that the endpoint is a Hugging Face Hub, or use another"
+                ) from error
+            subject = Subject(*repo, revision, self.public_endpoint)
+            raise explain(error, subject, secrets) from error
+
+    def _secrets(self) -> tuple[str, ...]:
+        from huggingface_hub import get_token
+
+        token = self.token if isinstance(self.token, str) else get_token()
+        login = login_of(self.endpoint)
+        secrets = (token, *self._login().values(), login and login[1])
+        return tuple(secret for secret in secrets if secret)
+
+
+def _in_chain(error: BaseException | None, kind: type[Exception]) -> BaseException | None:
+    seen: list[BaseException] = []
+    while error is not None and error not in seen and not isinstance(error, kind):
+        seen.append(error)
+        error = error.__cause__ or error.__context__
+    return error if isinstance(error, kind) else None
+
+
+def _next_page(url: str | None, query: dict[str, str]) -> dict[str, str] | None:
+    """The next page's query. Only that: a link to another host would take the token along."""
+    if url is None:
+        return None
+    following = dict(parse_qsl(urlsplit(url).query))
+    return following if following != query else None
+
+
+def _record_of(item: Any, repo: Repository) -> FileRecord | None:
+    try:
+        if item["type"] != "file":
+            return None
+        path, lfs = item["path"], item.get("lfs")
+        size, digest = (lfs["size"], lfs["oid"]) if lfs else (item["size"], item["oid"])
+        kind, length = (SHA256, 64) if lfs else (GIT_SHA1, 40)
+        digest = digest.removeprefix("sha256:")
+        if type(path) is str and type(size) is int and size >= 0 and _is_hex(digest, length):
+            path.encode()  # A lone surrogate cannot be a file's name.
+            return FileRecord(path, size, f"{kind}:{digest}")
+        raise ValueError("a field is not what it should be")
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise SnapshotIntegrityError(
+            f"{repo.repo_id}: the Hub's listing has an entry that cannot be read ({error!r}); "
+            "check that the endpoint is a Hugging Face Hub"
+        ) from error
+
+
+def _is_hex(text: str, length: int) -> bool:
+    return re.fullmatch(rf"[0-9a-f]{{{length}}}", text) is not None
+
+
+def _with_xet_or_without(download: Any, **arguments: Any) -> str:
+    """Download; where the Xet route fails (some mirrors announce it and lack it), over HTTP."""
+    try:
+        return str(download(**arguments))
+    except Exception as error:
+        if not _came_through_xet(error):
+            raise
+    with _xet_disabled():
+        return str(download(**arguments))
+
+
+def _came_through_xet(error: BaseException | None) -> bool:
+    """Whether the client was in a function of its Xet route when it failed."""
+    while error is not None:
+        for frame, _ in walk_tb(error.__traceback__):
+            module = str(frame.f_globals.get("__name__"))
+            if module.startswith("huggingface_hub.") and "xet" in frame.f_code.co_name:
+                return True
+        error = error.__cause__
+    return False
+
+
+@contextmanager
+def _xet_disabled() -> Iterator[None]:
+    from huggingface_hub import constants
+
+    with _xet_switch:
+        before = constants.HF_HUB_DISABLE_XET
+        constants.HF_HUB_DISABLE_XET = True
+        try:
+            yield
+        finally:
+            constants.HF_HUB_DISABLE_XET = before
+
+
+__all__ = ["HubClient", "HubFailure", "Repository", "checked_endpoint", "checked_token"]

@@ -1,0 +1,149 @@
+"""What a snapshot is made of, and what a listing may ask of this machine's disk.
+
+A listing is somebody else's text: its names become paths here and its sizes become bytes here,
+so both are judged before anything is downloaded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
+from envhub_sandbox.hub.grammar import has_control_characters
+
+MAX_NAME_BYTES = 255  # NAME_MAX of every common file system.
+MAX_PATH_BYTES = 1024  # Leaves room below PATH_MAX (4096) for the store and for a jail's root.
+MAX_DEPTH = 64
+
+
+@dataclass(frozen=True)
+class FileRecord:
+    """One file of a snapshot.
+
+    Attributes:
+        path: Relative to the root, with ``/``.
+        size: In bytes.
+        digest: ``"git-sha1:<40 hex>"``, the git blob id, or ``"sha256:<64 hex>"`` for files in
+            LFS and files of a local folder.
+    """
+
+    path: str
+    size: int
+    digest: str
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A repository's files at one commit: verified, real files, read-only, never imported here.
+
+    Attributes:
+        repo_id: ``"owner/name"``; for a local folder its absolute path.
+        repo_type: ``"model"``, ``"space"``, ``"dataset"`` or ``"local"``.
+        commit: The full commit; for a local folder ``"local-"`` and a hash of its content.
+        path: The entry file, relative to ``root``, for example ``"env.py"``.
+        root: The folder that holds the files (0444 in folders 0555) and nothing else.
+        files: Every file below ``root``, sorted by path.
+    """
+
+    repo_id: str
+    repo_type: str
+    commit: str
+    path: str
+    root: Path
+    files: tuple[FileRecord, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SnapshotLimits:
+    """What a repository may bring: judged by its listing before the download, then on disk.
+
+    Attributes:
+        max_bytes: All files together.
+        max_files: Their number.
+        max_file_bytes: The largest one.
+    """
+
+    max_bytes: int = 4 * 2**30
+    max_files: int = 20_000
+    max_file_bytes: int = 2 * 2**30
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise PolicyError(f"{field.name} must be a positive int, got {value!r}")
+
+
+DEFAULT_LIMITS = SnapshotLimits()
+
+
+class _Sized(Protocol):
+    @property
+    def path(self) -> str: ...
+
+    @property
+    def size(self) -> int: ...
+
+
+_File = TypeVar("_File", bound=_Sized)
+
+
+def within_limits(files: Iterable[_File], limits: SnapshotLimits, title: str) -> tuple[_File, ...]:
+    """Collect the files, sorted by path, and stop as soon as a limit is passed.
+
+    Raises:
+        SnapshotTooLargeError: The text names the limit and how to raise it.
+    """
+    taken: list[_File] = []
+    total = 0
+    for file in files:
+        taken.append(file)
+        total += file.size
+        if file.size > limits.max_file_bytes:
+            what = f"the file {file.path!r} has {file.size} bytes"
+            raise _too_large(title, what, "max_file_bytes", limits.max_file_bytes)
+        if len(taken) > limits.max_files:
+            raise _too_large(title, "it has too many files", "max_files", limits.max_files)
+        if total > limits.max_bytes:
+            raise _too_large(title, "its files are too large", "max_bytes", limits.max_bytes)
+    return tuple(sorted(taken, key=lambda file: file.path))
+
+
+def _too_large(title: str, what: str, name: str, limit: int) -> SnapshotTooLargeError:
+    return SnapshotTooLargeError(
+        f"{title}: {what}, over the limit {name}={limit}. If you trust it with the disk space, "
+        f"raise the limit: SnapshotLimits({name}=...)"
+    )
+
+
+def check_names(files: Iterable[FileRecord], title: str) -> None:
+    """Raise ``SnapshotError`` for a name that could leave the tree, hide, or clash."""
+    seen: set[str] = set()
+    folders: set[str] = set()
+    for file in files:
+        wrong = _wrong_with_name(file.path) or ("is listed twice" if file.path in seen else None)
+        if wrong is not None:
+            raise SnapshotError(f"{title}: refused, since the file {file.path!r} {wrong}")
+        seen.add(file.path)
+        steps = file.path.split("/")
+        folders.update("/".join(steps[:depth]) for depth in range(1, len(steps)))
+    for path in sorted(seen & folders):
+        raise SnapshotError(f"{title}: refused, since {path!r} is both a file and a folder")
+
+
+def _wrong_with_name(path: str) -> str | None:
+    steps = path.split("/")
+    if path.startswith("/"):
+        return "has an absolute name"
+    if not {"", ".", ".."}.isdisjoint(steps):
+        return "has an empty, '.' or '..' step in its name"
+    if "\\" in path or has_control_characters(path):
+        return "has a backslash or a control character in its name"
+    if len(steps) > MAX_DEPTH or len(path.encode()) > MAX_PATH_BYTES:
+        return f"has a name over {MAX_PATH_BYTES} bytes or {MAX_DEPTH} folders deep"
+    if any(len(step.encode()) > MAX_NAME_BYTES for step in steps):
+        return f"has a step over {MAX_NAME_BYTES} bytes in its name"
+    return None

@@ -1,0 +1,180 @@
+"""Snapshots: a repository's files at one commit, downloaded, verified, and never imported here.
+
+``fetch`` resolves a revision once, holds the listing against limits, downloads the whole
+repository through huggingface_hub, compares every file with the listing's hash, and lays it out
+read-only in a store of our own. A full commit that is in the store costs no request.
+``local`` does the same for a folder of this machine. See ``docs/snapshots.md``.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+from envhub_sandbox.errors import HubReferenceError, RepositoryUnavailableError, SnapshotError
+from envhub_sandbox.hub import store as store
+from envhub_sandbox.hub.candidate import Candidate, missing_entry
+from envhub_sandbox.hub.client import HubClient, Repository, checked_endpoint, checked_token
+from envhub_sandbox.hub.failures import ABSENT, UNREACHABLE, HubFailure, Kind
+from envhub_sandbox.hub.listing import (
+    DEFAULT_LIMITS,
+    FileRecord,
+    Snapshot,
+    SnapshotLimits,
+    check_names,
+    within_limits,
+)
+from envhub_sandbox.hub.local import content_commit, copier, hash_files, scan, split_local
+from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef, is_local
+
+__all__ = ["FileRecord", "Snapshot", "SnapshotLimits", "fetch", "local"]
+
+_SHOWN_COMMITS = 5
+_LOCAL_COPIES_DAYS = 14.0
+
+
+def named(
+    reference: str,
+    *,
+    hub_cache_dir: str | Path | None = None,
+    token: str | bool | None = None,
+    endpoint: str | None = None,
+) -> Snapshot:
+    """The snapshot of a hub reference or of a local folder; raises as ``fetch`` and ``local`` do.
+
+    A reference that is also a folder here gets a hint.
+    """
+    if is_local(reference):
+        return local(reference)
+    try:
+        ref = HubRef.parse(reference)
+        return fetch(ref, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
+    except (HubReferenceError, SnapshotError) as error:
+        if os.path.exists(reference.partition(":")[0]):
+            hint = f"There is such a folder here; for it, write './{reference}'."
+            error.args = (f"{error}\n{hint}",)
+        raise
+
+
+def fetch(
+    ref: HubRef,
+    *,
+    hub_cache_dir: str | Path | None = None,
+    token: str | bool | None = None,
+    endpoint: str | None = None,
+    limits: SnapshotLimits = DEFAULT_LIMITS,
+) -> Snapshot:
+    """Bring a repository's files here, verified.
+
+    Args:
+        ref: What to fetch. A full commit that is in the store costs no request; a branch or tag
+            is always asked for, so that nothing stale is taken for it.
+        hub_cache_dir: huggingface_hub's ``cache_dir``, where downloads land before they are
+            verified. The store itself is at ``$ENVHUB_CACHE`` or in the user's cache folder.
+        token: As in huggingface_hub: None for the stored one, False for none.
+        endpoint: As in huggingface_hub: None for ``$HF_ENDPOINT`` or https://huggingface.co.
+        limits: What the repository may bring.
+
+    Raises:
+        RepositoryUnavailableError: No such repository, revision or file, no access, no Hub. The
+            text says which, and ``__cause__`` is the Hub client's error.
+        SnapshotTooLargeError: Over the limits; nothing was downloaded.
+        SnapshotIntegrityError: A file is not what the commit's listing says.
+        SnapshotError: A hostile name in the listing, or the store cannot be written.
+        HubReferenceError: The token or endpoint cannot be one.
+    """
+    hub = HubClient(checked_endpoint(endpoint), checked_token(token), hub_cache_dir)
+    candidates = [
+        Candidate(ref, Repository(kind, ref.repo_id), hub, limits)
+        for kind in ((ref.repo_type,) if ref.repo_type else ("model", "space"))
+    ]
+    try:
+        return _first_stored(candidates) or _first_fetched(candidates)
+    except HubFailure as failure:
+        raise _unavailable(candidates, [failure]) from failure.__cause__
+
+
+def _first_stored(candidates: list[Candidate]) -> Snapshot | None:
+    if not candidates[0].ref.is_pinned:
+        return None
+    stored = (candidate.stored() for candidate in candidates)
+    return next((snapshot for snapshot in stored if snapshot is not None), None)
+
+
+def _first_fetched(candidates: list[Candidate]) -> Snapshot:
+    failures: list[HubFailure] = []
+    for candidate in candidates:
+        try:
+            return candidate.fetched()
+        except HubFailure as failure:
+            if failure.kind not in ABSENT:
+                raise
+            failures.append(failure)
+    raise _unavailable(candidates, failures) from failures[0].__cause__
+
+
+def _unavailable(
+    candidates: list[Candidate], failures: list[HubFailure]
+) -> RepositoryUnavailableError:
+    """One error for all that was tried; the furthest attempt gives the advice."""
+    ref, hub = candidates[0].ref, candidates[0].hub
+    whats = "; and ".join(dict.fromkeys(failure.what for failure in failures))
+    best = next((f for f in failures if f.kind is not Kind.NO_REPOSITORY), failures[0])
+    advice = best.advice
+    if best.kind is Kind.NO_REPOSITORY and ref.repo_type is None:
+        advice += f". A dataset repository is written 'datasets/{ref.repo_id}'"
+    in_store = "" if best.kind is Kind.NO_ENTRY else _in_store(candidates, best.kind in UNREACHABLE)
+    return RepositoryUnavailableError(
+        f"{ref} on {hub.public_endpoint}: {whats}. {advice}.{in_store}"
+    )
+
+
+def _in_store(candidates: list[Candidate], even_if_none: bool) -> str:
+    """Which commits can be had without the Hub, and how to write them."""
+    ref = candidates[0].ref
+    found = [stored for candidate in candidates for stored in store.commits(candidate.folder)]
+    others = [stored for stored in found if stored.commit != ref.revision][:_SHOWN_COMMITS]
+    if not others:
+        return " No commit of it is in the store to fall back on." if even_if_none else ""
+    shown = ", ".join(
+        f"'{replace(ref, revision=stored.commit)}' "
+        f"({stored.revision or 'pinned'}, {stored.fetched[:10]})"
+        for stored in others
+    )
+    return f" These are in the store and need no Hub: {shown}."
+
+
+def local(
+    folder: str | Path, path: str = DEFAULT_PATH, *, limits: SnapshotLimits = DEFAULT_LIMITS
+) -> Snapshot:
+    """Copy a folder of this machine into the store, by content: unchanged is the same snapshot.
+
+    Args:
+        folder: A folder, ``folder:path/env.py``, or a ``.py`` file (whose folder is taken).
+        path: The entry file in the folder, unless ``folder`` names one.
+        limits: What the folder may bring.
+
+    Raises:
+        RepositoryUnavailableError: There is no such folder or entry file.
+        SnapshotTooLargeError: Over the limits.
+        SnapshotError: A link leaves the folder, or a file cannot be read.
+    """
+    root, path = split_local(str(folder), path)
+    title = f"local folder {root}"
+    try:
+        found = within_limits(scan(root), limits, title)
+    except OSError as error:
+        raise SnapshotError(f"{title}: it cannot be read: {error}") from error
+    files = hash_files(found, title)
+    check_names(files, title)
+    if all(file.path != path for file in files):
+        what, advice = missing_entry(path, files)
+        raise RepositoryUnavailableError(f"{title} {what}. {advice}")
+    slot = store.Slot(store.local_folder(), content_commit(files), title)
+    if store.load(slot) is None:
+        store.publish(slot, files, copier(found, title), {"repo_type": "local"})
+        # Every edit leaves a copy; a Hub commit, in contrast, is kept until somebody removes it.
+        store.remove_unused(slot.folder, days=_LOCAL_COPIES_DAYS)
+    store.mark_used(slot)
+    return Snapshot(str(root), "local", slot.commit, path, slot.tree, files)

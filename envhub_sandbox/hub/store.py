@@ -1,0 +1,350 @@
+"""The store: verified snapshots on disk, keyed by endpoint, type, repository and commit.
+
+::
+
+    <cache>/snapshots/huggingface.co-1f2e3d4c/model--org--repo/<commit>/
+        record.json     what was verified: digests, and a stat fingerprint of each file
+        tree/           the files, 0444 in folders 0555, and nothing else
+
+A snapshot is built in a folder of another name and renamed into place: what bears a commit's
+name is complete. The record lies outside the tree, where the jail never sees it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import json
+import os
+import re
+import shutil
+import stat
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import urlsplit
+
+from envhub_sandbox import folders
+from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
+from envhub_sandbox.hub.hashing import Mismatch, digest_of
+from envhub_sandbox.hub.listing import FileRecord
+
+CACHE_VARIABLE = "ENVHUB_CACHE"
+_FORMAT = 1
+_BUILDING = ".building-"
+_ABANDONED_AFTER_S = 24 * 3600.0
+_FILE_MODE = 0o444
+_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
+_TREE_FOLDER_MODE = 0o555
+
+
+@dataclass(frozen=True)
+class Slot:
+    """The place of one snapshot; ``title`` names it in errors."""
+
+    folder: Path
+    commit: str
+    title: str
+
+    @property
+    def home(self) -> Path:
+        """The folder that appears at once, by a rename."""
+        return self.folder / self.commit
+
+    @property
+    def tree(self) -> Path:
+        """The root of the repository's files."""
+        return self.home / "tree"
+
+    @property
+    def record(self) -> Path:
+        """The hashes and fingerprints."""
+        return self.home / "record.json"
+
+
+class StoredCommit(NamedTuple):
+    """A commit in the store: the revision it was asked for by, and the date (UTC) of that."""
+
+    commit: str
+    revision: str | None
+    fetched: str
+
+
+class _Entry(NamedTuple):
+    path: str
+    size: int
+    digest: str
+    mtime_ns: int
+    ctime_ns: int
+    inode: int
+
+    def matches(self, found: os.stat_result) -> bool:
+        if found.st_mode & _OTHERS_WRITE:
+            return False
+        return (self.size, self.mtime_ns, self.ctime_ns, self.inode) == (
+            found.st_size,
+            found.st_mtime_ns,
+            found.st_ctime_ns,
+            found.st_ino,
+        )
+
+
+def cache_root() -> Path:
+    """``$ENVHUB_CACHE``, or the user's cache folder for ``envhub-sandbox``."""
+    chosen = os.environ.get(CACHE_VARIABLE)
+    if chosen:
+        return Path(os.path.abspath(os.path.expanduser(chosen)))
+    import platformdirs
+
+    return Path(platformdirs.user_cache_dir("envhub-sandbox", appauthor=False))
+
+
+def repository_folder(endpoint: str, repo_type: str, repo_id: str) -> Path:
+    """Where the commits of a repository lie; names of the Hub never contain ``--``."""
+    host = re.sub(r"[^A-Za-z0-9.-]", "_", urlsplit(endpoint).netloc.rpartition("@")[2])
+    key = hashlib.sha256(endpoint.encode()).hexdigest()[:8]
+    name = f"{repo_type}--{repo_id.replace('/', '--')}"
+    return cache_root() / "snapshots" / f"{host}-{key}" / name
+
+
+def local_folder() -> Path:
+    """Where the copies of local folders lie."""
+    return cache_root() / "snapshots" / "local"
+
+
+def load(slot: Slot) -> tuple[FileRecord, ...] | None:
+    """The files of a stored snapshot, verified; None if it is not in the store.
+
+    Each file's size, times and inode are compared with those recorded when its content was
+    verified, and it is hashed again where they differ. Extra and missing files are noticed.
+
+    Raises:
+        SnapshotIntegrityError: The tree is not what was verified; the text says how to remove it.
+    """
+    try:
+        _refuse_shared_store(slot.record)
+        text = slot.record.read_bytes()
+    except FileNotFoundError:
+        if os.path.lexists(slot.home):
+            raise _damaged(slot, "its record.json is missing") from None
+        return None
+    with contextlib.suppress(FileNotFoundError):  # which is said below
+        _refuse_shared_store(slot.tree)
+    document, entries = _read_record(slot, text)
+    found = dict(_walk(slot, slot.tree, ""))
+    _compare_names(slot, entries, found)
+    changed = [entry for entry in entries if not entry.matches(found[entry.path])]
+    if changed:
+        _verify_again(slot, changed)
+        with contextlib.suppress(OSError):  # A read-only store only stays slower.
+            _write_record(slot.home, slot.tree, document, [_plain(entry) for entry in entries])
+    return tuple(_plain(entry) for entry in entries)
+
+
+def _plain(entry: _Entry) -> FileRecord:
+    return FileRecord(entry.path, entry.size, entry.digest)
+
+
+def _read_record(slot: Slot, text: bytes) -> tuple[dict[str, object], list[_Entry]]:
+    try:
+        document = json.loads(text)
+        if document["format"] != _FORMAT:
+            raise ValueError(f"unknown format {document['format']!r}")
+        return document, [_Entry(*row) for row in document["files"]]
+    except (ValueError, KeyError, TypeError) as error:
+        raise _damaged(slot, f"its record.json cannot be read ({error})") from error
+
+
+def _walk(slot: Slot, folder: Path | str, prefix: str) -> Iterator[tuple[str, os.stat_result]]:
+    try:
+        listing = os.scandir(folder)
+    except OSError as error:
+        raise _damaged(slot, f"its folder {prefix or '.'!r} cannot be read ({error})") from error
+    with listing:
+        for item in listing:
+            status = item.stat(follow_symlinks=False)
+            if not folders.is_trusted(status.st_uid):
+                raise _damaged(slot, f"{prefix + item.name!r} belongs to uid {status.st_uid}")
+            if stat.S_ISDIR(status.st_mode):
+                if status.st_mode & _OTHERS_WRITE:
+                    raise _damaged(slot, f"others can write in {prefix + item.name!r}")
+                yield from _walk(slot, item.path, f"{prefix}{item.name}/")
+            elif stat.S_ISREG(status.st_mode):
+                yield prefix + item.name, status
+            else:
+                raise _damaged(slot, f"{prefix + item.name!r} is not a regular file")
+
+
+def _compare_names(slot: Slot, entries: list[_Entry], found: Mapping[str, os.stat_result]) -> None:
+    recorded = {entry.path for entry in entries}
+    for path in sorted(recorded ^ found.keys()):
+        state = "missing" if path in recorded else "extra"
+        raise _damaged(slot, f"the file {path!r} is {state}")
+
+
+def _verify_again(slot: Slot, changed: list[_Entry]) -> None:
+    for entry in changed:
+        path = slot.tree / entry.path
+        try:
+            found = digest_of(path, entry.digest.partition(":")[0], entry.size)
+        except (OSError, Mismatch) as error:
+            raise _damaged(slot, f"the file {entry.path!r} cannot be read ({error})") from error
+        if found != entry.digest or path.lstat().st_size != entry.size:
+            raise _damaged(
+                slot, f"the file {entry.path!r} was changed: {found}, not {entry.digest}"
+            )
+        with contextlib.suppress(OSError):
+            path.chmod(_FILE_MODE)
+
+
+def _damaged(slot: Slot, what: str) -> SnapshotIntegrityError:
+    return SnapshotIntegrityError(
+        f"{slot.title}: the copy in the store is not what was verified: {what}. Nothing of it was "
+        f"used. Remove it, and it is fetched again: chmod -R u+w '{slot.home}' && "
+        f"rm -r '{slot.home}'"
+    )
+
+
+def publish(
+    slot: Slot,
+    files: tuple[FileRecord, ...],
+    copy: Callable[[FileRecord, Path], None],
+    note: Mapping[str, object],
+) -> None:
+    """Lay out the files and rename them into place. A snapshot that is there already wins.
+
+    ``copy(record, target)`` writes the target and must raise unless it wrote what the record
+    says. ``note`` is kept in the record (where the snapshot is from). Nothing stays if it fails.
+    """
+    building = _begin(slot)
+    try:
+        tree = building / "tree"
+        _fill(tree, files, copy)
+        document = {"format": _FORMAT, **note, "fetched": time.strftime("%FT%TZ", time.gmtime())}
+        _write_record(building, tree, document, list(files))
+        building.chmod(folders.SHARED_MODE)
+        with _another_may_have_won():
+            os.rename(building, slot.home)
+    except OSError as error:
+        raise _not_writable(slot.folder, error) from error
+    finally:
+        remove_tree(building)
+
+
+def _begin(slot: Slot) -> Path:
+    try:
+        folders.make(slot.folder)
+        _refuse_shared_store(slot.folder)
+        _remove_abandoned(slot.folder)
+        # 0700 until it is complete: its files have the umask's modes while they are written
+        building = Path(tempfile.mkdtemp(prefix=_BUILDING, dir=slot.folder))
+        building.chmod(folders.PRIVATE_MODE)
+    except OSError as error:
+        raise _not_writable(slot.folder, error) from error
+    return building
+
+
+def remove_unused(folder: Path, days: float) -> None:
+    """Remove snapshots that nobody asked for in that many days (see ``mark_used``)."""
+    oldest = time.time() - days * 24 * 3600
+    for record in folder.glob("*/record.json"):
+        with contextlib.suppress(OSError):
+            if record.stat().st_mtime < oldest:
+                remove_tree(record.parent)
+
+
+def mark_used(slot: Slot) -> None:
+    """Note that a snapshot was asked for now."""
+    with contextlib.suppress(OSError):
+        os.utime(slot.record)
+
+
+def _refuse_shared_store(place: Path) -> None:
+    """Whoever can write there can put both a tree and a record that vouches for it."""
+    root = cache_root()
+    try:
+        why = folders.why_distrusted(place, root)
+    except PermissionError as error:
+        raise SnapshotError(f"the snapshot store {root} cannot be looked at: {error}") from error
+    if why:
+        raise SnapshotError(
+            f"the snapshot store {root} is not trusted, since other users can change what is in "
+            f"it: {why}; or set {CACHE_VARIABLE} to a folder of your own"
+        )
+
+
+def _remove_abandoned(folder: Path) -> None:
+    oldest = time.time() - _ABANDONED_AFTER_S
+    for path in folder.glob(f"{_BUILDING}*"):
+        with contextlib.suppress(OSError):
+            if path.stat().st_mtime < oldest:
+                remove_tree(path)
+
+
+def _fill(
+    tree: Path, files: tuple[FileRecord, ...], copy: Callable[[FileRecord, Path], None]
+) -> None:
+    made = {tree}
+    folders.make(tree)
+    for file in files:
+        target = tree / file.path
+        if target.parent not in made:
+            folders.make(target.parent)
+            made.update(p for p in target.parents if tree in p.parents)
+        copy(file, target)
+        target.chmod(_FILE_MODE)
+    for folder in made:
+        folder.chmod(_TREE_FOLDER_MODE)
+
+
+def _write_record(
+    home: Path, tree: Path, document: Mapping[str, object], files: list[FileRecord]
+) -> None:
+    rows = []
+    for file in files:
+        status = (tree / file.path).lstat()
+        times = (status.st_mtime_ns, status.st_ctime_ns, status.st_ino)
+        rows.append(_Entry(file.path, file.size, file.digest, *times))
+    handle, name = tempfile.mkstemp(prefix=".record-", dir=home)
+    with os.fdopen(handle, "w", encoding="utf-8") as stream:
+        json.dump({**document, "files": rows}, stream)
+    os.replace(name, home / "record.json")
+
+
+@contextlib.contextmanager
+def _another_may_have_won() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
+            raise
+
+
+def _not_writable(folder: Path, error: OSError) -> SnapshotError:
+    return SnapshotError(
+        f"the snapshot store {folder} cannot be written: {error}. Free space or fix its "
+        f"permissions, or set {CACHE_VARIABLE} to another folder"
+    )
+
+
+def remove_tree(path: Path) -> None:
+    """Remove a folder of the store, whose own folders are read-only; nothing if it is gone."""
+    for folder, _, _ in os.walk(path):
+        with contextlib.suppress(OSError):
+            os.chmod(folder, 0o700)
+    shutil.rmtree(path, ignore_errors=True)
+
+
+def commits(folder: Path) -> list[StoredCommit]:
+    """The commits of a repository in the store, the latest fetched first. Nothing is verified."""
+    found = []
+    for record in folder.glob("*/record.json"):
+        with contextlib.suppress(OSError, ValueError):
+            document = json.loads(record.read_bytes())
+            revision, fetched = document.get("revision"), document.get("fetched", "")
+            found.append(StoredCommit(record.parent.name, revision, str(fetched)))
+    return sorted(found, key=lambda stored: stored.fetched, reverse=True)

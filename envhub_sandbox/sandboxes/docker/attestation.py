@@ -1,0 +1,183 @@
+"""What a container's server says of its surroundings, against what was asked for. Pure.
+
+Trust: the server is our code, in an image that the caller chose. What it says is bounded and
+typed here all the same, and whatever does not hold ends the matter.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
+from envhub_sandbox.policy import PROFILES
+from envhub_sandbox.sandboxes.docker.run_arguments import Container
+
+_MIB = 1024 * 1024
+_NATIVE_RUNTIMES = (None, "runc", "crun", "io.containerd.runc.v2")
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What ``envhub_worker.container.surroundings`` returns, checked.
+
+    Attributes:
+        profiles: Those that a jail can have in there, the strongest first.
+        landlock: Its ABI, or 0.
+    """
+
+    profiles: tuple[str, ...]
+    landlock: int
+    user: int
+    capabilities: int
+    no_new_privileges: bool
+    seccomp: bool
+    read_only: bool
+    devices: tuple[str, ...]
+    memory: int | None
+    pids: int | None
+    cpus: float | None
+    python: str
+
+
+def parse(line: bytes) -> Surroundings:
+    """The server's announcement.
+
+    Raises:
+        WorkerStartupError: It is something else.
+    """
+    try:
+        said = json.loads(line)
+        return Surroundings(
+            profiles=tuple(name for name in said["profiles"] if name in PROFILES),
+            landlock=int(said["landlock"]),
+            user=int(said["user"]),
+            capabilities=int(said["capabilities"]),
+            no_new_privileges=said["no_new_privileges"] is True,
+            seccomp=said["seccomp"] is True,
+            read_only=said["read_only"] is True,
+            devices=tuple(str(name)[:64] for name in said["devices"]),
+            memory=None if said["memory"] is None else int(said["memory"]),
+            pids=None if said["pids"] is None else int(said["pids"]),
+            cpus=None if said["cpus"] is None else float(said["cpus"]),
+            python=str(said["python"]),
+        )
+    except (ValueError, LookupError, TypeError) as error:
+        raise WorkerStartupError(
+            "the container's program is no envhub-worker of this version; build the image again"
+        ) from error
+
+
+def profile_for(wanted: str, found: Surroundings) -> str:
+    """The profile of jails in a container where the policy names ``wanted``.
+
+    The container's own walls stand around every jail. So ``"strict"`` takes the strongest that can
+    be had in there, as long as something keeps a jail from the server next to it: namespaces, or
+    Landlock. The weaker profiles are taken at their word.
+
+    Raises:
+        SandboxUnavailableError: It cannot be had.
+    """
+    if wanted != "strict":
+        if wanted in found.profiles:
+            return wanted
+        raise SandboxUnavailableError(
+            f"the profile {wanted!r} cannot be had in this container; it can give "
+            f"{', '.join(found.profiles) or 'none'}"
+        )
+    if "strict" in found.profiles:
+        return "strict"
+    if "container" in found.profiles and found.landlock >= 1:
+        return "container"
+    raise SandboxUnavailableError(
+        "in this container neither namespaces nor Landlock can be had, so that nothing but a "
+        "system call filter would stand between the repository and the server that runs it. If the "
+        "container's own walls are enough for you, say so: Policy(profile='container')."
+    )
+
+
+def layers(wanted: Container, found: Surroundings, title: str) -> list[dict[str, Any]]:
+    """What holds around every jail, for the report.
+
+    Args:
+        wanted: What the engine was asked for.
+        found: What the server found.
+        title: Engine and image, for the first line.
+
+    Raises:
+        SandboxUnavailableError: Something that was asked for does not hold.
+    """
+    checks: Sequence[tuple[str, bool, str]] = (
+        ("container-user", found.user == wanted.user[0] != 0, f"user {found.user}, not root"),
+        ("container-capabilities", found.capabilities == 0, "none in any set"),
+        ("container-privileges", found.no_new_privileges, "no new ones can be gained"),
+        ("container-files", found.read_only, "a read-only root, the snapshot, and scratch"),
+        *_network(wanted, found),
+        *_seccomp(wanted, found),
+        *_limits(wanted, found),
+    )
+    for layer, holds, _ in checks:
+        if not holds:
+            raise _does_not_hold(layer, wanted, found)
+    report = [{"layer": "container", "enforced": True, "detail": title}]
+    report += [{"layer": name, "enforced": True, "detail": detail} for name, _, detail in checks]
+    return [*report, *_absent(wanted)]
+
+
+def _network(wanted: Container, found: Surroundings) -> list[tuple[str, bool, str]]:
+    if wanted.network != "none":
+        return []
+    return [("container-network", set(found.devices) <= {"lo"}, "no device but its own loopback")]
+
+
+def _seccomp(wanted: Container, found: Surroundings) -> list[tuple[str, bool, str]]:
+    if wanted.runtime not in _NATIVE_RUNTIMES:
+        return []  # another kernel than the host's answers
+    return [("container-seccomp", found.seccomp, "an allow-list around the jail's own")]
+
+
+def _limits(wanted: Container, found: Surroundings) -> list[tuple[str, bool, str]]:
+    checks = []
+    for name, most, has in (
+        ("memory", wanted.memory, found.memory),
+        ("pids", wanted.pids, found.pids),
+        ("cpus", wanted.cpus, found.cpus),
+    ):
+        if most is not None:
+            holds = has is not None and has <= most * 1.01
+            checks.append((f"container-{name}", holds, _amount(name, most)))
+    return checks
+
+
+def _amount(name: str, most: float) -> str:
+    amounts = {
+        "memory": f"{most / _MIB:.0f} MiB for all jails and the server",
+        "pids": f"{most:.0f} processes and threads",
+        "cpus": f"the time of {most:g} processors",
+    }
+    return amounts[name]
+
+
+def _absent(wanted: Container) -> list[dict[str, Any]]:
+    """What the caller has gone without."""
+    missing = []
+    if wanted.network != "none":
+        missing.append(("container-network", "the host's network, by explicit choice"))
+    if wanted.runtime not in _NATIVE_RUNTIMES:
+        missing.append(("container-seccomp", f"the runtime {wanted.runtime} has rules of its own"))
+    if wanted.memory is None:
+        missing.append(("container-memory", "without control groups, by explicit choice"))
+    return [{"layer": name, "enforced": False, "detail": detail} for name, detail in missing]
+
+
+def _does_not_hold(layer: str, wanted: Container, found: Surroundings) -> SandboxUnavailableError:
+    what = f"the engine started the container, but {layer} does not hold in it"
+    if layer in ("container-memory", "container-pids", "container-cpus"):
+        return SandboxUnavailableError(
+            f"{what}: this host's control groups do not give the engine that limit. Enable them, "
+            "or go without the container's own limits: DockerSandbox(cgroups=False). Each jail's "
+            "limits hold all the same."
+        )
+    return SandboxUnavailableError(f"{what}: {found}, wanted {wanted.user}. Nothing was run.")

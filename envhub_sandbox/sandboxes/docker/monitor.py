@@ -1,0 +1,122 @@
+"""The monitor of one container: it holds the container's lifeline, and cleans up after it.
+
+Run as a script of its own, with ``-I -S`` and the standard library only::
+
+    monitor.py CLIENT_PIDFD READY_FD FOLDER NAME -- ENGINE run ...
+
+It starts the engine's attached ``run`` with a pipe as stdin that nobody else holds (a fork of the
+client would keep it open), and ends it by closing that pipe: when the client ends, by whatever
+signal, or at SIGTERM. Killed itself, its pipe closes all the same. On ``READY_FD`` it writes one
+JSON document, what the container announced or how the engine's command ended. At the end it
+removes the container, if it is still there, and ``FOLDER``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+
+_LINE_BYTES = 65536
+_TAIL_BYTES = 8192
+_END_S = 8.0
+_REMOVE_S = 30.0
+
+
+def main(argv: Sequence[str]) -> int:
+    """Keep a container until its client ends."""
+    client, ready = int(argv[0]), int(argv[1])
+    folder, name, command = argv[2], argv[3], list(argv[5:])
+    woken, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+    signal.set_wakeup_fd(wakes)
+    signal.signal(signal.SIGTERM, lambda *_: None)
+    try:
+        return Keeper(client, ready, woken, command).run()
+    finally:
+        with contextlib.suppress(OSError, subprocess.TimeoutExpired):
+            # usually gone by now; an engine that was restarted meanwhile may have kept it
+            _quietly([command[0], "rm", "--force", "--volumes", name], _REMOVE_S)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _quietly(command: list[str], timeout_s: float) -> None:
+    nothing = subprocess.DEVNULL
+    subprocess.run(command, stdin=nothing, stdout=nothing, stderr=nothing, timeout=timeout_s)
+
+
+class Keeper:
+    """The loop: the client's life, the container's output, and its end."""
+
+    def __init__(self, client: int, ready: int, woken: int, command: list[str]) -> None:
+        self._client, self._ready, self._woken = client, ready, woken
+        self._line = b""
+        self._tail = b""
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        )
+        assert self._process.stdout is not None
+        self._output = self._process.stdout.fileno()
+
+    def run(self) -> int:
+        """Until the client or the container ends; the engine's exit code."""
+        poller = select.poll()
+        for fd in (self._client, self._woken, self._output):
+            poller.register(fd, select.POLLIN)
+        while True:
+            ready = {fd for fd, _ in poller.poll()}
+            if self._output in ready and not self._read():
+                break
+            if ready & {self._client, self._woken}:
+                break
+        return self._end()
+
+    def _read(self) -> bool:
+        data = os.read(self._output, 65536)
+        self._tail = (self._tail + data)[-_TAIL_BYTES:]
+        if self._ready >= 0:
+            self._line += data
+            self._look_for_the_announcement()
+        return bool(data)
+
+    def _look_for_the_announcement(self) -> None:
+        *lines, self._line = self._line.split(b"\n")
+        self._line = self._line[-_LINE_BYTES:]
+        for line in lines:
+            if line.startswith(b'{"envhub-worker"'):
+                self._tell(line)
+                return
+
+    def _tell(self, document: bytes) -> None:
+        if self._ready >= 0:
+            with contextlib.suppress(OSError):  # nobody waits any more
+                os.write(self._ready, document[:_LINE_BYTES] + b"\n")
+            os.close(self._ready)
+            self._ready = -1
+
+    def _end(self) -> int:
+        lifeline, self._process.stdin = self._process.stdin, None
+        assert lifeline is not None
+        lifeline.close()
+        code = self._wait()
+        tail = self._tail.decode("utf-8", "replace")
+        self._tell(json.dumps({"ended": code, "tail": tail}).encode())
+        return code
+
+    def _wait(self) -> int:
+        """The server ends at the end of its stdin; what it still says must be read, or it waits."""
+        try:
+            rest, _ = self._process.communicate(timeout=_END_S)
+            self._tail = (self._tail + rest)[-_TAIL_BYTES:]
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+        return self._process.wait()
+
+
+if __name__ == "__main__":
+    sys.exit(min(main(sys.argv[1:]), 125) if len(sys.argv) > 6 else 2)

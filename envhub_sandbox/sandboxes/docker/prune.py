@@ -1,0 +1,156 @@
+"""What clients that were killed left behind: containers, folders, control groups.
+
+Only what can be told to be ours, and to be nobody's any more. A container names its client in a
+label, a folder in a file or by a socket that nobody serves, a control group by a pid; what does not
+is left alone. So is what belongs to another user, whose processes we may not even see; root sees
+all, and removes every user's containers and control groups.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import socket
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from envhub_sandbox.errors import SandboxUnavailableError
+from envhub_sandbox.sandboxes.docker.engines import ENGINES, Engine, EngineError, find_engine
+from envhub_sandbox.sandboxes.docker.run_arguments import CLIENT_LABEL, USER_LABEL
+from envhub_sandbox.sandboxes.owner import has_ended, is_of_this_boot
+
+_CGROUPS = Path("/sys/fs/cgroup")
+_CONNECT_S = 2.0
+_ENDED = frozenset({"exited", "stopped", "dead"})
+_GROUP = re.compile(r"envhub-(\d+)-\w[\w-]*")
+_SERVER_FOLDER = re.compile(r"envhub-[a-z0-9_]{8}")
+_CONTAINER_FOLDER = re.compile(r"envhub-docker-[a-z0-9_]{8}")
+
+
+@dataclass(frozen=True)
+class Leftover:
+    """One thing that nobody uses any more.
+
+    Attributes:
+        kind: ``"container"``, ``"folder"`` or ``"control group"``.
+        name: A container's name, or a path.
+        engine: Whose container it is.
+    """
+
+    kind: str
+    name: str
+    engine: Engine | None = None
+
+    def remove(self) -> bool:
+        """Remove it; whether it is gone."""
+        if self.engine is not None:
+            with contextlib.suppress(EngineError):
+                self.engine.run("rm", "--force", "--volumes", self.name)
+                return True
+            return False
+        if self.kind == "folder":
+            shutil.rmtree(self.name, ignore_errors=True)
+            return not os.path.exists(self.name)
+        return _remove_groups(Path(self.name))
+
+
+def find() -> list[Leftover]:
+    """Everything that can be removed. Removes nothing."""
+    engines = list(_engines())
+    containers = [found for engine in engines for found in stale_containers(engine)]
+    folders = list(stale_folders(Path(tempfile.gettempdir())))
+    return [*containers, *folders, *stale_groups(_CGROUPS)]
+
+
+def _engines() -> Iterator[Engine]:
+    """Every engine that answers; a machine need not have one."""
+    commands = set()
+    for name in ENGINES:
+        with contextlib.suppress(SandboxUnavailableError):
+            engine = find_engine(name)
+            if engine.kind not in commands:
+                commands.add(engine.kind)
+                yield engine
+
+
+def stale_containers(engine: Engine) -> Iterator[Leftover]:
+    """Containers of ours whose client has ended, running or not.
+
+    One that runs for a client of another machine, or before this one started, is left alone.
+    """
+    listed = engine.run(
+        "ps", "--all", "--no-trunc", "--filter", f"label={CLIENT_LABEL}", "--format", "{{.ID}}"
+    )
+    for container in listed.split():
+        with contextlib.suppress(EngineError, ValueError):  # it may have gone meanwhile
+            said = json.loads(engine.run("inspect", container))[0]
+            labels = said["Config"]["Labels"]
+            if _is_mine(labels.get(USER_LABEL)) and _is_deserted_container(said):
+                yield Leftover("container", said["Name"].lstrip("/"), engine)
+
+
+def _is_deserted_container(said: dict[str, Any]) -> bool:
+    client = said["Config"]["Labels"].get(CLIENT_LABEL, "")
+    # an engine may be another machine's: its clients run there, or on a third one
+    judged = is_of_this_boot(client) or said["State"]["Status"] in _ENDED
+    return judged and has_ended(client) is True
+
+
+def _is_mine(user: str | None) -> bool:
+    return os.geteuid() == 0 or user == str(os.geteuid())
+
+
+def stale_folders(temporary: Path) -> Iterator[Leftover]:
+    """Runtime folders of servers and of containers, below the folder for temporary files."""
+    for path in sorted(temporary.glob("envhub-*")):
+        with contextlib.suppress(OSError):
+            if not path.is_dir() or path.is_symlink() or not _belongs_to_us(path):
+                continue
+            if _CONTAINER_FOLDER.fullmatch(path.name):
+                stale = has_ended((path / "client").read_text()) is True
+            else:
+                stale = bool(_SERVER_FOLDER.fullmatch(path.name)) and _is_deserted(path)
+            if stale:
+                yield Leftover("folder", str(path))
+
+
+def _belongs_to_us(path: Path) -> bool:
+    status = path.stat()
+    return status.st_uid == os.geteuid() and status.st_mode & 0o077 == 0
+
+
+def _is_deserted(path: Path) -> bool:
+    """Whether a server's folder is there, and its socket, and nobody listens at it."""
+    if not (path / "server.log").is_file():
+        return False
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+        connection.settimeout(_CONNECT_S)  # one that is merely busy is not deserted
+        try:
+            connection.connect(str(path / "fds"))
+        except ConnectionRefusedError:
+            return True
+    return False
+
+
+def stale_groups(root: Path) -> Iterator[Leftover]:
+    """Control groups of servers that have ended; the kernel keeps those with processes in them."""
+    folders = {path for level in ("", "*/", "*/*/") for path in root.glob(f"{level}envhub-*")}
+    for folder in sorted(folders):
+        found = _GROUP.fullmatch(folder.name)
+        if found and not os.path.exists(f"/proc/{found[1]}") and os.access(folder, os.W_OK):
+            yield Leftover("control group", str(folder))
+
+
+def _remove_groups(folder: Path) -> bool:
+    with contextlib.suppress(OSError):
+        for inner in folder.iterdir():
+            if inner.is_dir():
+                inner.rmdir()
+        folder.rmdir()
+    return not folder.exists()

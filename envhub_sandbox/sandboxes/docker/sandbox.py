@@ -1,0 +1,344 @@
+"""``sandbox="docker"``: the worker in a container of its own for each repository.
+
+The container has no network, a read-only root, no capability, limits, and three things from
+outside: the repository's files, scratch in memory, and a folder of mode 0700 with two sockets,
+over which messages and the fast lane's descriptors travel. Inside, the worker locks each jail
+down as it does on a host. What holds is read from inside before anything runs; see
+``docs/deployment.md``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import secrets
+import select
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
+from envhub_sandbox.policy import Policy
+from envhub_sandbox.sandboxes.base import WorkerServer
+from envhub_sandbox.sandboxes.docker import attestation, run_arguments, seccomp_profile
+from envhub_sandbox.sandboxes.docker.engines import (
+    Engine,
+    environment,
+    explained,
+    find_engine,
+    find_image,
+    own_limits,
+)
+from envhub_sandbox.sandboxes.docker.run_arguments import Container
+from envhub_sandbox.sandboxes.lingering import Lingering
+from envhub_sandbox.sandboxes.owner import identity_of
+from envhub_sandbox.sandboxes.refcount import Sharing
+
+_KEEPER = Path(__file__).with_name("monitor.py")
+_STARTUP_S = 120.0
+_STOP_S = 45.0
+_ANNOUNCEMENT_BYTES = 65536
+_PREFIX = "envhub-docker-"
+# of the engine's own: it failed, it could not run the program, there is no such program
+_ENGINES_CODES = (125, 126, 127)
+# Far above the users of distributions, systemd and rootless containers.
+_UNUSED_USERS = range(0x6E000000, 0x6EFFFFFF)
+
+
+@dataclass(kw_only=True)
+class DockerSandbox:
+    """Workers in containers. What ``sandbox="docker"`` means is this with its defaults.
+
+    Attributes:
+        image: The image: ``docker build -t envhub-worker .``, or one that is derived from it.
+        engine: ``"docker"`` or ``"podman"``; by default docker, if it answers, else podman.
+        runtime: The engine's runtime, such as ``"runsc"``.
+        gpus: What ``--gpus`` takes; ``"all"`` where the policy grants the GPU.
+        memory: Bytes for all jails of a repository and the server; by default the policy's limit
+            and 1 GiB.
+        pids: Processes and threads likewise; by default the policy's limit and 256.
+        cpus: Processors' worth of time; by default as many as this process may use.
+        cgroups: False goes without these three, where an engine cannot limit them.
+    """
+
+    image: str = "envhub-worker"
+    engine: str | None = None
+    runtime: str | None = None
+    gpus: str | None = None
+    memory: int | None = None
+    pids: int | None = None
+    cpus: float | None = None
+    cgroups: bool = True
+    name: str = field(default="docker", init=False)
+
+    def __post_init__(self) -> None:
+        for option in ("memory", "pids", "cpus"):
+            value = getattr(self, option)
+            if value is not None and not value > 0:
+                raise PolicyError(f"DockerSandbox: {option} is {value!r}; it takes more than 0")
+
+    def for_repository(self, snapshot: Path, policy: Policy, python: str) -> RepositoryContainer:
+        """The container for one repository. Starts nothing, but asks for engine and image.
+
+        Raises:
+            PolicyError: A container cannot give what the policy permits.
+            SandboxUnavailableError: There is no engine, no image, or no permission.
+        """
+        if python:
+            raise PolicyError(
+                f"python={python!r} is an interpreter of this machine, and a container has its "
+                "own: choose an image instead, with DockerSandbox(image=...)"
+            )
+        if self.gpus is not None and not policy.gpu:
+            raise PolicyError("DockerSandbox(gpus=...) takes a policy with gpu=True")
+        if not sys.platform.startswith("linux"):
+            raise SandboxUnavailableError(
+                f"sandbox='docker' needs Linux, and this is {sys.platform}, where containers run "
+                "in a virtual machine: run `docker run envhub-worker` and connect to it with "
+                "sandbox='tcp://...'"
+            )
+        run_arguments.check_readable(policy.readable)
+        engine = find_engine(self.engine)
+        _check_users(engine)
+        return RepositoryContainer(self, engine, find_image(engine, self.image), snapshot, policy)
+
+    def acquire(self, store: Path) -> WorkerServer:
+        """Not without a repository: a container sees the files of one only."""
+        raise SandboxUnavailableError("a container is started for a repository, not for a store")
+
+    def release(self, server: WorkerServer, idle_s: float | None = 0.0) -> None:
+        """Nothing was acquired here."""
+
+
+def _check_users(engine: Engine) -> None:
+    if engine.kind == "docker" and engine.rootless:
+        raise SandboxUnavailableError(
+            "rootless Docker gives a container no user of yours but its root, whom the worker "
+            "refuses to be; use podman (DockerSandbox(engine='podman')), which keeps your id, or "
+            "the engine of the system (DOCKER_HOST=unix:///var/run/docker.sock)"
+        )
+
+
+@dataclass
+class ContainerServer:
+    """A worker server in a container that we started.
+
+    Attributes:
+        layers: What holds around it.
+        profile: That of its jails.
+        python: Their interpreter; empty for the server's own.
+    """
+
+    folder: Path
+    process: subprocess.Popen[bytes]
+    process_fd: int
+    layers: list[Mapping[str, Any]]
+    profile: str
+    python: str
+    owner: int = field(default_factory=os.getpid)
+    users: int = 0
+    snapshot: str = run_arguments.SNAPSHOT
+
+    @property
+    def endpoint(self) -> str:
+        """Its ZeroMQ endpoint, in the folder that we share."""
+        return f"ipc://{self.folder}/sockets/server"
+
+    @property
+    def fd_path(self) -> str:
+        """The socket that takes descriptors."""
+        return f"{self.folder}/sockets/fds"
+
+    @property
+    def runs(self) -> bool:
+        """Whether it has not ended."""
+        return self.process.poll() is None
+
+    def stop(self) -> None:
+        """End the container, in bounded time. A fork of its owner does nothing."""
+        if os.getpid() != self.owner:
+            return
+        _end(self.process)
+        with contextlib.suppress(OSError):
+            os.close(self.process_fd)
+
+
+_IDLE: Lingering[ContainerServer] = Lingering()
+
+
+class RepositoryContainer:
+    """The sandbox of one repository: one container, which its environments share."""
+
+    name = "docker"
+
+    def __init__(
+        self, options: DockerSandbox, engine: Engine, image: str, snapshot: Path, policy: Policy
+    ) -> None:
+        self.interpreter = f"{image} in {engine.kind}"
+        self._options, self._engine, self._image = options, engine, image
+        self._snapshot, self._policy = snapshot, policy
+        # of one make_env, whose limits are for it alone; only one that nobody uses changes hands
+        self._servers: Sharing[ContainerServer] = Sharing(_IDLE)
+        self._key = repr((options, engine, image, str(snapshot), policy))
+
+    def acquire(self, store: Path) -> ContainerServer:
+        """The repository's container, started if there is none."""
+        return self._servers.acquire(self._key, self._start)
+
+    def release(self, server: WorkerServer, idle_s: float | None = 0.0) -> None:
+        """Give it back; the last one who does gives the container up."""
+        assert isinstance(server, ContainerServer)
+        self._servers.release(server, idle_s)
+
+    def _start(self) -> ContainerServer:
+        folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
+        ready, ready_end = os.pipe()
+        try:
+            wanted = self._wanted(folder)
+            process = _execute(self._engine, wanted, folder, ready_end)
+        except BaseException:
+            os.close(ready)
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        finally:
+            os.close(ready_end)
+        try:
+            return self._enclosed(wanted, folder, process, _answer(ready, process))
+        except BaseException:
+            _end(process)
+            raise
+        finally:
+            os.close(ready)
+
+    def _enclosed(
+        self, wanted: Container, folder: Path, process: subprocess.Popen[bytes], answer: bytes
+    ) -> ContainerServer:
+        _check_started(self._engine, answer)
+        found = attestation.parse(answer)
+        if not (folder / "sockets" / "fds").is_socket():
+            raise SandboxUnavailableError(
+                f"{self._engine.kind} started a container that shares no socket with this process: "
+                "an engine in a virtual machine, or a runtime with a kernel of its own. Run the "
+                "worker there, and connect to it with sandbox='tcp://...'"
+            )
+        title = f"{self._engine.kind} {self._engine.version}, image {self._options.image}"
+        runtime = self._options.runtime or "default"
+        title += f" ({self._image[:19]}), runtime {runtime}, {wanted.name}"
+        layers = attestation.layers(wanted, found, title)
+        profile = attestation.profile_for(self._policy.profile, found)
+        fd = os.pidfd_open(process.pid)
+        return ContainerServer(folder, process, fd, [*layers], profile, found.python)
+
+    def _wanted(self, folder: Path) -> Container:
+        options, policy = self._options, self._policy
+        user, group = _user()
+        sockets = folder / "sockets"
+        sockets.mkdir(mode=0o700)
+        if user != os.geteuid():
+            os.chown(sockets, user, group)
+        identity = identity_of(os.getpid())
+        (folder / "client").write_text(identity)
+        (folder / "seccomp.json").write_text(json.dumps(seccomp_profile.profile()))
+        own = len(os.sched_getaffinity(0))
+        limits = (
+            (options.memory or run_arguments.memory_for(policy)),
+            (options.pids or run_arguments.pids_for(policy)),
+            (options.cpus or float(own)),
+        )
+        memory, pids, cpus = limits if options.cgroups else (None, None, None)
+        return Container(
+            name=f"envhub-{secrets.token_hex(6)}",
+            image=self._image,
+            labels={
+                run_arguments.CLIENT_LABEL: identity,
+                run_arguments.USER_LABEL: str(os.geteuid()),
+            },
+            sockets=str(sockets),
+            snapshot=str(self._snapshot),
+            readable=policy.readable,
+            seccomp=str(folder / "seccomp.json"),
+            user=(user, group),
+            network="host" if policy.network == "host" else "none",
+            memory=memory,
+            pids=pids,
+            cpus=cpus,
+            scratch=run_arguments.scratch_for(policy),
+            runtime=options.runtime,
+            gpus=(options.gpus or "all") if policy.gpu else None,
+            ulimits=own_limits(self._engine),
+        )
+
+
+def _user() -> tuple[int, int]:
+    """Who the container's processes are: the caller; for root somebody who owns nothing."""
+    if os.geteuid() != 0:
+        return os.geteuid(), os.getegid()
+    user = _UNUSED_USERS[secrets.randbelow(len(_UNUSED_USERS))]
+    return user, user
+
+
+def _execute(
+    engine: Engine, wanted: Container, folder: Path, ready: int
+) -> subprocess.Popen[bytes]:
+    ourselves = os.pidfd_open(os.getpid())
+    try:
+        return subprocess.Popen(
+            [
+                *(sys.executable, "-I", "-S", str(_KEEPER), str(ourselves), str(ready)),
+                *(str(folder), wanted.name, "--", engine.command),
+                *run_arguments.run_arguments(engine, wanted),
+            ],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            cwd="/",
+            env=environment(),
+            pass_fds=(ready, ourselves),
+            start_new_session=True,  # Ctrl-C is for the client, which then ends the container
+        )
+    finally:
+        os.close(ourselves)
+
+
+def _answer(ready: int, process: subprocess.Popen[bytes]) -> bytes:
+    """The keeper's one line."""
+    readable, _, _ = select.select([ready], [], [], _STARTUP_S)
+    answer = os.read(ready, _ANNOUNCEMENT_BYTES + 1) if readable else b""
+    if not answer:
+        what = "ended" if readable else f"did not come up in {_STARTUP_S:.0f} s"
+        raise WorkerStartupError(f"the container {what}")
+    return answer
+
+
+def _check_started(engine: Engine, answer: bytes) -> None:
+    """Say why there is no container, if there is none.
+
+    Raises:
+        SandboxUnavailableError: The engine would not start it.
+        WorkerStartupError: The program in it ended.
+    """
+    if not answer.startswith(b'{"ended"'):
+        return
+    said = json.loads(answer)
+    tail = str(said["tail"])
+    if said["ended"] in _ENGINES_CODES:
+        raise SandboxUnavailableError(explained(engine.kind, tail))
+    raise WorkerStartupError(
+        f"the container's program ended at once (exit code {said['ended']}); an image that was "
+        f"built from another version must be built again:\n{tail[-4000:]}"
+    )
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(_STOP_S)
+    except subprocess.TimeoutExpired:
+        process.kill()  # its pipe closes, and the container ends
+        process.wait()

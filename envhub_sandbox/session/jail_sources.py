@@ -1,0 +1,117 @@
+"""Where environments get their jail from: one of their own each, or one that they share.
+
+A suite whose environments are built lazily has a jail per task in use, so that closing one frees
+its processes. Where ``make_env`` has already built all of them, they live in one jail.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import weakref
+from collections.abc import Callable
+from typing import Protocol
+
+from envhub_sandbox.session.launcher import Known, LoadedJail, Repository
+from envhub_sandbox.transport.deadline import Deadline
+
+
+class JailSource(Protocol):
+    """Gives jails and takes them back.
+
+    Attributes:
+        repository: Opens them.
+        forget_manifest: Drops the remembered manifest, when a jail contradicts it.
+    """
+
+    repository: Repository
+    forget_manifest: Callable[[], None]
+
+    def take(self, deadline: Deadline) -> LoadedJail:
+        """A jail for one environment."""
+
+    def end(self, loaded: LoadedJail) -> None:
+        """End the jail now, over another connection: somebody may be waiting on its own."""
+
+    def give_back(self, loaded: LoadedJail) -> None:
+        """Drop the connection; the last user's jail ends."""
+
+
+class OwnJails:
+    """A jail for each environment, of which ``known`` says what it is going to be."""
+
+    def __init__(
+        self, repository: Repository, forget_manifest: Callable[[], None], known: Known
+    ) -> None:
+        self.repository = repository
+        self.forget_manifest = forget_manifest
+        self._known = known
+
+    def take(self, deadline: Deadline) -> LoadedJail:
+        """A fresh jail."""
+        return self.repository.open(deadline, self._known)
+
+    def end(self, loaded: LoadedJail) -> None:
+        """End it."""
+        self.repository.interrupt(loaded)
+
+    def give_back(self, loaded: LoadedJail) -> None:
+        """End it and drop the connection."""
+        self.repository.close(loaded)
+
+
+class SharedJail:
+    """One jail for all environments of a repository, each with a connection of its own.
+
+    A death or a time-out of one environment takes the others' process along: they share it.
+    """
+
+    def __init__(self, repository: Repository, forget_manifest: Callable[[], None]) -> None:
+        self.repository = repository
+        self.forget_manifest = forget_manifest
+        self._lock = threading.RLock()  # the garbage collector may close one of them meanwhile
+        self._owner = os.getpid()
+        self._first: LoadedJail | None = None
+        self._users = 0
+
+    def provide(self, loaded: LoadedJail) -> None:
+        """Start with a jail that is loaded already."""
+        self._first = loaded
+        # nobody may ever take it, nor close
+        weakref.finalize(self, self.repository.close, loaded).atexit = False
+
+    def take(self, deadline: Deadline) -> LoadedJail:
+        """A connection to the jail, which is opened if there is none."""
+        with self._lock:
+            if self._first is None:
+                self._first = self.repository.open(deadline)
+            self._users += 1
+            return self.repository.connect(self._first, deadline)
+
+    def end(self, loaded: LoadedJail) -> None:
+        """End the jail, for everybody."""
+        self.repository.interrupt(loaded)
+        with self._lock:
+            if self._first is not None and self._first.jail.number == loaded.jail.number:
+                self._close_first()
+
+    def give_back(self, loaded: LoadedJail) -> None:
+        """Drop a connection; with the last one the jail ends."""
+        self.repository.disconnect(loaded)
+        with self._lock:
+            self._users -= 1
+            if self._users == 0:
+                self._close_first()
+
+    def close(self) -> None:
+        """End a jail that was provided and never taken. A fork of its owner does nothing."""
+        if os.getpid() != self._owner:
+            return
+        with self._lock:
+            if self._users == 0:
+                self._close_first()
+
+    def _close_first(self) -> None:
+        first, self._first = self._first, None
+        if first is not None:
+            self.repository.close(first)

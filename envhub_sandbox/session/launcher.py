@@ -1,0 +1,460 @@
+"""One repository under one policy: opens jails for it, and keeps what they said about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache, partial
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from envhub_sandbox.crash.history import Recording
+from envhub_sandbox.crash.writer import Crash, keep
+from envhub_sandbox.errors import (
+    EnvHubError,
+    LoadError,
+    WorkerDiedError,
+    WorkerTimeoutError,
+    name_bundle,
+    name_source,
+)
+from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.hub.store import cache_root
+from envhub_sandbox.log import CRASHES, WORKER
+from envhub_sandbox.policy import Policy, Timeouts
+from envhub_sandbox.sandboxes.base import (
+    EnclosedServer,
+    FarServer,
+    PerRepository,
+    Sandbox,
+    WorkerServer,
+)
+from envhub_sandbox.session.provenance import provenance_of
+from envhub_sandbox.session.recipe import Recipe
+from envhub_sandbox.session.server_hold import ServerHold
+from envhub_sandbox.transport.connection import WorkerClient, expect
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.jail import RemoteJail, open_jail, typed
+from envhub_sandbox.transport.output import OutputFollower, Wanted
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.manifest import EnvManifest, Manifest, decode_manifest
+from envhub_worker.protocol.untrusted import UNTRUSTED
+
+_CLOSE_S = 5.0
+_STATUS_S = 1.0
+_FIRST_WITH_LOAD_TASK = 3
+"""The version of the protocol."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadArguments:
+    """What the repository's ``make_env`` is called with."""
+
+    n_envs: int = 1
+    use_async_envs: bool = False
+    cfg: dict[str, object] | None = None
+    env_kwargs: dict[str, object] = field(default_factory=dict)
+
+    def message(self) -> m.Load:
+        """As it travels."""
+        return m.Load(self.n_envs, self.use_async_envs, self.cfg, self.env_kwargs)
+
+    def message_for(self, task: EnvManifest) -> m.LoadTask:
+        """The same, where it is known what it returns."""
+        given = (self.n_envs, self.use_async_envs, self.cfg, self.env_kwargs)
+        return m.LoadTask(*given, task.suite, task.task)
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a repository's ``make_env`` has returned before.
+
+    Attributes:
+        manifest: All of it.
+        task: The environment that a jail is wanted for.
+        shards: Over how many hosts it is going to be spread.
+    """
+
+    manifest: Manifest
+    task: EnvManifest
+    shards: int = 1
+
+
+@dataclass
+class LoadedJail:
+    """An open jail whose first host has called ``make_env``.
+
+    Attributes:
+        jail: The jail.
+        manifest: What ``make_env`` returned, checked.
+        loaded: Hosts that have called it.
+        changed: Whether it returned something else in one of them than the manifest says.
+    """
+
+    jail: RemoteJail
+    manifest: Manifest
+    value: dict[str, object]
+    loaded: set[int]
+    server: WorkerServer
+    closed: bool = False
+    changed: bool = False
+
+
+class Repository:
+    """Opens jails for one snapshot. Thread-safe.
+
+    Args:
+        snapshot: The verified files.
+        arguments: For the repository's ``make_env``.
+        policy: What a jail may do.
+        timeouts: How long operations may take.
+        sandbox: Where workers run.
+        python: The interpreter of the jails; empty for ours.
+        store: The folder that snapshots lie in.
+        lane: ``"auto"`` or ``"frames"``.
+        copy: Whether observations are copied for the caller, or lent.
+    """
+
+    def __init__(
+        self,
+        snapshot: Snapshot,
+        arguments: LoadArguments,
+        policy: Policy,
+        timeouts: Timeouts,
+        sandbox: Sandbox,
+        python: str,
+        store: Path,
+        lane: str,
+        copy: bool,
+    ) -> None:
+        self.snapshot = snapshot
+        self.arguments = arguments
+        self.policy = policy
+        self.timeouts = timeouts
+        self.python = python
+        self.lane = lane
+        self.copy = copy
+        self.report: list[dict[str, Any]] = []
+        self.recipe: Recipe | None = None
+        self._sandbox = sandbox
+        self.interpreter = python
+        if isinstance(sandbox, PerRepository):
+            own = sandbox.for_repository(snapshot.root, policy, python)
+            self._sandbox, self.interpreter = own, own.interpreter
+        self._store = store
+        self._hold = ServerHold(self._acquire, self._release)
+        self._jail_numbers = count(1)
+
+    @property
+    def label(self) -> str:
+        """Repository, commit and entry file, for errors."""
+        snapshot = self.snapshot
+        if snapshot.repo_type == "local":
+            return f"{snapshot.repo_id}:{snapshot.path}"
+        prefix = "" if snapshot.repo_type == "model" else f"{snapshot.repo_type}s/"
+        return f"{prefix}{snapshot.repo_id}@{snapshot.commit[:12]}:{snapshot.path}"
+
+    @property
+    def wire_limits(self) -> WireLimits:
+        """Bounds on what a jail may send."""
+        return _wire_limits(self.policy.limits.message_bytes)
+
+    @contextmanager
+    def named(self) -> Iterator[None]:
+        """Put the repository's name in front of the errors of this project."""
+        try:
+            yield
+        except EnvHubError as error:
+            name_source(error, self.label)
+            raise
+
+    @contextmanager
+    def starting(self, deadline: Deadline) -> Iterator[None]:
+        """Say what it was that took too long, and keep what led to a death that matters."""
+        try:
+            yield
+        except WorkerDiedError as error:
+            if not deadline.unasked:
+                self.keep_crash(error)
+            raise
+        except WorkerTimeoutError as error:
+            if error.request is not None or deadline.unasked:
+                raise
+            startup_s = self.timeouts.startup_s
+            late = WorkerTimeoutError(
+                f"make_env has not finished after {startup_s} s and was ended; give it longer "
+                "with timeouts={'startup_s': ...}, or make it again",
+                request="make_env",
+                timeout_s=startup_s,
+            )
+            self.keep_crash(late)
+            raise late from error
+
+    def keep_crash(
+        self,
+        error: WorkerDiedError | WorkerTimeoutError,
+        recording: Recording | None = None,
+        task: dict[str, Any] | None = None,
+        loaded: LoadedJail | None = None,
+        *,
+        shared: bool = False,
+    ) -> None:
+        """Write a crash bundle and name it in the error. What hinders that is only logged.
+
+        Args:
+            error: What the user is going to be told.
+            recording: What was asked of the environment; None before there is one.
+            task: Which environment, as in ``Crash``.
+            loaded: Its jail.
+            shared: Whether other environments lived in it.
+        """
+        ours = self.policy.crash_history and error.bundle is None and self.recipe is not None
+        if not ours or getattr(error, "reason", "") in ("killed", "idle", "gone", "connection"):
+            return
+        assert self.recipe is not None
+        manifest = None if loaded is None else loaded.manifest
+        crash = Crash(
+            error=error,
+            label=self.label,
+            provenance=provenance_of(self.snapshot, manifest, self.report),
+            load=self.arguments.message(),
+            options=self.recipe.options,
+            task=task,
+            shared=shared,
+            recording=recording or Recording(),
+        )
+        try:
+            folder = self.policy.crash_folder or cache_root() / "crashes"
+            bundle = keep(Path(folder).absolute(), crash)
+        except Exception as problem:
+            CRASHES.warning("%s: no crash bundle could be written: %s", self.label, problem)
+        else:
+            name_bundle(error, str(bundle))
+            CRASHES.info("%s: crash bundle %s", self.label, bundle)
+
+    def hold(self) -> Callable[[], None]:
+        """Keep the server between two jails; returns what gives it back."""
+        return partial(self._release, self._acquire())
+
+    def stay(self) -> Callable[[], None]:
+        """An environment may need the server again; returns what says that it is closed."""
+        return self._hold.enter()
+
+    def _acquire(self) -> WorkerServer:
+        return self._sandbox.acquire(self._store)
+
+    def _release(self, server: WorkerServer) -> None:
+        self._sandbox.release(server, self.timeouts.server_idle_s)
+
+    def open(self, deadline: Deadline, known: Known | None = None) -> LoadedJail:
+        """Fork a jail and have its first host call ``make_env``.
+
+        Args:
+            deadline: For all of it.
+            known: What that returns. It is then described no more, which for a suite means to
+                build an environment of each of its tasks; ``Built`` is held against it instead.
+
+        Raises:
+            LoadError: The repository failed to load, or returned something unusable.
+            WorkerError: The jail did not come up, died, or took too long.
+        """
+        server = self._acquire()
+        try:
+            if self.timeouts.server_idle_s != 0 and not isinstance(server, FarServer):
+                self._hold.keep()
+            with self.starting(deadline):
+                return self._open(server, deadline, known)
+        except BaseException:
+            self._release(server)
+            raise
+
+    def _open(self, server: WorkerServer, deadline: Deadline, known: Known | None) -> LoadedJail:
+        wanted = self._wanted_output()
+        client = self._client(server)
+        try:
+            client.hello(deadline)
+            if isinstance(server, FarServer):
+                server.bring(client, deadline)
+            # all at once, where they will load what is known: else it is asked for, and then again
+            known = known if client.version >= _FIRST_WITH_LOAD_TASK else None
+            order = replace(self._order(server), hosts=known.shards if known else 1)
+            jail = open_jail(client, order, self.wire_limits, deadline)
+        except BaseException:
+            client.close()
+            wanted.close()
+            raise
+        WORKER.info("%s: jail %x opened", self.label, jail.number)
+        try:
+            if wanted.sinks:
+                follower = OutputFollower(lambda: self._connected(server), jail.number, wanted)
+                jail.before_end = follower.stop
+            around = server.layers if isinstance(server, EnclosedServer) else ()
+            self.report = [*map(dict, around), *jail.report]
+            if known is None:
+                return self._load(jail, server, deadline)
+            loaded = LoadedJail(jail, known.manifest, {}, set(), server)
+            self.load(loaded, jail.hosts, deadline, known.task)
+            return loaded
+        except BaseException:
+            jail.close(Deadline(_CLOSE_S))
+            raise
+
+    def _client(self, server: WorkerServer) -> WorkerClient:
+        far = server.far if isinstance(server, FarServer) else None
+        return WorkerClient(server.endpoint, server.process_fd, self.wire_limits, far)
+
+    def _order(self, server: WorkerServer) -> m.OpenJail:
+        confinement = self.policy.confinement()
+        snapshot, python = str(self.snapshot.root), self.python
+        if isinstance(server, EnclosedServer):
+            snapshot, python = server.snapshot, server.python
+            confinement = replace(confinement, profile=server.profile)
+        return m.OpenJail(
+            name=self.label,
+            python=python,
+            snapshot=snapshot,
+            entry=self.snapshot.path,
+            confinement=asdict(confinement),
+            hosts=1,
+        )
+
+    def _load(self, jail: RemoteJail, server: WorkerServer, deadline: Deadline) -> LoadedJail:
+        host = jail.hosts[0]
+        [reply] = jail.exchange("make_env", [(host, self.arguments.message())], deadline)
+        if not isinstance(reply, m.Loaded):
+            raise LoadError(f"the worker answered Load with {type(reply).__name__}")
+        elements = self.policy.limits.elements
+        in_time = partial(_refuse_late, deadline)
+        manifest = decode_manifest(reply.manifest, max_elements=elements, check=in_time)
+        return LoadedJail(jail, manifest, reply.manifest, {host}, server)
+
+    def _wanted_output(self) -> Wanted:
+        """Where the next jail's output goes: each has a file of its own."""
+        output = self.policy.output
+        path = None if output == "tail" else Path(output)
+        number = next(self._jail_numbers)
+        if path is not None and number > 1:
+            path = path.with_name(f"{path.stem}-{number}{path.suffix}")
+        return Wanted(self.label, path)
+
+    def _connected(self, server: WorkerServer) -> WorkerClient:
+        client = self._client(server)
+        try:
+            client.hello(Deadline(_CLOSE_S))
+        except BaseException:
+            client.close()
+            raise
+        return client
+
+    def spread(
+        self, loaded: LoadedJail, shards: int, deadline: Deadline, task: EnvManifest
+    ) -> list[int]:
+        """The first ``shards`` hosts of a jail, forked and loaded if they are not yet."""
+        jail = loaded.jail
+        if len(jail.hosts) < shards:
+            jail.start_hosts(shards - len(jail.hosts), deadline)
+        hosts = jail.hosts[:shards]
+        fresh = [host for host in hosts if host not in loaded.loaded]
+        if fresh:
+            self.load(loaded, fresh, deadline, task)
+        return hosts
+
+    def load(
+        self, loaded: LoadedJail, hosts: list[int], deadline: Deadline, task: EnvManifest
+    ) -> None:
+        """Have hosts of a jail call ``make_env``, for a task that is known."""
+        jail = loaded.jail
+        if jail.client.version < _FIRST_WITH_LOAD_TASK:
+            load = self.arguments.message()
+            jail.exchange("make_env", [(host, load) for host in hosts], deadline)
+        else:
+            again = self.arguments.message_for(task)
+            replies = jail.exchange("make_env", [(host, again) for host in hosts], deadline)
+            found = [typed(reply, m.Value).value for reply in replies]
+            loaded.changed |= not all(_is_what(value, task) for value in found)
+        loaded.loaded.update(hosts)
+
+    def connect(self, loaded: LoadedJail, deadline: Deadline) -> LoadedJail:
+        """A further connection to an open jail; environments that share one wait apart."""
+        server = self._acquire()
+        client = self._client(server)
+        try:
+            client.hello(deadline)
+        except BaseException:
+            client.close()
+            self._release(server)
+            raise
+        jail = loaded.jail.through(client)
+        return LoadedJail(jail, loaded.manifest, loaded.value, loaded.loaded, server)
+
+    def disconnect(self, loaded: LoadedJail) -> None:
+        """Drop a further connection."""
+        loaded.jail.client.close()
+        self._release(loaded.server)
+
+    def close(self, loaded: LoadedJail) -> None:
+        """End a jail and give its server back. Idempotent."""
+        if loaded.closed:
+            return
+        loaded.closed = True
+        WORKER.info("%s: jail %x closes", self.label, loaded.jail.number)
+        try:
+            loaded.jail.close(Deadline(_CLOSE_S))
+        finally:
+            self._release(loaded.server)
+
+    def states(self, loaded: LoadedJail) -> tuple[str, ...]:
+        """What a jail's hosts are doing, one word each; asked over a connection of its own.
+
+        The late reply may come at any moment on the jail's own connection, and would be dropped.
+        """
+        client = self._client(loaded.server)
+        deadline = Deadline(_STATUS_S)
+        try:
+            client.hello(deadline)
+            status, _ = client.request(m.GetStatus(), deadline=deadline)
+        except EnvHubError:
+            return ()
+        finally:
+            client.close()
+        try:
+            with UNTRUSTED:
+                jails = [one for one in expect(status, m.Status).jails if isinstance(one, dict)]
+                mine = next((one for one in jails if one.get("jail") == loaded.jail.number), {})
+                return tuple(state for state in mine.get("states", ()) if isinstance(state, str))
+        except EnvHubError:  # it is for the text of another error
+            return ()
+
+    def interrupt(self, loaded: LoadedJail) -> None:
+        """End a jail over a connection of its own, while another thread waits on the first."""
+        loaded.jail.before_end()
+        client = self._client(loaded.server)
+        deadline = Deadline(_CLOSE_S)
+        try:
+            client.hello(deadline)
+            client.request(m.CloseJail(loaded.jail.number), deadline=deadline)
+        except EnvHubError:
+            pass  # the server has gone, and the jail with it
+        finally:
+            client.close()
+
+
+def _is_what(value: object, task: EnvManifest) -> bool:
+    """Whether an answer to ``LoadTask`` says what is known. Trust: input from the worker."""
+    if type(value) is not tuple or tuple(map(type, value)) != (int, bool):
+        return False  # arrays, for instance, compare to something else than a bool
+    return value == (task.num_envs, task.shardable)
+
+
+def _refuse_late(deadline: Deadline) -> None:
+    if deadline.passed:
+        raise WorkerTimeoutError("the worker's manifest could not be read in time")
+
+
+@cache
+def _wire_limits(size: int) -> WireLimits:
+    # one for all environments: what is remembered of a message is for the limits that it met
+    return WireLimits(frame_bytes=size, message_bytes=size)

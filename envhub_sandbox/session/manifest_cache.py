@@ -1,0 +1,115 @@
+"""Remembers what a pinned repository's ``make_env`` returned, so the next call starts no process.
+
+An entry is the worker's own message, and is read as suspiciously as when it came: whatever cannot
+be read is a miss. The key holds everything that the manifest may depend on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+from envhub_sandbox import folders
+from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.policy import Policy
+from envhub_sandbox.transport.shared_memory.sharding import PaceBook
+from envhub_worker import protocol
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec import encode
+from envhub_worker.protocol.manifest import Manifest, decode_manifest
+from envhub_worker.protocol.stream import PacketReader, pack_packet
+
+_FORMAT = 1
+
+
+class ManifestCache:
+    """One entry of the cache.
+
+    Args:
+        folder: Where entries lie.
+        key: The entry's name, or None for what must not be remembered.
+    """
+
+    def __init__(self, folder: Path, key: str | None) -> None:
+        self._path = None if key is None else folder / key
+
+    @property
+    def paces(self) -> PaceBook:
+        """What the environments took, which lies beside the entry."""
+        return PaceBook(None if self._path is None else self._path.with_suffix(".pace"))
+
+    def load(self, *, max_elements: int) -> Manifest | None:
+        """The remembered manifest, if there is one that can be read."""
+        if self._path is None:
+            return None
+        try:
+            if not folders.is_ours_alone(self._path.parent):
+                return None
+            [packet] = PacketReader().feed(self._path.read_bytes())
+            _, message = m.unpack(packet.frames)
+            if isinstance(message, m.Loaded):
+                return decode_manifest(message.manifest, max_elements=max_elements)
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, EnvHubError):
+            self.forget()
+        return None
+
+    def save(self, value: dict[str, object]) -> None:
+        """Remember a manifest. A cache that cannot be written is no error."""
+        if self._path is None:
+            return
+        data = b"".join(map(bytes, pack_packet(1, m.pack(m.Loaded(value), 1))))
+        with contextlib.suppress(OSError):
+            folders.make_private(self._path.parent)
+            fd, temporary = tempfile.mkstemp(dir=self._path.parent)
+            with os.fdopen(fd, "wb") as file:
+                file.write(data)
+            os.replace(temporary, self._path)
+
+    def forget(self) -> None:
+        """Drop the entry."""
+        if self._path is not None:
+            with contextlib.suppress(OSError):
+                self._path.unlink(missing_ok=True)
+
+
+def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, python: str) -> str | None:
+    """The entry's name; None if an argument has no form that can be compared."""
+    try:
+        arguments = b"".join(map(bytes, m.pack(load, 0, pickler=_refuse)))
+    except (EnvHubError, TypeError):
+        return None
+    facts = (
+        *(_FORMAT, m.VERSION, _stamp(Path(protocol.__file__).parent.parent)),
+        *(snapshot.repo_type, snapshot.repo_id, snapshot.commit, snapshot.path),
+        *(policy.profile, policy.network, policy.readable, policy.gpu, policy.environment),
+        *_interpreter_facts(python or sys.executable),
+    )
+    digest = hashlib.sha256(arguments)
+    digest.update(repr(facts).encode())
+    digest.update(b"".join(map(bytes, encode([os.environ.get(n) for n in policy.environment]))))
+    return digest.hexdigest()
+
+
+def _refuse(value: object) -> bytes:
+    raise TypeError(f"{type(value).__name__} has no stable form")
+
+
+def _interpreter_facts(python: str) -> tuple[object, ...]:
+    """The interpreter, and when packages were last installed into it."""
+    prefix = Path(python).parent.parent
+    folders = sorted(prefix.glob("lib/python3*/site-packages"))
+    return (python, _stamp(Path(python)), *((str(path), _stamp(path)) for path in folders))
+
+
+def _stamp(path: Path) -> int:
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0

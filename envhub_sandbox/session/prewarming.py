@@ -1,0 +1,112 @@
+"""The next tasks of a suite, started in the background while one plays.
+
+An evaluation plays task after task. What the next one costs before its first ``reset`` returns (a
+process, imports, the construction of its simulators) need not be waited for. Results do not depend
+on it: what fails, or dies, before anybody has asked for it, is started again by whoever asks.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import weakref
+from collections.abc import Iterator, Sequence
+from functools import partial
+
+from envhub_sandbox.session.env_session import RemoteEnv
+
+
+class Prewarming:
+    """Starts the tasks after the one that was used last, and gives up what nobody came for.
+
+    Thread-safe; the starting is done in one thread, one task after the other.
+
+    Args:
+        suites: The environments of each suite, in order.
+        count: How many tasks after the last one are started ahead, and so how many jails there
+            are at most that nobody has used yet. None: one, once tasks are seen to be closed
+            before the next is used; whoever uses just one task, or all at once, pays nothing.
+    """
+
+    def __init__(self, suites: Sequence[Sequence[RemoteEnv]], count: int | None) -> None:
+        self._count = count
+        # weak: an environment that nobody holds is closed
+        self._suites = [[weakref.ref(env) for env in suite] for suite in suites]
+        self._lock = threading.Lock()
+        self._wanted: list[weakref.ref[RemoteEnv]] = []
+        self._tried: set[weakref.ref[RemoteEnv]] = set()
+        self._ahead: list[weakref.ref[RemoteEnv]] = []  # started here and not used yet
+        self._thread: threading.Thread | None = None
+        for suite in suites:
+            for env in suite:
+                env.on_first_use(partial(self._used, weakref.ref(env)), self.make_room)
+
+    def make_room(self) -> bool:
+        """Give up what nobody has used yet, since a server has no place left; whether there was."""
+        with self._lock:
+            self._wanted = []
+            ahead, self._ahead = self._ahead, []
+        given_up = [_cool(env) for env in ahead]
+        return any(given_up)
+
+    def _used(self, used: weakref.ref[RemoteEnv]) -> None:
+        """A task has been asked something for the first time."""
+        with self._lock:
+            self._tried.add(used)
+            self._ahead = [one for one in self._ahead if one != used]
+            self._wanted = list(self._following(used))
+            if self._thread is None and (self._stale() or self._untried()):
+                self._thread = threading.Thread(
+                    target=self._run, name="envhub-prewarm", daemon=True
+                )
+                self._thread.start()
+
+    def _stale(self) -> list[weakref.ref[RemoteEnv]]:
+        return [one for one in self._ahead if one not in self._wanted]
+
+    def _untried(self) -> list[weakref.ref[RemoteEnv]]:
+        return [one for one in self._wanted if one not in self._tried]
+
+    def _following(self, used: weakref.ref[RemoteEnv]) -> Iterator[weakref.ref[RemoteEnv]]:
+        suite = next(suite for suite in self._suites if used in suite)
+        index = suite.index(used)
+        count = self._count
+        if count is None:
+            count = 1 if index and _is_closed(suite[index - 1]) else 0
+        left = [env for env in suite[index + 1 :] if env in self._ahead or env not in self._tried]
+        yield from [env for env in left if not _is_closed(env)][:count]
+
+    def _run(self) -> None:
+        while (todo := self._next()) is not None:
+            with contextlib.suppress(Exception):  # whoever asks for it meets it, too
+                env, start = todo
+                env.warm_up() if start else env.cool_down()
+            del todo, env  # nobody may hold one while this waits for nothing
+
+    def _next(self) -> tuple[RemoteEnv, bool] | None:
+        """What to give up (False) or start (True); first the former, which bounds their number."""
+        with self._lock:
+            for ref in self._stale():
+                self._ahead.remove(ref)
+                self._tried.discard(ref)
+                env = ref()
+                if env is not None:
+                    return env, False
+            for ref in self._untried():
+                env = ref()
+                self._tried.add(ref)
+                if env is not None:
+                    self._ahead.append(ref)
+                    return env, True
+            self._thread = None
+            return None
+
+
+def _is_closed(ref: weakref.ref[RemoteEnv]) -> bool:
+    env = ref()
+    return env is None or env.closed
+
+
+def _cool(ref: weakref.ref[RemoteEnv]) -> bool:
+    env = ref()
+    return env is not None and env.cool_down()

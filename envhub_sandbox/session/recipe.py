@@ -1,0 +1,63 @@
+"""How to make environments again, in another process: what a pickle of a proxy holds.
+
+A process cannot be handed over, so a proxy travels as the arguments that made it. The other side
+gets a fresh environment in a worker of its own, of the very same commit. A token never travels,
+nor does a login in ``endpoint``: the other side uses its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+from envhub_sandbox.hub.client import default_endpoint
+from envhub_sandbox.hub.logins import without_login
+from envhub_sandbox.hub.reference import HubRef
+from envhub_sandbox.hub.snapshot import Snapshot
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """The arguments of ``make_env``, with the commit pinned.
+
+    Attributes:
+        make_env: The function that takes them; it travels by its name.
+        reference: The pinned hub reference, or a local folder and its entry file.
+        config: The ``vars()`` of the caller's config object, or None.
+        options: The other arguments, by name.
+    """
+
+    make_env: Callable[..., Any]
+    reference: str
+    config: dict[str, object] | None = field(repr=False)
+    options: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        endpoint = self.options.get("endpoint")
+        if isinstance(endpoint, str):
+            plain = {**self.options, "endpoint": without_login(endpoint)}
+            object.__setattr__(self, "options", plain)
+
+    def make(self) -> Any:
+        """Fresh environments: what ``make_env`` returns and raises."""
+        cfg: Any = self.reference
+        if self.config is not None:
+            cfg = SimpleNamespace(**{**self.config, "hub_path": self.reference})
+        options = dict(self.options)
+        if options.get("endpoint") == without_login(default_endpoint()):
+            options["endpoint"] = None  # it may come with a login here
+        return self.make_env(cfg, **options)
+
+    def make_one(self, suite: str, task: int | str) -> Any:
+        """One fresh environment of them; the others are made by nobody."""
+        return self.make()[suite][task]
+
+
+def pinned(snapshot: Snapshot) -> str:
+    """A reference that means this snapshot, wherever it is read."""
+    if snapshot.repo_type == "local":
+        return f"{snapshot.repo_id}:{snapshot.path}"
+    kind = snapshot.repo_type
+    return str(HubRef(snapshot.repo_id, snapshot.commit, snapshot.path, kind))

@@ -1,0 +1,171 @@
+"""Checks what the shards sent against what was declared, and joins it into one batch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, cast
+
+import numpy as np
+
+from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, remote_error
+from envhub_sandbox.transport.jail import check, typed
+from envhub_sandbox.transport.shared_memory.lane import LaneShard, Outcome
+from envhub_worker.protocol import batches, slabs
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.inert import one_line
+from envhub_worker.protocol.limits import DEFAULT_LIMITS
+from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.untrusted import FAULTS
+
+_SHOWN = 500
+StepResult = tuple[Any, Any, Any, Any, dict[Any, Any]]
+
+
+class Results:
+    """Joins the replies for one environment. Trust: input from the worker.
+
+    Args:
+        manifest: What the worker declared.
+        bounds: The slices of the sub-environments, in the order of the replies.
+    """
+
+    def __init__(self, manifest: EnvManifest, bounds: Sequence[tuple[int, int]]) -> None:
+        self._space = manifest.single_observation_space
+        self._declared = manifest.shardable
+        self._sizes = [stop - start for start, stop in bounds]
+        self._restores = batches.restores(self._space)
+
+    def step(self, replies: list[m.StepDone], infos: dict[Any, Any] | None = None) -> StepResult:
+        """What ``VectorEnv.step`` returns; with these infos, if there are other ones.
+
+        Raises:
+            Misfit: The shards' infos do not go together; the others are what ``apart`` makes.
+        """
+        return (
+            self._observation([reply.observation for reply in replies]),
+            self._per_env("rewards", [reply.rewards for reply in replies]),
+            self._per_env("terminations", [reply.terminations for reply in replies]),
+            self._per_env("truncations", [reply.truncations for reply in replies]),
+            self.infos([reply.info for reply in replies]) if infos is None else infos,
+        )
+
+    def reset(
+        self, replies: list[m.ResetDone], infos: dict[Any, Any] | None = None
+    ) -> tuple[Any, dict[Any, Any]]:
+        """What ``VectorEnv.reset`` returns; as ``step``."""
+        observation = self._observation([reply.observation for reply in replies])
+        if infos is None:
+            infos = self.infos([reply.info for reply in replies])
+        return observation, infos
+
+    def apart(self, replies: list[m.Value]) -> dict[Any, Any]:
+        """One mapping of the sub-environments' own infos, joined here as Gymnasium does it.
+
+        Raises:
+            RemoteEnvError: It would raise in Gymnasium, too.
+        """
+        pairs, start = [], 0
+        for reply, size in zip(replies, self._sizes, strict=True):
+            pairs += [(start + index, info) for index, info in _own_infos(reply.value, size)]
+            start += size
+        try:
+            infos = batches.join_pairs(pairs, start, DEFAULT_LIMITS.message_bytes)
+        except FAULTS as error:
+            if isinstance(error, (EnvHubError, MemoryError)):
+                raise
+            name = type(error).__name__
+            raise remote_error(name, name, one_line(str(error), _SHOWN)) from error
+        return self._restored(infos)
+
+    def reset_done(self, observation: Any, reply: m.Message) -> m.ResetDone:
+        """A shard's reply to a reset by the fast lane."""
+        check(reply)
+        return m.ResetDone(observation, self._info(typed(reply, m.Value).value))
+
+    def infos(self, parts: list[dict[Any, Any]]) -> dict[Any, Any]:
+        """One mapping of the shards' infos."""
+        whole = len(parts) == 1
+        return self._restored(parts[0] if whole else batches.join_infos(parts, self._sizes))
+
+    def _restored(self, infos: dict[Any, Any]) -> dict[Any, Any]:
+        final = infos.get("final_obs") if self._restores else None
+        # one that is something else is the repository's own, who has a step of its own
+        if type(final) is np.ndarray and final.dtype == object and final.ndim == 1:
+            for index, member in enumerate(final):
+                final[index] = batches.restore(self._space, member)
+        return infos
+
+    def lane_info(
+        self, outcome: Outcome, shard: LaneShard, fetch: Callable[[], m.Message]
+    ) -> dict[Any, Any]:
+        """A shard's infos of a step by the fast lane; ``fetch`` asks for what did not fit.
+
+        Raises:
+            RemoteEnvError: The environment raised.
+        """
+        kind, message = outcome
+        if kind == slabs.COLUMNS:
+            return shard.columns()
+        if kind == slabs.FETCH:
+            message = fetch()
+        if message is None:
+            return {}
+        check(message)
+        return self._info(typed(message, m.Value).value)
+
+    def one_each(self, what: str, replies: list[m.Value]) -> tuple[Any, ...]:
+        """One value for each sub-environment."""
+        gathered: list[Any] = []
+        for reply, size in zip(replies, self._sizes, strict=True):
+            if type(reply.value) is not tuple or len(reply.value) != size:
+                raise RemoteProtocolError(f"the worker's {what} does not hold one result each")
+            gathered += reply.value
+        return tuple(gathered)
+
+    def _observation(self, parts: list[Any]) -> Any:
+        if self._declared:
+            for part, size in zip(parts, self._sizes, strict=True):
+                if not batches.conforms(self._space, part, size):
+                    raise RemoteProtocolError(
+                        f"the worker sent an observation that is not a batch of {self._space}"
+                    )
+        joined = parts[0] if len(parts) == 1 else batches.join(self._space, parts)
+        if not (self._restores and batches.conforms(self._space, joined, sum(self._sizes))):
+            return joined
+        return batches.restore_batch(self._space, joined)
+
+    def _per_env(self, name: str, parts: list[Any]) -> Any:
+        for part, size in zip(parts, self._sizes, strict=True):
+            shape = getattr(part, "shape", None)
+            if not shape or shape[0] != size:
+                raise RemoteProtocolError(f"the worker sent {name} that do not fit num_envs")
+            if not (_numeric(part) and (not self._declared or name == "rewards" or _flags(part))):
+                raise RemoteProtocolError(f"the worker sent {name} of a wrong dtype or shape")
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    @staticmethod
+    def _info(part: Any) -> dict[Any, Any]:
+        if type(part) is not dict:
+            raise RemoteProtocolError("the worker's infos are not a mapping")
+        return part
+
+
+def _own_infos(value: Any, size: int) -> Sequence[tuple[int, dict[Any, Any]]]:
+    """Trust: input from the worker."""
+    pairs: Any = value if type(value) is tuple else (None,)
+    for pair in pairs:
+        if type(pair) is not tuple or list(map(type, pair)) != [int, dict]:
+            raise RemoteProtocolError("the worker's infos are not one mapping each")
+        if not 0 <= pair[0] < size:
+            raise RemoteProtocolError("the worker's infos are of nobody")
+    return cast("Sequence[tuple[int, dict[Any, Any]]]", pairs)
+
+
+def _numeric(part: Any) -> bool:
+    """Whether these are numbers or booleans; a tensor's always are."""
+    return not isinstance(part, np.ndarray) or part.dtype.kind in "biuf"
+
+
+def _flags(part: Any) -> bool:
+    """Whether this is one boolean each."""
+    return isinstance(part, np.ndarray) and part.dtype.kind == "b" and part.ndim == 1

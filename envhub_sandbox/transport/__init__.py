@@ -1,0 +1,1 @@
+"""Messages to a worker server and to its runners. Knows no environment."""

@@ -1,0 +1,326 @@
+"""One connection to a worker server: requests, deadlines, late replies. Knows no Gymnasium."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import secrets
+from collections.abc import Sequence
+
+import zmq
+
+from envhub_sandbox.errors import (
+    PolicyError,
+    RemoteProtocolError,
+    SandboxUnavailableError,
+    SnapshotIntegrityError,
+    VersionMismatchError,
+    WorkerDiedError,
+    WorkerError,
+    WorkerTimeoutError,
+)
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.tcp import Far, Link
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol import packing
+from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimits
+from envhub_worker.protocol.text import printable
+from envhub_worker.protocol.untrusted import UNTRUSTED
+
+_MORE, _NOW = int(zmq.SNDMORE), int(zmq.NOBLOCK)
+_FAR_VERSION = 2
+_FIRST_OF_VERSION_2 = 17
+SESSION = secrets.token_bytes(16)
+_contexts: dict[int, zmq.Context[zmq.Socket[bytes]]] = {}
+
+
+def far_session() -> bytes:
+    """Our session on other hosts, where a fork of this process is another client."""
+    return SESSION + os.getpid().to_bytes(4, "little")
+
+
+def _context() -> zmq.Context[zmq.Socket[bytes]]:
+    """This process's ZeroMQ context: one that came through a fork cannot be used."""
+    pid = os.getpid()
+    if pid not in _contexts:
+        _contexts.clear()
+        _contexts[pid] = zmq.Context()
+    return _contexts[pid]
+
+
+_LOOK_MS = 500
+"""One wait on a connection over a network: whether it is still there is asked in between."""
+
+
+class WorkerClient:
+    """A connection. Not thread-safe: its owner holds a lock.
+
+    Args:
+        endpoint: The server's ZeroMQ endpoint.
+        process_fd: A descriptor that becomes readable when the server's process ends.
+        limits: Bounds on what the server may send.
+        far: The server's key and ours, where it is on another host.
+
+    Attributes:
+        version: The protocol's version that was agreed on; 0 before ``hello``.
+        patience_s: How long the server keeps the jails of a client that says nothing; 0: for ever.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        process_fd: int,
+        limits: WireLimits = DEFAULT_LIMITS,
+        far: Far | None = None,
+    ) -> None:
+        self._pid = os.getpid()
+        self._limits = limits
+        self._ids = itertools.count(1)
+        self._socket = _context().socket(zmq.DEALER)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, limits.frame_bytes)
+        self._socket.setsockopt(zmq.RCVHWM, 64)
+        self._far = far
+        self._link = None if far is None else Link(self._socket, endpoint, far)
+        self._socket.connect(endpoint)
+        self._process_fd = process_fd
+        self._poller = zmq.Poller()
+        self._poller.register(self._socket, zmq.POLLIN)
+        self._poller.register(process_fd, zmq.POLLIN)
+        if self._link is not None:
+            self._poller.register(self._link.monitor, zmq.POLLIN)
+        self._sent: dict[int, tuple[int, list[Buffer]]] = {}
+        self._compression = ""
+        self.version = 0
+        self.patience_s = 0
+        self.stale_replies = 0
+        self.sent_bytes = 0
+        self.received_bytes = 0
+
+    def hello(self, deadline: Deadline) -> m.Welcome:
+        """Agree on a protocol version."""
+        self._compression = ""
+        session = SESSION if self._far is None else far_session()
+        greeting = m.Hello(m.OLDEST_VERSION, m.VERSION, session)
+        reply, _ = self.request(greeting, deadline=deadline)
+        welcome = expect(reply, m.Welcome)
+        if not m.OLDEST_VERSION <= welcome.version <= m.VERSION:
+            raise VersionMismatchError(
+                f"this client speaks protocol {m.OLDEST_VERSION} to {m.VERSION}, the worker chose "
+                f"{welcome.version}"
+            )
+        self.version = welcome.version
+        if self._link is not None:
+            self._agree(deadline)
+        return welcome
+
+    def _agree(self, deadline: Deadline) -> None:
+        if self.version < _FAR_VERSION:
+            raise VersionMismatchError(
+                f"the worker speaks protocol {self.version}, and a server on another host needs "
+                f"{_FAR_VERSION}: upgrade the worker"
+            )
+        reply, _ = self.request(m.Agree(packing.available()), deadline=deadline)
+        agreed = expect(reply, m.Agreed)
+        if agreed.compression not in ("", *packing.available()):
+            raise RemoteProtocolError("the worker chose a compression that was not offered")
+        self._compression, self.patience_s = agreed.compression, agreed.idle_s
+
+    def request(
+        self, message: m.Message, payload: Sequence[Buffer] = (), *, deadline: Deadline
+    ) -> tuple[m.Message, list[Buffer]]:
+        """Send a request and wait for its reply."""
+        return self.receive(self.send(message, payload), deadline)
+
+    def send(self, message: m.Message, payload: Sequence[Buffer] = ()) -> int:
+        """Send a request; returns its id."""
+        self.check_process()
+        if self.version == 1 and _FIRST_OF_VERSION_2 <= message.kind < m.FIRST_HOST_KIND:
+            raise VersionMismatchError(
+                f"the worker speaks protocol 1, and {type(message).__name__} needs 2: upgrade it"
+            )
+        request_id = next(self._ids)
+        self._send(request_id, [*m.pack(message, request_id), *payload])
+        return request_id
+
+    def _send(self, request_id: int, frames: list[Buffer]) -> None:
+        travelling = frames
+        if self._link is not None:
+            self._sent[request_id] = self._link.next_number(), frames
+            if self._compression:
+                travelling = packing.pack_frames(frames, self._compression)
+        size = sum(map(len, travelling))
+        self._put(travelling, copy=size < LARGE_BYTES)
+        self.sent_bytes += size
+
+    def receive(self, request_id: int, deadline: Deadline) -> tuple[m.Message, list[Buffer]]:
+        """The reply to a request, with its payload. Replies to others are dropped and counted.
+
+        Raises:
+            WorkerTimeoutError: The deadline came first. The reply may still come; it is dropped.
+            WorkerDiedError: The worker server has ended, or the connection to it is lost.
+            SandboxUnavailableError: A server on another host does not let us in.
+            RemoteProtocolError: What came is not a reply.
+        """
+        self.check_process()
+        while True:
+            self._wait(request_id, deadline)
+            frames = self._take()
+            self.received_bytes += sum(map(len, frames))
+            if self._link is not None:
+                with UNTRUSTED:
+                    frames = packing.unpack_frames(frames, self._limits)
+            reply_id, reply = m.unpack(frames[:1], limits=self._limits)
+            if reply_id != request_id:
+                self._sent.pop(reply_id, None)
+                self.stale_replies += 1
+                if deadline.passed:  # a flood of these would be waited for without end
+                    raise WorkerTimeoutError("the worker did not answer in time")
+            elif not self._must_say_hello(request_id, reply):
+                self._sent.pop(request_id, None)
+                return reply, frames[1:]
+            else:
+                _, unanswered = self._sent.pop(request_id)
+                self.hello(deadline)
+                self._send(request_id, unanswered)
+
+    def _put(self, frames: Sequence[Buffer], *, copy: bool) -> None:
+        # one by one: pyzmq's own loop costs more than the calls in it
+        for frame in frames[:-1]:
+            self._socket.send(frame, _MORE, copy)
+        self._socket.send(frames[-1], 0, copy)
+
+    def _take(self) -> list[Buffer]:
+        """The message that is there. What is large stays in ZeroMQ's memory until it is decoded."""
+        frames: list[Buffer] = []
+        more = True
+        while more:
+            frame = self._socket.recv(_NOW, copy=False)
+            frames.append(frame.bytes if len(frame) < LARGE_BYTES else frame.buffer)
+            more = frame.more
+        return frames
+
+    def _must_say_hello(self, request_id: int, reply: m.Message) -> bool:
+        """Whether we came back over a new connection: nothing was done, so it can be asked anew."""
+        unknown = isinstance(reply, m.Refused) and reply.error == "HelloError"
+        return unknown and request_id in self._sent
+
+    def _wait(self, request_id: int, deadline: Deadline) -> None:
+        while True:
+            ready = dict(self._poller.poll(self._wait_ms(deadline)))
+            if self._socket in ready:
+                return
+            if self._process_fd in ready:
+                raise WorkerDiedError("the worker server has ended", reason="server")
+            if self._link is not None and request_id in self._sent:
+                self._link.check(self._sent[request_id][0])
+            if deadline.passed:
+                raise WorkerTimeoutError("the worker did not answer in time")
+
+    def _wait_ms(self, deadline: Deadline) -> int | None:
+        left = deadline.left_ms()
+        if self._link is None:
+            return left
+        return _LOOK_MS if left is None else min(left, _LOOK_MS)
+
+    def hold(self, jail: int) -> None:
+        """A jail on another host is ours: the server is told so while we live."""
+        if self._far is not None:
+            self._far.held.add(jail)
+
+    def let_go(self, jail: int) -> None:
+        """It no longer is; the server ends it, if it has not heard so already."""
+        if self._far is not None:
+            self._far.held.discard(jail)
+
+    def check_process(self) -> None:
+        """Refuse in a forked child: the connection belongs to the parent.
+
+        Raises:
+            WorkerError: This is not the process that made the connection.
+        """
+        if os.getpid() != self._pid:
+            raise WorkerError(
+                f"this environment belongs to process {self._pid}, and this is a fork of it "
+                f"({os.getpid()}); call make_env here to get one of its own"
+            )
+
+    def close(self) -> None:
+        """Close the connection. Idempotent; in a forked child nothing is touched."""
+        if os.getpid() == self._pid and not self._socket.closed:
+            if self._link is not None:
+                self._link.close()
+            self._socket.close(0)
+
+
+def expect(reply: m.Message, kind: type[m.M]) -> m.M:
+    """The reply, if it is of the kind that the request asks for.
+
+    Raises:
+        SandboxUnavailableError: A layer of the confinement is missing.
+        WorkerDiedError: A process of the jail ended.
+        RemoteProtocolError: It is another message.
+    """
+    if isinstance(reply, kind):
+        return reply
+    if isinstance(reply, m.Refused):
+        raise refusal(reply)
+    if isinstance(reply, m.Died):
+        raise death(reply)
+    raise RemoteProtocolError(
+        f"the worker answered with {type(reply).__name__} where {kind.__name__} belongs"
+    )
+
+
+def refusal(reply: m.Refused) -> Exception:
+    """The error for a refused request. Trust: text from the worker."""
+    message = printable(reply.message)
+    if reply.error == "SandboxUnavailableError":
+        layer = f"{printable(reply.layer)}: " if reply.layer else ""
+        fix = f"\n{printable(reply.fix)}" if reply.fix else ""
+        return SandboxUnavailableError(f"this host cannot enforce {layer}{message}{fix}")
+    if reply.error == "WorkerDiedError":
+        return WorkerDiedError(message, reason="gone")
+    return _REFUSALS.get(reply.error, WorkerError)(message)
+
+
+_REFUSALS: dict[str, type[Exception]] = {
+    "PolicyError": PolicyError,
+    "SnapshotIntegrityError": SnapshotIntegrityError,
+    "VersionMismatchError": VersionMismatchError,
+}
+
+
+_REASONS = {
+    "exit": "it exited",
+    "signal": "a signal ended it",
+    "out-of-memory": "it ran out of memory",
+    "cpu-limit": "it used up its cpu limit",
+    "disk-limit": "it used up its disk limit",
+    "protocol": "it broke the rules of the wire and was killed",
+    "killed": "it was closed",
+    "zygote": "the process that forks workers ended",
+    "idle": "the server ended it",
+}
+
+
+def death(reply: m.Died) -> WorkerDiedError:
+    """The error for a jail that ended."""
+    how = _REASONS.get(reply.reason, reply.reason)
+    if reply.signal:
+        how += f" ({reply.signal})"
+    elif reply.exit_code is not None:
+        how += f" (exit code {reply.exit_code})"
+    during = f" during {reply.operation}" if reply.operation else ""
+    detail = f"\n{reply.detail}" if reply.detail else ""
+    tail = f"\nIts last output:\n{reply.tail}" if reply.tail else ""
+    return WorkerDiedError(
+        f"the worker process died{during}: {how}{detail}{tail}",
+        exit_code=reply.exit_code,
+        signal=reply.signal,
+        reason=reply.reason,
+        log_tail=reply.tail,
+        request=reply.operation or None,
+        detail=reply.detail,
+    )

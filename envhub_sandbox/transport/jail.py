@@ -1,0 +1,303 @@
+"""The client's end of one open jail: messages to its hosts, and the jail's end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import islice
+from typing import Any
+
+import cloudpickle  # type: ignore[import-untyped]
+
+from envhub_sandbox.errors import (
+    DependencyError,
+    EnvHubError,
+    LoadError,
+    RemoteProtocolError,
+    WorkerDiedError,
+    WorkerError,
+    remote_error,
+)
+from envhub_sandbox.transport.connection import WorkerClient, death, expect
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.tensors import to_tensor
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.inert import one_line
+from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.text import printable
+from envhub_worker.protocol.untrusted import UNTRUSTED
+
+
+class HostsDiedError(WorkerDiedError):
+    """Hosts of a kept jail have died; the others have answered.
+
+    Never seen by a user: he is told ``first``, or nothing.
+
+    Attributes:
+        replies: In the order of the request; None where a host has died.
+        deaths: How, by its place in the request.
+        jail_gone: Whether the jail has ended, too.
+    """
+
+    def __init__(
+        self,
+        replies: Sequence[m.Message | None],
+        deaths: dict[int, WorkerDiedError],
+        *,
+        jail_gone: bool = False,
+    ) -> None:
+        self.first = next(iter(deaths.values()))
+        super().__init__(str(self.first), reason=self.first.reason)
+        self.replies = list(replies)
+        self.deaths = deaths
+        self.jail_gone = jail_gone
+
+
+class RemoteJail:
+    """An open jail. Not thread-safe: its owner holds a lock.
+
+    Attributes:
+        number: The server's number for it.
+        hosts: Its hosts' numbers; sub-environments are spread over them in this order.
+        kept: Whether it goes on without a host that has died.
+        report: One mapping per layer of the confinement: ``layer``, ``enforced``, ``detail``.
+        before_end: Runs before it is ended; brings what it has printed last.
+    """
+
+    def __init__(
+        self,
+        client: WorkerClient,
+        number: int,
+        hosts: Sequence[int],
+        report: list[dict[str, Any]],
+        limits: WireLimits,
+    ) -> None:
+        self.client = client
+        self.number = number
+        self.hosts = list(hosts)
+        self.kept = False
+        self.report = report
+        self.before_end: Callable[[], None] = _nothing
+        self._limits = limits
+        self._asked: dict[int, int] = {}  # how many hosts, by request
+
+    def through(self, client: WorkerClient) -> RemoteJail:
+        """The same jail over another connection of ours."""
+        jail = RemoteJail(client, self.number, self.hosts, self.report, self._limits)
+        jail.before_end = self.before_end
+        return jail
+
+    def start_hosts(self, count: int, deadline: Deadline) -> list[int]:
+        """Fork further hosts; returns their numbers."""
+        reply, _ = self.client.request(m.StartHosts(self.number, count), deadline=deadline)
+        started = _hosts(expect(reply, m.JailOpened), count)
+        self.hosts += started
+        return started
+
+    def keep(self, deadline: Deadline) -> None:
+        """From now on it goes on without a host that dies."""
+        reply, _ = self.client.request(m.KeepJail(self.number), deadline=deadline)
+        expect(reply, m.Done)
+        self.kept = True
+
+    def expire(self, idle_s: float, deadline: Deadline) -> None:
+        """From now on it ends once it has been idle for so long."""
+        message = m.ExpireIdle(self.number, max(1, int(idle_s * 1000)))
+        expect(self.client.request(message, deadline=deadline)[0], m.Done)
+
+    def replace_hosts(self, dead: Sequence[int], deadline: Deadline) -> list[int]:
+        """Fork a host in the place of each that has died; returns the new numbers, in order."""
+        self.hosts = [host for host in self.hosts if host not in dead]
+        return self.start_hosts(len(dead), deadline)
+
+    def pack(self, message: m.Message) -> list[Buffer]:
+        """The frames of a message to a host."""
+        # the only way in for the caller's own objects; nothing is ever unpickled here
+        return m.pack(message, 0, pickler=cloudpickle.dumps, limits=self._limits)
+
+    def send(self, operation: str, requests: Sequence[tuple[int, m.Message]]) -> int:
+        """Send one message to each of some hosts, in one request; returns its id."""
+        return self.relay(operation, [(host, self.pack(message)) for host, message in requests])
+
+    def relay(self, operation: str, requests: Sequence[tuple[int, list[Buffer]]]) -> int:
+        """``send`` for messages that are packed."""
+        parts = tuple((host, len(frames)) for host, frames in requests)
+        payload = [frame for _, frames in requests for frame in frames]
+        request_id = self.client.send(m.Relay(self.number, operation, parts), payload)
+        self._asked[request_id] = len(parts)
+        return request_id
+
+    def receive(self, request_id: int, deadline: Deadline) -> list[m.Message]:
+        """The hosts' replies, in the order of the request.
+
+        Raises:
+            WorkerTimeoutError: The deadline came first.
+            WorkerDiedError: The jail ended.
+            HostsDiedError: Hosts of a kept jail did.
+            RemoteProtocolError: A host broke the rules.
+        """
+        reply, payload = self.client.receive(request_id, deadline)
+        asked = self._asked.pop(request_id, None)
+        with UNTRUSTED:
+            if not (self.kept and isinstance(reply, m.RelayedPartly)):
+                reply = expect(reply, m.Relayed)
+            parts = _cut(payload, reply.parts)
+            if len(parts) != asked:
+                raise RemoteProtocolError(f"{asked} hosts were asked, {len(parts)} answered")
+            if isinstance(reply, m.RelayedPartly):
+                raise self._died(reply.dead, parts)
+            return [self._unpack(part) for part in parts]
+
+    def _died(self, dead: Sequence[int], parts: list[list[Buffer]]) -> HostsDiedError:
+        """Who has died is the server's word, which no host can say."""
+        if not dead or not set(dead) <= set(range(len(parts))):
+            raise RemoteProtocolError("the worker names dead hosts that were not asked")
+        deaths = {index: death(typed(self._unpack(parts[index]), m.Died)) for index in dead}
+        living = [None if i in deaths else self._unpack(part) for i, part in enumerate(parts)]
+        return HostsDiedError(living, deaths)
+
+    def _unpack(self, frames: Sequence[Buffer]) -> m.Message:
+        return m.unpack(frames, limits=self._limits, tensors=to_tensor)[1]
+
+    def exchange(
+        self, operation: str, requests: Sequence[tuple[int, m.Message]], deadline: Deadline
+    ) -> list[m.Message]:
+        """``ask`` for messages that are not packed; a host's exception is raised."""
+        packed = [(host, self.pack(message)) for host, message in requests]
+        replies = self.ask(operation, packed, deadline)
+        for reply in replies:
+            check(reply)
+        return replies
+
+    def ask(
+        self, operation: str, requests: Sequence[tuple[int, list[Buffer]]], deadline: Deadline
+    ) -> list[m.Message]:
+        """``relay`` and ``receive``; of deaths, the first is raised."""
+        try:
+            return self.receive(self.relay(operation, requests), deadline)
+        except HostsDiedError as error:
+            raise error.first from None
+
+    def output(self, operation: str, deadline: Deadline) -> str:
+        """The last lines that the jail printed.
+
+        Raises:
+            WorkerDiedError: The jail has ended, during ``operation``.
+        """
+        reply, _ = self.client.request(m.ReadOutput(self.number, operation), deadline=deadline)
+        return expect(reply, m.Output).text
+
+    def close(self, deadline: Deadline) -> None:
+        """End the jail and everything in it. A server that has gone has ended it already."""
+        self.before_end()
+        try:
+            self.client.request(m.CloseJail(self.number), deadline=deadline)
+        except WorkerError:
+            pass
+        finally:
+            self.client.let_go(self.number)
+            self.client.close()
+
+
+def _cut(payload: list[Buffer], counts: Sequence[int]) -> list[list[Buffer]]:
+    """The frames of each part."""
+    if any(type(count) is not int or count < 1 for count in counts) or sum(counts) != len(payload):
+        raise RemoteProtocolError("the worker's frames do not add up")
+    frames = iter(payload)
+    return [list(islice(frames, count)) for count in counts]
+
+
+def _nothing() -> None:
+    """Nobody follows what it prints."""
+
+
+def open_jail(
+    client: WorkerClient, request: m.OpenJail, limits: WireLimits, deadline: Deadline
+) -> RemoteJail:
+    """Open a jail.
+
+    Raises:
+        SandboxUnavailableError: A layer of the confinement is missing.
+        WorkerDiedError: It did not come up.
+    """
+    reply, _ = client.request(request, deadline=deadline)
+    opened = expect(reply, m.JailOpened)
+    hosts = _hosts(opened, request.hosts)
+    report = [dict(layer) for layer in opened.report if isinstance(layer, dict)]
+    client.hold(opened.jail)
+    return RemoteJail(client, opened.jail, hosts, report, limits)
+
+
+def _hosts(opened: m.JailOpened, count: int) -> list[int]:
+    """The numbers of as many hosts as were asked for."""
+    hosts = list(opened.hosts)
+    if not all(type(host) is int for host in hosts) or not len(set(hosts)) == len(hosts) == count:
+        raise RemoteProtocolError(f"the worker did not start {count} hosts, each with a number")
+    return hosts
+
+
+def check(reply: m.Message) -> None:
+    """Raise what a host's reply says went wrong.
+
+    Raises:
+        EnvHubError: What the repository raised.
+        RemoteProtocolError: A host spoke in the server's name.
+    """
+    if isinstance(reply, m.Raised):
+        raise raised(reply)
+    if reply.kind < m.FIRST_HOST_KIND:
+        raise RemoteProtocolError(f"a host sent {type(reply).__name__}")
+
+
+def typed(reply: m.Message, kind: type[m.M]) -> m.M:
+    """The reply, if it is of the kind that the request asks for.
+
+    Raises:
+        RemoteProtocolError: It is another message.
+    """
+    if not isinstance(reply, kind):
+        raise RemoteProtocolError(
+            f"the worker answered with {type(reply).__name__} where {kind.__name__} belongs"
+        )
+    return reply
+
+
+_LOADING = {
+    "import": "the entry file could not be imported",
+    "make_env": "its make_env failed",
+    "return": "its make_env returned something unusable",
+}
+
+
+def raised(reply: m.Raised) -> EnvHubError:
+    """The error for an exception of the repository. Trust: text from the worker."""
+    reply = _harmless(reply)
+    if reply.stage not in _LOADING:
+        return remote_error(reply.builtin, reply.type_name, reply.message, reply.traceback)
+    what = _LOADING[reply.stage]
+    if reply.stage == "return":
+        return LoadError(reply.message)
+    cause: Any = remote_error(reply.builtin, reply.type_name, reply.message, reply.traceback)
+    if reply.builtin == "ModuleNotFoundError":
+        error: EnvHubError = DependencyError(
+            f"{what}: {reply.message}. The worker runs in this interpreter's environment: install "
+            "the package there, or choose another interpreter with make_env(..., python=...)"
+        )
+    elif reply.type_name.endswith(".EntryError"):
+        return LoadError(reply.message)
+    else:
+        trace = f"\nRemote traceback:\n{reply.traceback.rstrip()}" if reply.traceback else ""
+        error = LoadError(f"{what}: {reply.type_name}: {reply.message}{trace}")
+    error.__cause__ = cause
+    return error
+
+
+def _harmless(reply: m.Raised) -> m.Raised:
+    """The same without what a terminal would obey, and no longer than anybody reads."""
+    return m.Raised(
+        reply.builtin,
+        one_line(reply.type_name, 512),
+        printable(reply.message),
+        printable(reply.traceback, 32_768),
+        reply.stage,
+    )

@@ -1,0 +1,165 @@
+"""What a jail prints, brought to a log or a file while it runs.
+
+A thread asks the server a few times a second, over a connection of its own: the steps do not
+notice. Only where somebody wants it: ``Policy(output=...)``, or DEBUG on
+``envhub_sandbox.worker.output``. Trust: the text is the jail's; it loses its control characters.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TextIO
+
+from envhub_sandbox.errors import EnvHubError, PolicyError
+from envhub_sandbox.log import OUTPUT
+from envhub_sandbox.transport.connection import WorkerClient, expect
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.text import printable
+
+FILE_BYTES = 64 << 20
+"""What one file takes; a worker may print for ever."""
+_PERIOD_S = 0.25
+_ASK_S = 5.0
+_LINE_CHARS = 4096
+_LINE_BYTES = 4 * _LINE_CHARS
+_ENDS = re.compile(rb"\r\n|\n|\r")
+
+Sink = Callable[[str], None]
+
+
+class Lines:
+    """Cuts bytes into lines that a terminal only prints."""
+
+    def __init__(self, sinks: Sequence[Sink]) -> None:
+        self._sinks = sinks
+        self._rest = b""
+
+    def feed(self, data: bytes) -> None:
+        """Take bytes; every line that they end goes to the sinks."""
+        *lines, self._rest = _ENDS.split(self._rest + data)
+        for line in lines:
+            self._emit(line)
+        while len(self._rest) > _LINE_BYTES:
+            self._emit(self._rest[:_LINE_BYTES])
+            self._rest = self._rest[_LINE_BYTES:]
+
+    def say(self, text: str) -> None:
+        """A line of our own, after what came before it."""
+        self.end()
+        for sink in self._sinks:
+            sink(f"[{text}]")
+
+    def end(self) -> None:
+        """There is no more: the last line need not be ended."""
+        if self._rest:
+            self._emit(self._rest)
+            self._rest = b""
+
+    def _emit(self, line: bytes) -> None:
+        text = printable(line.decode("utf-8", "backslashreplace"), _LINE_CHARS)
+        for sink in self._sinks:
+            sink(text)
+
+
+class OutputFile:
+    """A file that takes lines, up to ``FILE_BYTES``."""
+
+    def __init__(self, path: Path) -> None:
+        self._file: TextIO = open(path, "a", encoding="utf-8", buffering=1)  # noqa: SIM115
+        self._left = FILE_BYTES - self._file.tell()
+
+    def __call__(self, line: str) -> None:
+        """Write a line, or say once that there is no room for more."""
+        if self._left <= 0:
+            return
+        size = len(line.encode("utf-8", "backslashreplace")) + 1
+        self._left -= size
+        self._file.write(f"{line}\n" if self._left > 0 else "[the rest is left out]\n")
+
+    def close(self) -> None:
+        """Close it."""
+        self._file.close()
+
+
+class OutputFollower:
+    """Follows one jail's output until ``stop``.
+
+    Args:
+        connect: Makes a connection to the server, for this thread alone.
+        jail: The jail's number.
+        wanted: Where its lines go.
+    """
+
+    def __init__(self, connect: Callable[[], WorkerClient], jail: int, wanted: Wanted) -> None:
+        self._connect, self._jail, self._wanted = connect, jail, wanted
+        self._lines = Lines(wanted.sinks)
+        self._offset = 0
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="envhub-output", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Bring the rest, and end. To be called before the jail is closed. Idempotent."""
+        self._stopped.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join(_ASK_S)
+
+    def _run(self) -> None:
+        try:
+            client = self._connect()
+            try:
+                while not self._stopped.wait(_PERIOD_S):
+                    self._ask(client)
+                while self._ask(client):
+                    pass
+            finally:
+                client.close()
+        except EnvHubError:
+            pass  # the server has gone, or the jail was closed
+        finally:
+            self._lines.end()
+            self._wanted.close()
+
+    def _ask(self, client: WorkerClient) -> int:
+        """Bring what there is; returns how many bytes that was."""
+        request = m.FollowOutput(self._jail, self._offset)
+        reply = expect(client.request(request, deadline=Deadline(_ASK_S))[0], m.OutputBytes)
+        if reply.start > self._offset:
+            self._lines.say(f"{reply.start - self._offset} bytes are lost: it printed too fast")
+        self._offset = reply.start + len(reply.data)
+        self._lines.feed(reply.data)
+        return len(reply.data)
+
+
+class Wanted:
+    """Where a jail's lines are to go: a log, a file, both or nowhere.
+
+    Args:
+        label: What the log calls the jail.
+        path: The file, or None.
+
+    Raises:
+        PolicyError: The file cannot be written.
+    """
+
+    def __init__(self, label: str, path: Path | None) -> None:
+        self.sinks: list[Sink] = []
+        self._file: OutputFile | None = None
+        if path is not None:
+            try:
+                self._file = OutputFile(path)
+            except OSError as error:
+                raise PolicyError(f"policy: output {str(path)!r}: {error}") from error
+            self.sinks.append(self._file)
+        if OUTPUT.isEnabledFor(logging.DEBUG):
+            self.sinks.append(lambda line: OUTPUT.debug("%s: %s", label, line))
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()

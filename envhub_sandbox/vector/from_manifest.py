@@ -1,0 +1,89 @@
+"""What a vector environment shows its user, made from what the worker declared.
+
+Trust: the manifest is input from the worker.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+
+from envhub_sandbox.vector.actions import ActionReader
+from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.spaces import OpaqueSpace
+
+
+def action_reader(manifest: EnvManifest) -> Callable[[Any], Any]:
+    """Checks a batch of actions and makes it what the worker takes."""
+    space = manifest.single_action_space
+    if isinstance(space, OpaqueSpace):
+        return lambda actions: actions
+    return ActionReader(space, manifest.num_envs).read
+
+
+def metadata(manifest: EnvManifest) -> dict[str, Any]:
+    """``env.metadata``, with the autoreset mode as Gymnasium's enum where it has one."""
+    mode: Any = manifest.autoreset_mode
+    if mode is None:
+        return dict(manifest.metadata)
+    if hasattr(gym.vector, "AutoresetMode"):
+        mode = gym.vector.AutoresetMode(mode)
+    return {**manifest.metadata, "autoreset_mode": mode}
+
+
+_REFUSAL = f"{__name__}:not_here"
+
+
+def spec(manifest: EnvManifest, reference: str) -> EnvSpec | None:
+    """``env.spec``, where the repository gave one: its facts, and nothing that makes anything.
+
+    A string names what refuses, so that it can be written as JSON like any other.
+    """
+    given = manifest.spec
+    # gym.make imports what stands before a colon
+    if given is None or given.get("id") is None or ":" in given["id"]:
+        return None
+    facts = {name: value for name, value in given.items() if value is not None}
+    try:
+        return EnvSpec(
+            **facts,
+            entry_point=_REFUSAL,
+            vector_entry_point=_REFUSAL,
+            kwargs={"reference": reference},
+        )
+    except Exception:  # an id that this Gymnasium cannot read: not worth failing for
+        return None
+
+
+def not_here(*args: Any, reference: str = "", **kwargs: Any) -> NoReturn:
+    """What ``gym.make(env.spec)`` calls.
+
+    Raises:
+        gymnasium.error.Error: Always.
+    """
+    raise gym.error.Error(
+        f"this spec is of an environment in a sandbox, {reference}: gym.make would need its code "
+        "in this process, which it never enters. Use envhub_sandbox.make_env with that repository, "
+        "or copy.deepcopy(env) for another one like it"
+    )
+
+
+def check_mask(mask: Any, num_envs: int) -> None:
+    """``SyncVectorEnv.reset``'s checks, in its words."""
+    if not isinstance(mask, np.ndarray):
+        raise TypeError(f"`options['reset_mask']` must be a numpy array, got {type(mask)}")
+    if mask.shape != (num_envs,):
+        raise ValueError(
+            f"`options['reset_mask']` must have shape `({num_envs},)`, got {mask.shape}"
+        )
+    if mask.dtype != np.bool_:
+        raise TypeError(f"`options['reset_mask']` must have `dtype=np.bool_`, got {mask.dtype}")
+    if not np.any(mask):
+        raise ValueError(
+            "`options['reset_mask']` must contain a boolean array with at least one True value, "
+            f"got reset_mask={mask}"
+        )

@@ -1,0 +1,85 @@
+"""What ``make_env`` returns: ``{suite: {task_id: VectorEnv}}``, with an end and an origin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from types import TracebackType
+from typing import Any
+
+from gymnasium.vector import VectorEnv
+
+from envhub_sandbox.session.recipe import Recipe
+
+Envs = Mapping[str, Mapping[int | str, VectorEnv[Any, Any, Any]]]
+
+
+class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
+    """A real ``dict`` of suites, each a ``dict`` of vector environments by task id.
+
+    Usable as a context manager, which closes all of them.
+
+    Args:
+        envs: The environments.
+        provenance: Makes ``provenance``.
+        on_close: Runs after the environments have been closed.
+        recipe: Makes them again: a pickle starts workers of its own.
+    """
+
+    def __init__(
+        self,
+        envs: Envs,
+        provenance: Callable[[], dict[str, Any]],
+        on_close: Callable[[], None] = lambda: None,
+        recipe: Recipe | None = None,
+    ) -> None:
+        super().__init__({suite: dict(tasks) for suite, tasks in envs.items()})
+        self._provenance = provenance
+        self._on_close = on_close
+        self._recipe = recipe
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if self._recipe is None:
+            raise TypeError("environments that run in this process cannot be pickled")
+        return self._recipe.make, ()
+
+    @property
+    def env(self) -> Any:
+        """The environment of a repository that has just one.
+
+        Raises:
+            ValueError: There are several; the text names them.
+        """
+        found = list(self.envs())
+        if len(found) == 1:
+            return found[0]
+        names = ", ".join(f"[{suite!r}][{task!r}]" for suite in self for task in self[suite])
+        raise ValueError(f"there are {len(found)} environments; choose one: {names}")
+
+    def envs(self) -> Iterator[VectorEnv[Any, Any, Any]]:
+        """All environments, suite by suite."""
+        for tasks in self.values():
+            yield from tasks.values()
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """What runs: repository, commit, file hashes, interpreter, packages, protocol, layers."""
+        return self._provenance()
+
+    def close(self) -> None:
+        """Close every environment and end its processes. Idempotent."""
+        try:
+            for env in self.envs():
+                env.close()
+        finally:
+            self._on_close()
+
+    def __enter__(self) -> EnvSuites:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()

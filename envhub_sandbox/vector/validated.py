@@ -1,0 +1,128 @@
+"""Every action and observation held against its space: for whoever tests an environment.
+
+Costs a look at each value. Shapes, dtypes and structures are checked in any case; values are not,
+because many environments leave their own bounds and train all the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector.utils import iterate
+
+from envhub_sandbox.errors import ActionError, ObservationError
+from envhub_sandbox.session.env_session import RemoteEnv
+from envhub_sandbox.session.results import StepResult
+from envhub_sandbox.vector.vector_env import SandboxVectorEnv
+from envhub_worker.protocol.inert import one_line
+from envhub_worker.protocol.spaces import ARRAY_SPACES, OpaqueSpace
+
+_SHOWN = 200
+
+
+class ValidatedVectorEnv(SandboxVectorEnv):
+    """A ``SandboxVectorEnv`` that refuses what its spaces do not hold.
+
+    Raises:
+        ActionError: An action is outside of its space; nothing was sent.
+        ObservationError: An observation is. The environment is still usable.
+    """
+
+    def __init__(self, remote: RemoteEnv) -> None:
+        super().__init__(remote)
+        spaces_of_actions = self.single_action_space, self.action_space
+        # not a method of ours: who holds himself is not closed when nobody else holds him
+        self._read_actions = partial(_read_and_check, self._read_actions, *spaces_of_actions)
+
+    def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
+        """As ``SandboxVectorEnv.reset_wait``, checked."""
+        observations, infos = super().reset_wait(timeout)
+        self._check_batch("reset", observations)
+        return observations, infos
+
+    def step(self, actions: Any) -> StepResult:
+        """As ``SandboxVectorEnv.step``, checked."""
+        return self._checked(super().step(actions))
+
+    def step_wait(self, timeout: float | None = None) -> StepResult:
+        """As ``SandboxVectorEnv.step_wait``, checked."""
+        return self._checked(super().step_wait(timeout))
+
+    def _checked(self, result: StepResult) -> StepResult:
+        self._check_batch("step", result[0])
+        finals = result[4].get("final_obs")
+        if isinstance(finals, np.ndarray) and finals.dtype == object:
+            self._check("the last step of an episode", finals)
+        return result
+
+    def _check_batch(self, operation: str, observations: Any) -> None:
+        with self._remote.repository.named():
+            try:
+                members = list(_members(self.observation_space, observations))
+            except Exception as error:  # a vector environment of the repository's own gave it
+                text = f"{operation} returned no batch of observations for {self.observation_space}"
+                raise ObservationError(text, observation=observations) from error
+        self._check(operation, members)
+
+    def _check(self, operation: str, observations: Iterable[Any]) -> None:
+        space = self.single_observation_space
+        with self._remote.repository.named():
+            for index, observation in enumerate(observations):
+                if observation is not None and not holds(space, observation):
+                    raise ObservationError(
+                        f"{operation} returned an observation outside of its space: "
+                        f"sub-environment {index} gave {_shown(observation)}, which is not in "
+                        f"{space}",
+                        index=index,
+                        observation=observation,
+                    )
+
+
+def holds(space: gym.Space[Any], member: Any) -> bool:
+    """Whether a value is in a space; numbers of another dtype count as what they are worth."""
+    if isinstance(space, OpaqueSpace):
+        return True  # nobody here knows
+    if isinstance(space, spaces.Dict):
+        if not isinstance(member, dict) or member.keys() != space.spaces.keys():
+            return False
+        return all(holds(sub, member[key]) for key, sub in space.spaces.items())
+    if isinstance(space, spaces.Tuple):
+        if not isinstance(member, tuple) or len(member) != len(space.spaces):
+            return False
+        return all(map(holds, space.spaces, member))
+    try:
+        if isinstance(space, ARRAY_SPACES):
+            member = np.asarray(member)
+            if member.dtype != space.dtype and np.can_cast(member.dtype, space.dtype, "same_kind"):
+                member = member.astype(space.dtype)
+        return bool(space.contains(member))
+    except (AttributeError, TypeError, ValueError):
+        return False  # it is nothing of the kind
+
+
+def _read_and_check(
+    read: Callable[[Any], Any], single: gym.Space[Any], batched: gym.Space[Any], actions: Any
+) -> Any:
+    batch = read(actions)
+    for index, action in enumerate(_members(batched, batch)):
+        if not holds(single, action):
+            raise ActionError(
+                f"the action of sub-environment {index} is outside of its space: "
+                f"{_shown(action)} is not in {single}"
+            )
+    return batch
+
+
+def _members(space: gym.Space[Any], batch: Any) -> Iterable[Any]:
+    """One value for each sub-environment."""
+    return batch if isinstance(space, OpaqueSpace) else iterate(space, batch)
+
+
+def _shown(value: Any) -> str:
+    """Trust: it may be the worker's."""
+    return one_line(repr(value), _SHOWN)

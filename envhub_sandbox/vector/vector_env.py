@@ -1,0 +1,425 @@
+"""The Gymnasium face of an environment that lives in a jail. Knows no sockets.
+
+Followed: ``gymnasium.vector.AsyncVectorEnv`` for the calls and their errors, ``SyncVectorEnv`` for
+the results.
+"""
+
+from __future__ import annotations
+
+import html
+import weakref
+from collections.abc import Callable, Sequence
+from typing import Any, cast
+
+import numpy as np
+from gymnasium.error import (
+    AlreadyPendingCallError,
+    ClosedEnvironmentError,
+    NoAsyncCallError,
+)
+from gymnasium.vector import VectorEnv
+
+from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
+from envhub_sandbox.session.env_session import RemoteEnv
+from envhub_sandbox.session.results import StepResult
+from envhub_sandbox.transport.jail import typed
+from envhub_sandbox.vector import from_manifest, generators
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.names import is_servable
+from envhub_worker.protocol.untrusted import UNTRUSTED
+
+Bounds = tuple[int, int]
+
+
+class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
+    """A vector environment whose code runs in a confined process.
+
+    Everything that ``VectorEnv`` has, and ``AsyncVectorEnv``'s ``*_async`` and ``*_wait``. Arrays
+    that it returns belong to the caller: writable, and never changed by a later step. One thread
+    at a time; ``close`` may come from any.
+
+    Attributes:
+        num_envs: Number of sub-environments.
+        closed: Whether ``close`` has been called.
+        metadata: With ``"autoreset_mode"``, as in Gymnasium.
+        sandbox_report: What confines it: one mapping per layer, once it runs.
+    """
+
+    def __init__(self, remote: RemoteEnv) -> None:
+        manifest = remote.manifest
+        self._remote = remote
+        self._manifest = manifest
+        self._timeouts = remote.repository.timeouts
+        self._waiting: str | None = None
+        self._read_actions = from_manifest.action_reader(manifest)
+        self.closed = False
+        self.num_envs = manifest.num_envs
+        self.single_observation_space = manifest.single_observation_space
+        self.single_action_space = manifest.single_action_space
+        self.observation_space = manifest.observation_space
+        self.action_space = manifest.action_space
+        self.metadata = from_manifest.metadata(manifest)
+        self.render_mode = manifest.render_mode
+        self.spec = from_manifest.spec(manifest, remote.repository.label)
+        # a proxy that nobody holds any more must not keep processes alive
+        weakref.finalize(self, remote.close).atexit = False
+
+    def prewarm(self) -> None:
+        """Start its processes now, in the background; returns at once.
+
+        The first ``reset`` then waits only for what is left of that. Without it they start when
+        they are first needed, so that a suite of many tasks costs nothing before it is used: an
+        evaluation can prewarm the next task while it plays one. What fails is raised by the
+        first request.
+        """
+        self._raise_if_closed()
+        self._remote.prewarm()
+
+    # --- reset and step ------------------------------------------------------------------------
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Reset all sub-environments, or those of ``options["reset_mask"]``.
+
+        Args:
+            seed: One seed (sub-environment ``i`` gets ``seed + i``), one each, or None.
+            options: Handed to each sub-environment; ``"reset_mask"`` is bool ``(num_envs,)``.
+
+        Returns:
+            Batched observation ``(num_envs, *single_observation_space.shape)``, and infos.
+
+        Raises:
+            WorkerTimeoutError: Longer than ``Timeouts.reset_s``; call it again.
+            WorkerDiedError: The worker process ended.
+            RemoteEnvError: The environment raised; it is still usable.
+        """
+        self.reset_async(seed=seed, options=options)
+        return self.reset_wait()
+
+    def reset_async(
+        self,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> None:
+        """Send the reset; ``reset_wait`` returns its results."""
+        self._refuse_if_busy("reset_async")
+        options = None if options is None else dict(options)
+        mask = None if options is None else options.pop("reset_mask", None)
+        if mask is not None:
+            from_manifest.check_mask(mask, self.num_envs)
+        seeds = self._seeds(seed)
+        self._recover()
+        sliced = self._manifest.shardable and seeds is not None
+
+        def message(number: int, bounds: Bounds) -> m.Message:  # kept: it must not hold us
+            start, stop = bounds
+            some = seeds[start:stop] if sliced else seeds
+            return m.Reset(number, some, options, None if mask is None else mask[start:stop])
+
+        self._submit("reset", message)
+
+    def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
+        """The results of ``reset_async``; ``timeout`` in seconds, else ``Timeouts.reset_s``."""
+        replies = self._collect("reset", timeout, self._timeouts.reset_s, m.ResetDone)
+        return self._remote.finish_reset(
+            replies, self._timeouts.reset_s if timeout is None else timeout
+        )
+
+    def step(self, actions: Any) -> StepResult:
+        """Step every sub-environment.
+
+        Args:
+            actions: A batch for ``action_space``, as arrays, lists or torch tensors.
+
+        Returns:
+            observations ``(num_envs, *single_observation_space.shape)``, rewards float64
+            ``(num_envs,)``, terminations and truncations bool ``(num_envs,)``, infos.
+
+        Raises:
+            ActionError: A wrong shape or dtype; nothing was sent.
+            WorkerTimeoutError: Longer than ``Timeouts.step_s``; ``reset`` brings it back.
+            WorkerDiedError: The worker process ended.
+            RemoteEnvError: The environment raised; it is still usable.
+        """
+        if self.closed or self._waiting is not None:
+            self._refuse_if_busy("step_async")
+        remote = self._remote  # both halves in one: this is the way that is taken most
+        try:
+            remote.submit_step(self._read_actions(actions))
+            return remote.collect_step(self._timeouts.step_s)
+        except WorkerDiedError:
+            self._raise_if_closed()  # close() in another thread ended it under us
+            raise
+
+    def step_async(self, actions: Any) -> None:
+        """Send the actions; ``step_wait`` returns the results."""
+        self._refuse_if_busy("step_async")
+        batch = self._read_actions(actions)
+        try:
+            self._remote.submit_step(batch)
+        except WorkerDiedError:
+            self._raise_if_closed()
+            raise
+        self._waiting = "step"
+
+    def step_wait(self, timeout: float | None = None) -> StepResult:
+        """The results of ``step_async``; ``timeout`` in seconds, else ``Timeouts.step_s``."""
+        self._end_wait("step")
+        try:
+            return self._remote.collect_step(self._timeouts.step_s if timeout is None else timeout)
+        except WorkerDiedError:
+            self._raise_if_closed()  # close() in another thread ended it under us
+            raise
+
+    # --- everything else -----------------------------------------------------------------------
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Call a method, or read an attribute, of every sub-environment: a tuple of results."""
+        self.call_async(name, *args, **kwargs)
+        return self.call_wait()
+
+    def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
+        """Send the call; ``call_wait`` returns its results."""
+        self._refuse_if_busy("call_async")
+        self._submit("call", lambda number, _: m.Call(number, name, args, kwargs))
+
+    def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
+        """The results of ``call_async``; ``timeout`` in seconds, else ``Timeouts.call_s``."""
+        replies = self._collect("call", timeout, self._timeouts.call_s, m.Value)
+        if not self._manifest.shardable:
+            return cast("tuple[Any, ...]", replies[0].value)
+        with self._remote.handling():
+            return self._remote.results.one_each("call", replies)
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """An attribute of every sub-environment."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of every sub-environment: one value each, or one for all."""
+        each = list(values) if isinstance(values, (list, tuple)) else [values] * self.num_envs
+        if len(each) != self.num_envs:
+            raise ValueError(
+                "Values must be a list or tuple with length equal to the number of environments. "
+                f"Got `{len(each)}` values for {self.num_envs} environments."
+            )
+        self._ask(
+            "set_attr",
+            lambda number, bounds: m.SetAttr(number, name, tuple(each[bounds[0] : bounds[1]])),
+        )
+
+    def render(self) -> tuple[Any, ...] | None:
+        """What each sub-environment renders; None where the environment gives None."""
+        replies = self._ask("render", lambda number, _: m.Render(number))
+        if not self._manifest.shardable:
+            return cast("tuple[Any, ...] | None", replies[0].value)
+        with self._remote.handling():
+            return self._remote.results.one_each("render", replies)
+
+    @property  # type: ignore[misc]  # there is nothing to set, as in SyncVectorEnv
+    def np_random(self) -> Any:
+        """Copies of the generators: ``SyncVectorEnv`` has one for each sub-environment."""
+        replies = self._ask("np_random", lambda number, _: m.GetRandom(number))
+        with UNTRUSTED:  # a generator that numpy does not know breaks no rule of the wire
+            if type(replies[0].value) is dict:
+                return generators.generator(replies[0].value)
+            states = self._remote.results.one_each("np_random", replies)
+            return tuple(generators.generator(state) for state in states)
+
+    @property
+    def np_random_seed(self) -> Any:
+        """Their seeds."""
+        replies = self._ask("np_random_seed", lambda number, _: m.GetOwn(number, "np_random_seed"))
+        if type(replies[0].value) is not tuple:
+            return generators.seeds(replies[0].value)
+        with self._remote.handling():
+            seeds = self._remote.results.one_each("np_random_seed", replies)
+        return generators.seeds(seeds)
+
+    @property
+    def envs(self) -> tuple[SubEnvironment, ...]:
+        """A handle on each sub-environment, to read attributes as ``env.envs[0].task`` does."""
+        return tuple(SubEnvironment(self, index) for index in range(self.num_envs))
+
+    @property
+    def sandbox_report(self) -> list[dict[str, Any]]:
+        """One mapping per layer: ``layer``, ``enforced``, ``detail``. Empty before it runs."""
+        return [dict(layer) for layer in self._remote.repository.report]
+
+    def stats(self) -> dict[str, Any]:
+        """Counters, at any moment, from any thread; asks nothing of the worker.
+
+        Returns:
+            ``requests``, ``steps``, ``timeouts``, ``deaths``, ``restarts`` (after deaths),
+            ``stale_replies``, ``sent_bytes`` and ``received_bytes`` (over both lanes; infos in
+            shared memory are not counted), ``state``, and ``step_latency_s``: from the request to
+            the reply in seconds, ``p50``, ``p90``, ``p99`` and ``max`` of the last 1024 steps, and
+            the ``total`` of all.
+        """
+        return self._remote.stats()
+
+    def close(self, **kwargs: Any) -> None:
+        """Close the sub-environments and end their processes, in bounded time. Idempotent."""
+        self.closed = True
+        self._remote.close()
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """There is nothing beyond ``close``."""
+
+    def __getattr__(self, name: str) -> Any:
+        """An attribute that the repository's vector environment has beyond Gymnasium's."""
+        manifest = self.__dict__.get("_manifest")
+        # Judged once more, whatever the manifest went through: what has a name of ours would be
+        # asked for when a property of that name fails.
+        ours = not is_servable(name) or hasattr(type(self), name)
+        if manifest is None or ours or name not in manifest.attributes:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        self._refuse_if_busy(name)
+        [reply] = self._own("get attribute", m.GetOwn, name)
+        if isinstance(reply, m.Value):
+            return reply.value
+        if not isinstance(reply, m.Method):
+            raise RemoteProtocolError(f"the worker answered GetOwn with {type(reply).__name__}")
+
+        def method(*args: Any, **kwargs: Any) -> Any:
+            self._refuse_if_busy(name)
+            [result] = self._own(name, m.CallOwn, name, args, kwargs)
+            return typed(result, m.Value).value
+
+        return method
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # For copy and deepcopy, too: two environments cannot share processes that either may end.
+        recipe = self._remote.repository.recipe
+        if recipe is None:
+            raise TypeError(f"{self!r} does not know how it was made, so it cannot be pickled")
+        return recipe.make_one, (self._manifest.suite, self._manifest.task)
+
+    def __repr__(self) -> str:
+        return f"SandboxVectorEnv({self._remote.repository.label}, num_envs={self.num_envs})"
+
+    def _repr_html_(self) -> str:
+        return f"<code>{html.escape(repr(self))}</code>"
+
+    __html__ = _repr_html_
+
+    # --- inside --------------------------------------------------------------------------------
+
+    def _recover(self) -> None:
+        try:
+            self._remote.recover()
+        except WorkerDiedError:
+            self._raise_if_closed()  # close() in another thread ended the wait
+            raise
+
+    def _own(self, operation: str, kind: Callable[..., m.Message], *fields: Any) -> list[m.Message]:
+        try:
+            return self._remote.request(
+                operation, lambda number, _: kind(number, *fields), self._timeouts.call_s
+            )
+        except WorkerDiedError:
+            self._raise_if_closed()
+            raise
+
+    def _ask(self, operation: str, message: Callable[[int, Bounds], m.Message]) -> list[m.Value]:
+        self._refuse_if_busy(operation)
+        self._submit(operation, message)
+        return self._collect(operation, None, self._timeouts.call_s, m.Value)
+
+    def _submit(self, operation: str, message: Callable[[int, Bounds], m.Message]) -> None:
+        try:
+            self._remote.submit(operation, message)
+        except WorkerDiedError:
+            self._raise_if_closed()
+            raise
+        self._waiting = operation
+
+    def _collect(
+        self, operation: str, timeout: float | None, default: float | None, kind: type[m.M]
+    ) -> list[m.M]:
+        self._end_wait(operation)
+        try:
+            replies = self._remote.collect(default if timeout is None else timeout)
+        except WorkerDiedError:
+            self._raise_if_closed()  # close() in another thread ended it under us
+            raise
+        with self._remote.handling():
+            return [typed(reply, kind) for reply in replies]
+
+    def _end_wait(self, operation: str) -> None:
+        self._raise_if_closed()
+        if self._waiting != operation:
+            raise NoAsyncCallError(
+                f"Calling `{operation}_wait` without any prior call to `{operation}_async`.",
+                operation,
+            )
+        self._waiting = None
+
+    def _refuse_if_busy(self, name: str) -> None:
+        self._raise_if_closed()
+        if self._waiting is not None:
+            raise AlreadyPendingCallError(
+                f"Calling `{name}` while waiting for a pending call to `{self._waiting}` to "
+                "complete.",
+                self._waiting,
+            )
+
+    def _raise_if_closed(self) -> None:
+        if self.closed:
+            raise ClosedEnvironmentError(
+                f"Trying to operate on `{type(self).__name__}`, after a call to `close()`."
+            )
+
+    def _seeds(self, seed: Any) -> Any:
+        """One seed or None per sub-environment, or None for none at all."""
+        if isinstance(seed, (int, np.integer)):
+            if not self._manifest.shardable:
+                return int(seed)
+            return [int(seed) + index for index in range(self.num_envs)]
+        if seed is None:
+            return None
+        seeds = [None if one is None else int(one) for one in seed]
+        if len(seeds) != self.num_envs:
+            raise ValueError(
+                "If seeds are passed as a list the length must match "
+                f"num_envs={self.num_envs} but got length={len(seeds)}."
+            )
+        return seeds
+
+
+class SubEnvironment:
+    """Reads attributes of one sub-environment: ``env.envs[0].task``, ``hasattr`` included.
+
+    What Gymnasium's environments have is answered here: looking at a method does not run it.
+    """
+
+    def __init__(self, vector: SandboxVectorEnv, index: int) -> None:
+        self._vector = vector
+        self._index = index
+        self.action_space = vector.single_action_space
+        self.observation_space = vector.single_observation_space
+        self.metadata = vector.metadata
+        self.render_mode = vector.render_mode
+        self.spec = vector.spec
+
+    @property
+    def unwrapped(self) -> SubEnvironment:
+        """Itself: wrappers are not told from what they wrap."""
+        return self
+
+    def render(self) -> Any:
+        """What this one renders; the others do, too."""
+        return self._vector.call("render")[self._index]
+
+    def __getattr__(self, name: str) -> Any:
+        """The attribute; methods are called without arguments, as ``get_attr`` does."""
+        if not is_servable(name):
+            raise AttributeError(f"a sub-environment shows no {name!r}; ask the vector environment")
+        return self._vector.get_attr(name)[self._index]
+
+    def __repr__(self) -> str:
+        return f"<sub-environment {self._index} of {self._vector!r}>"
