@@ -16,9 +16,9 @@ import numpy as np
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.manifest import EnvManifest
-from envhub_worker.protocol.spaces import ARRAY_SPACES
+from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
 
 HISTORY_BYTES = 8 << 20
 """Memory that the history of one environment takes at most."""

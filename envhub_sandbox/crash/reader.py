@@ -22,7 +22,7 @@ from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.policy import Limits, Policy
 from envhub_sandbox.transport.tensors import to_tensor
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.slabs import DTYPE_CODES
+from envhub_worker.protocol.shared_memory.slabs import DTYPE_CODES
 from envhub_worker.protocol.stream import PacketReader
 from envhub_worker.protocol.text import printable
 from envhub_worker.protocol.untrusted import FAULTS

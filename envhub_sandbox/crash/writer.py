@@ -37,8 +37,8 @@ from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.policy import Policy, Timeouts
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec import Buffer
-from envhub_worker.protocol.inert import describe, one_line
+from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.codec.inert import describe, one_line
 from envhub_worker.protocol.stream import pack_packet
 from envhub_worker.protocol.text import printable
 

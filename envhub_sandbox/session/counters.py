@@ -15,8 +15,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from envhub_worker.protocol import slabs
 from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.shared_memory import slabs
 
 KEPT = 1024
 """Step latencies that are kept: the last ones. A power of two."""

@@ -27,10 +27,10 @@ from envhub_sandbox.session.results import StepResult
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import HostsDiedError, check, typed
 from envhub_sandbox.transport.shared_memory.lane import JailGoneError, Outcome
-from envhub_worker.protocol import batches
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.lifecycle import Event, State
+from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.untrusted import blamed, is_fault
 
 _GRACE_S = 2.0

@@ -13,10 +13,11 @@ from envhub_sandbox.session.placement import Place
 from envhub_sandbox.session.results import Results
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.shared_memory.lane import Outcome
-from envhub_worker.protocol import batches, slabs
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.shared_memory import slabs
+from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import pack_packet
 from envhub_worker.protocol.untrusted import UNTRUSTED
 

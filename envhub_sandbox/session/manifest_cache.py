@@ -20,7 +20,7 @@ from envhub_sandbox.policy import Policy
 from envhub_sandbox.transport.shared_memory.sharding import PaceBook
 from envhub_worker import protocol
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec import encode
+from envhub_worker.protocol.codec.codec import encode
 from envhub_worker.protocol.manifest import Manifest, decode_manifest
 from envhub_worker.protocol.stream import PacketReader, pack_packet
 

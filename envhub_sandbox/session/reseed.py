@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.codec.codec import Buffer
 
 RESTARTED = "worker_restarted"
 """In the infos: whether a sub-environment was lost and came back reset."""

@@ -10,11 +10,12 @@ import numpy as np
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, remote_error
 from envhub_sandbox.transport.jail import check, typed
 from envhub_sandbox.transport.shared_memory.lane import LaneShard, Outcome
-from envhub_worker.protocol import batches, slabs
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.inert import one_line
+from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.shared_memory import slabs
+from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.untrusted import FAULTS
 
 _SHOWN = 500

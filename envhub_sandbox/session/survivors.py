@@ -12,9 +12,9 @@ from envhub_sandbox.session.results import Results
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import HostsDiedError, typed
 from envhub_sandbox.transport.shared_memory.lane import Outcome
-from envhub_worker.protocol import batches
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.spaces import batches
 
 _CAUSE_S = 10.0
 

@@ -21,9 +21,9 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.tcp import Far, Link
+from envhub_worker.protocol import compression
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol import packing
-from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimits
 from envhub_worker.protocol.text import printable
 from envhub_worker.protocol.untrusted import UNTRUSTED
@@ -121,9 +121,9 @@ class WorkerClient:
                 f"the worker speaks protocol {self.version}, and a server on another host needs "
                 f"{_FAR_VERSION}: upgrade the worker"
             )
-        reply, _ = self.request(m.Agree(packing.available()), deadline=deadline)
+        reply, _ = self.request(m.Agree(compression.available()), deadline=deadline)
         agreed = expect(reply, m.Agreed)
-        if agreed.compression not in ("", *packing.available()):
+        if agreed.compression not in ("", *compression.available()):
             raise RemoteProtocolError("the worker chose a compression that was not offered")
         self._compression, self.patience_s = agreed.compression, agreed.idle_s
 
@@ -149,7 +149,7 @@ class WorkerClient:
         if self._link is not None:
             self._sent[request_id] = self._link.next_number(), frames
             if self._compression:
-                travelling = packing.pack_frames(frames, self._compression)
+                travelling = compression.pack_frames(frames, self._compression)
         size = sum(map(len, travelling))
         self._put(travelling, copy=size < LARGE_BYTES)
         self.sent_bytes += size
@@ -170,7 +170,7 @@ class WorkerClient:
             self.received_bytes += sum(map(len, frames))
             if self._link is not None:
                 with UNTRUSTED:
-                    frames = packing.unpack_frames(frames, self._limits)
+                    frames = compression.unpack_frames(frames, self._limits)
             reply_id, reply = m.unpack(frames[:1], limits=self._limits)
             if reply_id != request_id:
                 self._sent.pop(reply_id, None)

@@ -21,8 +21,8 @@ from envhub_sandbox.transport.connection import WorkerClient, death, expect
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.tensors import to_tensor
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec import Buffer
-from envhub_worker.protocol.inert import one_line
+from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.limits import WireLimits
 from envhub_worker.protocol.text import printable
 from envhub_worker.protocol.untrusted import UNTRUSTED

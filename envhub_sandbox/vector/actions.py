@@ -16,8 +16,8 @@ import numpy as np
 from gymnasium import spaces
 
 from envhub_sandbox.errors import ActionError
-from envhub_worker.protocol.slabs import DTYPE_CODES
-from envhub_worker.protocol.spaces import ARRAY_SPACES
+from envhub_worker.protocol.shared_memory.slabs import DTYPE_CODES
+from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
 
 _INTEGERS = frozenset("iub")
 _NUMBERS = frozenset("fiub")

@@ -14,7 +14,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from envhub_sandbox.vector.actions import ActionReader
 from envhub_worker.protocol.manifest import EnvManifest
-from envhub_worker.protocol.spaces import OpaqueSpace
+from envhub_worker.protocol.spaces.spaces import OpaqueSpace
 
 
 def action_reader(manifest: EnvManifest) -> Callable[[Any], Any]:

@@ -19,8 +19,8 @@ from envhub_sandbox.errors import ActionError, ObservationError
 from envhub_sandbox.session.env_session import RemoteEnv
 from envhub_sandbox.session.results import StepResult
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
-from envhub_worker.protocol.inert import one_line
-from envhub_worker.protocol.spaces import ARRAY_SPACES, OpaqueSpace
+from envhub_worker.protocol.codec.inert import one_line
+from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES, OpaqueSpace
 
 _SHOWN = 200
 

@@ -24,7 +24,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.manifest import EnvManifest, Manifest, encode_env, encode_manifest
 
 Frames = list[Buffer]

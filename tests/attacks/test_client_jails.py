@@ -25,7 +25,7 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.codec.codec import Buffer
 from tests.attacks.harness import TIMEOUTS, Arena
 from tests.attacks.lying_server import step_done
 from tests.attacks.test_client_lies import Canary, peak_growth

@@ -26,8 +26,8 @@ from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerError,
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest import encode_env
-from envhub_worker.protocol.opaque import MAX_SPACE_DEPTH
-from envhub_worker.protocol.spaces import decode_space, encode_space
+from envhub_worker.protocol.spaces.opaque import MAX_SPACE_DEPTH
+from envhub_worker.protocol.spaces.spaces import decode_space, encode_space
 from tests.attacks.lying_server import (
     NUM_ENVS,
     Asked,

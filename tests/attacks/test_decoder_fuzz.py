@@ -21,9 +21,9 @@ from gymnasium import spaces
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from envhub_worker.protocol.codec import Buffer, RemoteObject, decode, encode
+from envhub_worker.protocol.codec.codec import Buffer, RemoteObject, decode, encode
 from envhub_worker.protocol.errors import RemoteProtocolError
-from envhub_worker.protocol.spaces import decode_space, encode_space
+from envhub_worker.protocol.spaces.spaces import decode_space, encode_space
 from tests.attacks import decoder_bombs
 from tests.attacks.decoder_bombs import ACCEPTED, MIB, REFUSED
 from tests.support.wire import ext, message, packed

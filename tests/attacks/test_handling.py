@@ -27,9 +27,10 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.session import results
 from envhub_sandbox.vector.suites import EnvSuites
-from envhub_worker.protocol import batches, untrusted
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol import untrusted
 from envhub_worker.protocol.manifest import Manifest, encode_env, encode_manifest
+from envhub_worker.protocol.spaces import batches
 from tests.attacks.lying_server import (
     NUM_ENVS,
     Asked,

@@ -15,7 +15,7 @@ from gymnasium.vector import VectorEnv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envhub_worker.protocol.batches import join_infos
+from envhub_worker.protocol.spaces.batches import join_infos
 from tests.support.compare import assert_same
 
 VALUES: dict[str, st.SearchStrategy[Any]] = {

@@ -11,7 +11,7 @@ from envhub_sandbox.session.results import Results
 from envhub_sandbox.transport.shared_memory.lane import LaneShard
 from envhub_sandbox.transport.shared_memory.observations import ObservationSlab
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol import slabs
+from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.stream import pack_packet
 from envhub_worker.protocol.untrusted import UNTRUSTED
 from tests.attacks.lying_server import env_manifest

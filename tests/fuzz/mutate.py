@@ -9,9 +9,9 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from envhub_worker.protocol.codec import decode, encode
+from envhub_worker.protocol.codec.codec import decode, encode
+from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
 from envhub_worker.protocol.errors import ProtocolError
-from envhub_worker.protocol.inert import RemoteEnum, RemoteObject
 from envhub_worker.protocol.limits import WireLimits
 
 SMALL = WireLimits(items=20_000, header_bytes=1 << 20)

@@ -20,12 +20,13 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import HostsDiedError, RemoteJail, check, open_jail
 from envhub_sandbox.vector import from_manifest
 from envhub_sandbox.vector.generators import generator
-from envhub_worker.protocol import batches, columns
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec import decode
+from envhub_worker.protocol.codec.codec import decode
+from envhub_worker.protocol.compression import pack_frames, unpack_frames
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.manifest import decode_env, decode_manifest
-from envhub_worker.protocol.packing import pack_frames, unpack_frames
+from envhub_worker.protocol.shared_memory import columns
+from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import PacketReader, pack_packet
 from envhub_worker.protocol.untrusted import UNTRUSTED
 from tests.attacks.lying_server import env_manifest

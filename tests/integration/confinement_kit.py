@@ -16,9 +16,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from envhub_worker.jailspec import JailSpec
+from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.confinement import Confinement
-from envhub_worker.spawner import (
+from envhub_worker.spawn.jail_handle import (
     HostExited,
     HostStarted,
     Jail,

@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 
 from envhub_worker.protocol.confinement import Confinement
-from envhub_worker.spawner import Failed
+from envhub_worker.spawn.jail_handle import Failed
 from tests.integration.confinement_kit import (
     KIT,
     Cell,

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from envhub_worker.lockdown import cgroups
+from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.protocol.confinement import MIB, Confinement, Limits
 from tests.integration.confinement_kit import (
     Cell,

@@ -11,7 +11,7 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvError
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_worker.protocol import slabs
+from envhub_worker.protocol.shared_memory import slabs
 from tests.support.compare import assert_same
 
 REPOSITORY = '''

@@ -16,7 +16,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import ActionError, ObservationError, PolicyError
 from envhub_sandbox.vector.validated import holds
 from envhub_worker.protocol.lifecycle import State
-from envhub_worker.protocol.spaces import OpaqueSpace
+from envhub_worker.protocol.spaces.spaces import OpaqueSpace
 from tests.support import inside
 from tests.support.repositories import write_repository
 from tests.support.samples import sample

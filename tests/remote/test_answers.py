@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_worker import keys
+from envhub_worker.access import keys
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from tests.remote.listening import Listening

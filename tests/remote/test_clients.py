@@ -15,8 +15,8 @@ import zmq
 from envhub_sandbox import make_env
 from envhub_sandbox.transport.connection import far_session
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_worker import keys
-from envhub_worker.keys import KeyPair
+from envhub_worker.access import keys
+from envhub_worker.access.keys import KeyPair
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.keys import key_text

@@ -18,10 +18,11 @@ from zmq.utils import z85
 
 from envhub_sandbox import RemoteSandbox, make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
-from envhub_worker import keys, listen
-from envhub_worker.keys import AuthorizedClients
+from envhub_worker.access import keys
+from envhub_worker.access.keys import AuthorizedClients
+from envhub_worker.access.rate_limited_log import LINES, Log
+from envhub_worker.cli import listen
 from envhub_worker.protocol.keys import key_text, parse_key
-from envhub_worker.refusals import LINES, Log
 from tests.remote.listening import WORKER, Listening, listening
 from tests.support import inside
 
@@ -83,7 +84,7 @@ def test_a_container_without_landlock_permits_no_weak_profile_by_itself(
 ) -> None:
     """A jail of the profile ``container`` is the server's user: it would read every store."""
     monkeypatch.setattr(*inside.CONTAINER_MARKS, ("/",))
-    monkeypatch.setattr("envhub_worker.lockdown.landlock.version", lambda: abi)
+    monkeypatch.setattr("envhub_worker.lockdown.mechanisms.landlock.version", lambda: abi)
     parser = argparse.ArgumentParser()
     listen.add_arguments(parser)
     assert parser.parse_args([]).weakest_profile == default
@@ -103,7 +104,7 @@ def test_without_landlock_a_weak_profile_is_for_one_client(
         ["--weakest-profile", "container", "--authorized-clients", str(path)]
     )
     identity = listen.Identity(keys.generate(), path)
-    monkeypatch.setattr("envhub_worker.lockdown.landlock.version", lambda: 0)
+    monkeypatch.setattr("envhub_worker.lockdown.mechanisms.landlock.version", lambda: 0)
     with pytest.raises(ValueError, match="without Landlock"):
         inside.gate_of(options, tmp_path, identity)
     path.write_text(f"{one}\n")
@@ -113,7 +114,7 @@ def test_without_landlock_a_weak_profile_is_for_one_client(
     with pytest.raises(ValueError, match="2 clients"):
         few.refresh()
     assert few.name_of(parse_key(other)) is None
-    monkeypatch.setattr("envhub_worker.lockdown.landlock.version", lambda: 1)
+    monkeypatch.setattr("envhub_worker.lockdown.mechanisms.landlock.version", lambda: 1)
     inside.gate_of(options, tmp_path, identity)
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import make_env
+from envhub_worker.protocol import compression
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol import packing
 from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
 from envhub_worker.protocol.limits import WireLimits
 from tests.remote.listening import Listening
@@ -26,16 +26,16 @@ def test_what_is_packed_is_the_same_again() -> None:
     """Small and noisy frames travel as they are, beside one that shrinks."""
     array = np.zeros((64, 64, 3), np.float32)
     frames = [b"header", SMOOTH, NOISE, memoryview(array)]
-    packed = packing.pack_frames(frames, "lz4")
+    packed = compression.pack_frames(frames, "lz4")
     assert sum(memoryview(frame).nbytes for frame in packed) < len(NOISE) + 20_000
-    assert packing.unpack_frames(packed, LIMITS) == [b"header", SMOOTH, NOISE, array.tobytes()]
+    assert compression.unpack_frames(packed, LIMITS) == [b"header", SMOOTH, NOISE, array.tobytes()]
 
 
-@pytest.mark.parametrize("frames", [[b"small"], [NOISE], [bytes(packing.SMALLEST - 1)]])
+@pytest.mark.parametrize("frames", [[b"small"], [NOISE], [bytes(compression.SMALLEST - 1)]])
 def test_what_does_not_pay_is_left_alone(frames: list[bytes]) -> None:
     """Not even a header is added."""
-    assert packing.pack_frames(frames, "lz4") == frames
-    assert packing.pack_frames(frames, "") == frames
+    assert compression.pack_frames(frames, "lz4") == frames
+    assert compression.pack_frames(frames, "") == frames
 
 
 def packed_by_hand(sizes: tuple[int, ...], *bodies: bytes, name: str = "lz4") -> list[bytes]:
@@ -60,7 +60,7 @@ def packed_by_hand(sizes: tuple[int, ...], *bodies: bytes, name: str = "lz4") ->
 def test_a_lie_about_a_size_is_refused(frames: list[bytes], error: type[Exception]) -> None:
     """Before anything of that size is allocated, and never as another message."""
     with pytest.raises(error):
-        packing.unpack_frames(frames, LIMITS)
+        compression.unpack_frames(frames, LIMITS)
 
 
 def test_images_take_less_of_a_wire_than_they_hold(server: Listening, tmp_path: Path) -> None:

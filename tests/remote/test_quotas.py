@@ -11,10 +11,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, WorkerError
-from envhub_worker.entries import Asker
-from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.confinement import Confinement
-from envhub_worker.quotas import (
+from envhub_worker.access.quotas import (
     InFlight,
     Permissions,
     Quotas,
@@ -23,7 +20,10 @@ from envhub_worker.quotas import (
     check_jail,
     check_policy,
 )
-from envhub_worker.sessions import MAX_HELD, Sessions
+from envhub_worker.access.sessions import MAX_HELD, Sessions
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.confinement import Confinement
+from envhub_worker.supervisor.records import Asker
 from tests.remote.listening import Listening, listening
 from tests.support.processes import eventually
 from tests.support.samples import sample

@@ -20,18 +20,19 @@ import zmq
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerError
-from envhub_worker import keys, listen
-from envhub_worker.doorman import Doorman
-from envhub_worker.entries import Asker
-from envhub_worker.gate import RemoteGate, Rules
-from envhub_worker.keys import AuthorizedClients
+from envhub_worker.access import keys
+from envhub_worker.access.connection_limit import Doorman
+from envhub_worker.access.gate import RemoteGate, Rules
+from envhub_worker.access.keys import AuthorizedClients
+from envhub_worker.access.quotas import Permissions, Quotas, RefusedError
+from envhub_worker.access.rate_limited_log import LINES, PERIOD_S, Log
+from envhub_worker.access.sessions import Sessions
+from envhub_worker.access.uploads import Uploads
+from envhub_worker.cli import listen
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import key_text
-from envhub_worker.quotas import Permissions, Quotas, RefusedError
-from envhub_worker.refusals import LINES, PERIOD_S, Log
-from envhub_worker.sessions import Sessions
-from envhub_worker.uploads import Uploads
+from envhub_worker.supervisor.records import Asker
 from tests.remote.listening import Listening, listening
 from tests.remote.relay import relay
 from tests.support import inside

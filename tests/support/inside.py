@@ -28,15 +28,15 @@ from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RemoteJail
 from envhub_sandbox.transport.shared_memory.lane import FastLane
-from envhub_worker import listen
-from envhub_worker.doorman import Doorman
-from envhub_worker.gate import RemoteGate
-from envhub_worker.lockdown import cgroups
+from envhub_worker.access.connection_limit import Doorman
+from envhub_worker.access.gate import RemoteGate
+from envhub_worker.cli import listen
+from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.lifecycle import Lifecycle, State
 from envhub_worker.protocol.manifest import EnvManifest
-from envhub_worker.spawner import Spawner
+from envhub_worker.spawn.jail_handle import Spawner
 
 Spot = tuple[Any, str]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import msgpack
 
-from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.codec.codec import Buffer
 
 
 def message(document: bytes, tail: bytes = b"", *frames: bytes) -> list[Buffer]:

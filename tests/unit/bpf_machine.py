@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 
-from envhub_worker.lockdown.bpf import Instruction
+from envhub_worker.lockdown.seccomp.bpf import Instruction
 
 
 def run(program: Sequence[Instruction], arch: int, number: int, args: Sequence[int] = ()) -> int:

@@ -12,8 +12,8 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array,
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envhub_worker.protocol import batches
 from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
+from envhub_worker.protocol.spaces import batches
 from tests.support.compare import assert_same
 
 NODES = spaces.Graph(spaces.Box(-1, 1, (2,)), spaces.Discrete(3))

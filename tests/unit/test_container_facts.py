@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from envhub_worker import container, health
+from envhub_worker.cli import health
+from envhub_worker.lockdown import surroundings
 
 
 def layers(*names: str) -> list[dict[str, object]]:
@@ -33,12 +34,12 @@ def test_the_strongest_profile_is_the_one_whose_layers_are_there(
     there: tuple[str, ...], abi: int, expected: str
 ) -> None:
     """A single missing layer costs the profiles that name it."""
-    assert container.profiles(layers(*there), abi)[0] == expected
+    assert surroundings.profiles(layers(*there), abi)[0] == expected
 
 
 def test_without_a_system_call_filter_there_is_no_profile() -> None:
     """Nothing would keep the stranger from the server."""
-    assert container.profiles(layers("user-namespace", "landlock"), 7) == []
+    assert surroundings.profiles(layers("user-namespace", "landlock"), 7) == []
 
 
 def test_limits_are_read_from_either_kind_of_control_group(tmp_path: Path) -> None:
@@ -53,10 +54,10 @@ def test_limits_are_read_from_either_kind_of_control_group(tmp_path: Path) -> No
     (one / "cpu/cpu.cfs_quota_us").write_text("150000\n")
     (one / "cpu/cpu.cfs_period_us").write_text("100000\n")
     for root in (two, one):
-        assert container.memory_limit(root) == 1000
-        assert container.pids_limit(root) == 7
-        assert container.cpus_limit(root) == 1.5
-    for read in (container.memory_limit, container.pids_limit, container.cpus_limit):
+        assert surroundings.memory_limit(root) == 1000
+        assert surroundings.pids_limit(root) == 7
+        assert surroundings.cpus_limit(root) == 1.5
+    for read in (surroundings.memory_limit, surroundings.pids_limit, surroundings.cpus_limit):
         assert read(none) is None
 
 
@@ -71,19 +72,19 @@ def test_no_limit_is_not_read_as_one(tmp_path: Path) -> None:
     (tmp_path / "one/cpu/cpu.cfs_quota_us").write_text("-1")
     (tmp_path / "one/cpu/cpu.cfs_period_us").write_text("100000")
     for root in (tmp_path / "two", tmp_path / "one"):
-        for read in (container.memory_limit, container.pids_limit, container.cpus_limit):
+        for read in (surroundings.memory_limit, surroundings.pids_limit, surroundings.cpus_limit):
             assert read(root) is None
 
 
 def test_the_network_is_what_the_kernel_lists() -> None:
     """Two lines of head, then a device a line."""
     table = "Inter-|   Receive\n face |bytes\n    lo:  0 0\n  eth0: 12 3\n"
-    assert container.network_devices(table) == ["lo", "eth0"]
+    assert surroundings.network_devices(table) == ["lo", "eth0"]
 
 
 def test_the_announcement_is_one_line_of_json() -> None:
     """The client reads one line and no more."""
-    said = container.announcement()
+    said = surroundings.announcement()
     assert "\n" not in said
     assert {"envhub-worker", "profiles", "devices", "memory", "user"} <= set(json.loads(said))
 

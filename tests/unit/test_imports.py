@@ -23,7 +23,7 @@ CLIENTS_OWN = {
 }
 # used where they are installed, and only there
 OPTIONAL = {
-    "envhub_worker.protocol.packing": {"lz4"},
+    "envhub_worker.protocol.compression": {"lz4"},
     "envhub_sandbox.metrics": {"prometheus_client"},
     "envhub_sandbox.transport.tensors": {"torch"},
     "envhub_sandbox.cli.rollout.video": {"imageio_ffmpeg"},
@@ -46,8 +46,8 @@ IGNORANT = {
 }
 # what a jail is for, what it is permitted, and the way to tell its init
 LOCKDOWN_KNOWS = {
-    *("envhub_worker.channel", "envhub_worker.jailspec"),
-    "envhub_worker.protocol.confinement",
+    *("envhub_worker", "envhub_worker.channel", "envhub_worker.protocol.confinement"),
+    *("envhub_worker.protocol.errors", "envhub_worker.protocol.limits"),
 }
 WITHOUT_IO = {"asyncio", "multiprocessing", "os", "select", "socket", "subprocess", "zmq"}
 ZEROMQ = {
@@ -60,11 +60,11 @@ ZEROMQ = {
     "envhub_worker.multipart",
     # sockets, keys and handshakes of clients on other hosts
     *(
-        "envhub_worker.gate",
-        "envhub_worker.keys",
-        "envhub_worker.zap",
-        "envhub_worker.asking",
-        "envhub_worker.doorman",
+        "envhub_worker.access.gate",
+        "envhub_worker.access.keys",
+        "envhub_worker.access.zap",
+        "envhub_worker.cli.status",
+        "envhub_worker.access.connection_limit",
     ),
 }
 # who runs code by a name that is not written in its source, and whose code that is
@@ -72,9 +72,9 @@ IMPORTERS = {
     "envhub_sandbox": "our own public names",
     "envhub_sandbox.sandboxes.inprocess": "the repository's, where sandbox=None trusts it",
     "envhub_worker.bootstrap": "our own programs",
-    "envhub_worker.jail.loader": "the repository's",
-    "envhub_worker.launch": "the program of a host, which the server names",
-    "envhub_worker.zygote": "a list of our own",
+    "envhub_worker.runner.loader": "the repository's",
+    "envhub_worker.spawn.runner_entry": "the program of a host, which the server names",
+    "envhub_worker.spawn.zygote": "a list of our own",
 }
 
 # where tests and benchmarks may name what starts with an underscore, and others' names that they do
@@ -148,7 +148,7 @@ def foreign(package: str, own: set[str]) -> list[tuple[str, str]]:
 def test_both_packages_are_seen() -> None:
     """The walk below finds something to look at."""
     names = set(modules())
-    assert {"envhub_sandbox.api", "envhub_worker.server", "envhub_worker.jail.loader"} <= names
+    assert {"envhub_sandbox.api", "envhub_worker.server", "envhub_worker.runner.loader"} <= names
 
 
 def test_worker_is_self_contained() -> None:
@@ -204,7 +204,7 @@ def test_nobody_imports_the_jail() -> None:
         (name, target)
         for package in ("envhub_sandbox", "envhub_worker")
         for name, target in arrows(package)
-        if below(target, "envhub_worker.jail") and not below(name, "envhub_worker.jail")
+        if below(target, "envhub_worker.runner") and not below(name, "envhub_worker.runner")
     ]
     assert wrong == []
 
@@ -256,7 +256,7 @@ def test_zeromq_is_one_module_on_each_side() -> None:
 
 def test_nothing_unpickles_but_the_jail() -> None:
     """There is one ``loads`` of anything but JSON in the whole tree, and it is in the jail."""
-    assert list(loaders()) == [("envhub_worker.jail.host", "cloudpickle.loads")]
+    assert list(loaders()) == [("envhub_worker.runner.runner", "cloudpickle.loads")]
 
 
 _LOADERS = ("load", "loads", "Unpickler")
@@ -292,7 +292,7 @@ def test_no_deserialiser_is_imported() -> None:
     ]
     assert found == []
     users = {name for name in modules() if "cloudpickle" in imported(name)}
-    assert users == {"envhub_sandbox.transport.jail", "envhub_worker.jail.host"}
+    assert users == {"envhub_sandbox.transport.jail", "envhub_worker.runner.runner"}
 
 
 def test_only_the_loader_imports_by_computed_names() -> None:

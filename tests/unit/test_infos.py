@@ -10,10 +10,11 @@ from gymnasium.vector import VectorEnv
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envhub_worker.jail.infos import InfoWriter, join
-from envhub_worker.protocol import batches, slabs
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.columns import columns_of
+from envhub_worker.protocol.shared_memory import slabs
+from envhub_worker.protocol.shared_memory.columns import columns_of
+from envhub_worker.protocol.spaces import batches
+from envhub_worker.runner.infos import InfoWriter, join
 from tests.support.compare import assert_same
 
 SCALARS = st.one_of(

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from envhub_worker.jailspec import confinement_from_wire
+from envhub_worker.lockdown.spec import confinement_from_wire
 from envhub_worker.protocol.confinement import Confinement, Limits
 from envhub_worker.protocol.errors import RemoteProtocolError
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envhub_worker.lockdown.bpf import (
+from envhub_worker.lockdown.seccomp.bpf import (
     JUMP_EQUAL,
     JUMP_GREATER,
     LOAD,

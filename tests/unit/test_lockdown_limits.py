@@ -11,16 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from envhub_worker.lockdown import cgroups, watchdog
-from envhub_worker.lockdown.cgroups import Group, Hierarchy, Tree
-from envhub_worker.lockdown.environment import jail_environment, zygote_environment
-from envhub_worker.lockdown.scratch import remove_tree
-from envhub_worker.lockdown.watchdog import (
+from envhub_worker.lockdown.limits import cgroups, watchdog
+from envhub_worker.lockdown.limits.cgroups import Group, Hierarchy, Tree
+from envhub_worker.lockdown.limits.watchdog import (
     MemoryWatch,
     folder_usage,
     seconds_to_next_look,
     unlinked_bytes,
 )
+from envhub_worker.lockdown.mechanisms.environment import jail_environment, zygote_environment
+from envhub_worker.lockdown.mechanisms.scratch import remove_tree
 from envhub_worker.protocol.confinement import GIB, MIB, Limits
 from tests.support import inside
 
@@ -227,7 +227,7 @@ def test_sockets_that_nobody_has_count_in_a_network_of_their_own() -> None:
     script = (
         "import os, socket\n"
         "from envhub_worker.lockdown import kernel\n"
-        "from envhub_worker.lockdown.watchdog import MemoryWatch, socket_bytes\n"
+        "from envhub_worker.lockdown.limits.watchdog import MemoryWatch, socket_bytes\n"
         "kernel.unshare(kernel.CLONE_NEWUSER | kernel.CLONE_NEWNET)\n"
         "watch = MemoryWatch(2**62, None, own_network=True)\n"
         "before = watch.look([os.getpid()])[0]\n"

@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import pytest
 
-from envhub_worker.lockdown import landlock, rlimits
-from envhub_worker.lockdown.landlock import Ruleset
-from envhub_worker.lockdown.namespaces import user_namespace_unavailable
+from envhub_worker.lockdown.limits import rlimits
+from envhub_worker.lockdown.mechanisms import landlock
+from envhub_worker.lockdown.mechanisms.landlock import Ruleset
+from envhub_worker.lockdown.mechanisms.namespaces import user_namespace_unavailable
 from envhub_worker.lockdown.plan import HostFacts, plan
 from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.protocol.confinement import GIB, MIB, Confinement, Limits

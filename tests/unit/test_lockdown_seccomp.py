@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from envhub_worker.lockdown import bpf, seccomp
-from envhub_worker.lockdown.bpf import Instruction
 from envhub_worker.lockdown.report import LayerUnavailableError
-from envhub_worker.lockdown.seccomp_policy import (
+from envhub_worker.lockdown.seccomp import bpf, filter
+from envhub_worker.lockdown.seccomp.bpf import Instruction
+from envhub_worker.lockdown.seccomp.policy import (
     ALLOW,
     ASK,
     EINVAL,
@@ -23,7 +23,7 @@ from envhub_worker.lockdown.seccomp_policy import (
     ByArguments,
     table,
 )
-from envhub_worker.lockdown.syscalls import NUMBERS
+from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
 from tests.unit.bpf_machine import run
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -42,7 +42,7 @@ class Filter:
 
     def __init__(self, machine: str, namespaced: bool, network: str = "none") -> None:
         self.machine = machine
-        self.program: Sequence[Instruction] = seccomp.program(
+        self.program: Sequence[Instruction] = filter.program(
             machine, table(namespaced=namespaced, network=network)
         )
 
@@ -56,7 +56,7 @@ class Filter:
 def test_program_is_the_golden_one(machine: str, namespaced: bool, network: str) -> None:
     """Any change of the compiled program shows in a review."""
     name = f"seccomp-{machine}-{'namespaced' if namespaced else 'bare'}-{network}.txt"
-    program = seccomp.program(machine, table(namespaced=namespaced, network=network))
+    program = filter.program(machine, table(namespaced=namespaced, network=network))
     assert bpf.listing(program) == (GOLDEN / name).read_text()
 
 
@@ -77,7 +77,7 @@ def test_every_number_gets_the_verdict_of_the_table(
 ) -> None:
     """The search tree agrees with the table for every number to well above the highest."""
     verdicts = table(namespaced=namespaced, network=network)
-    program = seccomp.program(machine, verdicts)
+    program = filter.program(machine, verdicts)
     names = {number: name for name, number in NUMBERS[machine].items()}
     for number in range(600):
         verdict = verdicts.get(names.get(number, ""), EPERM if number in names else ENOSYS)
@@ -151,7 +151,7 @@ def test_socket_families_without_network(machine: str, namespaced: bool) -> None
 def test_local_sockets_end_where_the_hosts_abstract_names_begin(machine: str) -> None:
     """On the host's network, with a Landlock that does not keep them out of reach."""
     verdicts = table(namespaced=True, network="host", scoped=False)
-    program = seccomp.program(machine, verdicts)
+    program = filter.program(machine, verdicts)
 
     def verdict(name: str, *args: int) -> int:
         return run(program, ARCH[machine], NUMBERS[machine][name], args)
@@ -286,7 +286,7 @@ def test_memory_out_of_sight_is_denied_where_it_is_measured(machine: str) -> Non
     """Files without a name, and shared memory but for a little; mapped files are what they were."""
     counted = Filter(machine, True)
     verdicts = table(namespaced=True, network="none", measured=True)
-    program = seccomp.program(machine, verdicts)
+    program = filter.program(machine, verdicts)
 
     def measured(name: str, *args: int) -> int:
         return run(program, ARCH[machine], NUMBERS[machine][name], args)
@@ -313,7 +313,7 @@ def test_memory_out_of_sight_is_denied_where_it_is_measured(machine: str) -> Non
 def test_signals_are_handed_to_init_where_it_sends_them(machine: str) -> None:
     """All that name a process; what has no broker is denied, or falls back."""
     verdicts = table(namespaced=False, network="none", brokered=True)
-    program = seccomp.program(machine, verdicts)
+    program = filter.program(machine, verdicts)
     numbers = NUMBERS[machine]
     answers = {
         name: run(program, ARCH[machine], numbers[name], (1, 15))
@@ -339,4 +339,4 @@ def test_only_plain_nodes_are_made(machine: str) -> None:
 def test_unknown_machine_is_refused() -> None:
     """No table, no jail."""
     with pytest.raises(LayerUnavailableError, match="riscv64"):
-        seccomp.program("riscv64", {})
+        filter.program("riscv64", {})

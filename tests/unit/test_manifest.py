@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envhub_worker.protocol.codec import decode, encode
+from envhub_worker.protocol.codec.codec import decode, encode
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import MAX_NUM_ENVS
 from envhub_worker.protocol.manifest import (

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec import encode
+from envhub_worker.protocol.codec.codec import encode
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
 from tests.support.compare import assert_same
 from tests.support.wire import deep

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from envhub_sandbox.errors import RemoteEnvError, RemoteProtocolError, remote_error
 from envhub_sandbox.vector import from_manifest, generators
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
-from envhub_worker.protocol.codec import decode, encode
+from envhub_worker.protocol.codec.codec import decode, encode
+from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
 from envhub_worker.protocol.facts import MAX_METADATA, read_metadata, read_spec
-from envhub_worker.protocol.inert import RemoteEnum, RemoteObject
 from envhub_worker.protocol.names import GYMNASIUMS, PROBED, is_servable
 from tests.support.curious import names_asked_for
 from tests.support.protocol_names import names_that_libraries_call

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from envhub_worker.protocol import arrays
-from envhub_worker.protocol.arrays import ArrayReader, ArrayWriter
+from envhub_worker.protocol.codec import arrays
+from envhub_worker.protocol.codec.arrays import ArrayReader, ArrayWriter
 from envhub_worker.protocol.errors import (
     LocalProtocolError,
     MessageTooLargeError,

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envhub_worker.protocol.arrays import INLINE_BYTES
-from envhub_worker.protocol.codec import Buffer, RemoteEnum, RemoteObject, decode, encode
+from envhub_worker.protocol.codec.arrays import INLINE_BYTES
+from envhub_worker.protocol.codec.codec import Buffer, RemoteEnum, RemoteObject, decode, encode
 from tests.support.compare import assert_same
 
 GOLDEN = Path(__file__).parent / "golden" / "values.json"

@@ -9,7 +9,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from envhub_worker.protocol.codec import Buffer, RemoteObject, decode, encode
+from envhub_worker.protocol.codec.codec import Buffer, RemoteObject, decode, encode
 from envhub_worker.protocol.errors import (
     LocalProtocolError,
     MessageTooLargeError,

@@ -16,11 +16,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from envhub_sandbox.errors import WorkerTimeoutError
-from envhub_worker.protocol.codec import decode, encode
+from envhub_worker.protocol.codec.codec import decode, encode
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
-from envhub_worker.protocol.opaque import MAX_SPACE_DEPTH
-from envhub_worker.protocol.space_reader import ELEMENT_BYTES, SPACE_BYTES, SpaceReader
-from envhub_worker.protocol.spaces import OpaqueSpace, decode_space, encode_space
+from envhub_worker.protocol.spaces.opaque import MAX_SPACE_DEPTH
+from envhub_worker.protocol.spaces.reader import ELEMENT_BYTES, SPACE_BYTES, SpaceReader
+from envhub_worker.protocol.spaces.spaces import OpaqueSpace, decode_space, encode_space
 from tests.support.compare import assert_same
 
 Space = gym.Space[Any]
@@ -164,7 +164,7 @@ def test_one_of_arrives() -> None:
 
 def test_one_of_is_opaque_where_gymnasium_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """An older Gymnasium describes what it cannot build."""
-    monkeypatch.setattr("envhub_worker.protocol.space_reader.OneOf", None)
+    monkeypatch.setattr("envhub_worker.protocol.spaces.reader.OneOf", None)
     value = {"kind": "one_of", "spaces": [encode_space(spaces.Discrete(2))]}
     space = decode_space(value, max_elements=MANY)
     assert repr(space) == "OpaqueSpace(gymnasium.spaces.OneOf: OneOf([Discrete(2)]))"

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol import recurring
-from envhub_worker.protocol.codec import decode, encode
+from envhub_worker.protocol.codec import templates
+from envhub_worker.protocol.codec.codec import decode, encode
 from envhub_worker.protocol.errors import (
     LocalProtocolError,
     MessageTooLargeError,
@@ -66,7 +66,7 @@ OUTGOING, INCOMING = inside.FORMS
 def no_forms(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever other tests have sent."""
     for spot in (OUTGOING, INCOMING):
-        monkeypatch.setattr(*spot, recurring.Forms())
+        monkeypatch.setattr(*spot, templates.Forms())
 
 
 def alike(one: Any, other: Any) -> bool:
@@ -224,16 +224,16 @@ def test_a_peer_that_never_repeats_itself_fills_nothing() -> None:
 @given(st.integers(-(2**63), 2**64 - 1))
 def test_an_id_is_packed_as_msgpack_packs_it(number: int) -> None:
     """A liar's are negative."""
-    assert recurring.pack_id(number) == msgpack.packb(number)
+    assert templates.pack_id(number) == msgpack.packb(number)
 
 
 @given(st.integers(0, 2**63 - 1), st.binary(min_size=1, max_size=40))
 def test_an_id_is_read_as_msgpack_reads_it(number: int, rest: bytes) -> None:
     """Whatever follows it, and whatever its size."""
     packed = msgpack.packb(number)
-    cut = recurring.without_id(b"\x93\x30" + packed + rest)
+    cut = templates.without_id(b"\x93\x30" + packed + rest)
     assert cut == (b"\x93\x30" + rest, packed)
-    assert recurring.read_id(packed) == number
+    assert templates.read_id(packed) == number
 
 
 @pytest.mark.parametrize("message", [m.Value(None), m.Done()], ids=["a field", "no field"])
@@ -260,7 +260,7 @@ def test_an_id_that_nobody_can_answer_under_is_refused(number: int) -> None:
 def test_memory_that_is_not_there_is_the_peers_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     """As without a form."""
     header, large = _framed()
-    monkeypatch.setattr(recurring.ArrayReader, "take", _without_memory)
+    monkeypatch.setattr(templates.ArrayReader, "take", _without_memory)
     with pytest.raises(MessageTooLargeError):
         m.unpack([header, large])
 

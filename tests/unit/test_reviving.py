@@ -13,7 +13,7 @@ from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import HostsDiedError, RemoteJail
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 
 DIED = m.Died(2, "exit", 3, None, "", "last words", "step")

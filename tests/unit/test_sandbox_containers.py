@@ -20,7 +20,7 @@ from envhub_sandbox.sandboxes.docker import attestation, engines, run_arguments,
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
-from envhub_worker.lockdown import seccomp_policy
+from envhub_worker.lockdown.seccomp import policy as seccomp_policy
 from tests.unit.test_imports import folder, modules
 
 DOCKER = Engine("docker", "/usr/bin/docker", "28", rootless=False)

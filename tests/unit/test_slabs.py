@@ -11,7 +11,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
-from envhub_worker.protocol import slabs
+from envhub_worker.protocol.shared_memory import slabs
 
 BOX = spaces.Box(-1, 1, (3,), np.float32)
 NESTED = spaces.Dict(

@@ -15,8 +15,8 @@ import pytest
 
 from envhub_worker import bootstrap
 from envhub_worker.protocol.confinement import Confinement, Limits
-from envhub_worker.spawner import Spawner, ZygoteDied
-from envhub_worker.zygote_process import ZygoteProcess
+from envhub_worker.spawn.jail_handle import Spawner, ZygoteDied
+from envhub_worker.spawn.zygote_process import ZygoteProcess
 from tests.integration.confinement_kit import (
     Cell,
     HostExited,
@@ -326,7 +326,7 @@ def test_killed_server_leaves_no_process(folder: Path, confinement: Confinement)
 
 def processes_below(root: int) -> list[int]:
     """Every descendant of ``root``."""
-    from envhub_worker.lockdown.sweep import descendants
+    from envhub_worker.lockdown.mechanisms.reap import descendants
 
     return descendants(root)
 

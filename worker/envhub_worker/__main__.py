@@ -38,7 +38,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from envhub_worker.zygote_process import ZygoteProcess
+    from envhub_worker.spawn.zygote_process import ZygoteProcess
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -77,21 +77,21 @@ def _serve(arguments: argparse.Namespace) -> int:
 
 
 def _ahead(arguments: argparse.Namespace) -> ZygoteProcess | None:
-    from envhub_worker.zygote_process import ZygoteProcess
+    from envhub_worker.spawn.zygote_process import ZygoteProcess
 
     return ZygoteProcess.ahead(arguments.runtime_dir) if arguments.ahead else None
 
 
 def _announced() -> str:
-    from envhub_worker import container
+    from envhub_worker.lockdown import surroundings
 
-    return container.announcement()
+    return surroundings.announcement()
 
 
 def _health(arguments: argparse.Namespace) -> int:
     """Say whether a server answers: one that listens by its key, any other by its greeting."""
-    from envhub_worker.asking import is_healthy
-    from envhub_worker.health import answers
+    from envhub_worker.cli.health import answers
+    from envhub_worker.cli.status import is_healthy
 
     healthy = is_healthy(arguments.state_dir)
     return 0 if healthy or (healthy is None and answers("127.0.0.1", arguments.port)) else 1
@@ -99,21 +99,21 @@ def _health(arguments: argparse.Namespace) -> int:
 
 def _listen(arguments: argparse.Namespace) -> int:
     """Serve clients on other hosts."""
-    from envhub_worker import listen
+    from envhub_worker.cli import listen
 
     return listen.run(arguments)
 
 
 def _status(arguments: argparse.Namespace) -> int:
     """Say who uses a listening server."""
-    from envhub_worker import asking
+    from envhub_worker.cli import status
 
-    return asking.run(arguments)
+    return status.run(arguments)
 
 
 def _keygen(arguments: argparse.Namespace) -> int:
     """Make a key pair, and say its public key."""
-    from envhub_worker import keys
+    from envhub_worker.access import keys
     from envhub_worker.protocol.keys import key_text
 
     pair = keys.generate()
@@ -153,14 +153,14 @@ def _parser(*, remote: bool) -> argparse.ArgumentParser:
 
 
 def _add_remote(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    from envhub_worker import asking, listen
+    from envhub_worker.cli import listen, status
 
     listening = commands.add_parser("listen", help="serve clients on other hosts, with keys")
     listen.add_arguments(listening)
     listening.set_defaults(run=_listen)
-    status = commands.add_parser("status", help="who uses a listening server")
-    asking.add_arguments(status)
-    status.set_defaults(run=_status)
+    asking = commands.add_parser("status", help="who uses a listening server")
+    status.add_arguments(asking)
+    asking.set_defaults(run=_status)
     keygen = commands.add_parser("keygen", help="make a CURVE key pair")
     keygen.add_argument("--out", type=Path, default=Path(), metavar="DIR")
     keygen.add_argument("--name", default="client")

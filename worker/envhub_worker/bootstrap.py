@@ -5,7 +5,7 @@ environment), and a repository may bring a ``worker.py`` of its own. So the pack
 from the folder of this very file::
 
     python -I .../bootstrap.py worker ARGS...    envhub_worker.__main__.main(ARGS)
-    python -I .../bootstrap.py zygote ARGS...    envhub_worker.zygote.main(ARGS)
+    python -I .../bootstrap.py zygote ARGS...    envhub_worker.spawn.zygote.main(ARGS)
     python -I .../bootstrap.py probe             envhub_worker.lockdown.probe.main([])
 """
 
@@ -19,7 +19,7 @@ from collections.abc import Sequence
 
 _PROGRAMS = {
     "worker": "envhub_worker.__main__",
-    "zygote": "envhub_worker.zygote",
+    "zygote": "envhub_worker.spawn.zygote",
     "probe": "envhub_worker.lockdown.probe",
 }
 

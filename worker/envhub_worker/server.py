@@ -15,19 +15,19 @@ from typing import Any
 import zmq
 
 from envhub_worker import __version__, multipart
-from envhub_worker.entries import Asker
-from envhub_worker.gate import Gate, LocalGate
-from envhub_worker.jails import Jails
-from envhub_worker.lockdown.scratch import remove_tree
+from envhub_worker.access.gate import Gate, LocalGate
+from envhub_worker.access.quotas import RefusedError
+from envhub_worker.access.sessions import Sessions
+from envhub_worker.lockdown.mechanisms.scratch import remove_tree
 from envhub_worker.loop import Loop
+from envhub_worker.protocol import compression
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol import packing
-from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimits
-from envhub_worker.quotas import RefusedError
-from envhub_worker.sessions import Sessions
-from envhub_worker.zygote_process import ZygoteProcess
+from envhub_worker.spawn.zygote_process import ZygoteProcess
+from envhub_worker.supervisor.jails import Jails
+from envhub_worker.supervisor.records import Asker
 
 _RCVHWM = 64
 _ROUND = 64
@@ -123,7 +123,7 @@ class Server:
         session = self._sessions.find(identity, key)
         try:
             if self._compression(identity, key):
-                frames[:] = packing.unpack_frames(frames, self._limits)
+                frames[:] = compression.unpack_frames(frames, self._limits)
             request_id, request = m.unpack(frames[:1], limits=self._limits)
         except Exception as error:
             self._refuse_unread(identity, key, frames[0], error)
@@ -175,9 +175,9 @@ class Server:
         """Answer a request."""
         self._gate.answered(asker)
         frames: list[Buffer] = [*m.pack(message, asker.request_id), *payload]
-        compression = self._compression(asker.identity, asker.key)
-        if compression:
-            frames = packing.pack_frames(frames, compression)
+        agreed = self._compression(asker.identity, asker.key)
+        if agreed:
+            frames = compression.pack_frames(frames, agreed)
         copy = sum(map(len, payload)) < LARGE_BYTES
         multipart.send(self._router, [asker.identity, *frames], copy=copy)
 
@@ -208,7 +208,7 @@ class Server:
 
     def _agree(self, asker: Asker, request: m.Agree) -> None:
         """Answer before it holds, so that the answer itself can be read."""
-        known = packing.available() if self._gate.compresses else ()
+        known = compression.available() if self._gate.compresses else ()
         chosen = next((name for name in request.compressions if name in known), "")
         self.reply(asker, m.Agreed(str(chosen), self._gate.idle_s))
         self._sessions.agree(asker.identity, asker.key, str(chosen))

@@ -21,7 +21,7 @@ _NATIVE_RUNTIMES = (None, "runc", "crun", "io.containerd.runc.v2")
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What ``envhub_worker.container.surroundings`` returns, checked.
+    """What ``envhub_worker.lockdown.surroundings.surroundings`` returns, checked.
 
     Attributes:
         profiles: Those that a jail can have in there, the strongest first.

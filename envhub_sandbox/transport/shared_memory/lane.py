@@ -33,9 +33,9 @@ from envhub_sandbox.transport.shared_memory.sharding import (
 from envhub_sandbox.transport.shared_memory.spin import SpinChooser
 from envhub_sandbox.transport.tensors import to_tensor
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol import slabs
-from envhub_worker.protocol.columns import Column, columns_of
 from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.shared_memory import slabs
+from envhub_worker.protocol.shared_memory.columns import Column, columns_of
 from envhub_worker.protocol.stream import read_packet
 from envhub_worker.protocol.untrusted import UNTRUSTED
 

@@ -22,7 +22,7 @@ import gymnasium as gym
 import numpy as np
 
 from envhub_sandbox.transport.shared_memory.memfd import slab
-from envhub_worker.protocol import slabs
+from envhub_worker.protocol.shared_memory import slabs
 
 RING = 4
 """Slots that are handed out: the last two batches, and two that a caller keeps."""

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from envhub_worker.jailspec import JailSpec
+from envhub_worker.lockdown.mechanisms.scratch import Scratch
 from envhub_worker.lockdown.plan import Plan
-from envhub_worker.lockdown.scratch import Scratch
+from envhub_worker.lockdown.spec import JailSpec
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from envhub_worker.lockdown.report import Layer, LayerUnavailableError
-from envhub_worker.lockdown.syscalls import NUMBERS
+from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
 from envhub_worker.protocol.confinement import MIB, Confinement
 
 PROFILES = ("strict", "no-userns", "container")

@@ -18,18 +18,18 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from envhub_worker.lockdown import (
+from envhub_worker.lockdown import root_plan
+from envhub_worker.lockdown.limits import cgroups
+from envhub_worker.lockdown.mechanisms import (
     capabilities,
-    cgroups,
     kernel,
     landlock,
     namespaces,
     process,
-    root_plan,
-    seccomp,
     user,
 )
 from envhub_worker.lockdown.report import LayerUnavailableError
+from envhub_worker.lockdown.seccomp import filter
 
 _APPARMOR = """\
 abi <abi/4.0>,
@@ -171,7 +171,7 @@ def _landlock() -> str:
 def _seccomp() -> str:
     process.set_no_new_privileges()
     machine = os.uname().machine
-    seccomp.install(seccomp.compile_filter(machine, namespaced=True, network="none"))
+    filter.install(filter.compile_filter(machine, namespaced=True, network="none"))
     try:
         socket.socket(socket.AF_INET)
     except OSError:

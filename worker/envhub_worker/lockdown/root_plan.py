@@ -10,7 +10,7 @@ import posixpath
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from envhub_worker.lockdown.namespaces import INSIDE_UID
+from envhub_worker.lockdown.mechanisms.namespaces import INSIDE_UID
 
 HOME = "/sandbox/home"
 WORK = "/sandbox/work"

@@ -23,8 +23,8 @@ from envhub_worker.protocol.names import (
     optional_name,
     string_keys,
 )
-from envhub_worker.protocol.space_reader import SpaceReader
-from envhub_worker.protocol.spaces import encode_space
+from envhub_worker.protocol.spaces.reader import SpaceReader
+from envhub_worker.protocol.spaces.spaces import encode_space
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 MAX_ENVS = 4096

@@ -18,10 +18,10 @@ from typing import Any, ClassVar, TypeVar
 
 import msgpack  # type: ignore[import-untyped]
 
-from envhub_worker.protocol import recurring
-from envhub_worker.protocol.codec import Buffer, decode_parts, encode, split
+from envhub_worker.protocol.codec import templates
+from envhub_worker.protocol.codec.codec import Buffer, decode_parts, encode, split
+from envhub_worker.protocol.codec.kinds import DOCUMENT_BYTES
 from envhub_worker.protocol.errors import RemoteProtocolError
-from envhub_worker.protocol.kinds import DOCUMENT_BYTES
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
@@ -640,8 +640,8 @@ class Raised(Message):
 
 # --- packing -----------------------------------------------------------------------------------
 
-_OUTGOING: recurring.Forms[Any, recurring.Outgoing] = recurring.Forms()
-_INCOMING: recurring.Forms[bytes, recurring.Incoming[Message]] = recurring.Forms()
+_OUTGOING: templates.Forms[Any, templates.Outgoing] = templates.Forms()
+_INCOMING: templates.Forms[bytes, templates.Incoming[Message]] = templates.Forms()
 
 
 def pack(
@@ -658,7 +658,7 @@ def pack(
     """
     cls = type(message)
     values = [getattr(message, name) for name, _ in _CHECKS[cls]]
-    found = recurring.outline(values)
+    found = templates.outline(values)
     if found is None:
         return encode([cls.kind, request_id, *values], pickler=pickler, limits=limits)
     outline, arrays = found
@@ -666,7 +666,7 @@ def pack(
     if form is not None and form.limits is limits:
         return form.frames(request_id, arrays)
     frames = encode([cls.kind, request_id, *values], pickler=pickler, limits=limits)
-    _OUTGOING.met((cls, outline), lambda: recurring.Outgoing(frames, arrays, limits))
+    _OUTGOING.met((cls, outline), lambda: templates.Outgoing(frames, arrays, limits))
     return frames
 
 
@@ -684,15 +684,15 @@ def unpack(
     """
     with UNTRUSTED:
         document, tail, buffers = split(frames, limits)
-        plain = recurring.without_id(document)
+        plain = templates.without_id(document)
         if plain is None:
             return _decode(document, tail, buffers, limits, unpickler, tensors)
         key, packed_id = plain
         form = _INCOMING.get(key)
         if form is not None and form.limits is limits:
-            return recurring.read_id(packed_id), form.message(tail, buffers)
+            return templates.read_id(packed_id), form.message(tail, buffers)
         request_id, message = _decode(document, tail, buffers, limits, unpickler, tensors)
-        _INCOMING.met(key, lambda: recurring.Incoming(document, type(message), limits))
+        _INCOMING.met(key, lambda: templates.Incoming(document, type(message), limits))
         return request_id, message
 
 

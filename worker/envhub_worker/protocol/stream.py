@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from envhub_worker.protocol.codec import Buffer
+from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 

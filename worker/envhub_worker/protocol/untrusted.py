@@ -13,8 +13,8 @@ from __future__ import annotations
 import struct
 from types import TracebackType
 
+from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.errors import EnvHubError, MessageTooLargeError, RemoteProtocolError
-from envhub_worker.protocol.inert import one_line
 
 FAULTS: tuple[type[Exception], ...] = (
     ArithmeticError,

@@ -1,0 +1,162 @@
+"""One client key's files on disk, and a running total of what they are charged."""
+
+from __future__ import annotations
+
+import contextlib
+import operator
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass
+from itertools import takewhile
+from pathlib import Path
+
+from envhub_worker.access.quotas import RefusedError
+from envhub_worker.lockdown.mechanisms.scratch import remove_tree
+
+BLOCK_BYTES = 4096
+"""What the smallest file and each entry of a tree are charged: they take disk, too."""
+
+
+@dataclass(frozen=True)
+class Listed:
+    """One file of an offered snapshot."""
+
+    path: str
+    size: int
+    sha256: bytes
+
+
+def blob_charge(size: int) -> int:
+    """Bytes that a file is charged."""
+    return max(size, BLOCK_BYTES)
+
+
+def tree_charge(paths: Iterable[str]) -> int:
+    """Bytes that a tree of links to files is charged: a block for each of its entries."""
+    entries, before = 0, list[str]()
+    for steps in sorted(path.split("/") for path in paths):
+        entries += len(steps) - sum(takewhile(bool, map(operator.eq, before, steps)))
+        before = steps
+    return BLOCK_BYTES * entries
+
+
+class Store:
+    """The files of one key.
+
+    Args:
+        home: Where they lie; what is there is counted once.
+
+    Attributes:
+        held: Bytes that they are charged.
+    """
+
+    def __init__(self, home: Path) -> None:
+        self.home = home
+        self._blobs: dict[str, int] = {}
+        self._trees: dict[str, int] = {}
+        with contextlib.suppress(FileNotFoundError), os.scandir(home / "blobs") as items:
+            self._blobs = {item.name: blob_charge(item.stat().st_size) for item in items}
+        for tree in (home / "trees").glob("[0-9a-f]*"):
+            self._trees[tree.name] = _charge_on_disk(tree)
+        self.held = sum(self._blobs.values()) + sum(self._trees.values())
+
+    @property
+    def trees(self) -> int:
+        """How many there are."""
+        return len(self._trees)
+
+    def blob(self, sha256: bytes) -> Path:
+        """Where a file lies, or would."""
+        return self.home / "blobs" / sha256.hex()
+
+    def tree(self, digest: str) -> Path:
+        """Where a snapshot lies, or would."""
+        return self.home / "trees" / digest
+
+    def take(self, part: Path, sha256: bytes, size: int) -> None:
+        """A file has arrived whole."""
+        part.chmod(0o444)
+        blob = self.blob(sha256)
+        blob.parent.mkdir(mode=0o700, exist_ok=True)
+        os.rename(part, blob)
+        self.held += blob_charge(size) - self._blobs.get(blob.name, 0)
+        self._blobs[blob.name] = blob_charge(size)
+
+    def unused(self, in_use: Collection[str]) -> list[str]:
+        """Digests of the trees that nobody uses, the longest unused first."""
+        real = os.path.realpath(self.home / "trees")
+        used = {os.path.realpath(path) for path in in_use}
+        names = [name for name in self._trees if os.path.join(real, name) not in used]
+        return sorted(names, key=lambda name: _modified(self.tree(name)))
+
+    def remove(self, digest: str) -> None:
+        """Remove a tree."""
+        remove_tree(str(self.tree(digest)))
+        self.held -= self._trees.pop(digest)
+
+    def remove_unlinked(self, keep: Collection[bytes]) -> None:
+        """Remove the files that no tree has, but for these."""
+        names = {sha256.hex() for sha256 in keep}
+        with contextlib.suppress(FileNotFoundError), os.scandir(self.home / "blobs") as items:
+            for item in items:
+                if item.name not in names and item.stat().st_nlink == 1:
+                    os.unlink(item.path)
+                    self.held -= self._blobs.pop(item.name, 0)
+
+    def lay_out(self, digest: str, files: list[Listed], copying: Callable[[int], None]) -> None:
+        """Build a tree beside its place and rename it: what bears a digest is complete.
+
+        ``copying`` is told the size of each file that cannot be a link, before it is copied.
+        """
+        tree = self.tree(digest)
+        make_passable(tree.parent)
+        building = Path(tempfile.mkdtemp(prefix=".building-", dir=tree.parent))
+        try:
+            for file in files:
+                if self.blob(file.sha256).stat().st_size != file.size:
+                    raise RefusedError("LocalProtocolError", f"{file.path!r} has another size")
+                _place(self.blob(file.sha256), building / file.path, copying)
+            for folder, _, _ in os.walk(building, topdown=False):
+                if folder != str(building):
+                    os.chmod(folder, 0o555)
+            os.rename(building, tree)
+            os.chmod(tree, 0o555)  # not before: a folder that cannot be written cannot be moved
+        finally:
+            if building.exists():
+                remove_tree(str(building))
+        self._trees[digest] = _charge_on_disk(tree)
+        self.held += self._trees[digest]
+
+
+def make_passable(folder: Path) -> None:
+    """Make a folder that nobody else lists; root's jails, another user, pass through to a tree."""
+    folder.mkdir(parents=True, exist_ok=True)
+    os.chmod(folder, 0o711 if os.getuid() == 0 else 0o700)
+
+
+def _modified(path: Path) -> float:
+    with contextlib.suppress(FileNotFoundError):
+        return path.stat().st_mtime
+    return 0.0  # somebody has removed it by hand
+
+
+def _place(blob: Path, target: Path, copying: Callable[[int], None]) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(blob, target)
+    except OSError:  # more links than the file system allows, or none at all
+        copying(blob.stat().st_size)
+        shutil.copyfile(blob, target)
+        target.chmod(0o444)
+
+
+def _charge_on_disk(tree: Path) -> int:
+    charge = 0
+    for folder, folders, files in os.walk(tree):
+        charge += BLOCK_BYTES * (len(folders) + len(files))
+        for name in files:
+            status = os.lstat(os.path.join(folder, name))
+            charge += status.st_size if status.st_nlink == 1 else 0  # a copy
+    return charge

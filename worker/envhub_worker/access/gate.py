@@ -1,0 +1,368 @@
+"""What a server's clients may do: everything, or what a stranger's quotas permit.
+
+One ``Server`` serves both. A ``LocalGate`` stands before a socket in a private folder, whose
+clients are the user who started the server. A ``RemoteGate`` stands before a TCP port: its clients
+have proved a key, and still may neither name a path of this machine nor take it all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import zmq
+
+from envhub_worker.access.connection_limit import MAX_CONNECTIONS, Doorman
+from envhub_worker.access.keys import AuthorizedClients, KeyPair
+from envhub_worker.access.quotas import (
+    InFlight,
+    Permissions,
+    Quotas,
+    RefusedError,
+    Use,
+    check_jail,
+    check_policy,
+)
+from envhub_worker.access.rate_limited_log import Log
+from envhub_worker.access.sessions import Session, Sessions
+from envhub_worker.access.uploads import Uploads, wrong_with_path
+from envhub_worker.access.zap import DOMAIN, Zap
+from envhub_worker.lockdown.spec import confinement_from_wire
+from envhub_worker.loop import Loop
+from envhub_worker.multipart import receive
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.errors import ProtocolError
+from envhub_worker.protocol.keys import KEY_BYTES, key_text
+from envhub_worker.supervisor.jails import Jails
+from envhub_worker.supervisor.records import Asker, JailEntry
+
+TICK_S = 1.0
+_HANDSHAKE_MS = 5_000
+_HEARTBEAT_MS = 15_000
+_HEARTBEAT_TIMEOUT_MS = 60_000
+_BACKLOG = 64
+_SNDHWM = 32
+_FORGOTTEN_S = 3600.0
+"""Where silent clients keep their jails, those without any are forgotten after so long."""
+ANYBODY = bytes(KEY_BYTES)
+"""The key of clients that have none, behind ``--insecure-loopback``."""
+
+
+class Gate(Protocol):
+    """Decides what a client may.
+
+    Attributes:
+        compresses: Whether frames are worth compressing.
+        idle_s: How long the jails of a client that says nothing live on; 0 for ever.
+    """
+
+    compresses: bool
+    idle_s: int
+
+    def secure(self, router: zmq.Socket[bytes], loop: Loop) -> None:
+        """Set what must be set before the socket is bound."""
+
+    def receive(self, router: zmq.Socket[bytes]) -> tuple[bytes, bytes, list[bytes]]:
+        """A message that is there: the routing id of its sender, the key that he has proved (empty
+        where none is needed), and its frames."""
+
+    def greet(self, sessions: Sessions, key: bytes, name: bytes) -> None:
+        """A session begins, or is found again; raises ``RefusedError``."""
+
+    def check(
+        self, asker: Asker, request: m.Message, size: int, sessions: Sessions, jails: Jails
+    ) -> m.Message:
+        """The request as it may be carried out; raises ``RefusedError``."""
+
+    def serve(
+        self, asker: Asker, request: m.Message, payload: Sequence[bytes], jails: Jails
+    ) -> m.Message | None:
+        """The reply to a request that only this gate knows; None for others."""
+
+    def answered(self, asker: Asker) -> None:
+        """A request was answered."""
+
+    def tick(self, sessions: Sessions, jails: Jails) -> None:
+        """Time has passed."""
+
+    def close(self) -> None:
+        """Close what ``secure`` opened."""
+
+
+class LocalGate:
+    """The folder of the socket is the gate: whoever can reach it is the user."""
+
+    compresses = False
+    idle_s = 0
+
+    def secure(self, router: zmq.Socket[bytes], loop: Loop) -> None:
+        """Nothing: the folder is of mode 0700."""
+
+    def receive(self, router: zmq.Socket[bytes]) -> tuple[bytes, bytes, list[bytes]]:
+        """Nobody has a key."""
+        identity, *frames = receive(router)
+        return identity, b"", frames
+
+    def greet(self, sessions: Sessions, key: bytes, name: bytes) -> None:
+        """Everybody is welcome."""
+
+    def check(
+        self, asker: Asker, request: m.Message, size: int, sessions: Sessions, jails: Jails
+    ) -> m.Message:
+        """Everything is permitted."""
+        return request
+
+    def serve(
+        self, asker: Asker, request: m.Message, payload: Sequence[bytes], jails: Jails
+    ) -> m.Message | None:
+        """There is nothing that only it knows."""
+        return None
+
+    def answered(self, asker: Asker) -> None:
+        """Nothing is counted."""
+
+    def tick(self, sessions: Sessions, jails: Jails) -> None:
+        """The server ends with its client."""
+
+    def close(self) -> None:
+        """There is nothing to close."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rules:
+    """How a ``RemoteGate`` is set up.
+
+    Attributes:
+        keys: The server's key pair; None only for ``--insecure-loopback``.
+        authorized: Whose keys may come in.
+        operators: Keys that see everybody's sessions: the server's own.
+        quotas: What one key may take.
+        permissions: What a policy may ask for.
+        idle_s: How long the jails of a client that says nothing live on.
+        max_connections: Of everybody together, strangers included.
+    """
+
+    keys: KeyPair | None
+    authorized: AuthorizedClients
+    operators: frozenset[bytes]
+    quotas: Quotas
+    permissions: Permissions
+    idle_s: int
+    max_connections: int = MAX_CONNECTIONS
+
+
+class RemoteGate:
+    """Keys, quotas and the snapshots that clients bring along."""
+
+    compresses = True
+
+    def __init__(self, rules: Rules, uploads: Uploads, log: Log) -> None:
+        self.idle_s = rules.idle_s
+        self._rules = rules
+        self._uploads = uploads
+        self._log = log
+        self._in_flight = InFlight()
+        self._closers: list[Callable[[], None]] = []
+        self._doorman: Doorman | None = None
+
+    # --- the socket ----------------------------------------------------------------------------
+
+    def secure(self, router: zmq.Socket[bytes], loop: Loop) -> None:
+        """CURVE, and what bounds a peer that keeps none of the rules."""
+        router.setsockopt(zmq.HANDSHAKE_IVL, _HANDSHAKE_MS)
+        router.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
+        router.setsockopt(zmq.HEARTBEAT_TIMEOUT, _HEARTBEAT_TIMEOUT_MS)
+        router.setsockopt(zmq.BACKLOG, _BACKLOG)
+        router.setsockopt(zmq.SNDHWM, _SNDHWM)
+        self._doorman = Doorman(router, loop, self._log, self._rules.max_connections)
+        self._closers.append(self._doorman.close)
+        keys = self._rules.keys
+        if keys is None:
+            return
+        zap = Zap(router.context, self._admits)
+        self._closers.append(zap.close)
+        loop.watch(zap.socket, zap.answer)
+        router.setsockopt(zmq.CURVE_SERVER, 1)
+        router.setsockopt(zmq.CURVE_SECRETKEY, keys.secret)
+        router.setsockopt(zmq.ZAP_DOMAIN, DOMAIN)
+        # without it libzmq lets everybody in whom no handler was there to ask about
+        router.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
+
+    def _admits(self, key: bytes, address: str) -> bool:
+        if self._rules.authorized.name_of(key) is not None or key in self._rules.operators:
+            return True
+        self._log.say("refused", f"{address} has the key {key_text(key)}, which is not authorised")
+        return False
+
+    def receive(self, router: zmq.Socket[bytes]) -> tuple[bytes, bytes, list[bytes]]:
+        """The key is the one that was proved in the handshake, never what the peer claims."""
+        identity = router.recv(zmq.NOBLOCK)
+        # not of the frame before: libzmq 4.3.4 knows nothing of who sent the first one
+        header = router.recv(zmq.NOBLOCK, copy=False)
+        rest = receive(router) if header.more else []
+        return identity, self._key_of(header), [header.bytes, *rest]
+
+    def _key_of(self, frame: zmq.Frame) -> bytes:
+        if self._rules.keys is None:
+            return ANYBODY
+        try:
+            return bytes.fromhex(str(frame.get("User-Id")))
+        except (zmq.ZMQError, ValueError):
+            return b""
+
+    # --- requests ------------------------------------------------------------------------------
+
+    def greet(self, sessions: Sessions, key: bytes, name: bytes) -> None:
+        """Refuse who has proved no key, and more sessions than the quota."""
+        self._refuse_unless_authorized(key)
+        mine = sessions.of_key(key)
+        if len(name) > 64:
+            raise RefusedError("LocalProtocolError", "the name of a session is too long")
+        quota = self._rules.quotas.sessions
+        if all(one.name != name for one in mine) and len(mine) >= quota:
+            raise RefusedError(
+                "WorkerError", f"your key has {quota} sessions, which is the server's quota"
+            )
+
+    def check(
+        self, asker: Asker, request: m.Message, size: int, sessions: Sessions, jails: Jails
+    ) -> m.Message:
+        """Hold a request against keys and quotas."""
+        key = asker.key
+        self._refuse_unless_authorized(key)
+        if isinstance(request, m.KeepAlive):
+            self._keep(asker, request, sessions)
+        elif isinstance(request, m.OpenJail):
+            return self._check_open(key, request, jails)
+        elif isinstance(request, m.StartHosts):
+            check_jail(_uses(jails, key), Use(0, request.hosts), self._rules.quotas)
+        elif isinstance(request, m.Relay):
+            self._in_flight.add(key, asker, size, self._rules.quotas.inflight_bytes)
+        elif isinstance(request, m.GetSessions):
+            return m.Sessions(tuple(self._sessions_of(key, sessions, jails)))
+        return request
+
+    def _is_known(self, key: bytes) -> bool:
+        rules = self._rules
+        if rules.keys is None or key in rules.operators:
+            return True
+        return rules.authorized.name_of(key) is not None
+
+    def _refuse_unless_authorized(self, key: bytes) -> None:
+        if not self._is_known(key):
+            raise RefusedError("WorkerError", "your key is not authorised any more")
+
+    def _check_open(self, key: bytes, request: m.OpenJail, jails: Jails) -> m.OpenJail:
+        try:
+            confinement = confinement_from_wire(request.confinement)
+        except ProtocolError as error:
+            raise RefusedError("LocalProtocolError", f"no confinement: {error}") from None
+        check_policy(request, confinement, self._rules.permissions)
+        wrong = wrong_with_path(request.entry)
+        if wrong:
+            raise RefusedError("PolicyError", f"the entry file {wrong}")
+        check_jail(
+            _uses(jails, key),
+            Use(confinement.limits.memory_bytes, request.hosts),
+            self._rules.quotas,
+        )
+        tree = self._uploads.tree(key, request.snapshot)
+        return m.OpenJail(
+            request.name[:512], "", tree, request.entry, request.confinement, request.hosts
+        )
+
+    def _keep(self, asker: Asker, request: m.KeepAlive, sessions: Sessions) -> None:
+        session = sessions.find(asker.identity, asker.key)
+        if session is not None and all(type(jail) is int for jail in request.jails[:4096]):
+            sessions.keep(session, request.jails[:4096])
+
+    def serve(
+        self, asker: Asker, request: m.Message, payload: Sequence[bytes], jails: Jails
+    ) -> m.Message | None:
+        """Take snapshots; say who is here."""
+        key = asker.key
+        if isinstance(request, m.OfferSnapshot):
+            in_use = {entry.jail.spec.snapshot for entry in jails.open_ones()}
+            return self._uploads.offer(asker.session, key, request, in_use)
+        if isinstance(request, m.PutBlob):
+            if len(payload) != 1:
+                raise RefusedError("LocalProtocolError", "PutBlob has one frame")
+            self._uploads.put(asker.session, key, request, payload[0])
+            return m.Done()
+        if isinstance(request, m.Sessions):
+            return request
+        return m.Done() if isinstance(request, m.KeepAlive) else None
+
+    def answered(self, asker: Asker) -> None:
+        """Its bytes are no longer in flight."""
+        self._in_flight.answered(asker)
+
+    def _sessions_of(self, key: bytes, sessions: Sessions, jails: Jails) -> list[dict[str, Any]]:
+        rules = self._rules
+        seen = sessions.all() if key in rules.operators else sessions.of_key(key)
+        used = {key: self._uploads.used_bytes(key) for key in {one.key for one in seen}}
+        return [
+            {
+                "client": rules.authorized.name_of(one.key) or "operator",
+                "key": key_text(one.key),
+                "session": one.name.hex()[:8],
+                "heard_s": sessions.age_s(one),
+                "connections": len(one.connections),
+                "upload_bytes": used[one.key],
+                "jails": tuple(jails.statuses(one.owner)),
+            }
+            for one in seen
+        ]
+
+    # --- time ----------------------------------------------------------------------------------
+
+    def tick(self, sessions: Sessions, jails: Jails) -> None:
+        """End the jails of clients that are not heard from, and what clients no longer hold."""
+        self._log.tick()
+        if self._doorman is not None:
+            self._doorman.tick()
+        try:
+            self._rules.authorized.refresh()
+        except (OSError, ValueError) as error:
+            self._log.say("authorised clients", f"kept as they were: {error}")
+        for session in sessions.all():
+            if not self._is_known(session.key):
+                self._end(session, sessions, jails, "its key is not authorised any more")
+        for session in sessions.idle(self.idle_s or _FORGOTTEN_S):
+            if self.idle_s:
+                why = f"nothing was heard of its client for {self.idle_s} s"
+                self._end(session, sessions, jails, why)
+            elif not jails.open_ones(session.owner):
+                self._uploads.forget(session.owner)
+                sessions.drop(session)
+        if self.idle_s:
+            self._end_unheld(sessions, jails)
+
+    def _end_unheld(self, sessions: Sessions, jails: Jails) -> None:
+        for session in sessions.all():
+            for entry in jails.open_ones(session.owner):
+                if sessions.unheld(session, entry.number, self.idle_s):
+                    self._reap(entry, jails, "its client gave it up")
+
+    def _end(self, session: Session, sessions: Sessions, jails: Jails, why: str) -> None:
+        for entry in jails.open_ones(session.owner):
+            self._reap(entry, jails, why)
+        self._uploads.forget(session.owner)
+        sessions.drop(session)
+
+    def _reap(self, entry: JailEntry, jails: Jails, why: str) -> None:
+        self._log.say("ended", f"the jail of {entry.name[:200]!r}: {why}")
+        jails.end(entry, why)
+
+    def close(self) -> None:
+        """Close the sockets of the handshakes."""
+        for close in self._closers:
+            close()
+
+
+def _uses(jails: Jails, key: bytes) -> list[Use]:
+    return [
+        Use(entry.jail.spec.confinement.limits.memory_bytes, len(entry.links))
+        for entry in jails.open_ones(key)
+    ]

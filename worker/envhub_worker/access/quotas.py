@@ -1,0 +1,157 @@
+"""What one client key may take of a server that many share, and what its policy may say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.confinement import GIB, MIB, Confinement
+from envhub_worker.supervisor.records import Asker
+
+PROFILES = ("strict", "no-userns", "container")
+"""The strongest first."""
+
+
+class RefusedError(Exception):
+    """A request is not done. ``error`` is a name out of the client's table."""
+
+    def __init__(self, error: str, message: str) -> None:
+        super().__init__(message)
+        self.error = error
+        self.message = message
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quotas:
+    """Of one client key, all its processes together.
+
+    Attributes:
+        jails: Open jails.
+        hosts: Processes of environments in them.
+        memory_bytes: The sum of its open jails' memory limits.
+        upload_bytes: Files of snapshots that it has brought here; the longest unused go first.
+        upload_files: Files of one snapshot.
+        inflight_bytes: Requests that its jails have not answered yet.
+        sessions: Processes of the client.
+    """
+
+    jails: int = 64
+    hosts: int = 256
+    memory_bytes: int = 512 * GIB
+    upload_bytes: int = 8 * GIB
+    upload_files: int = 20_000
+    inflight_bytes: int = 512 * MIB
+    sessions: int = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class Permissions:
+    """What a client's policy may ask of this host.
+
+    Attributes:
+        weakest_profile: ``"strict"``, ``"no-userns"`` or ``"container"``.
+        network: Whether jails may have this host's network.
+        gpu: Whether jails may have its GPU.
+    """
+
+    weakest_profile: str = "strict"
+    network: bool = False
+    gpu: bool = False
+
+
+@dataclass(frozen=True)
+class Use:
+    """What the open jails of a key take: one entry a jail."""
+
+    memory_bytes: int
+    hosts: int
+
+
+def check_policy(request: m.OpenJail, confinement: Confinement, permitted: Permissions) -> None:
+    """Refuse what a client on another host cannot have.
+
+    Raises:
+        RefusedError: With what to do instead.
+    """
+    if request.python:
+        raise RefusedError("PolicyError", "python: the interpreter is the remote server's own")
+    if confinement.readable:
+        raise RefusedError("PolicyError", "readable: paths of the remote server cannot be named")
+    if confinement.network == "host" and not permitted.network:
+        raise RefusedError(
+            "PolicyError", "network='host' needs a server that was started with --allow-network"
+        )
+    if confinement.gpu and not permitted.gpu:
+        raise RefusedError(
+            "PolicyError", "gpu=True needs a server that was started with --allow-gpu"
+        )
+    asked, weakest = confinement.profile, permitted.weakest_profile
+    if asked not in PROFILES or PROFILES.index(asked) > PROFILES.index(weakest):
+        raise RefusedError(
+            "PolicyError",
+            f"profile {asked[:20]!r} needs a server that was started with "
+            f"--weakest-profile {asked[:20]}; this one permits nothing weaker than {weakest!r}",
+        )
+
+
+def check_jail(open_jails: Iterable[Use], more: Use, quotas: Quotas) -> None:
+    """Refuse a jail, or further hosts of one (then without memory), above the quotas.
+
+    Raises:
+        RefusedError: With the quota that it would break.
+    """
+    uses = list(open_jails)
+    jails = len(uses) + (more.memory_bytes > 0)
+    memory = sum(use.memory_bytes for use in uses) + more.memory_bytes
+    hosts = sum(use.hosts for use in uses) + more.hosts
+    for what, number, quota, option in (
+        ("jails", jails, quotas.jails, "--max-jails"),
+        ("hosts", hosts, quotas.hosts, "--max-hosts"),
+        ("bytes of memory limits", memory, quotas.memory_bytes, "--max-memory"),
+    ):
+        if number > quota:
+            raise RefusedError(
+                "WorkerError",
+                f"this would make {number} {what} of your key, over the server's quota of {quota} "
+                f"({option}); close environments, or lower their limits",
+            )
+
+
+@dataclass
+class InFlight:
+    """Bytes that clients have sent and nobody has answered yet."""
+
+    _of: dict[bytes, int] = field(default_factory=dict)
+    _requests: dict[tuple[bytes, int], tuple[Asker, bytes, int]] = field(default_factory=dict)
+
+    def add(self, key: bytes, asker: Asker, size: int, quota: int) -> None:
+        """Count a request until it is answered.
+
+        Raises:
+            RefusedError: Over the quota, or its id is that of one that is not answered yet.
+        """
+        taken = self._of.get(key, 0)
+        if (asker.identity, asker.request_id) in self._requests:
+            raise RefusedError("LocalProtocolError", "a request with this id is not answered yet")
+        if taken + size > quota:
+            raise RefusedError(
+                "WorkerError",
+                f"{taken} bytes of your key's requests are not answered yet, and {size} more are "
+                f"over the server's quota of {quota}; wait for replies",
+            )
+        self._of[key] = taken + size
+        self._requests[asker.identity, asker.request_id] = asker, key, size
+
+    def answered(self, asker: Asker) -> None:
+        """A request was answered: this very one, not another under the same id."""
+        place = (asker.identity, asker.request_id)
+        counted, key, size = self._requests.get(place, (None, b"", 0))
+        if counted is not asker:
+            return
+        del self._requests[place]
+        left = self._of[key] - size
+        if left > 0:
+            self._of[key] = left
+        else:
+            self._of.pop(key)

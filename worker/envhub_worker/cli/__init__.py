@@ -1,0 +1,1 @@
+"""The commands of ``envhub-worker``, one file each."""

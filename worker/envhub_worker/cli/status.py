@@ -1,0 +1,126 @@
+"""``envhub-worker status`` and ``health``: ask a running ``listen``, as its operator."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from envhub_worker.access import keys
+from envhub_worker.cli.listen import reachable, state_dir
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.errors import ProtocolError
+from envhub_worker.protocol.keys import parse_key
+from envhub_worker.protocol.text import printable
+
+_WAIT_MS = 5_000
+_SESSION = b"status"
+"""The same each time: whoever asks often does not use up the sessions of a key."""
+
+
+class UnreachableError(Exception):
+    """There is no server, or it does not answer us."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``status``."""
+    parser.add_argument("--state-dir", type=Path, help="as for listen")
+    parser.add_argument("--endpoint", help="of a server elsewhere: tcp://HOST:PORT")
+    parser.add_argument("--server-key", help="its public key")
+    parser.add_argument("--key", type=Path, help="a secret key that it knows")
+    parser.add_argument("--json", action="store_true", help="for programs")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print who uses the server, and what their jails do."""
+    try:
+        sessions = _ask(*_address(arguments))
+    except (OSError, ValueError, ProtocolError, UnreachableError) as error:
+        sys.stderr.write(f"envhub-worker status: {error}\n")
+        return 1
+    print(json.dumps(sessions, indent=2) if arguments.json else table(sessions))
+    return 0
+
+
+def _address(arguments: argparse.Namespace) -> tuple[str, bytes | None, keys.KeyPair]:
+    """The endpoint, the server's public key, and the pair to be known by."""
+    if arguments.endpoint:
+        if not arguments.server_key or not arguments.key:
+            raise ValueError("--endpoint needs --server-key and --key")
+        return arguments.endpoint, parse_key(arguments.server_key), keys.load(arguments.key)
+    noted = _noted(arguments.state_dir)
+    if noted is None:
+        raise UnreachableError("no 'envhub-worker listen' of this user is running here")
+    return noted
+
+
+def _noted(chosen: Path | None) -> tuple[str, bytes | None, keys.KeyPair] | None:
+    """What a server of this user wrote down when it started; None if there is none."""
+    state = state_dir(chosen, create=False)
+    try:
+        if state is None:
+            return None
+        endpoint, public, key_file = (state / "endpoint").read_text().rstrip("\n").split(" ", 2)
+    except FileNotFoundError:
+        return None
+    if public == "insecure":
+        return endpoint, None, keys.generate()
+    return reachable(endpoint), parse_key(public), keys.load(Path(key_file))
+
+
+def is_healthy(chosen: Path | None) -> bool | None:
+    """Whether the server of this user answers requests; None if none was started here."""
+    try:
+        noted = _noted(chosen)
+        if noted is not None:
+            _ask(*noted)
+    except (OSError, ValueError, ProtocolError, UnreachableError):
+        return False
+    return None if noted is None else True
+
+
+def _ask(endpoint: str, server_key: bytes | None, pair: keys.KeyPair) -> list[dict[str, Any]]:
+    with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        if server_key is not None:
+            socket.setsockopt(zmq.CURVE_SERVERKEY, server_key)
+            socket.setsockopt(zmq.CURVE_PUBLICKEY, pair.public)
+            socket.setsockopt(zmq.CURVE_SECRETKEY, pair.secret)
+        socket.connect(endpoint)
+        _request(socket, m.Hello(2, m.VERSION, _SESSION), 1, m.Welcome)
+        reply = _request(socket, m.GetSessions(), 2, m.Sessions)
+        assert isinstance(reply, m.Sessions)
+        return [dict(one) for one in reply.sessions if isinstance(one, dict)]
+
+
+def _request(
+    socket: zmq.Socket[bytes], request: m.Message, number: int, kind: type[m.Message]
+) -> m.Message:
+    socket.send_multipart(m.pack(request, number))
+    if not socket.poll(_WAIT_MS):
+        raise UnreachableError("the server does not answer: is the key one that it knows?")
+    _, reply = m.unpack(socket.recv_multipart())
+    if isinstance(reply, m.Refused):
+        raise UnreachableError(printable(reply.message))
+    if not isinstance(reply, kind):
+        raise UnreachableError(f"the server answered with {type(reply).__name__}")
+    return reply
+
+
+def table(sessions: list[dict[str, Any]]) -> str:
+    """Sessions and their jails, one line each."""
+    lines = [f"{len(sessions)} sessions"]
+    for one in sessions:
+        lines.append(
+            f"{one['client']} {one['session']}: heard {one['heard_s']:.0f} s ago, "
+            f"{one['connections']} connections, {one['upload_bytes']} bytes of snapshots, "
+            f"{len(one['jails'])} jails"
+        )
+        for jail in one["jails"]:
+            doing = f"{jail['operation']} for {jail['busy_s']:.1f} s" if jail["operation"] else "-"
+            lines.append(f"  {jail['name']}: {', '.join(jail['states'])}; {doing}")
+    return printable("\n".join(lines))

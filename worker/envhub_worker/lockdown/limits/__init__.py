@@ -1,0 +1,1 @@
+"""How much a jail may use: by the kernel where it counts, measured elsewhere."""

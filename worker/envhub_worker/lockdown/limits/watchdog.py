@@ -1,0 +1,268 @@
+"""Measuring a jail's memory and scratch where no cgroup and no quota count them.
+
+A resource limit counts one process, and misses files in memory (memfd), System V segments,
+shared anonymous memory and what waits in sockets and pipes. So init looks at all processes of the
+jail, the sooner the nearer they are to the limit, and ends them over it. What it cannot see the
+filter denies (``seccomp_policy.table``, "measured") or the kernel bounds; ``plan`` names what
+remains.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import re
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field
+
+from envhub_worker.lockdown.seccomp.policy import SHARED_BYTES
+
+#: Bytes a second that a jail may be expected to fill: a few cores on huge pages.
+_FILL_RATE = 8 * 1024**3
+_SHORTEST_S, _LONGEST_S = 0.01, 1.0
+
+_SHARED = re.compile(
+    rb"^([0-9a-f]+)-([0-9a-f]+) \S+ \S+ ([0-9a-f]+):([0-9a-f]+) (\d+) +(?:/dev/zero|/memfd:.*)"
+    rb" \(deleted\)$",
+    re.MULTILINE,
+)
+
+# Of the kernel's own memory, generously: a mapping with what reverses it, and an open file.
+_MAPPING, _DESCRIPTOR = 512, 1024
+# The filter keeps pipes at the size that they are made with.
+_PIPE = 64 * 1024
+# Of a socket, where the host does not say.
+_BUFFER = 212992
+
+
+def seconds_to_next_look(used: int, limit: int) -> float:
+    """How long nothing can happen: the headroom over the rate at which memory can be filled."""
+    return min(max((limit - used) / _FILL_RATE, _SHORTEST_S), _LONGEST_S)
+
+
+@dataclass
+class Usage:
+    """Memory of a jail in bytes, as far as it can be had cheaply; never less than it is.
+
+    Attributes:
+        private: Anonymous memory of each process, swap included.
+        kernel: What the kernel keeps for the processes: page tables, mappings, descriptors.
+        mapped: Shared mappings of memory without a name, by (device, inode).
+        files: memfds that some process has open, by (device, inode).
+        sockets: Names of open sockets.
+        pipes: Names of open pipes.
+        other: System V segments, and files in the jail's tmpfs.
+    """
+
+    private: int = 0
+    kernel: int = 0
+    mapped: dict[tuple[int, int], int] = field(default_factory=dict)
+    files: dict[tuple[int, int], int] = field(default_factory=dict)
+    sockets: set[str] = field(default_factory=set)
+    pipes: set[str] = field(default_factory=set)
+    other: int = 0
+
+    @property
+    def shared(self) -> int:
+        """What shared anonymous mappings may hold."""
+        return sum(self.mapped.values())
+
+    @property
+    def certain(self) -> int:
+        """All but processes' own and shared memory: what cannot be had more exactly."""
+        buffers = len(self.sockets) * socket_bytes() + len(self.pipes) * _PIPE
+        return self.kernel + sum(self.files.values()) + buffers + self.other
+
+    @property
+    def total(self) -> int:
+        """All of it. Pages that forked processes share are counted for each."""
+        return self.private + self.shared + self.certain
+
+
+class MemoryWatch:
+    """Looks at the memory of a jail's processes."""
+
+    def __init__(self, limit: int, tmpfs: str | None, *, own_network: bool = False) -> None:
+        """A watch for ``limit`` bytes.
+
+        Args:
+            limit: What the jail may use.
+            tmpfs: A path in the jail's own, if it has one.
+            own_network: Whether all sockets of our network namespace are the jail's, those too
+                that wait in another socket, where no process has them.
+        """
+        self._limit = limit
+        self._tmpfs = tmpfs
+        self._own_network = own_network
+        self._foreign: set[tuple[int, int]] = set()
+
+    def ignore(self, fds: Iterable[int]) -> None:
+        """Do not count these files: they are the client's (slabs)."""
+        for fd in fds:
+            status = os.fstat(fd)
+            self._foreign.add((status.st_dev, status.st_ino))
+
+    def look(self, pids: Collection[int]) -> tuple[int, list[int]]:
+        """(bytes in use, pids that cannot be measured).
+
+        The cheap upper bound first; only when that is over the limit, what is really there.
+        Shared memory may have left every page table, where no process's account shows it: it is
+        what its mappings may hold, or less where the whole machine has less.
+        """
+        usage, hidden = self._bound(pids)
+        if usage.total <= self._limit:
+            return usage.total, hidden
+        exact = sum(_proportional(pid) for pid in pids)
+        return exact + min(usage.shared, shared_of_the_machine()) + usage.certain, hidden
+
+    def _bound(self, pids: Collection[int]) -> tuple[Usage, list[int]]:
+        usage, hidden = Usage(other=self._tmpfs_bytes() + _system_v_bytes()), []
+        for pid in pids:
+            try:
+                _add_process(usage, pid)
+                _add_mappings(usage, pid)
+                _add_descriptors(usage, pid)
+            except PermissionError:
+                hidden.append(pid)
+        for key in self._foreign:
+            usage.files.pop(key, None)
+            usage.mapped.pop(key, None)
+        for key in usage.files:
+            usage.mapped.pop(key, None)  # it is open, so that it was measured
+        if self._own_network:
+            usage.sockets.update(f"unseen {n}" for n in range(_sockets() - len(usage.sockets)))
+        return usage, hidden
+
+    def _tmpfs_bytes(self) -> int:
+        if self._tmpfs is None:
+            return 0
+        status = os.statvfs(self._tmpfs)
+        return (status.f_blocks - status.f_bfree) * status.f_frsize
+
+
+def _add_process(usage: Usage, pid: int) -> None:
+    fields = _fields(f"/proc/{pid}/status")
+    usage.private += fields.get(b"RssAnon", 0) + fields.get(b"VmSwap", 0)
+    usage.kernel += fields.get(b"VmPTE", 0)
+
+
+def _add_mappings(usage: Usage, pid: int) -> None:
+    """Of each shared object what is mapped, or what the filter lets be made, if that is more.
+
+    It keeps pages that nobody maps any more, while there is one that somebody does.
+    """
+    maps = _content(f"/proc/{pid}/maps")
+    usage.kernel += maps.count(b"\n") * _MAPPING
+    sizes: dict[tuple[int, int], int] = {}
+    for low, high, major, minor, inode in _SHARED.findall(maps):
+        key = os.makedev(int(major, 16), int(minor, 16)), int(inode)
+        sizes[key] = sizes.get(key, 0) + int(high, 16) - int(low, 16)
+    for key, size in sizes.items():
+        usage.mapped[key] = max(usage.mapped.get(key, SHARED_BYTES), size)
+
+
+def _add_descriptors(usage: Usage, pid: int) -> None:
+    folder = f"/proc/{pid}/fd"
+    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+        names = os.listdir(folder)
+        usage.kernel += len(names) * _DESCRIPTOR
+        for name in names:
+            with contextlib.suppress(FileNotFoundError):
+                link = os.readlink(f"{folder}/{name}")
+                if link.startswith("socket:"):
+                    usage.sockets.add(link)
+                elif link.startswith("pipe:"):
+                    usage.pipes.add(link)
+                elif link.startswith("/memfd:"):
+                    status = os.stat(f"{folder}/{name}")
+                    usage.files[status.st_dev, status.st_ino] = status.st_blocks * 512
+
+
+@functools.cache
+def socket_bytes() -> int:
+    """The most that waits in one socket: what fills its buffer, and a message that still went in.
+
+    The filter keeps the size of the buffers.
+    """
+    return 2 * int(_content("/proc/sys/net/core/wmem_default") or _BUFFER) + _DESCRIPTOR
+
+
+def _sockets() -> int:
+    """All sockets of our network namespace."""
+    words = _content("/proc/net/sockstat").split(None, 3)
+    return int(words[2]) if words[:2] == [b"sockets:", b"used"] else 0
+
+
+def shared_of_the_machine() -> int:
+    """All memory that processes of this machine share, and files in memory."""
+    fields = _fields("/proc/meminfo")
+    swapped = fields.get(b"SwapTotal", 0) - fields.get(b"SwapFree", 0)
+    return fields.get(b"Shmem", 0) + swapped
+
+
+def unlinked_bytes(pids: Iterable[int], device: int) -> int:
+    """What files of ``device`` take that have no name any more, but that somebody has open."""
+    found: dict[int, int] = {}
+    for pid in pids:
+        folder = f"/proc/{pid}/fd"
+        with contextlib.suppress(OSError):
+            for name in os.listdir(folder):
+                with contextlib.suppress(OSError):
+                    status = os.stat(f"{folder}/{name}")
+                    if status.st_nlink == 0 and status.st_dev == device:
+                        found[status.st_ino] = status.st_blocks * 512
+    return sum(found.values())
+
+
+def _fields(path: str) -> dict[bytes, int]:
+    """``Name:   123 kB`` lines as bytes."""
+    found: dict[bytes, int] = {}
+    for line in _content(path).splitlines():
+        name, _, rest = line.partition(b":")
+        if rest.endswith(b" kB"):
+            found[name] = int(rest[:-3]) * 1024
+    return found
+
+
+def _content(path: str) -> bytes:
+    """A file of /proc; empty when its process has gone."""
+    try:
+        with open(path, "rb") as file:
+            return file.read()
+    except (FileNotFoundError, ProcessLookupError):
+        return b""
+
+
+def _system_v_bytes() -> int:
+    lines = _content("/proc/sysvipc/shm").splitlines()
+    if not lines:
+        return 0
+    columns = lines[0].split()
+    rss, swap = columns.index(b"rss"), columns.index(b"swap")
+    rows = [line.split() for line in lines[1:]]
+    return sum(int(row[rss]) + int(row[swap]) for row in rows)
+
+
+def _proportional(pid: int) -> int:
+    """This process's share of anonymous memory: shared pages divided among their owners.
+
+    Changed pages of a file that is mapped privately are anonymous too.
+    """
+    fields = _fields(f"/proc/{pid}/smaps_rollup")
+    return fields.get(b"Pss_Anon", fields.get(b"Pss", 0)) + fields.get(b"SwapPss", 0)
+
+
+def folder_usage(root: str, most_files: int) -> tuple[int, int]:
+    """(bytes, files) below ``root``; stops counting above ``most_files``."""
+    size = files = 0
+    pending = [root]
+    while pending and files <= most_files:
+        with contextlib.suppress(OSError), os.scandir(pending.pop()) as entries:
+            for entry in entries:
+                files += 1
+                with contextlib.suppress(OSError):
+                    size += entry.stat(follow_symlinks=False).st_blocks * 512
+                    if entry.is_dir(follow_symlinks=False):
+                        pending.append(entry.path)
+    return size, files

@@ -1,0 +1,141 @@
+"""System calls through ctypes: what the standard library does not offer."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import struct
+
+from envhub_worker.lockdown.seccomp.syscalls import number
+
+_libc = ctypes.CDLL(None, use_errno=True)
+_libc.syscall.restype = ctypes.c_long
+
+CLONE_NEWNS = 0x00020000
+CLONE_NEWCGROUP = 0x02000000
+CLONE_NEWUTS = 0x04000000
+CLONE_NEWIPC = 0x08000000
+CLONE_NEWUSER = 0x10000000
+CLONE_NEWPID = 0x20000000
+CLONE_NEWNET = 0x40000000
+
+MS_RDONLY, MS_NOSUID, MS_NODEV, MS_NOEXEC = 1, 2, 4, 8
+MS_BIND, MS_REC, MS_PRIVATE = 1 << 12, 1 << 14, 1 << 18
+MNT_DETACH = 2
+
+ATTR_RDONLY, ATTR_NOSUID, ATTR_NODEV, ATTR_NOEXEC = 1, 2, 4, 8
+ATTR_IDMAP = 1 << 20
+
+_AT_FDCWD = -100
+_AT_EMPTY_PATH = 0x1000
+_AT_RECURSIVE = 0x8000
+_OPEN_TREE_CLONE = 1
+_OPEN_TREE_CLOEXEC = os.O_CLOEXEC
+_MOVE_MOUNT_F_EMPTY_PATH = 4
+
+_CAPABILITY_VERSION_3 = 0x20080522
+
+
+def syscall(call: int, *args: int | bytes | None) -> int:
+    """Call the kernel. Integers are passed as longs, bytes as pointers.
+
+    Raises:
+        OSError: With the kernel's errno.
+    """
+    words = [ctypes.c_long(arg) if isinstance(arg, int) else arg for arg in args]
+    return _checked(_libc.syscall(ctypes.c_long(call), *words))
+
+
+def prctl(option: int, *args: int) -> int:
+    """``prctl(2)`` with the unused arguments zero, as newer options demand."""
+    words = [ctypes.c_ulong(arg) for arg in (*args, 0, 0, 0, 0)[:4]]
+    return _checked(_libc.prctl(ctypes.c_int(option), *words))
+
+
+def unshare(flags: int) -> None:
+    """``unshare(2)``."""
+    _checked(_libc.unshare(ctypes.c_int(flags)))
+
+
+def setns(fd: int, flags: int) -> None:
+    """``setns(2)``; ``fd`` may be a pidfd."""
+    _checked(_libc.setns(ctypes.c_int(fd), ctypes.c_int(flags)))
+
+
+def mount(source: str, target: str, kind: str, flags: int = 0, options: str = "") -> None:
+    """``mount(2)``. The error names the target."""
+    words = (os.fsencode(source), os.fsencode(target), kind.encode())
+    data = os.fsencode(options) or None
+    _checked(_libc.mount(*words, ctypes.c_ulong(flags), data), target)
+
+
+def unmount(target: str) -> None:
+    """Detach whatever is mounted at ``target``, now; it goes when nobody uses it."""
+    _checked(_libc.umount2(os.fsencode(target), ctypes.c_int(MNT_DETACH)), target)
+
+
+def pivot_root(new_root: str, put_old: str) -> None:
+    """``pivot_root(2)``."""
+    syscall(number("pivot_root"), os.fsencode(new_root), os.fsencode(put_old))
+
+
+def clone_tree(path: str) -> int:
+    """A detached copy of the mounts at and below ``path``, as a descriptor."""
+    flags = _OPEN_TREE_CLONE | _OPEN_TREE_CLOEXEC | _AT_RECURSIVE
+    try:
+        return syscall(number("open_tree"), _AT_FDCWD, os.fsencode(path), flags)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, path) from None
+
+
+def restrict_tree(tree: int, attributes: int, *, recursive: bool = True, userns: int = 0) -> None:
+    """Add mount ``attributes`` (``ATTR_*``) to the detached ``tree``."""
+    flags = _AT_EMPTY_PATH | (_AT_RECURSIVE if recursive else 0)
+    words = struct.pack("=QQQQ", attributes, 0, 0, userns)
+    syscall(number("mount_setattr"), tree, b"", flags, words, len(words))
+
+
+def restrict_mount(path: str, attributes: int) -> None:
+    """Add mount ``attributes`` to the one mount at ``path``."""
+    words = struct.pack("=QQQQ", attributes, 0, 0, 0)
+    syscall(number("mount_setattr"), _AT_FDCWD, os.fsencode(path), 0, words, len(words))
+
+
+def attach_tree(tree: int, path: str) -> None:
+    """Attach the detached ``tree`` at ``path``; the descriptor stays the caller's."""
+    target = os.fsencode(path)
+    flags = _MOVE_MOUNT_F_EMPTY_PATH
+    try:
+        syscall(number("move_mount"), tree, b"", _AT_FDCWD, target, flags)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, path) from None
+
+
+def capget() -> tuple[int, int, int]:
+    """This thread's (effective, permitted, inheritable) capabilities as bit masks."""
+    header = struct.pack("=Ii", _CAPABILITY_VERSION_3, 0)
+    data = ctypes.create_string_buffer(24)
+    syscall_buffer(number("capget"), header, data)
+    words = struct.unpack("=6I", data.raw)
+    effective, permitted, inheritable = (words[n] | words[n + 3] << 32 for n in range(3))
+    return effective, permitted, inheritable
+
+
+def capset(effective: int, permitted: int, inheritable: int) -> None:
+    """Set this thread's capabilities."""
+    header = struct.pack("=Ii", _CAPABILITY_VERSION_3, 0)
+    low = [mask & 0xFFFFFFFF for mask in (effective, permitted, inheritable)]
+    high = [mask >> 32 for mask in (effective, permitted, inheritable)]
+    syscall(number("capset"), header, struct.pack("=6I", *low, *high))
+
+
+def syscall_buffer(call: int, header: bytes, buffer: ctypes.Array[ctypes.c_char]) -> int:
+    """Call the kernel with a constant and a buffer that it fills."""
+    return _checked(_libc.syscall(ctypes.c_long(call), header, buffer))
+
+
+def _checked(result: int, path: str | None = None) -> int:
+    if result < 0:
+        error = ctypes.get_errno()
+        raise OSError(error, os.strerror(error), path)
+    return int(result)

@@ -1,0 +1,230 @@
+"""Building a private, read-only root, and what each jail mounts over it.
+
+Twice: the zygote builds the root that its jails have in common, once; a jail's init then hides
+all snapshots but its own, and mounts its scratch, its proc and its working view. Mount points
+that a jail needs lie where the path says, so a snapshot below ``/tmp`` is no special case.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+from collections.abc import Iterable, Mapping, Sequence
+
+from envhub_worker.lockdown import root_plan
+from envhub_worker.lockdown.mechanisms.kernel import (
+    ATTR_NODEV,
+    ATTR_NOEXEC,
+    ATTR_NOSUID,
+    ATTR_RDONLY,
+    MS_NODEV,
+    MS_NOEXEC,
+    MS_NOSUID,
+    MS_PRIVATE,
+    MS_REC,
+    attach_tree,
+    clone_tree,
+    mount,
+    pivot_root,
+    restrict_mount,
+    restrict_tree,
+    unmount,
+)
+from envhub_worker.lockdown.root_plan import HOME, SHARED_MEMORY, TEMPORARY, WORK, RootPlan, within
+
+_READ_ONLY = ATTR_RDONLY | ATTR_NOSUID | ATTR_NODEV
+_SCRATCH = "/.scratch"
+
+# Of what /proc shows about the host, this stays: libraries ask for it. The rest is covered.
+_PROC_KEPT = frozenset(
+    [
+        "cgroups",
+        "cpuinfo",
+        "devices",
+        "filesystems",
+        "loadavg",
+        "meminfo",
+        "mounts",
+        "net",
+        "self",
+        "stat",
+        "sys",
+        "sysvipc",
+        "thread-self",
+        "uptime",
+        "version",
+    ]
+)
+
+
+def build_root(plan: RootPlan, place: str) -> None:
+    """Make ``place`` a new root with what ``plan`` says, and the host's /proc. Not yet entered.
+
+    Needs a mount namespace of our own; nothing propagates out of it.
+    """
+    mount("none", "/", "none", MS_REC | MS_PRIVATE)
+    # Before the new root is mounted, which may itself lie below one of the trees.
+    trees = _take(root_plan.outermost((*plan.trees, *plan.roots)), _READ_ONLY)
+    trees |= _take(plan.devices, ATTR_NOSUID | ATTR_NOEXEC)
+    # A new proc may be mounted only where an unmasked one is in sight, so bring the old along.
+    trees |= _take(("/proc",), 0)
+    files = {path: _content(path) for path in plan.copies}
+    files |= {path: text.encode() for path, text in plan.texts.items()}
+    mount("sandbox", place, "tmpfs", MS_NOSUID | MS_NODEV, "size=4m,nr_inodes=4096,mode=755")
+    for path in plan.folders:
+        os.makedirs(place + path, 0o755, exist_ok=True)
+    _put(trees, place)
+    for path, content in files.items():
+        _write(place + path, content)
+    for path, target in plan.links.items():
+        _link(place + path, target)
+
+
+def _take(paths: Iterable[str], attributes: int) -> dict[str, int]:
+    """Path to a detached copy of what is there."""
+    trees = {}
+    for path in paths:
+        trees[path] = clone_tree(path)
+        if attributes:
+            restrict_tree(trees[path], attributes)
+    return trees
+
+
+def _put(trees: Mapping[str, int], place: str = "") -> None:
+    """Attach each copy where it was taken, below ``place``."""
+    for path, tree in trees.items():
+        _attach(tree, place + path, os.path.isdir(f"/proc/self/fd/{tree}"))
+        os.close(tree)
+
+
+def _content(path: str) -> bytes:
+    with open(path, "rb") as file:
+        return file.read()
+
+
+def _attach(tree: int, target: str, folder: bool) -> None:
+    if folder:
+        os.makedirs(target, 0o755, exist_ok=True)
+    elif not os.path.exists(target):
+        _write(target, b"")
+    attach_tree(tree, target)
+
+
+def _write(path: str, content: bytes) -> None:
+    os.makedirs(os.path.dirname(path), 0o755, exist_ok=True)
+    with open(path, "wb") as file:
+        file.write(content)
+
+
+def _link(path: str, target: str) -> None:
+    os.makedirs(os.path.dirname(path), 0o755, exist_ok=True)
+    with contextlib.suppress(OSError):
+        # Where the parent is a read-only tree of the host, the link is already in it.
+        os.symlink(target, path)
+
+
+def enter_root(plan: RootPlan, place: str) -> None:
+    """Make ``place`` a root with what ``plan`` says, enter it and detach the old one."""
+    build_root(plan, place)
+    os.chdir(place)
+    pivot_root(".", ".")
+    unmount(".")
+    os.chdir("/")
+    restrict_mount("/", ATTR_RDONLY)
+
+
+def mount_proc() -> None:
+    """A /proc of our own pid namespace, over whatever is there."""
+    mount("proc", "/proc", "proc", MS_NOSUID | MS_NODEV | MS_NOEXEC)
+
+
+def proc_to_cover() -> tuple[list[str], list[str]]:
+    """(files, folders) of /proc that a jail has no use for and could read."""
+    files: list[str] = []
+    folders: list[str] = []
+    for name in sorted(os.listdir("/proc")):
+        path = f"/proc/{name}"
+        mode = os.lstat(path).st_mode
+        if name.isdigit() or name in _PROC_KEPT or not mode & 0o004:
+            continue
+        (folders if stat.S_ISDIR(mode) else files).append(path)
+    return files, folders
+
+
+def cover_proc(files: Sequence[str], folders: Sequence[str]) -> None:
+    """Hide each of ``files`` and ``folders`` of the mounted /proc under something empty."""
+    for path in files:
+        _bind("/dev/null", path)
+    for path in folders:
+        _bind(_SCRATCH, path)
+
+
+def _bind(source: str, target: str) -> None:
+    tree = clone_tree(source)
+    attach_tree(tree, target)
+    os.close(tree)
+
+
+def mount_jail(
+    snapshot: str, roots: Iterable[str], trees: Iterable[str], *, size: int, inodes: int
+) -> str:
+    """Everything that is one jail's own; needs a mount namespace of its own.
+
+    Args:
+        snapshot: Shown at this path; everything else below ``roots`` is hidden.
+        roots: Folders that snapshots lie in.
+        trees: What the zygote's root shows (``RootPlan.trees``).
+        size: Bytes of the scratch, all of it together.
+        inodes: Files and folders in it.
+
+    Returns:
+        How the working directory shows the snapshot: ``"overlay"`` or ``"links"``.
+    """
+    hidden = [*roots, TEMPORARY, SHARED_MEMORY, HOME, WORK]
+    buried = [path for path in trees if any(within(path, folder) for folder in hidden)]
+    kept = _take((*buried, snapshot), 0)
+    for folder in roots:
+        mount("hidden", folder, "tmpfs", MS_NOSUID | MS_NODEV, "size=64k,nr_inodes=64,mode=755")
+    _mount_scratch(size, inodes)
+    _put(kept)
+    for folder in roots:
+        with contextlib.suppress(OSError):
+            restrict_mount(folder, ATTR_RDONLY)
+    view = _mount_view(snapshot)
+    unmount(_SCRATCH)
+    return view
+
+
+def _mount_scratch(size: int, inodes: int) -> None:
+    """One tmpfs, so that home, temporary files and work share one quota."""
+    options = f"size={size},nr_inodes={inodes},mode=700"
+    mount("scratch", _SCRATCH, "tmpfs", MS_NOSUID | MS_NODEV, options)
+    for name, target in (("home", HOME), ("tmp", TEMPORARY), ("shm", SHARED_MEMORY)):
+        os.mkdir(f"{_SCRATCH}/{name}", 0o700)
+        _bind(f"{_SCRATCH}/{name}", target)
+    os.mkdir(f"{TEMPORARY}/runtime", 0o700)
+
+
+def _mount_view(snapshot: str) -> str:
+    upper, inner = f"{_SCRATCH}/upper", f"{_SCRATCH}/inner"
+    os.mkdir(inner, 0o700)
+    _mirror_folders(snapshot, upper)
+    lower = snapshot.replace("\\", "\\\\").replace(":", "\\:").replace(",", "\\,")
+    options = f"lowerdir={lower},upperdir={upper},workdir={inner},userxattr"
+    try:
+        mount("work", WORK, "overlay", MS_NOSUID | MS_NODEV, options)
+    except OSError:
+        _bind(inner, WORK)
+        for name in os.listdir(snapshot):
+            os.symlink(f"{snapshot}/{name}", f"{WORK}/{name}")
+        return "links"
+    return "overlay"
+
+
+def _mirror_folders(snapshot: str, upper: str) -> None:
+    """The snapshot's folders are read-only, and another user's: in the view they are the jail's."""
+    os.mkdir(upper, 0o755)
+    for folder, names, _ in os.walk(snapshot):
+        for name in names:
+            os.mkdir(upper + os.path.join(folder, name)[len(snapshot) :], 0o755)

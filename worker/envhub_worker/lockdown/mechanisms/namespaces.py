@@ -1,0 +1,167 @@
+"""User, pid, mount, network, IPC, UTS and cgroup namespaces."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import socket
+import struct
+from collections.abc import Callable
+
+from envhub_worker.lockdown.mechanisms.kernel import (
+    CLONE_NEWCGROUP,
+    CLONE_NEWIPC,
+    CLONE_NEWNET,
+    CLONE_NEWNS,
+    CLONE_NEWPID,
+    CLONE_NEWUSER,
+    CLONE_NEWUTS,
+    setns,
+    unshare,
+)
+from envhub_worker.lockdown.report import LayerUnavailableError
+
+#: The user that a jail sees itself as. Not 0: programs treat that one specially.
+INSIDE_UID = 1000
+
+#: The most that a TCP socket buffers in each direction, where the network is the jail's own.
+TCP_BUFFER = 128 * 1024
+
+_SIOCGIFFLAGS = 0x8913
+_SIOCSIFFLAGS = 0x8914
+_IFF_UP = 1
+
+_WEAKER = 'Or choose the weaker profile by name: Policy(profile="no-userns").'
+
+
+def enter_user_namespace(uid: int, gid: int) -> None:
+    """Become ``INSIDE_UID`` of a new user namespace, with every capability over it.
+
+    Args:
+        uid: This process's user, as it is seen now.
+        gid: This process's group.
+
+    Raises:
+        LayerUnavailableError: The host forbids it; the fix is for this host.
+    """
+    try:
+        unshare(CLONE_NEWUSER)
+        # Without this the kernel lets nobody write gid_map: a group may also take rights away.
+        _write("/proc/self/setgroups", "deny")
+        _write("/proc/self/uid_map", f"{INSIDE_UID} {uid} 1")
+        _write("/proc/self/gid_map", f"{INSIDE_UID} {gid} 1")
+    except OSError as error:
+        raise user_namespace_unavailable(error) from error
+
+
+def _write(path: str, text: str) -> None:
+    with open(path, "w") as file:
+        file.write(text)
+
+
+def unshare_for_zygote(network: str) -> None:
+    """What all jails of a zygote have in common: their ancestors' namespaces."""
+    flags = CLONE_NEWNS | CLONE_NEWPID | CLONE_NEWIPC | CLONE_NEWUTS
+    _unshare(flags | (0 if network == "host" else CLONE_NEWNET))
+    socket.sethostname("sandbox")
+
+
+def unshare_for_jail(network: str) -> None:
+    """What each jail has for itself; its pid namespace was made by ``in_new_pid_namespace``."""
+    flags = CLONE_NEWNS | CLONE_NEWIPC | CLONE_NEWCGROUP
+    _unshare(flags | (0 if network == "host" else CLONE_NEWNET))
+
+
+def _unshare(flags: int) -> None:
+    try:
+        unshare(flags)
+    except OSError as error:
+        reason = f"unshare({flags:#x}) answers {os.strerror(error.errno or 0)}"
+        raise LayerUnavailableError("namespaces", reason, _WEAKER) from error
+
+
+def fork_in_new_pid_namespace() -> int:
+    """``os.fork()`` whose child is the first process of a new pid namespace.
+
+    The zygote must own its own pid namespace: only then may it return to it.
+    """
+    unshare(CLONE_NEWPID)
+    pid = os.fork()
+    if pid:
+        back = os.pidfd_open(os.getpid())
+        setns(back, CLONE_NEWPID)
+        os.close(back)
+    return pid
+
+
+def forbid_what_is_counted() -> None:
+    """Let nobody below ours make a namespace or watch a file, should the filter let it by.
+
+    The kernel counts these for each user, in each user namespace and all above it; so the user's
+    other programs keep their share.
+    """
+    for name in os.listdir("/proc/sys/user"):
+        _write(f"/proc/sys/user/{name}", "0")
+
+
+def shrink_tcp() -> None:
+    """Let what waits in a connection of our own network namespace stay below ``TCP_BUFFER``."""
+    for name in ("tcp_rmem", "tcp_wmem"):
+        with contextlib.suppress(FileNotFoundError):
+            _write(f"/proc/sys/net/ipv4/{name}", f"4096 65536 {TCP_BUFFER}")
+
+
+def raise_loopback() -> None:
+    """Bring up the loopback device of our own network namespace."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as control:
+        request = struct.pack("16sh22x", b"lo", 0)
+        answer = fcntl.ioctl(control, _SIOCGIFFLAGS, request)
+        flags = struct.unpack_from("16sh", answer)[1]
+        fcntl.ioctl(control, _SIOCSIFFLAGS, struct.pack("16sh22x", b"lo", flags | _IFF_UP))
+
+
+def user_namespace_unavailable(
+    error: OSError, read: Callable[[str], str | None] | None = None
+) -> LayerUnavailableError:
+    """Why this host refused a user namespace, and what to do about it here.
+
+    Args:
+        error: What the kernel answered.
+        read: Gives the text of a sysctl file, or None where there is none.
+    """
+    read = read or _read
+    reason, fix = _diagnosis(error, read)
+    return LayerUnavailableError("user-namespace", reason, f"{fix} {_WEAKER}")
+
+
+def _diagnosis(error: OSError, read: Callable[[str], str | None]) -> tuple[str, str]:
+    if read("/proc/sys/user/max_user_namespaces") == "0":
+        return "user.max_user_namespaces is 0", "Run: sudo sysctl user.max_user_namespaces=15000."
+    if read("/proc/sys/kernel/unprivileged_userns_clone") == "0":
+        return (
+            "kernel.unprivileged_userns_clone is 0",
+            "Run: sudo sysctl kernel.unprivileged_userns_clone=1.",
+        )
+    if read("/proc/sys/kernel/apparmor_restrict_unprivileged_userns") == "1":
+        return (
+            "AppArmor restricts unprivileged user namespaces (Ubuntu 23.10 and later)",
+            "Install the AppArmor profile that `envhub doctor` prints, or run: "
+            "sudo sysctl kernel.apparmor_restrict_unprivileged_userns=0.",
+        )
+    answer = errno.errorcode.get(error.errno or 0, "?")
+    if read("/.dockerenv") is not None or read("/run/.containerenv") is not None:
+        return (
+            f"the container's seccomp profile forbids it ({answer})",
+            "Lock the container itself down (--network none --read-only --cap-drop ALL "
+            "--security-opt no-new-privileges --pids-limit 512 --memory 8g) and choose "
+            'Policy(profile="container").',
+        )
+    return f"the kernel answers {answer}", "Ask the administrator of this host to allow it."
+
+
+def _read(path: str) -> str | None:
+    with contextlib.suppress(OSError), open(path) as file:
+        return file.read().strip()
+    return None

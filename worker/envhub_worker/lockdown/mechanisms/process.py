@@ -1,0 +1,96 @@
+"""What a process sets about itself: its parent's death, signals, descriptors, privileges."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+from collections.abc import Iterable
+
+from envhub_worker.lockdown.mechanisms.kernel import prctl, syscall
+from envhub_worker.lockdown.seccomp.syscalls import number
+
+_PR_SET_PDEATHSIG = 1
+_PR_SET_DUMPABLE = 4
+_PR_SET_CHILD_SUBREAPER = 36
+_PR_SET_NO_NEW_PRIVS = 38
+_PR_GET_NO_NEW_PRIVS = 39
+
+_LAST_FD = 2**31 - 1
+
+
+def die_with_parent(parent: int, signum: int = signal.SIGKILL) -> None:
+    """Receive ``signum`` when the parent thread ends; ``parent`` is its pid as we see it.
+
+    Arm again after every change of user: that clears it. A parent that has already gone sends
+    nothing, so that is checked after arming.
+    """
+    prctl(_PR_SET_PDEATHSIG, signum)
+    if os.getppid() != parent:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def set_dumpable(dumpable: bool) -> None:
+    """Say whether same-user processes may trace this one and read its memory."""
+    prctl(_PR_SET_DUMPABLE, int(dumpable))
+
+
+def become_subreaper() -> None:
+    """Adopt the orphans among our descendants."""
+    prctl(_PR_SET_CHILD_SUBREAPER, 1)
+
+
+def set_no_new_privileges() -> None:
+    """Let no later ``execve`` gain anything: set-user-id bits and file capabilities are dead."""
+    prctl(_PR_SET_NO_NEW_PRIVS, 1)
+
+
+def has_no_new_privileges() -> bool:
+    """Whether ``set_no_new_privileges`` holds for this thread."""
+    return prctl(_PR_GET_NO_NEW_PRIVS) == 1
+
+
+def close_all_but(keep: Iterable[int]) -> None:
+    """Close every descriptor that is not in ``keep``."""
+    low = 0
+    for fd in sorted(set(keep)):
+        if fd > low:
+            _close_range(low, fd - 1)
+        low = fd + 1
+    _close_range(low, _LAST_FD)
+
+
+def _close_range(low: int, high: int) -> None:
+    try:
+        syscall(number("close_range"), low, high, 0)
+    except OSError as error:
+        if error.errno != errno.ENOSYS:
+            raise
+        for fd in [int(name) for name in os.listdir("/proc/self/fd")]:
+            if low <= fd <= high:
+                os.closerange(fd, fd + 1)
+
+
+def reset_signals(handled: Iterable[int]) -> None:
+    """Dispositions and mask as a Python program finds them after a plain exec.
+
+    Args:
+        handled: The signals that this program has set a handler for. (Asking for all 64 costs
+            more than the rest of a fork.)
+    """
+    signal.set_wakeup_fd(-1)
+    for signum in handled:
+        signal.signal(signum, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
+
+
+def pid_of(pidfd: int) -> int:
+    """The pid behind ``pidfd`` as this process sees it; 0 or less when it has ended."""
+    with open(f"/proc/self/fdinfo/{pidfd}") as file:
+        return next(int(line.split()[1]) for line in file if line.startswith("Pid:"))
+
+
+def exit_fields(status: int) -> dict[str, int | None]:
+    """``{"code", "signal"}`` of a wait status; exactly one is not None."""
+    code = os.waitstatus_to_exitcode(status)
+    return {"code": code, "signal": None} if code >= 0 else {"code": None, "signal": -code}

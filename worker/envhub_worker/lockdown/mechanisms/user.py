@@ -1,0 +1,95 @@
+"""Leaving root behind: a user that owns nothing and runs nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pwd
+import random
+
+from envhub_worker.lockdown.mechanisms import capabilities, kernel, process
+from envhub_worker.lockdown.report import LayerUnavailableError
+
+CAP_CHOWN, CAP_SETGID, CAP_SETUID = 0, 6, 7
+
+# Far above the ranges that distributions, systemd and rootless containers hand out.
+_HIGH = range(0x6E000000, 0x6EFFFFFF)
+# For a container whose own user namespace maps only 65536 users.
+_LOW = range(62000, 65000)
+
+
+def choose() -> int | None:
+    """The user that root's jails become; None for a plain user, who stays.
+
+    Raises:
+        LayerUnavailableError: This root has no right to become another user.
+    """
+    if os.geteuid() != 0:
+        return None
+    needed = 1 << CAP_CHOWN | 1 << CAP_SETGID | 1 << CAP_SETUID
+    if kernel.capget()[0] & needed != needed:
+        raise LayerUnavailableError(
+            "unprivileged-user",
+            "this root was started without the right to become another user",
+            "Start as a plain user (in a container: --user 1000:1000), or give it back: "
+            "--cap-add CHOWN --cap-add SETGID --cap-add SETUID.",
+        )
+    return unused_uid()
+
+
+def unused_uid() -> int:
+    """A user id that is mapped here, has no name and runs no process.
+
+    Raises:
+        LayerUnavailableError: This user namespace maps too few users.
+    """
+    mapped = _mapped()
+    for candidates in (_HIGH, _LOW):
+        if mapped[0] <= candidates[0] and candidates[-1] <= mapped[1]:
+            return _unused(candidates)
+    raise LayerUnavailableError(
+        "unprivileged-user",
+        "root here cannot become another user: this user namespace maps too few ids",
+        "Start as a plain user, or map at least 65536 ids into the container.",
+    )
+
+
+def _mapped() -> tuple[int, int]:
+    """First and last id of the widest range that this user namespace maps."""
+    with open("/proc/self/uid_map") as file:
+        ranges = [tuple(map(int, line.split())) for line in file]
+    inside, _, length = max(ranges, key=lambda entry: entry[2])
+    return inside, inside + length - 1
+
+
+def _unused(candidates: range) -> int:
+    running = set(_running_uids())
+    while True:
+        uid = random.SystemRandom().choice(candidates)
+        if uid not in running and not _has_name(uid):
+            return uid
+
+
+def _running_uids() -> list[int]:
+    uids = []
+    for name in os.listdir("/proc"):
+        if name.isdigit():
+            with contextlib.suppress(OSError):
+                uids.append(os.stat(f"/proc/{name}").st_uid)
+    return uids
+
+
+def _has_name(uid: int) -> bool:
+    with contextlib.suppress(KeyError):
+        return bool(pwd.getpwuid(uid))
+    return False
+
+
+def become(uid: int) -> None:
+    """Become ``uid`` with that group only, for good. ``die_with_parent`` must be armed again."""
+    capabilities.empty_the_bounding_set()
+    os.setgroups([])
+    os.setresgid(uid, uid, uid)
+    os.setresuid(uid, uid, uid)
+    # The change made /proc/self root's; without this nobody could write our user map.
+    process.set_dumpable(True)

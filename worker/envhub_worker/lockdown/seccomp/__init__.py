@@ -1,0 +1,1 @@
+"""The system call filter: a policy as a table, compiled to BPF and installed."""

@@ -1,0 +1,202 @@
+"""The system call filter: ``seccomp_policy``'s table as a program, and its installation."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from collections.abc import Mapping
+
+from envhub_worker.lockdown.mechanisms.kernel import prctl, syscall
+from envhub_worker.lockdown.report import LayerUnavailableError
+from envhub_worker.lockdown.seccomp import bpf
+from envhub_worker.lockdown.seccomp.bpf import Branch, Do, Item, Label
+from envhub_worker.lockdown.seccomp.policy import (
+    ENOSYS,
+    EPERM,
+    KILL_PROCESS,
+    ByArguments,
+    Check,
+    Verdict,
+    table,
+)
+from envhub_worker.lockdown.seccomp.syscalls import NUMBERS, number
+
+_AUDIT_ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
+# The x32 ABI reaches the same calls under numbers that a table does not list.
+_X32 = 0x40000000
+
+_PR_GET_SECCOMP = 21
+_PR_SET_SECCOMP = 22
+_MODE_FILTER = 2
+_SET_MODE_FILTER = 1
+_NEW_LISTENER = 1 << 3
+
+_NUMBER, _ARCHITECTURE, _ARGUMENTS = 0, 4, 16
+
+
+def compile_filter(
+    machine: str,
+    *,
+    namespaced: bool,
+    network: str,
+    brokered: bool = False,
+    measured: bool = False,
+    scoped: bool = True,
+) -> bytes:
+    """The program for ``machine`` as bytes; see ``seccomp_policy.table``.
+
+    Raises:
+        LayerUnavailableError: No table for this machine.
+    """
+    verdicts = table(
+        namespaced=namespaced,
+        network=network,
+        brokered=brokered,
+        measured=measured,
+        scoped=scoped,
+    )
+    return bpf.to_bytes(program(machine, verdicts))
+
+
+def program(machine: str, verdicts: Mapping[str, Verdict]) -> list[bpf.Instruction]:
+    """Architecture first, then a balanced tree over the numbers, then the argument checks."""
+    if machine not in NUMBERS:
+        raise LayerUnavailableError(
+            "seccomp",
+            f"no system call table for {machine}",
+            "Run on x86-64 or aarch64, or in a container on such a host.",
+        )
+    numbers = NUMBERS[machine]
+    highest = max(numbers.values())
+    by_number = {numbers[name]: verdict for name, verdict in verdicts.items() if name in numbers}
+    known = set(numbers.values())
+    items: list[Item] = [
+        Do(bpf.LOAD, _ARCHITECTURE),
+        Branch(bpf.JUMP_EQUAL, _AUDIT_ARCH[machine], None, _returning(KILL_PROCESS)),
+        Do(bpf.LOAD, _NUMBER),
+    ]
+    if machine == "x86_64":
+        items.append(Branch(bpf.JUMP_GREATER_OR_EQUAL, _X32, _returning(KILL_PROCESS), None))
+    items.append(Branch(bpf.JUMP_GREATER, highest, _returning(ENOSYS), None))
+    labels = [
+        _label(n, by_number.get(n, EPERM if n in known else ENOSYS)) for n in range(highest + 1)
+    ]
+    items += _tree(_segments(labels))
+    items += _argument_blocks(by_number)
+    return bpf.assemble(items + _returns(items))
+
+
+def _label(call: int, verdict: Verdict) -> str:
+    return f"call-{call}" if isinstance(verdict, ByArguments) else _returning(verdict)
+
+
+def _returning(verdict: int) -> str:
+    return f"return-{verdict:#x}"
+
+
+def _segments(labels: list[str]) -> list[tuple[int, str]]:
+    """(first number, label) of each run of equal labels."""
+    starts = [n for n, label in enumerate(labels) if n == 0 or labels[n - 1] != label]
+    return [(n, labels[n]) for n in starts]
+
+
+def _tree(segments: list[tuple[int, str]]) -> list[Item]:
+    """Binary search for the segment of the loaded number."""
+    middle = len(segments) // 2
+    left, right = segments[:middle], segments[middle:]
+    items: list[Item] = [
+        Branch(bpf.JUMP_GREATER_OR_EQUAL, right[0][0], _entry(right), _entry(left))
+    ]
+    for half in (left, right):
+        if len(half) > 1:
+            items += [Label(_entry(half)), *_tree(half)]
+    return items
+
+
+def _entry(segments: list[tuple[int, str]]) -> str:
+    """Where to go for these segments: the verdict of the only one, or their own sub-tree."""
+    if len(segments) == 1:
+        return segments[0][1]
+    return f"tree-{segments[0][0]}-{segments[-1][0]}"
+
+
+def _argument_blocks(by_number: Mapping[int, Verdict]) -> list[Item]:
+    items: list[Item] = []
+    for call, verdict in sorted(by_number.items()):
+        if isinstance(verdict, ByArguments):
+            items += _argument_block(_label(call, verdict), verdict)
+    return items
+
+
+def _argument_block(label: str, verdict: ByArguments) -> list[Item]:
+    items: list[Item] = [Label(label)]
+    for index, (checks, action) in enumerate(verdict.rules):
+        following = f"{label}-{index + 1}"
+        for check in checks:
+            items += _compare(check, following)
+        items += [Do(bpf.RETURN, action), Label(following)]
+    return [*items, Do(bpf.RETURN, verdict.otherwise)]
+
+
+def _compare(check: Check, otherwise: str) -> list[Item]:
+    """Fall through when the check holds. Both machines are little-endian."""
+    offset = _ARGUMENTS + 8 * check.arg
+    items: list[Item] = [Do(bpf.LOAD, offset)]
+    if check.mask != 0xFFFFFFFF:
+        items.append(Do(bpf.AND, check.mask))
+    items.append(Branch(bpf.JUMP_EQUAL, check.value & 0xFFFFFFFF, None, otherwise))
+    if check.wide:
+        items.append(Do(bpf.LOAD, offset + 4))
+        items.append(Branch(bpf.JUMP_EQUAL, check.value >> 32, None, otherwise))
+    return items
+
+
+def _returns(items: list[Item]) -> list[Item]:
+    """One return per verdict that some branch names."""
+    targets = {
+        target
+        for item in items
+        if isinstance(item, Branch)
+        for target in (item.if_true, item.if_false)
+        if target is not None and target.startswith("return-")
+    }
+    return [
+        item
+        for target in sorted(targets)
+        for item in (Label(target), Do(bpf.RETURN, int(target.removeprefix("return-"), 16)))
+    ]
+
+
+class _Program(ctypes.Structure):
+    _fields_ = (("length", ctypes.c_ushort), ("filter", ctypes.c_void_p))
+
+
+def install(compiled: bytes, *, brokered: bool = False) -> int:
+    """Filter this thread and its descendants for good. ``no_new_privs`` must be set.
+
+    Returns:
+        Where the calls that ask arrive if ``brokered``, else -1. Whoever holds it decides.
+
+    Raises:
+        LayerUnavailableError: The kernel refuses.
+    """
+    code = ctypes.create_string_buffer(compiled, len(compiled))
+    header = _Program(len(compiled) // 8, ctypes.addressof(code))
+    try:
+        if brokered:
+            place = ctypes.addressof(header)
+            return syscall(number("seccomp"), _SET_MODE_FILTER, _NEW_LISTENER, place)
+        prctl(_PR_SET_SECCOMP, _MODE_FILTER, ctypes.addressof(header))
+    except OSError as error:
+        raise LayerUnavailableError(
+            "seccomp",
+            f"the kernel answers {os.strerror(error.errno or 0)}",
+            "It needs CONFIG_SECCOMP_FILTER, which every distribution's kernel has"
+            f"{', and Linux 5.5' if brokered else ''}.",
+        ) from error
+    return -1
+
+
+def installed() -> bool:
+    """Whether a filter holds for this thread."""
+    return prctl(_PR_GET_SECCOMP) == _MODE_FILTER

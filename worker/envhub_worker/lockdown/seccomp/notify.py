@@ -1,0 +1,158 @@
+"""Signals of a jail without a pid namespace, where Landlock cannot scope them (before ABI 6).
+
+The filter hands ``kill``, ``tkill`` and ``tgkill`` to init, which sends the signal when the
+target is a process of the jail. All of their arguments are numbers in registers, so nothing can
+change between the check and the act; a target is held by a pidfd before it is looked at, so no
+other process can take its pid. What a process sends to itself the kernel is told to go on with:
+sent by init, it would interrupt the very call that waits for the answer.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import select
+import signal
+import struct
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+
+from envhub_worker.lockdown.mechanisms import reap
+from envhub_worker.lockdown.mechanisms.kernel import syscall
+from envhub_worker.lockdown.seccomp.syscalls import number
+
+_RECEIVE = 0xC0502100
+_SEND = 0xC0182101
+_CONTINUE = 1
+
+# struct seccomp_notif: id, tid, flags, then struct seccomp_data: call, arch, address, arguments.
+_REQUEST = struct.Struct("=QIIiIQ6Q")
+# struct seccomp_notif_resp: id, value, error, flags.
+_ANSWER = struct.Struct("=QqiI")
+
+
+@dataclass(frozen=True)
+class Request:
+    """One system call that waits for an answer.
+
+    Attributes:
+        thread: The calling thread.
+        caller: Its process.
+        call: The call's number.
+        arguments: The first three, as the C integers that the kernel reads.
+    """
+
+    thread: int
+    caller: int
+    call: int
+    arguments: tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """``error``: an errno, or 0; ``proceed``: the kernel shall make the call itself."""
+
+    error: int = 0
+    proceed: bool = False
+
+
+_PROCEED = Answer(proceed=True)
+_Inside = Callable[[], Collection[int]]
+
+
+def serve(listener: int) -> bool:
+    """Answer one request that waits at ``listener``; False when nobody is left to ask."""
+    buffer = bytearray(_REQUEST.size)
+    try:
+        fcntl.ioctl(listener, _RECEIVE, buffer)
+    except OSError as error:
+        # Something took the caller out of its call; others may still come.
+        return error.errno == errno.EINTR or _has_callers(listener)
+    identity, thread, _, call, _, _, *words = _REQUEST.unpack(buffer)
+    first, second, third = (_c_int(word) for word in words[:3])
+    request = Request(thread, reap.process_of(thread), call, (first, second, third))
+    answer = decide(request, lambda: reap.descendants(os.getpid()))
+    flags = _CONTINUE if answer.proceed else 0
+    with contextlib.suppress(OSError):
+        fcntl.ioctl(listener, _SEND, _ANSWER.pack(identity, 0, -answer.error, flags))
+    return True
+
+
+def _has_callers(listener: int) -> bool:
+    poller = select.poll()
+    poller.register(listener, select.POLLIN)
+    return not any(events & select.POLLHUP for _, events in poller.poll(0))
+
+
+def _c_int(word: int) -> int:
+    low = word & 0xFFFFFFFF
+    return low - (1 << 32) if low >> 31 else low
+
+
+def decide(request: Request, inside: _Inside) -> Answer:
+    """Send the signal that ``request`` asks for, where that is permitted.
+
+    Args:
+        request: The call.
+        inside: Gives the pids of the jail's processes, without init.
+    """
+    first, second, third = request.arguments
+    if request.caller == 0:
+        return Answer(errno.ESRCH)
+    if request.call == number("kill"):
+        return _kill(request.caller, first, second, inside)
+    if request.call == number("tkill"):
+        if first == request.thread:
+            return _PROCEED
+        return _send_to_thread(reap.process_of(first), first, second, inside)
+    if first == request.caller:
+        return _PROCEED
+    return _send_to_thread(first, second, third, inside)
+
+
+def _kill(caller: int, target: int, signum: int, inside: _Inside) -> Answer:
+    # A process is alone with the jail in its own group: the host has a session of its own.
+    if target in (caller, 0, -os.getpgid(caller)):
+        return _PROCEED
+    if target == -1:
+        return Answer(errno.EPERM)
+    if target > 0:
+        return Answer(_send(target, signum, inside))
+    members = [pid for pid in inside() if _group_of(pid) == -target]
+    return Answer(min((_send(pid, signum, inside) for pid in members), default=errno.ESRCH))
+
+
+def _group_of(pid: int) -> int:
+    with contextlib.suppress(ProcessLookupError):
+        return os.getpgid(pid)
+    return -1
+
+
+def _send(pid: int, signum: int, inside: _Inside) -> int:
+    return _held(pid, inside, lambda pidfd: signal.pidfd_send_signal(pidfd, signum))
+
+
+def _send_to_thread(pid: int, thread: int, signum: int, inside: _Inside) -> Answer:
+    if pid <= 0 or thread <= 0:
+        return Answer(errno.ESRCH)
+    tgkill = number("tgkill")
+    return Answer(_held(pid, inside, lambda _: syscall(tgkill, pid, thread, signum)))
+
+
+def _held(pid: int, inside: _Inside, act: Callable[[int], object]) -> int:
+    """``act`` on the pidfd of ``pid`` if that is a process of the jail; 0 or an errno."""
+    try:
+        pidfd = os.pidfd_open(pid)
+    except OSError as error:
+        return error.errno or errno.ESRCH
+    try:
+        if pid not in inside():
+            return errno.EPERM
+        act(pidfd)
+    except OSError as error:
+        return error.errno or errno.EPERM
+    finally:
+        os.close(pidfd)
+    return 0

@@ -1,0 +1,90 @@
+"""A host's own confinement: what the kernel binds to one process and its descendants."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+
+from envhub_worker.channel import Channel
+from envhub_worker.lockdown.context import JailContext
+from envhub_worker.lockdown.limits import rlimits
+from envhub_worker.lockdown.mechanisms import capabilities, landlock, process
+from envhub_worker.lockdown.mechanisms.landlock import DEVICE, READ, WRITE, Rule
+from envhub_worker.lockdown.seccomp import filter
+from envhub_worker.lockdown.stages import selftest
+
+# What the C library and numerical libraries read; nothing here is about a person.
+_HOST_FILES = (
+    "/etc/alternatives",
+    "/etc/fonts",
+    "/etc/group",
+    "/etc/host.conf",
+    "/etc/hosts",
+    "/etc/ld.so.cache",
+    "/etc/localtime",
+    "/etc/mime.types",
+    "/etc/nsswitch.conf",
+    "/etc/passwd",
+    "/proc/cpuinfo",
+    "/proc/filesystems",
+    "/proc/meminfo",
+    "/proc/stat",
+    "/proc/sys/kernel",
+    "/proc/sys/vm/overcommit_memory",
+    "/proc/uptime",
+    "/proc/version",
+)
+
+
+def enter(jail: JailContext, descriptors: Iterable[int], init: Channel) -> None:
+    """Confine this single-threaded process for good, and test that it holds.
+
+    Args:
+        jail: The jail that it belongs to.
+        descriptors: Every descriptor that may be open.
+        init: Takes the broker's listener, if there is one.
+
+    Raises:
+        LayerUnavailableError: A layer cannot be had, or a denial does not hold.
+    """
+    # Init is not; but then a process may not even open its own files in /proc.
+    process.set_dumpable(True)
+    _be_killed_first()
+    rlimits.apply(rlimits.wanted(jail.spec.confinement.limits, jail.processes))
+    capabilities.drop_all()
+    process.set_no_new_privileges()
+    if jail.plan.landlock:
+        wanted = landlock.ruleset(jail.common.landlock_abi, jail.common.config.network)
+        landlock.restrict(wanted, rules(jail, os.getpid()))
+    program = jail.common.programs[jail.plan.measured]
+    listener = filter.install(program, brokered=jail.common.brokered)
+    if listener >= 0:
+        init.send({"broker": True}, [listener])
+        os.close(listener)  # whoever holds it may permit anything
+    selftest.run(jail, descriptors)
+
+
+def _be_killed_first() -> None:
+    """When the whole host runs out of memory, the kernel should end a jail, not its client."""
+    with open("/proc/self/oom_score_adj", "w") as file:
+        file.write("1000")
+
+
+def rules(jail: JailContext, pid: int) -> list[Rule]:
+    """What Landlock permits a host; everything else it denies.
+
+    Args:
+        jail: The jail.
+        pid: The host's own: without a pid namespace it may read only its own ``/proc`` folder.
+    """
+    common, scratch = jail.common, jail.scratch
+    readable = [*common.trees, jail.spec.snapshot]
+    readable += ["/proc", "/etc", "/dev"] if common.namespaced else [*_HOST_FILES, f"/proc/{pid}"]
+    writable = [scratch.home, scratch.temporary, scratch.work]
+    if scratch.shared_memory is not None:
+        writable.append(scratch.shared_memory)
+    return [
+        *(Rule(path, READ) for path in readable),
+        *(Rule(path, WRITE) for path in writable),
+        *(Rule(path, DEVICE) for path in common.devices),
+    ]

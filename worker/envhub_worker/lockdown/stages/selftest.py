@@ -1,0 +1,82 @@
+"""A host tries what it must not be able to do. The last thing before a stranger's code."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable, Iterable
+
+from envhub_worker.lockdown.context import JailContext
+from envhub_worker.lockdown.mechanisms import capabilities, process
+from envhub_worker.lockdown.mechanisms.kernel import CLONE_NEWUSER, mount, syscall, unshare
+from envhub_worker.lockdown.report import LayerUnavailableError
+from envhub_worker.lockdown.seccomp import filter
+from envhub_worker.lockdown.seccomp.syscalls import number
+
+_PTRACE_ATTACH = 16
+_RLIMIT_CORE = 4
+
+
+def run(jail: JailContext, descriptors: Iterable[int]) -> None:
+    """Test every denial that can be tested without harm.
+
+    Raises:
+        LayerUnavailableError: Layer ``self-test``: one of them does not hold.
+    """
+    _hold("no capability is left", capabilities.held() == 0)
+    _hold("no_new_privs is set", process.has_no_new_privileges())
+    _hold("a system call filter is installed", filter.installed())
+    _hold("only named descriptors are open", _open_descriptors() <= set(descriptors))
+    for claim, attempt in _denials(jail).items():
+        _hold(claim, _denied(attempt))
+
+
+def _denials(jail: JailContext) -> dict[str, Callable[[], object]]:
+    entry = os.path.join(jail.spec.snapshot, jail.spec.entry)
+    init = os.getppid()
+    denials: dict[str, Callable[[], object]] = {
+        "the snapshot cannot be written": lambda: os.open(entry, os.O_WRONLY),
+        "no user namespace can be made": lambda: unshare(CLONE_NEWUSER),
+        "nothing can be mounted": lambda: mount("none", "/tmp", "tmpfs"),
+        "init cannot be traced": lambda: syscall(number("ptrace"), _PTRACE_ATTACH, init, 0, 0),
+        "init's limits cannot be changed": lambda: syscall(
+            number("prlimit64"), init, _RLIMIT_CORE, 0, 0
+        ),
+    }
+    if jail.plan.landlock or jail.common.namespaced:
+        canary = jail.common.config.canary
+        denials["files outside cannot be read"] = lambda: os.open(canary, os.O_RDONLY)
+    if jail.common.landlock_abi >= 6 or jail.common.brokered:
+        denials["init cannot be signalled"] = lambda: os.kill(init, 0)
+    if jail.common.config.network == "none":
+        denials["no internet socket can be made"] = lambda: socket.socket(socket.AF_INET)
+    return denials
+
+
+def _denied(attempt: Callable[[], object]) -> bool:
+    try:
+        attempt()
+    except OSError:
+        return True
+    return False
+
+
+def _open_descriptors() -> set[int]:
+    return {fd for fd in map(int, os.listdir("/proc/self/fd")) if _is_open(fd)}
+
+
+def _is_open(fd: int) -> bool:
+    try:
+        os.fstat(fd)
+    except OSError:
+        return False  # the listing's own
+    return True
+
+
+def _hold(claim: str, holds: bool) -> None:
+    if not holds:
+        raise LayerUnavailableError(
+            "self-test",
+            f"it does not hold that {claim}",
+            "Nothing was run. Please report this with the output of `envhub doctor --json`.",
+        )

@@ -1,0 +1,159 @@
+"""The zygote's own confinement, once: what all its jails have in common.
+
+Under ``strict`` the zygote becomes the first process of its own namespaces with a private root,
+so that a jail is a matter of a few cheap mounts, and the zygote's death is every jail's death.
+As root it first becomes a user that owns nothing; the root is built before, while folders like
+/root can still be crossed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pwd
+import signal
+import sys
+from collections.abc import Iterable
+
+import envhub_worker
+from envhub_worker.lockdown import root_plan
+from envhub_worker.lockdown.context import Common, ZygoteConfig
+from envhub_worker.lockdown.mechanisms import landlock, mounts, namespaces, process, user
+from envhub_worker.lockdown.mechanisms.kernel import CLONE_NEWNS, unshare
+from envhub_worker.lockdown.plan import needs_broker
+from envhub_worker.lockdown.report import LayerUnavailableError
+from envhub_worker.lockdown.seccomp.filter import compile_filter
+
+
+def enter(config: ZygoteConfig) -> Common:
+    """Confine this process as far as its jails have it in common.
+
+    Under ``strict`` it returns in a child of the process that called: that one only waits.
+
+    Raises:
+        LayerUnavailableError: The host lacks a layer that the profile names.
+    """
+    if config.refusal is not None:
+        raise LayerUnavailableError(**config.refusal)
+    namespaced = config.profile == "strict"
+    plan = _plan_root(config)
+    if namespaced:
+        _enter_namespaces(config, plan)
+        covered = mounts.proc_to_cover()
+    else:
+        if config.user is not None:
+            _become(config)
+            _check_interpreter()
+        covered = ([], [])
+    abi = landlock.version()
+    brokered = needs_broker(namespaced=namespaced, landlock_abi=abi)
+    # A driver keeps more out of sight than a filter could deny.
+    programs = tuple(
+        compile_filter(
+            os.uname().machine,
+            namespaced=namespaced,
+            network=config.network,
+            brokered=brokered,
+            measured=measured and not config.gpu,
+            scoped=landlock.scopes(abi),
+        )
+        for measured in (False, True)
+    )
+    return Common(
+        config=config,
+        pid=0 if namespaced else os.getpid(),
+        namespaced=namespaced,
+        trees=plan.trees,
+        roots=plan.roots,
+        devices=plan.devices,
+        covered=covered,
+        landlock_abi=abi,
+        brokered=brokered,
+        programs=programs,
+    )
+
+
+def _plan_root(config: ZygoteConfig) -> root_plan.RootPlan:
+    return root_plan.plan_root(
+        interpreter_paths(),
+        config.readable,
+        config.roots,
+        private=[*_homes(), config.place],
+        gpu=config.gpu,
+        network=config.network,
+        host=root_plan.real_host(),
+    )
+
+
+def _homes() -> list[str]:
+    # HOME is not ours to ask: the zygote's environment is built.
+    with contextlib.suppress(KeyError):
+        return [pwd.getpwuid(os.getuid()).pw_dir]
+    return []
+
+
+def interpreter_paths() -> list[str]:
+    """Everything that this interpreter and this package are loaded from."""
+    package = os.path.dirname(os.path.abspath(envhub_worker.__file__))
+    prefixes = [sys.prefix, sys.base_prefix, sys.exec_prefix, sys.base_exec_prefix]
+    binaries = [os.path.dirname(sys.executable), os.path.dirname(os.path.realpath(sys.executable))]
+    return [*prefixes, *binaries, *filter(os.path.isabs, sys.path), package, *_mapped_folders()]
+
+
+def _mapped_folders() -> Iterable[str]:
+    """Folders of the shared libraries in use (an interpreter of nix or conda has its own)."""
+    with open("/proc/self/maps") as maps:
+        paths = {line.split(maxsplit=5)[5].rstrip("\n") for line in maps if "/" in line}
+    return {os.path.dirname(path) for path in paths if path.startswith("/") and ".so" in path}
+
+
+def _enter_namespaces(config: ZygoteConfig, plan: root_plan.RootPlan) -> None:
+    try:
+        if config.user is not None:
+            unshare(CLONE_NEWNS)
+            mounts.enter_root(plan, config.place)
+            _become(config)
+        namespaces.enter_user_namespace(os.getuid(), os.getgid())
+        namespaces.unshare_for_zygote(config.network)
+        if config.user is None:
+            mounts.enter_root(plan, config.place)
+        _be_the_first_process()
+        mounts.mount_proc()
+    except OSError as error:
+        raise _mounts_unavailable(error) from error
+
+
+def _become(config: ZygoteConfig) -> None:
+    assert config.user is not None
+    user.become(config.user)
+    process.die_with_parent(config.parent)
+
+
+def _check_interpreter() -> None:
+    """Without a private root, the new user needs the host's permission to read its Python."""
+    for path in (os.__file__, sys.prefix, __file__):
+        if not os.access(path, os.R_OK):
+            raise LayerUnavailableError(
+                "unprivileged-user",
+                f"root must run jails as another user, and that one may not read {path}",
+                'Use an interpreter that all users may read, the profile "strict", or start as '
+                "a plain user.",
+            )
+
+
+def _be_the_first_process() -> None:
+    """Go on as the first process of the new pid namespace; this one stays to be its parent."""
+    child = os.fork()
+    if child:
+        process.close_all_but({2})
+        _, status = os.waitpid(child, 0)
+        code = os.waitstatus_to_exitcode(status)
+        os._exit(code if code >= 0 else 128 - code)
+    # The parent lives outside, where its pid means nothing to us: 0 stands for it.
+    process.die_with_parent(0, signal.SIGKILL)
+
+
+def _mounts_unavailable(error: OSError) -> LayerUnavailableError:
+    where = f"mounting at {error.filename}: " if error.filename else ""
+    cause = namespaces.user_namespace_unavailable(error)
+    return LayerUnavailableError("mount-namespace", where + cause.reason, cause.fix)

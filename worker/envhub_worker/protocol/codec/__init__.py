@@ -1,0 +1,1 @@
+"""Values to frames and back; docs/values.md is its document."""

@@ -1,0 +1,149 @@
+"""Values to frames and back. ``docs/values.md`` is the reference of the encoding.
+
+The first frame holds a msgpack document and the bytes of small arrays; each large array is a
+frame of its own. What msgpack has no type for is either an extension (arrays, numpy scalars, big
+integers) or an array whose first element is an extension that says what the rest is (tuples,
+sets, ranges). Nothing that ``decode`` is given can make it execute anything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from envhub_worker.protocol.codec import structure
+from envhub_worker.protocol.codec.arrays import ArrayReader, Buffer
+from envhub_worker.protocol.codec.decoder import Decoder, TensorMaker, Unpickler
+from envhub_worker.protocol.codec.encoder import Encoder, Pickler
+from envhub_worker.protocol.codec.explain import explain
+from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
+from envhub_worker.protocol.codec.kinds import DOCUMENT_BYTES
+from envhub_worker.protocol.errors import (
+    LocalProtocolError,
+    MessageTooLargeError,
+    RemoteProtocolError,
+)
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+
+__all__ = ["Buffer", "RemoteEnum", "RemoteObject", "decode", "encode"]
+
+
+def encode(
+    value: object,
+    *,
+    pickler: Pickler | None = None,
+    limits: WireLimits = DEFAULT_LIMITS,
+) -> list[Buffer]:
+    """Encodes a value as frames: the header, then one per large array.
+
+    Args:
+        value: Plain Python values, numpy arrays and scalars, torch tensors, nested in any way.
+            Anything else crosses as ``RemoteObject``.
+        pickler: Encodes objects that have no form of their own instead. Client to worker only.
+        limits: What the receiver accepts.
+
+    Returns:
+        Frames to be sent in this order. Large contiguous arrays are not copied: nobody may
+        write them until the frames are sent.
+
+    Raises:
+        LocalProtocolError: The value is cyclic, too deep, too large, or holds a dtype that
+            cannot cross. The text names the path to the offender. Nothing was sent.
+    """
+    encoder = Encoder(pickler, limits)
+    try:
+        frames = encoder.frames(value)
+    except Exception as error:
+        # Objects' own code runs here (__array__, iteration): anything can come out of it.
+        raise LocalProtocolError(explain(value, error, limits, pickler)) from error
+    check_outgoing(frames, limits)
+    return frames
+
+
+def decode(
+    frames: Sequence[Buffer],
+    *,
+    limits: WireLimits = DEFAULT_LIMITS,
+    unpickler: Unpickler | None = None,
+    tensors: TensorMaker | None = None,
+    copy: bool = True,
+) -> object:
+    """Decodes frames into the value that was encoded.
+
+    Trust: input from the worker. Sizes are checked before anything is allocated, every byte
+    must be accounted for, and nothing is executed.
+
+    Args:
+        frames: As ``encode`` returned them.
+        limits: What is accepted.
+        unpickler: Decodes pickled objects; only a worker, which trusts its client, has one.
+        tensors: Makes a tensor of an array and a dtype name (``"bfloat16"`` comes as uint16
+            bits). Without it tensors come as arrays, bfloat16 as float32.
+        copy: Arrays own their memory and can be written. Otherwise they are read-only and the
+            large ones are views of ``frames``.
+
+    Raises:
+        MessageTooLargeError: Over one of ``limits``.
+        RemoteProtocolError: Malformed in any other way.
+    """
+    return decode_parts(*split(frames, limits), limits, unpickler, tensors, copy)
+
+
+def decode_parts(
+    document: bytes,
+    tail: Buffer,
+    buffers: list[Buffer],
+    limits: WireLimits,
+    unpickler: Unpickler | None,
+    tensors: TensorMaker | None,
+    copy: bool = True,
+) -> object:
+    """``decode`` for frames that ``split`` has taken apart."""
+    structure.check(document, limits)
+    reader = ArrayReader(tail, buffers, limits, copy)
+    decoder = Decoder(reader, limits, unpickler, tensors)
+    value = decoder.value(document)
+    reader.finish()
+    return value
+
+
+def check_outgoing(frames: Sequence[Buffer], limits: WireLimits) -> None:
+    """Raises ``LocalProtocolError`` for frames that the receiver will not accept."""
+    try:
+        _check_sizes(frames, limits)
+    except MessageTooLargeError as error:
+        raise LocalProtocolError(f"The message is too large to be sent: {error}") from None
+
+
+def split(frames: Sequence[Buffer], limits: WireLimits) -> tuple[bytes, Buffer, list[Buffer]]:
+    """Checks the frames' sizes; returns document, tail of the header, and the other frames.
+
+    Raises:
+        MessageTooLargeError: Over one of ``limits``.
+        RemoteProtocolError: There is no header, or not all of it.
+    """
+    flat = [frame if type(frame) is bytes else memoryview(frame).cast("B") for frame in frames]
+    _check_sizes(flat, limits)
+    header, *buffers = flat
+    if len(header) < DOCUMENT_BYTES.size:
+        raise RemoteProtocolError("The header is too short.")
+    end = DOCUMENT_BYTES.size + DOCUMENT_BYTES.unpack_from(header)[0]
+    if end > len(header):
+        raise RemoteProtocolError("The header is shorter than it says.")
+    return bytes(header[DOCUMENT_BYTES.size : end]), header[end:], buffers
+
+
+def _check_sizes(frames: Sequence[Buffer], limits: WireLimits) -> None:
+    """Raises ``MessageTooLargeError`` for too much. Frames must consist of single bytes."""
+    if not frames:
+        raise RemoteProtocolError("A message has no frame.")
+    if len(frames) == 1 and len(frames[0]) <= min(limits.header_bytes, limits.message_bytes):
+        return
+    sizes = list(map(len, frames))
+    for name, size, cap in (
+        ("frames", len(sizes), limits.frames),
+        ("header_bytes", sizes[0], limits.header_bytes),
+        ("frame_bytes", max(sizes), max(limits.frame_bytes, sizes[0])),
+        ("message_bytes", sum(sizes), limits.message_bytes),
+    ):
+        if size > cap:
+            raise MessageTooLargeError(f"{size} is over the limit of {cap} ({name}).")

@@ -1,0 +1,82 @@
+"""Finds what in a value cannot be sent, for the error message. Runs only after a failure."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import numpy as np
+
+from envhub_worker.protocol.codec.encoder import Encoder, Pickler
+from envhub_worker.protocol.codec.inert import describe, one_line
+from envhub_worker.protocol.limits import WireLimits
+
+Path = tuple[object, ...]
+
+
+def explain(value: object, error: Exception, limits: WireLimits, pickler: Pickler | None) -> str:
+    """Says what cannot be sent, and where in the value it is."""
+    found = _Search(limits, pickler).first(value, (), ())
+    if found is None:
+        return f"The value cannot be sent: {error}"
+    path, reason = found
+    return f"{_path_text(path)} cannot be sent: {reason}."
+
+
+class _Search:
+    """Walks a value until it meets the offender, or has met as many values as may be sent."""
+
+    def __init__(self, limits: WireLimits, pickler: Pickler | None) -> None:
+        self.limits, self.pickler = limits, pickler
+        self._left = limits.items
+
+    def first(self, value: object, path: Path, above: tuple[int, ...]) -> tuple[Path, str] | None:
+        """Returns path and reason of the first value that is cyclic, too deep, or refused."""
+        children = _children(value)
+        if children is None:
+            reason = self._refusal(value)
+            return None if reason is None else (path, reason)
+        if id(value) in above:
+            return path, "it contains itself"
+        if len(above) == self.limits.depth:
+            return path, f"it is nested deeper than {self.limits.depth} containers"
+        for step, child in children:
+            self._left -= 1
+            if self._left < 0:
+                return None
+            found = self.first(child, (*path, step), (*above, id(value)))
+            if found is not None:
+                return found
+        return None
+
+    def _refusal(self, value: object) -> str | None:
+        try:
+            Encoder(self.pickler, self.limits).frames(value)
+        except Exception as error:
+            return str(error).rstrip(".") or type(error).__name__
+        return None
+
+
+def _children(value: object) -> list[tuple[object, object]] | None:
+    """Returns steps and elements of a container, None for a leaf."""
+    if isinstance(value, dict):
+        keys = [(key, key) for key in value if isinstance(key, tuple | frozenset | Enum)]
+        return [*keys, *value.items()]
+    if isinstance(value, list | tuple | set | frozenset):
+        return list(enumerate(value))
+    if isinstance(value, np.ndarray) and value.dtype.kind == "O":
+        return list(enumerate(value.ravel().tolist()))
+    return None
+
+
+def _path_text(path: tuple[object, ...]) -> str:
+    """Writes ``("info", "a", 3)`` as ``info["a"][3]``."""
+    if not path:
+        return "The value"
+    first, *rest = path
+    named = isinstance(first, str) and first.isidentifier()
+    steps = [str(first)] if named else [f"value[{_step_text(first)}]"]
+    return one_line("".join([*steps, *(f"[{_step_text(step)}]" for step in rest)]))
+
+
+def _step_text(step: object) -> str:
+    return '"' + step + '"' if isinstance(step, str) else describe(step).text

@@ -1,0 +1,309 @@
+"""What recurs in messages: documents that differ in nothing but the id, and in their arrays' bytes.
+
+In a run of steps nearly every message is of that kind. So what the codec has made of a document
+is kept, when it is met again: a *form*, into which only the arrays are put. The key is the whole
+document, or all that it depends on, so a form says exactly what the codec would say. Forms are
+few and small: a peer that sends nothing twice gains nothing and costs nothing.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+import msgpack  # type: ignore[import-untyped]
+import numpy as np
+
+from envhub_worker.protocol.codec.arrays import (
+    Array,
+    ArrayReader,
+    ArrayWriter,
+    Buffer,
+    check_content,
+    parse_descriptor,
+)
+from envhub_worker.protocol.codec.codec import check_outgoing, split
+from envhub_worker.protocol.codec.kinds import ARRAY, DOCUMENT_BYTES, TUPLE
+from envhub_worker.protocol.errors import MessageTooLargeError
+from envhub_worker.protocol.limits import WireLimits
+
+_MAX_DOCUMENT_BYTES = 1024
+_MAX_FORMS = 256
+_MAX_ITEMS = 32
+_MAX_TEXT = 256
+_CONSTANTS = frozenset({int, bool, str, bytes, type(None)})
+_BITS = struct.Struct("<d")
+_TEXTS = frozenset({str, bytes})
+_NUMBERS = frozenset("biufc")
+_ID = 2
+"""Where a message's id begins: after the array's head and the kind, a byte each."""
+_ID_BYTES = {0xCC: 2, 0xCD: 3, 0xCE: 5, 0xCF: 9}
+_ID_FORMS = (
+    (b"", struct.Struct(">B"), 0x80),
+    (b"\xcc", struct.Struct(">B"), 1 << 8),
+    (b"\xcd", struct.Struct(">H"), 1 << 16),
+    (b"\xce", struct.Struct(">I"), 1 << 32),
+    (b"\xcf", struct.Struct(">Q"), 1 << 64),
+)
+
+K = TypeVar("K")
+F = TypeVar("F")
+T = TypeVar("T")
+
+
+class Forms(Generic[K, F]):
+    """Forms by key; one is made when its key is met for the second time."""
+
+    def __init__(self) -> None:
+        self._forms: dict[K, F | None] = {}
+        self.get = self._forms.get
+
+    def met(self, key: K, make: Callable[[], F]) -> None:
+        """Take note of a key that has no form."""
+        if key in self._forms:
+            self._forms[key] = make()
+        elif len(self._forms) < _MAX_FORMS:
+            self._forms[key] = None
+        else:
+            self._forms.clear()
+
+
+class Outgoing:
+    """How to pack messages of one outline.
+
+    Args:
+        frames: What the codec has made of one of them.
+        arrays: That one's arrays.
+        limits: For which it was encoded.
+
+    Attributes:
+        limits: For which it holds; None if it does not hold at all.
+    """
+
+    __slots__ = ("_after", "_before", "_in_header", "limits")
+
+    def __init__(self, frames: list[Buffer], arrays: list[Array], limits: WireLimits) -> None:
+        document, tail, buffers = split(frames, limits)
+        cut = without_id(document)
+        self.limits = None if cut is None else limits
+        document = b"" if cut is None else cut[0]
+        self._before, self._after = document[:_ID], document[_ID:]
+        longest = DOCUMENT_BYTES.size + len(document) + len(pack_id(2**63)) + len(tail)
+        self._in_header = (
+            not buffers
+            and longest <= min(limits.header_bytes, limits.message_bytes)
+            and all(array.dtype.isnative for array in arrays)
+        )
+
+    def frames(self, request_id: int, arrays: list[Array]) -> list[Buffer]:
+        """What ``encode`` would return.
+
+        Raises:
+            LocalProtocolError: More than the receiver accepts.
+        """
+        assert self.limits is not None
+        document = self._before + pack_id(request_id) + self._after
+        prefix = DOCUMENT_BYTES.pack(len(document))
+        if self._in_header:
+            return [b"".join([prefix, document, *[array.tobytes() for array in arrays]])]
+        writer = ArrayWriter()
+        for array in arrays:
+            writer.add(array)
+        frames: list[Buffer] = [b"".join((prefix, document, *writer.tail)), *writer.frames]
+        check_outgoing(frames, self.limits)
+        return frames
+
+
+class Incoming(Generic[T]):
+    """What to make of a document that was decoded before.
+
+    Args:
+        document: With its id.
+        make: Makes the message of its fields.
+        limits: For which it was decoded.
+
+    Attributes:
+        limits: For which it holds; None if it does not hold at all.
+    """
+
+    __slots__ = ("_descriptors", "_make", "_message", "_shape", "_tail_bytes", "_views", "limits")
+
+    def __init__(self, document: bytes, make: Callable[..., T], limits: WireLimits) -> None:
+        self._make = make
+        self._message: T | None = None
+        self._shape: list[Any] = []
+        self._descriptors: list[bytes] = []
+        self._views: list[tuple[np.dtype[Any], tuple[int, ...], slice]] = []
+        self._tail_bytes: int | None = 0
+        self.limits: WireLimits | None = limits
+        try:
+            # as tuples: what is a key has to be hashed, and was before in another form
+            fields = msgpack.unpackb(document, strict_map_key=False, use_list=False)
+            _, _, *self._shape = _shaped(fields, self._descriptors)
+        except _IrregularError:
+            self.limits = None
+        else:
+            self._lay_out()
+            if all(map(_is_constant, self._shape)):
+                self._message = make(*self._shape)
+
+    def _lay_out(self) -> None:
+        """Where each array lies, if all lie in the tail of the header and hold numbers."""
+        start = 0
+        for dtype, shape, nbytes, own_frame in map(parse_descriptor, self._descriptors):
+            if own_frame or dtype.kind not in _NUMBERS:
+                self._tail_bytes = None
+                self._views.clear()
+                return
+            self._views.append((dtype, shape, slice(start, start + nbytes)))
+            start += nbytes
+        self._tail_bytes = start
+
+    def message(self, tail: Buffer, buffers: list[Buffer]) -> T:
+        """The message with these arrays. Trust: as ``decode``.
+
+        Raises:
+            RemoteProtocolError: Their bytes are not what the document says.
+        """
+        assert self.limits is not None
+        if len(tail) == self._tail_bytes and not buffers:
+            arrays = [_own(tail[where], dtype, shape) for dtype, shape, where in self._views]
+        else:
+            arrays = self._read(ArrayReader(tail, buffers, self.limits, copy=True))
+        if self._message is not None:
+            return self._message
+        take = iter(arrays).__next__
+        return self._make(
+            *[take() if type(shape) is _Place else _fill(shape, take) for shape in self._shape]
+        )
+
+    def _read(self, reader: ArrayReader) -> list[Array]:
+        try:
+            arrays = [reader.take(descriptor) for descriptor in self._descriptors]
+        except MemoryError as error:
+            raise MessageTooLargeError("There is not enough memory to decode it.") from error
+        reader.finish()
+        return arrays
+
+
+def _own(raw: Buffer, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
+    """An array of its own memory."""
+    array: Array = np.ndarray(shape, dtype, bytearray(raw))
+    if dtype.kind == "b":
+        check_content(array)
+    return array
+
+
+def pack_id(number: int) -> bytes:
+    """An id as msgpack packs it, in less time."""
+    for head, form, limit in _ID_FORMS:
+        if 0 <= number < limit:
+            return head + form.pack(number)
+    packed: bytes = msgpack.packb(number)
+    return packed
+
+
+def without_id(document: bytes) -> tuple[bytes, bytes] | None:
+    """A message's document without the id, and the id's own bytes; None if that is not plain."""
+    if not _ID < len(document) <= _MAX_DOCUMENT_BYTES:
+        return None
+    array, kind, first = document[: _ID + 1]
+    size = 1 if first < 0x80 else _ID_BYTES.get(first, 0)
+    if not (size and _ID + size <= len(document) and 0x92 <= array <= 0x9F and kind < 0x80):
+        return None
+    if size == _ID_BYTES[0xCF] and document[_ID + 1] > 0x7F:
+        return None  # larger than an id may be
+    return document[:_ID] + document[_ID + size :], document[_ID : _ID + size]
+
+
+def read_id(packed: bytes) -> int:
+    """The id of its own bytes."""
+    return int.from_bytes(packed if len(packed) == 1 else packed[1:], "big")
+
+
+class _Place:
+    """Where the next array goes."""
+
+    __slots__ = ()
+
+
+_PLACE = _Place()
+
+
+class _IrregularError(Exception):
+    """There is no form for this."""
+
+
+def _shaped(value: Any, descriptors: list[bytes]) -> Any:
+    """A value with places for its arrays, and what the document says of those, in its order."""
+    kind = type(value)
+    if kind is msgpack.ExtType:
+        if value.code != ARRAY:
+            raise _IrregularError
+        descriptors.append(value.data)
+        return _PLACE
+    if kind is dict:
+        if set(map(type, value)) - {str}:
+            raise _IrregularError
+        return {key: _shaped(item, descriptors) for key, item in value.items()}
+    if kind is tuple:  # either sort of sequence: a real tuple has a head
+        if value and type(value[0]) is msgpack.ExtType and value[0].code == TUPLE:
+            return tuple([_shaped(item, descriptors) for item in value[1:]])
+        return [_shaped(item, descriptors) for item in value]
+    return value
+
+
+def _is_constant(shape: Any) -> bool:
+    """Whether every message of this shape is the same object, as far as anybody can tell."""
+    if type(shape) is tuple:
+        return all(map(_is_constant, shape))
+    return type(shape) not in (_Place, dict, list)
+
+
+def _fill(shape: Any, take: Callable[[], Array]) -> Any:
+    """A fresh value of a shape; ``take`` gives the arrays, in their order."""
+    kind = type(shape)
+    if kind is _Place:
+        return take()
+    if kind is dict:
+        return {key: _fill(item, take) for key, item in shape.items()}
+    if kind is tuple:
+        return tuple([_fill(item, take) for item in shape])
+    if kind is list:
+        return [_fill(item, take) for item in shape]
+    return shape
+
+
+def outline(values: list[Any]) -> tuple[Any, list[Array]] | None:
+    """All that the document of these values depends on, and their arrays in its order.
+
+    None if they hold anything but constants, numeric arrays, and small tuples, lists and dicts.
+    """
+    arrays: list[Array] = []
+    try:
+        return tuple([_outlined(value, arrays) for value in values]), arrays
+    except _IrregularError:
+        return None
+
+
+def _outlined(value: Any, arrays: list[Array]) -> Any:
+    kind = type(value)
+    if kind is np.ndarray:
+        if value.dtype.kind not in _NUMBERS:
+            raise _IrregularError
+        arrays.append(value)
+        return value.dtype, value.shape
+    if kind is float:
+        return kind, _BITS.pack(value)  # 0.0 is -0.0, and nan is not nan
+    if kind in _CONSTANTS:
+        if kind in _TEXTS and len(value) > _MAX_TEXT:
+            raise _IrregularError
+        return kind, value
+    if kind is dict and len(value) <= _MAX_ITEMS:
+        if set(map(type, value)) - {str}:
+            raise _IrregularError
+        return kind, tuple([(key, _outlined(item, arrays)) for key, item in value.items()])
+    if (kind is tuple or kind is list) and len(value) <= _MAX_ITEMS:
+        return kind, tuple([_outlined(item, arrays) for item in value])
+    raise _IrregularError

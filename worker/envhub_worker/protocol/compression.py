@@ -1,0 +1,121 @@
+"""Lossless compression of a message's large frames, where both sides have agreed on it.
+
+A ``Packed`` header goes in front of the frames and says how large each was. It is worth it on a
+network, for frames that shrink (rendered images do, noise does not): a sample tells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
+from envhub_worker.protocol.limits import WireLimits
+
+SMALLEST = 16 * 1024
+"""Smaller frames are not worth a call: they fit a few packets of a network."""
+_SAMPLE = 16 * 1024
+_WORTH = 0.8
+
+
+def available() -> tuple[str, ...]:
+    """The compressions that can be had here, best first."""
+    return () if _lz4() is None else ("lz4",)
+
+
+def pack_frames(frames: Sequence[Buffer], compression: str) -> list[Buffer]:
+    """The frames as they travel; unchanged where nothing is gained."""
+    block = _lz4() if compression == "lz4" else None
+    if block is None or all(_size(frame) < SMALLEST for frame in frames):
+        return list(frames)
+    packed = [_packed(frame, block) for frame in frames]
+    if all(new is None for new in packed):
+        return list(frames)
+    sizes = [-1 if n is None else _size(f) for n, f in zip(packed, frames, strict=True)]
+    bodies = [f if n is None else n for n, f in zip(packed, frames, strict=True)]
+    return [*m.pack(m.Packed(compression, tuple(sizes)), 0), *bodies]
+
+
+def _packed(frame: Buffer, block: Any) -> bytes | None:
+    """The frame compressed, or None where that does not pay."""
+    if _size(frame) < SMALLEST:
+        return None
+    view = memoryview(frame).cast("B")
+    middle = max(0, len(view) // 2 - _SAMPLE // 2)
+    sample = view[middle : middle + _SAMPLE]
+    if len(block.compress(sample, store_size=False)) > _WORTH * len(sample):
+        return None
+    made: bytes = block.compress(view, store_size=False)
+    return made if len(made) <= _WORTH * len(view) else None
+
+
+def unpack_frames(frames: Sequence[Buffer], limits: WireLimits) -> list[Buffer]:
+    """The frames as they were before ``pack_frames``.
+
+    Trust: input from the other side. Every size is checked before it is allocated.
+
+    Raises:
+        MessageTooLargeError: Over ``limits`` once unpacked.
+        RemoteProtocolError: What is there is not what ``Packed`` says.
+    """
+    if not frames or not _starts_packed(frames[0], limits):
+        return list(frames)
+    _, header = m.unpack(frames[:1], limits=limits)
+    assert isinstance(header, m.Packed)
+    bodies = list(frames[1:])
+    _check(header, bodies, limits)
+    unpack = _unpacker(header.compression)
+    return [
+        body if size == -1 else unpack(body, size)
+        for body, size in zip(bodies, header.sizes, strict=True)
+    ]
+
+
+_HEAD_BYTES = 256
+
+
+def _starts_packed(frame: Buffer, limits: WireLimits) -> bool:
+    # every message is a list whose first item is its kind: after the length of the document
+    head = bytes(memoryview(frame).cast("B")[:_HEAD_BYTES])
+    return head[4:5] == b"\x94" and head[5:6] == bytes([m.Packed.kind])
+
+
+def _check(header: m.Packed, bodies: Sequence[Buffer], limits: WireLimits) -> None:
+    if len(header.sizes) != len(bodies):
+        raise RemoteProtocolError("Packed does not fit its frames")
+    if any(type(size) is not int or size < -1 for size in header.sizes):
+        raise RemoteProtocolError("Packed has a size that is none")
+    total = sum(_size(b) if s == -1 else s for b, s in zip(bodies, header.sizes, strict=True))
+    if max(header.sizes, default=0) > limits.frame_bytes or total > limits.message_bytes:
+        raise MessageTooLargeError(f"{total} bytes when unpacked are over the limit.")
+
+
+def _unpacker(compression: str) -> Callable[[Buffer, int], bytes]:
+    block = _lz4() if compression == "lz4" else None
+    if block is None:
+        raise RemoteProtocolError(f"nobody agreed on the compression {compression[:20]!r}")
+
+    def unpack(body: Buffer, size: int) -> bytes:
+        try:
+            made: bytes = block.decompress(body, uncompressed_size=size)
+        except Exception as error:  # lz4 has errors of its own
+            raise RemoteProtocolError(f"a frame cannot be unpacked: {error}") from None
+        if len(made) != size:
+            raise RemoteProtocolError("a frame is not as large as it says")
+        return made
+
+    return unpack
+
+
+def _size(frame: Buffer) -> int:
+    return len(frame) if type(frame) is bytes else memoryview(frame).nbytes
+
+
+def _lz4() -> Any:
+    try:
+        import lz4.block  # type: ignore[import-not-found,import-untyped,unused-ignore]
+    except ImportError:
+        return None
+    return lz4.block

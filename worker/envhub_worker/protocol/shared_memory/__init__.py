@@ -1,0 +1,1 @@
+"""Where everything lies in the memory that client and runner share. Pure arithmetic."""

@@ -1,0 +1,255 @@
+"""The fast lane's shared memory: where everything lies. Pure arithmetic; each side does its own.
+
+Two slabs a shard. The *request* slab is written by the client and sealed against the jail's
+writes; the *reply* slab is written by the jail. Each starts with a header of 64-bit words, those
+that are polled on a cache line of their own. All shards share the *observation* slab, and write
+their rows of the batch in it; it holds one batch, or several in turn (slots), and one batch of
+rewards and flags. Arrays lie at 64-byte boundaries. The client never follows an offset or a
+length that it has not computed or bounded itself.
+
+::
+
+    request       header | one area per action leaf | a message, encoded
+    reply         header | infos, encoded | the answer to a message, encoded
+    observations  slot 0: one area per leaf | slot 1 ... | rewards, terminations, truncations
+
+``step`` goes this way, and messages that are small, both ways.
+"""
+
+from __future__ import annotations
+
+import math
+import mmap
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from envhub_worker.protocol.shared_memory.words import SEQUENCE as SEQUENCE
+from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
+
+LINE = 64
+"""Bytes of a cache line: words that two cores poll must not share one."""
+INFO_BYTES = 64 * 1024
+"""Room for a step's infos, or for what it raised, or for a message or its answer. What is larger
+goes through the server."""
+MAX_SLAB_BYTES = 1 << 31
+"""Above this the frames lane serves: a slab is pinned memory."""
+
+# word numbers in the headers (a word is 8 bytes, a line holds 8 of them); ``SEQUENCE`` is first
+PARKED = 8
+"""1 while this slab's writer sleeps in poll and wants its doorbell rung."""
+OUTCOME = 16
+"""Reply: ``DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``."""
+LENGTH = 17
+"""Reply: bytes of the encoded infos, or of what was raised; 0 for an empty info."""
+BUSY = 18
+"""Reply: nanoseconds that a step took the shard itself; written now and then."""
+SPIN = 16
+"""Request: nanoseconds that the shard may wait for the next request without sleeping."""
+SLOT = 17
+"""Request: the slot of the observation slab that the shard writes."""
+CPU = 18
+"""Request: one more than the number of the core that the shard should keep to; 0 for any."""
+CHANGES = 19
+"""Request: grows with every change of ``SPIN``, ``SLOT``, ``CPU`` and the dtypes."""
+MESSAGE = 20
+"""Request: bytes of the encoded message; 0 for a step."""
+DTYPES = 24
+"""Request: the dtype code of each action leaf, one word each, up to ``MAX_LEAVES``."""
+MAX_LEAVES = 64
+MAX_SLOTS = 16
+HEADER_WORDS = DTYPES + MAX_LEAVES
+HEADER_BYTES = HEADER_WORDS * 8
+
+DONE, RAISED, FETCH, COLUMNS = 1, 2, 3, 4
+"""Results and encoded infos are in the slab; an encoded ``Raised`` is; the infos must be fetched;
+the infos are columns (see ``columns``)."""
+
+ACTION_DTYPES = tuple(
+    np.dtype(name)
+    for name in (
+        *("bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
+        *("float16", "float32", "float64"),
+    )
+)
+"""An action keeps the dtype that the caller gave it; the code is the place in this table."""
+DTYPE_CODES = {dtype: code for code, dtype in enumerate(ACTION_DTYPES)}
+_ACTION_ITEM_BYTES = 8
+
+Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One array of a batched space.
+
+    Attributes:
+        path: Keys and indices from the space's root.
+        dtype: Of the space.
+        shape: ``(count, *shape of a member)``.
+        offset: Bytes from the slab's start.
+    """
+
+    path: tuple[Any, ...]
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    offset: int
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where a shard's actions and infos lie.
+
+    Attributes:
+        count: Sub-environments of the shard.
+        actions: Leaves of the action space, in the request slab.
+        message: Offset of a message, in the request slab.
+        request_bytes: Size of the request slab.
+        infos: Offset of the encoded infos, in the reply slab.
+        answer: Offset of the answer to a message, in the reply slab.
+        reply_bytes: Size of the reply slab.
+    """
+
+    count: int
+    actions: tuple[Leaf, ...]
+    message: int
+    request_bytes: int
+    infos: int
+    answer: int
+    reply_bytes: int
+
+
+@dataclass(frozen=True)
+class ObservationLayout:
+    """Where the observations of all shards lie: whole batches, one after the other.
+
+    Attributes:
+        count: Sub-environments of all shards together.
+        leaves: Leaves of the observation space in the first slot.
+        slots: Number of batches.
+        slot_bytes: Size of one.
+        results: Offset of the rewards (float64), the terminations and the truncations (bool).
+        total_bytes: Size of the slab.
+    """
+
+    count: int
+    leaves: tuple[Leaf, ...]
+    slots: int
+    slot_bytes: int
+    results: int
+    total_bytes: int
+
+
+def layout_of(action: gym.Space[Any], count: int) -> Layout | None:
+    """A shard's layout for a single action space, or None if it has no fixed one."""
+    leaves = list(_leaves(action))
+    if None in leaves or len(leaves) > MAX_LEAVES:
+        return None
+    actions, message = _placed(leaves, count, HEADER_BYTES, _ACTION_ITEM_BYTES)
+    request_bytes = message + INFO_BYTES
+    if request_bytes > MAX_SLAB_BYTES:
+        return None
+    infos, answer = HEADER_BYTES, HEADER_BYTES + INFO_BYTES
+    return Layout(count, actions, message, request_bytes, infos, answer, answer + INFO_BYTES)
+
+
+def observation_layout(space: gym.Space[Any], count: int, slots: int) -> ObservationLayout | None:
+    """The layout for a single observation space, or None if it has no fixed one."""
+    leaves = list(_leaves(space))
+    if None in leaves or len(leaves) > MAX_LEAVES:
+        return None
+    placed, slot_bytes = _placed(leaves, count, 0, None)
+    if slots > 1:  # each slot is a map of its own in the client
+        slot_bytes = -(-slot_bytes // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
+    results = slot_bytes * slots
+    total_bytes = _aligned(results + count * (8 + 1 + 1))
+    if total_bytes > MAX_SLAB_BYTES:
+        return None
+    return ObservationLayout(count, placed, slots, slot_bytes, results, total_bytes)
+
+
+def _leaves(space: gym.Space[Any], path: tuple[Any, ...] = ()) -> Iterator[Any]:
+    if isinstance(space, ARRAY_SPACES):
+        yield path, np.dtype(space.dtype), tuple(space.shape or ())
+    elif isinstance(space, spaces.Dict):
+        for key, sub in space.spaces.items():
+            yield from _leaves(sub, (*path, key))
+    elif isinstance(space, spaces.Tuple):
+        for index, sub in enumerate(space.spaces):
+            yield from _leaves(sub, (*path, index))
+    else:
+        yield None
+
+
+def _placed(
+    leaves: list[Any], count: int, start: int, item_bytes: int | None
+) -> tuple[tuple[Leaf, ...], int]:
+    placed = []
+    for path, dtype, shape in leaves:
+        placed.append(Leaf(path, dtype, (count, *shape), start))
+        start = _aligned(start + count * math.prod(shape) * (item_bytes or dtype.itemsize))
+    return tuple(placed), start
+
+
+def _aligned(offset: int) -> int:
+    return -(-offset // LINE) * LINE
+
+
+def view(buffer: Any, leaf: Leaf, dtype: np.dtype[Any] | None = None, base: int = 0) -> Array:
+    """A leaf's array in a mapped slab; ``base`` is the offset of its slot."""
+    made: Array = np.ndarray(leaf.shape, dtype or leaf.dtype, buffer, base + leaf.offset)
+    return made
+
+
+def results(buffer: Any, layout: ObservationLayout) -> tuple[Array, Array]:
+    """Rewards, float64 ``(count,)``, and the bytes of terminations and truncations."""
+    rewards: Array = np.frombuffer(buffer, np.float64, layout.count, layout.results)
+    start = layout.results + rewards.nbytes
+    flags: Array = np.frombuffer(buffer, np.uint8, 2 * layout.count, start)
+    return rewards, flags
+
+
+def words(buffer: Any) -> memoryview:
+    """The header of a mapped slab, as words."""
+    return memoryview(buffer)[:HEADER_BYTES].cast("Q")
+
+
+def assembler(space: gym.Space[Any]) -> Callable[[list[Any]], Any]:
+    """A function that puts a flat list of leaves, in their order, into the space's structure."""
+    if isinstance(space, ARRAY_SPACES):
+        return _first
+    if isinstance(space, spaces.Dict):
+        keys = list(space.spaces)
+        if all(isinstance(sub, ARRAY_SPACES) for sub in space.spaces.values()):
+            return lambda leaves: dict(zip(keys, leaves, strict=True))
+    nested = _nested(space)
+    return lambda leaves: nested(iter(leaves))
+
+
+def _first(leaves: list[Any]) -> Any:
+    return leaves[0]
+
+
+def _nested(space: gym.Space[Any]) -> Callable[[Iterator[Any]], Any]:
+    if isinstance(space, spaces.Dict):
+        parts = {key: _nested(sub) for key, sub in space.spaces.items()}
+        return lambda leaves: {key: part(leaves) for key, part in parts.items()}
+    if isinstance(space, spaces.Tuple):
+        members = [_nested(sub) for sub in space.spaces]
+        return lambda leaves: tuple(member(leaves) for member in members)
+    return next
+
+
+def flatten(space: gym.Space[Any], batch: Any) -> list[Any]:
+    """The leaves of a batch in the order of ``Layout``: the inverse of ``assembler``."""
+    if isinstance(space, spaces.Dict):
+        return [leaf for key, sub in space.spaces.items() for leaf in flatten(sub, batch[key])]
+    if isinstance(space, spaces.Tuple):
+        pairs = zip(space.spaces, batch, strict=True)
+        return [leaf for sub, item in pairs for leaf in flatten(sub, item)]
+    return [batch]

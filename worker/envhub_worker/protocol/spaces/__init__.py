@@ -1,0 +1,1 @@
+"""Gymnasium spaces as plain values, read back with every claim checked."""

@@ -1,0 +1,303 @@
+"""Cutting batches of actions into slices for shards, and joining the slices of their results.
+
+The dispatch is on the *single* space: a batched ``Tuple`` may be a batch of tuples or, for a
+custom space, a tuple of members. Followed: ``gymnasium.vector.utils.iterate`` and ``concatenate``.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from functools import singledispatch
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.spaces.graph import GraphInstance
+
+from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
+from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
+from envhub_worker.protocol.untrusted import FAULTS
+
+Bounds = Sequence[tuple[int, int]]
+
+
+def even_bounds(count: int, parts: int) -> list[tuple[int, int]]:
+    """``count`` members over ``parts`` shards, as evenly as it goes: ``[(start, stop), ...]``."""
+    size, larger = divmod(count, parts)
+    starts = [index * size + min(index, larger) for index in range(parts + 1)]
+    return list(itertools.pairwise(starts))
+
+
+@singledispatch
+def split(space: gym.Space[Any], batch: Any, bounds: Bounds) -> list[Any]:
+    """The slices of a batch. Arrays are views."""
+    return [batch[start:stop] for start, stop in bounds]
+
+
+@split.register(spaces.Dict)
+def _split_dict(space: spaces.Dict, batch: Any, bounds: Bounds) -> list[Any]:
+    parts = {key: split(sub, batch[key], bounds) for key, sub in space.spaces.items()}
+    return [{key: part[index] for key, part in parts.items()} for index in range(len(bounds))]
+
+
+@split.register(spaces.Tuple)
+def _split_tuple(space: spaces.Tuple[Any], batch: Any, bounds: Bounds) -> list[Any]:
+    parts = [split(sub, item, bounds) for sub, item in zip(space.spaces, batch, strict=True)]
+    return [tuple(part[index] for part in parts) for index in range(len(bounds))]
+
+
+@singledispatch
+def join(space: gym.Space[Any], parts: Sequence[Any]) -> Any:
+    """One batch out of the shards' slices, in order."""
+    if isinstance(space, ARRAY_SPACES):
+        return np.concatenate(parts)
+    return tuple(member for part in parts for member in part)
+
+
+@join.register(spaces.Dict)
+def _join_dict(space: spaces.Dict, parts: Sequence[Any]) -> Any:
+    return {key: join(sub, [part[key] for part in parts]) for key, sub in space.spaces.items()}
+
+
+@join.register(spaces.Tuple)
+def _join_tuple(space: spaces.Tuple[Any], parts: Sequence[Any]) -> Any:
+    return tuple(
+        join(sub, [part[index] for part in parts]) for index, sub in enumerate(space.spaces)
+    )
+
+
+@singledispatch
+def conforms(space: gym.Space[Any], batch: Any, count: int) -> bool:
+    """Whether a batch of ``count`` members has the structure, shapes and dtypes of the space.
+
+    Values are not looked at: many environments leave their own bounds.
+    """
+    if isinstance(space, ARRAY_SPACES):
+        shape = (count, *(space.shape or ()))
+        return type(batch) is np.ndarray and batch.dtype == space.dtype and batch.shape == shape
+    return type(batch) is tuple and len(batch) == count
+
+
+@conforms.register(spaces.Dict)
+def _conforms_dict(space: spaces.Dict, batch: Any, count: int) -> bool:
+    if type(batch) is not dict or batch.keys() != space.spaces.keys():
+        return False
+    return all(conforms(sub, batch[key], count) for key, sub in space.spaces.items())
+
+
+@conforms.register(spaces.Tuple)
+def _conforms_tuple(space: spaces.Tuple[Any], batch: Any, count: int) -> bool:
+    if type(batch) is not tuple or len(batch) != len(space.spaces):
+        return False
+    return all(conforms(sub, item, count) for sub, item in zip(space.spaces, batch, strict=True))
+
+
+class Misfit(RemoteProtocolError):
+    """Shards' infos that are no parts of one mapping: they have to be joined one by one."""
+
+
+APART: dict[Any, Any] = {None: None}
+"""What a shard says in place of infos that it cannot join without knowing the other shards'."""
+
+
+def join_infos(parts: Sequence[dict[Any, Any]], sizes: Sequence[int]) -> dict[Any, Any]:
+    """The infos of all shards as ``VectorEnv._add_info`` would have built them in one go.
+
+    The first sub-environment that has a key decides about its dtype, and each shard has a first
+    one of its own. Where these agree the shards' arrays are parts of the whole.
+
+    Raises:
+        Misfit: They do not agree, or are not what infos look like; ask for each one's own.
+    """
+    joined: dict[Any, Any] = {}
+    if not any(parts):
+        return joined
+    starts = np.cumsum([0, *sizes]).tolist()
+    for part, start, size in zip(parts, starts, sizes, strict=False):
+        try:
+            _join_part(joined, part, slice(start, start + size), starts[-1])
+        except FAULTS as error:
+            raise Misfit(f"the shards' infos do not fit together: {error}") from error
+    return joined
+
+
+def _join_part(joined: dict[Any, Any], part: dict[Any, Any], window: slice, count: int) -> None:
+    for key, value in part.items():
+        if type(key) is int and f"_{key}" not in part:
+            raise ValueError("an entry has no mask")
+        if isinstance(value, dict):
+            _join_part(joined.setdefault(key, {}), value, window, count)
+            continue
+        size = window.stop - window.start
+        if len(value) != size:  # or its other dimensions cost nothing
+            raise ValueError("an entry does not have one value per sub-environment")
+        array = joined.setdefault(key, _blank(value, count))
+        if (array.dtype, array.shape[1:]) != (value.dtype, value.shape[1:]):
+            raise ValueError("an entry is of another dtype or shape in another shard")
+        array[window] = value
+
+
+def _blank(value: Any, count: int) -> Any:
+    if value.dtype == object and value.ndim == 1:
+        return np.full(count, None, dtype=object)
+    return np.zeros((count, *value.shape[1:]), dtype=value.dtype)
+
+
+Pairs = Sequence[tuple[int, dict[Any, Any]]]
+"""Infos with the index of their sub-environment, in the order in which they came."""
+Column = Callable[[Any, int], Any]
+_SCALARS = frozenset({int, float, bool})
+
+
+def join_pairs(pairs: Pairs, count: int, max_bytes: int | None = None) -> dict[Any, Any]:
+    """The infos of ``count`` sub-environments, as ``VectorEnv._add_info`` joins them.
+
+    Args:
+        pairs: Each sub-environment's own.
+        count: Number of sub-environments.
+        max_bytes: What all columns together may take: a few bytes make a large column.
+
+    Raises:
+        Exception: Whatever Gymnasium would raise, with the key in front.
+        MessageTooLargeError: They take more than that.
+    """
+    left = max_bytes
+
+    def column(value: Any, count: int) -> Any:
+        nonlocal left
+        if left is not None:
+            left -= count * max(np.dtype(np.float64).itemsize, getattr(value, "nbytes", 0))
+            if left < 0:
+                raise MessageTooLargeError(f"joined infos take more than {max_bytes} bytes")
+        return blank_column(value, count)
+
+    infos: dict[Any, Any] = {}
+    for index, info in pairs:
+        add_info(infos, info, index, count, blank_column if max_bytes is None else column)
+    return infos
+
+
+def add_info(
+    infos: dict[Any, Any], info: dict[Any, Any], index: int, count: int, column: Column
+) -> dict[Any, Any]:
+    """``VectorEnv._add_info``, without its allocations."""
+    for key, value in info.items():
+        array: Any
+        try:
+            if key == "final_obs":
+                array = infos.get(key)
+                if array is None:
+                    array = np.full(count, None, dtype=object)
+                array[index] = value
+            elif isinstance(value, dict):
+                array = add_info(infos.get(key, {}), value, index, count, column)
+            else:
+                array = infos[key] if key in infos else column(value, count)
+                array[index] = value
+            mask_key = f"_{key}"
+            mask = infos.get(mask_key)
+            if mask is None:
+                mask = np.zeros(count, np.bool_)
+            mask[index] = True
+            infos[key], infos[mask_key] = array, mask
+        except FAULTS as error:
+            error.args = (f"info {key!r} of sub-environment {index}: {error}",)
+            raise
+    return infos
+
+
+def blank_column(value: Any, count: int) -> Any:
+    """The array for a key that is seen first: its dtype is decided by this value."""
+    kind = type(value)
+    if is_scalar(kind):
+        return np.zeros(count, dtype=kind)
+    if isinstance(value, np.ndarray):
+        return np.zeros((count, *value.shape), dtype=value.dtype)
+    return np.full(count, None, dtype=object)
+
+
+def is_scalar(kind: type) -> bool:
+    """Whether values of this class are kept in an array of their dtype."""
+    return kind in _SCALARS or issubclass(kind, np.number)
+
+
+def restores(space: gym.Space[Any]) -> bool:
+    """Whether members of the space lose their class on the wire (``GraphInstance``)."""
+    if isinstance(space, spaces.Graph):
+        return True
+    if isinstance(space, spaces.Dict):
+        return any(map(restores, space.spaces.values()))
+    inner = getattr(space, "spaces", None) or getattr(space, "feature_space", None)
+    if isinstance(inner, tuple):
+        return any(map(restores, inner))
+    return isinstance(inner, gym.Space) and restores(inner)
+
+
+@singledispatch
+def restore_batch(space: gym.Space[Any], batch: Any) -> Any:
+    """A batch with the classes that Gymnasium gives its members."""
+    if isinstance(batch, tuple):
+        return tuple(restore(space, member) for member in batch)
+    return batch
+
+
+@restore_batch.register(spaces.Dict)
+def _restore_batch_dict(space: spaces.Dict, batch: Any) -> Any:
+    return {key: restore_batch(sub, batch[key]) for key, sub in space.spaces.items()}
+
+
+@restore_batch.register(spaces.Tuple)
+def _restore_batch_tuple(space: spaces.Tuple[Any], batch: Any) -> Any:
+    pairs = zip(space.spaces, batch, strict=True)
+    return tuple(restore_batch(sub, item) for sub, item in pairs)
+
+
+@singledispatch
+def restore(space: gym.Space[Any], member: Any) -> Any:
+    """One member with the class that Gymnasium gives it."""
+    return member
+
+
+@restore.register(spaces.Graph)
+def _restore_graph(space: spaces.Graph, member: Any) -> Any:
+    is_graph = isinstance(member, tuple) and len(member) == len(GraphInstance._fields)
+    return GraphInstance(*member) if is_graph else member
+
+
+@restore.register(spaces.Dict)
+def _restore_dict(space: spaces.Dict, member: Any) -> Any:
+    if not isinstance(member, dict):
+        return member
+    return {
+        key: restore(space[key], item) if key in space.spaces else item
+        for key, item in member.items()
+    }
+
+
+@restore.register(spaces.Tuple)
+def _restore_tuple(space: spaces.Tuple[Any], member: Any) -> Any:
+    if not isinstance(member, tuple) or len(member) != len(space.spaces):
+        return member
+    return tuple(restore(sub, item) for sub, item in zip(space.spaces, member, strict=True))
+
+
+@restore.register(spaces.OneOf)
+def _restore_one_of(space: Any, member: Any) -> Any:
+    if not isinstance(member, tuple):
+        return member
+    try:
+        index, chosen = member
+        return (index, restore(space.spaces[index], chosen))
+    except FAULTS:
+        return member
+
+
+@restore.register(spaces.Sequence)
+def _restore_sequence(space: spaces.Sequence, member: Any) -> Any:
+    if not isinstance(member, tuple):
+        return member
+    if space.stack:
+        return restore_batch(space.feature_space, member)
+    return tuple(restore(space.feature_space, item) for item in member)

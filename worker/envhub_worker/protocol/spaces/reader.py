@@ -1,0 +1,339 @@
+"""Gymnasium spaces from plain values, with every claim checked before anything is built."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+from inspect import signature
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from envhub_worker.protocol.codec.inert import MAX_NAME_CHARS, one_line
+from envhub_worker.protocol.errors import EnvHubError, RemoteProtocolError
+from envhub_worker.protocol.spaces.opaque import (
+    BOX_DTYPES,
+    INTEGER_DTYPES,
+    MAX_SPACE_DEPTH,
+    OneOf,
+    OpaqueSpace,
+    is_charset,
+    is_shape,
+)
+
+# Children of one Dict, Tuple or OneOf; a batch of custom spaces is a Tuple of as many.
+MAX_CHILDREN = 65_536
+# Keys of one Dict. Keys that are no text can be made to collide.
+MAX_KEYS = 4096
+MAX_INT64 = 2**63 - 1
+
+ELEMENT_BYTES = 10
+"""One element of a float32 Box: two bounds, and whether they are finite. Smaller ones cost as much
+time, so none is cheaper."""
+SPACE_BYTES = 1024
+"""A space without elements: objects of Python."""
+CHARACTER_BYTES = 256
+"""One character of a Text's set, which stands in a set, a list and a dict."""
+_SHARED_BYTES = 256
+
+_DISCRETE_HAS_DTYPE = "dtype" in signature(spaces.Discrete.__init__).parameters
+
+Space = gym.Space[Any]
+
+
+def decode_space(value: object, *, max_elements: int) -> Space:
+    """Builds the space that ``encode_space`` described.
+
+    Trust: input from the worker.
+
+    Args:
+        value: What the wire brought.
+        max_elements: What all spaces in it may cost together, as ``SpaceReader`` counts it.
+
+    Raises:
+        RemoteProtocolError: Malformed, contradictory, or over ``max_elements``.
+    """
+    return SpaceReader(max_elements).space(value)
+
+
+class SpaceReader:
+    """Builds spaces out of one budget of bytes, which is asked before anything is built.
+
+    The budget covers what stays in memory of each space, and one sample of it. Boxes that are
+    described alike share their bounds and cost them once: the tasks of a suite mostly are.
+
+    Args:
+        max_elements: The budget, in elements of a float32 Box, each ``ELEMENT_BYTES``.
+        check: Called before each space is built; raises what ends the reading.
+    """
+
+    __slots__ = ("_boxes", "_check", "_left", "_max_elements", "_twice")
+
+    def __init__(self, max_elements: int, check: Callable[[], None] | None = None) -> None:
+        self._left, self._max_elements = max_elements * ELEMENT_BYTES, max_elements
+        self._check = check
+        self._boxes: dict[tuple[object, ...], spaces.Box] = {}
+        self._twice = False
+
+    def space(self, value: object) -> Space:
+        """The next space. Trust: input from the worker.
+
+        Raises:
+            RemoteProtocolError: As ``decode_space``.
+        """
+        try:
+            return self.read(value, 0)
+        except EnvHubError:
+            raise
+        except Exception as error:
+            # Gymnasium's constructors refuse in many ways; whatever they raise, the peer is wrong.
+            text = f"Gymnasium refuses the described space: {one_line(str(error))}"
+            raise RemoteProtocolError(text) from error
+
+    def read(self, value: object, depth: int) -> Space:
+        """One space and all that is in it, at a depth."""
+        if self._check is not None:
+            self._check()
+        self.spend(SPACE_BYTES)
+        if type(value) is not dict or type(value.get("kind")) is not str:
+            raise RemoteProtocolError("A space is not described by a map with a kind.")
+        names, build = _KINDS.get(value["kind"], ((), None))
+        if build is None:
+            raise RemoteProtocolError("A space is of an unknown kind.")
+        if value.keys() != {"kind", *names}:
+            raise RemoteProtocolError(f"A space of kind {value['kind']} has wrong attributes.")
+        return build(self, depth, *(value[name] for name in names))
+
+    def child(self, value: object, depth: int) -> Space:
+        """What a space at this depth holds."""
+        if depth == MAX_SPACE_DEPTH:
+            raise RemoteProtocolError(f"Spaces are nested deeper than {MAX_SPACE_DEPTH}.")
+        return self.read(value, depth + 1)
+
+    def children(self, value: object, depth: int) -> list[Space]:
+        """All that a space at this depth holds."""
+        if type(value) is not list or len(value) > MAX_CHILDREN:
+            raise RemoteProtocolError("A space's parts are not a list of sane length.")
+        return [self.child(part, depth) for part in value]
+
+    def spend(self, size: int) -> None:
+        """Raises ``RemoteProtocolError`` when this many bytes are too many."""
+        self._left -= size
+        if self._left < 0:
+            raise RemoteProtocolError(
+                f"The spaces cost more than {self._max_elements} elements (max_elements)."
+            )
+
+    def shape(self, value: object, element_bytes: int) -> tuple[int, ...]:
+        """Checks a shape and pays for its elements."""
+        if not is_shape(value):
+            raise RemoteProtocolError("A space's shape is not a tuple of sizes.")
+        # Sizes of 0 must not hide absurd ones: numpy multiplies the others.
+        count = max(1, math.prod(size for size in value if size))
+        self.spend(count * max(ELEMENT_BYTES, element_bytes))
+        return value
+
+    def like(self, key: tuple[object, ...]) -> spaces.Box | None:
+        """Another Box of the same description, which has the bounds of the first."""
+        found = None if self._twice else self._boxes.get(key)
+        return None if found is None else copy.copy(found)
+
+    def keep(self, key: tuple[object, ...], box: spaces.Box) -> None:
+        """Takes note of a Box, for those that are described alike."""
+        if not self._twice:
+            self._boxes[key] = box
+
+
+def _read_opaque(
+    reader: SpaceReader, depth: int, name: object, text: object, shape: object, dtype: object
+) -> Space:
+    if not (type(name) is type(text) is type(dtype) is str):
+        raise RemoteProtocolError("A custom space is not described by text.")
+    if shape is not None and not is_shape(shape):
+        raise RemoteProtocolError("A custom space's shape is not a tuple of sizes.")
+    return OpaqueSpace(
+        one_line(name, MAX_NAME_CHARS), one_line(text), shape, one_line(dtype, MAX_NAME_CHARS)
+    )
+
+
+def _read_box(
+    reader: SpaceReader,
+    depth: int,
+    name: object,
+    shape: object,
+    low: object,
+    high: object,
+    below: object,
+    above: object,
+) -> Space:
+    dtype = _dtype(name, BOX_DTYPES)
+    key = _box_key(name, shape, low, high, below, above)
+    known = None if key is None else reader.like(key)
+    if known is not None:
+        return known
+    size = reader.shape(shape, 2 * dtype.itemsize + 2)
+    bounds = [_expand(bound, size, dtype) for bound in (low, high)]
+    masks = [_expand(mask, size, np.dtype(bool)) for mask in (below, above)]
+    # Says no to nan as well, which some versions of Gymnasium let pass.
+    if not (bounds[0] <= bounds[1]).all():
+        raise RemoteProtocolError("A Box's low is not below its high.")
+    box = spaces.Box(low=bounds[0], high=bounds[1], shape=size, dtype=dtype.type)
+    # Integer bounds cannot say "infinite"; these two do, and decide how samples are drawn.
+    box.bounded_below, box.bounded_above = masks[0].copy(), masks[1].copy()
+    if key is not None:
+        reader.keep(key, box)
+    return box
+
+
+def _box_key(name: object, shape: object, *arrays: object) -> tuple[object, ...] | None:
+    """All that a Box is made of, if that is little; None for others, and for what is no Box."""
+    known: list[object] = [name]
+    if not is_shape(shape):
+        return None
+    for array in arrays:
+        if type(array) is not np.ndarray or array.nbytes > _SHARED_BYTES:
+            return None
+        known += [array.dtype, array.shape, array.tobytes()]
+    return (*known, shape)
+
+
+def _read_discrete(
+    reader: SpaceReader, depth: int, n: object, start: object, name: object
+) -> Space:
+    dtype = _dtype(name, INTEGER_DTYPES)
+    least, most = _integer_range(dtype)
+    count, first = _integer(n, 1, most), _integer(start, least, most)
+    if first + count - 1 > most:
+        raise RemoteProtocolError("A Discrete space ends beyond its dtype.")
+    if not _DISCRETE_HAS_DTYPE:
+        return spaces.Discrete(count, start=first)
+    return spaces.Discrete(count, start=first, dtype=dtype.type)
+
+
+def _read_multi_discrete(
+    reader: SpaceReader, depth: int, name: object, shape: object, nvec: object, start: object
+) -> Space:
+    dtype = _dtype(name, INTEGER_DTYPES)
+    # its bounds; a sample takes as much once more
+    size = reader.shape(shape, 4 * dtype.itemsize)
+    counts, first = _expand(nvec, size, dtype), _expand(start, size, dtype)
+    return spaces.MultiDiscrete(counts.copy(), dtype=dtype.type, start=first.copy())
+
+
+def _read_multi_binary(reader: SpaceReader, depth: int, n: object) -> Space:
+    if isinstance(n, tuple):
+        return spaces.MultiBinary(list(reader.shape(n, ELEMENT_BYTES)))
+    size = _integer(n, 1, MAX_INT64)
+    reader.spend(size * ELEMENT_BYTES)
+    return spaces.MultiBinary(size)
+
+
+def _read_text(
+    reader: SpaceReader, depth: int, shortest: object, longest: object, characters: object
+) -> Space:
+    if type(characters) is not str or not is_charset(characters):
+        raise RemoteProtocolError("A Text space's characters are not distinct characters.")
+    reader.spend(CHARACTER_BYTES * len(characters))
+    most = _integer(longest, 0, MAX_INT64)
+    reader.spend(most * ELEMENT_BYTES)  # it is a text of so many characters that is drawn
+    return spaces.Text(
+        max_length=most,
+        min_length=_integer(shortest, 0, MAX_INT64),
+        charset=characters,
+    )
+
+
+def _read_dict(
+    reader: SpaceReader, depth: int, keys: object, parts: object, sort_keys: object
+) -> Space:
+    if type(keys) is not list or len(keys) > MAX_KEYS or type(sort_keys) is not bool:
+        raise RemoteProtocolError("A Dict space's keys are not a list of sane length.")
+    children = reader.children(parts, depth)
+    if not len(set(keys)) == len(keys) == len(children):
+        raise RemoteProtocolError("A Dict space has a key twice, or not one key per part.")
+    # Pairs keep their order; Gymnasium sorts plain mappings.
+    space = spaces.Dict(list(zip(keys, children, strict=True)))
+    if hasattr(space, "sort_keys"):
+        space.sort_keys = sort_keys
+    return space
+
+
+def _read_tuple(reader: SpaceReader, depth: int, parts: object) -> Space:
+    return spaces.Tuple(reader.children(parts, depth))
+
+
+def _read_one_of(reader: SpaceReader, depth: int, parts: object) -> Space:
+    children = reader.children(parts, depth)
+    if OneOf is None:
+        return OpaqueSpace("gymnasium.spaces.OneOf", one_line(f"OneOf({children})"))
+    space: Space = OneOf(children)
+    return space
+
+
+def _read_sequence(reader: SpaceReader, depth: int, part: object, stack: object) -> Space:
+    if type(stack) is not bool:
+        raise RemoteProtocolError("A Sequence space's stack flag is not a boolean.")
+    return spaces.Sequence(_read_twice(reader, part, depth), stack=stack)
+
+
+def _read_graph(reader: SpaceReader, depth: int, node: object, edge: object) -> Space:
+    nodes: Any = _read_twice(reader, node, depth)
+    edges: Any = None if edge is None else _read_twice(reader, edge, depth)
+    return spaces.Graph(nodes, edges)
+
+
+def _read_twice(reader: SpaceReader, part: object, depth: int) -> Space:
+    """Reads a space of which Gymnasium keeps a batch of one besides, and pays for both."""
+    before, within = reader._left, reader._twice
+    reader._twice = True  # that batch has bounds of its own
+    try:
+        space = reader.child(part, depth)
+    finally:
+        reader._twice = within
+    reader.spend(before - reader._left)
+    return space
+
+
+_KINDS: dict[str, tuple[tuple[str, ...], Callable[..., Space]]] = {
+    "opaque": (("type", "text", "shape", "dtype"), _read_opaque),
+    "box": (("dtype", "shape", "low", "high", "bounded_below", "bounded_above"), _read_box),
+    "discrete": (("n", "start", "dtype"), _read_discrete),
+    "multi_discrete": (("dtype", "shape", "nvec", "start"), _read_multi_discrete),
+    "multi_binary": (("n",), _read_multi_binary),
+    "text": (("min_length", "max_length", "characters"), _read_text),
+    "dict": (("keys", "spaces", "sort_keys"), _read_dict),
+    "tuple": (("spaces",), _read_tuple),
+    "one_of": (("spaces",), _read_one_of),
+    "sequence": (("space", "stack"), _read_sequence),
+    "graph": (("node", "edge"), _read_graph),
+}
+
+
+def _integer(value: object, least: int, most: int) -> int:
+    if type(value) is not int or not least <= value <= most:
+        raise RemoteProtocolError("A space's number is not an integer in its range.")
+    return value
+
+
+def _integer_range(dtype: np.dtype[Any]) -> tuple[int, int]:
+    info = np.iinfo(dtype)
+    return int(info.min), min(int(info.max), MAX_INT64)
+
+
+def _dtype(name: object, allowed: dict[str, np.dtype[Any]]) -> np.dtype[Any]:
+    if type(name) is not str or name not in allowed:
+        raise RemoteProtocolError("A space's dtype is not on the list.")
+    return allowed[name]
+
+
+def _expand(value: object, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Undoes ``_compact``. The result shares memory with itself: copy it before writing."""
+    if not isinstance(value, np.ndarray) or value.dtype != dtype:
+        raise RemoteProtocolError("A space's bounds are not an array of its dtype.")
+    if value.ndim and value.shape != shape[len(shape) - value.ndim :]:
+        raise RemoteProtocolError("A space's bounds do not fit its shape.")
+    return np.broadcast_to(value, shape)

@@ -1,0 +1,216 @@
+"""The jail's end of the fast lane: steps out of one slab into another, at the ring of a doorbell.
+
+Our doorbell is the other end of the client's socket, the client's an eventfd (an older client's are
+two of these): both are read and written with whole words. Followed: ``eventfd(2)``, ``unix(7)``,
+``memfd_create(2)``. The request slab is mapped read-only (the client has
+sealed it against our writes); the reply slab belongs to both.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import mmap
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from time import perf_counter_ns
+from typing import Any
+
+import numpy as np
+
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.shared_memory import slabs
+from envhub_worker.protocol.stream import Packet, pack_packet, read_packet
+from envhub_worker.runner.exceptions import raised
+from envhub_worker.runner.infos import InfoWriter, Pairs, join
+from envhub_worker.runner.sync_envs import SubEnvs
+
+_RING = (1).to_bytes(8, "little")
+_MEASURE = 31
+"""One step in 32 is measured."""
+
+
+class Lane:
+    """One environment's steps.
+
+    Args:
+        env: Its sub-environments.
+        attach: Which rows of the batch they are, and how many slots there are.
+        fds: Request slab, reply slab, observation slab, our doorbell, the client's. Owned from
+            now on.
+        answer: Gives the frames of the answer to a message.
+
+    Attributes:
+        number: The environment's.
+        unsent: The frames of the last answer, if it did not fit.
+    """
+
+    def __init__(
+        self,
+        env: SubEnvs,
+        attach: m.Attach,
+        fds: list[int],
+        answer: Callable[[Packet], list[Any]],
+    ) -> None:
+        self.number = attach.env
+        self.unsent: list[Any] = []
+        self._answer = answer
+        layout = slabs.layout_of(env.single_action_space, env.num_envs)
+        observed = slabs.observation_layout(
+            env.single_observation_space, attach.count, attach.slots
+        )
+        if layout is None or observed is None:
+            raise ValueError("these spaces have no fixed layout")
+        *slab_fds, self.bell, self._client_bell = fds
+        self._request = mmap.mmap(slab_fds[0], layout.request_bytes, prot=mmap.PROT_READ)
+        self._reply = mmap.mmap(slab_fds[1], layout.reply_bytes)
+        self._observations = mmap.mmap(slab_fds[2], observed.total_bytes)
+        for fd in slab_fds:
+            os.close(fd)
+        os.set_blocking(self.bell, False)
+        self._asked = slabs.words(self._request)
+        self._told = slabs.words(self._reply)
+        self._told[slabs.PARKED] = 1
+        self._layout = layout
+        self._env = env
+        self._assemble = slabs.assembler(env.single_action_space)
+        self._served = 0
+        self._codes: list[int] = []
+        self._views: list[Any] = []
+        self._pairs: Pairs = []
+        self._writer = InfoWriter(self._reply, layout.infos, layout.count, sliced=env.sliced)
+        self._changes = self._cpu = self._spin_ns = 0
+        self._move(attach.start, observed)
+
+    def _move(self, start: int, observed: slabs.ObservationLayout) -> None:
+        """Have the environment write into the slabs."""
+        batch, count, stop = self._env.batch, observed.count, start + self._layout.count
+        rewards, flags = slabs.results(self._observations, observed)
+        bools = flags.view(np.bool_)
+        batch.rewards = rewards[start:stop]
+        batch.terminations = bools[:count][start:stop]
+        batch.truncations = bools[count:][start:stop]
+        bools[:count][start:stop] = bools[count:][start:stop] = False  # another may have died here
+        bases = [slot * observed.slot_bytes for slot in range(observed.slots)]
+        rows = [[self._rows(leaf, base, start) for leaf in observed.leaves] for base in bases]
+        batch.write_to(rows)
+
+    def _rows(self, leaf: slabs.Leaf, base: int, start: int) -> Any:
+        return slabs.view(self._observations, leaf, base=base)[start : start + self._layout.count]
+
+    def wake(self) -> bool:
+        """After the doorbell: silence it, and serve while requests keep coming quickly.
+
+        Returns:
+            Whether it can ring again: no, once the client has closed its end.
+        """
+        rung = True
+        with contextlib.suppress(BlockingIOError):
+            rung = bool(os.read(self.bell, 8))
+        while self.serve() and self._wait_awake():
+            pass
+        return rung
+
+    def _wait_awake(self) -> bool:
+        """Wait for the next request without sleeping, for as long as the client says."""
+        asked, served = self._asked, self._served
+        if self._spin_ns:
+            self._told[slabs.PARKED] = 0
+            until = perf_counter_ns() + self._spin_ns
+            while perf_counter_ns() < until:
+                if asked[slabs.SEQUENCE] != served:
+                    return True
+        self._told[slabs.PARKED] = 1
+        return asked[slabs.SEQUENCE] != served
+
+    def serve(self) -> bool:
+        """Serve a request if there is one."""
+        sequence = self._asked[slabs.SEQUENCE]
+        if sequence == self._served:
+            return False
+        told = self._told
+        if sequence & _MEASURE or self._asked[slabs.MESSAGE]:
+            told[slabs.OUTCOME], told[slabs.LENGTH] = self._run()
+        else:
+            self._run_measured()
+        self._served = sequence
+        told[slabs.SEQUENCE] = sequence
+        if self._asked[slabs.PARKED]:
+            self._ring()
+        return True
+
+    def _ring(self) -> None:
+        with contextlib.suppress(BlockingIOError):  # it is full: it has been rung already
+            os.write(self._client_bell, _RING)
+
+    def _run_measured(self) -> None:
+        told, start = self._told, perf_counter_ns()
+        told[slabs.OUTCOME], told[slabs.LENGTH] = self._run()
+        told[slabs.BUSY] = perf_counter_ns() - start
+
+    def _run(self) -> tuple[int, int]:
+        try:
+            changes = self._asked[slabs.CHANGES]
+            if changes != self._changes:
+                self._changes = changes
+                self._change()
+            if self._asked[slabs.MESSAGE]:
+                return self._run_message(self._asked[slabs.MESSAGE])
+            self.unsent = []  # what is fetched after this step are its infos
+            # copied, because an environment may keep its action and the client writes the next one
+            actions = self._assemble([view.copy() for view in self._views])
+            pairs = self._pairs = self._env.run_step(actions)
+            return self._writer.write(pairs) if pairs else (slabs.DONE, 0)
+        except BaseException as error:
+            return slabs.RAISED, self._writer.put(_raised_frame(error))
+
+    def _run_message(self, length: int) -> tuple[int, int]:
+        start = self._layout.message
+        packet = read_packet(self._request[start : start + length])
+        frames = self._answer(packet)
+        data = b"".join(pack_packet(packet.request_id, frames))
+        if len(data) > slabs.INFO_BYTES:
+            self.unsent = frames
+            return slabs.FETCH, 0
+        self.unsent = []
+        start = self._layout.answer
+        self._reply[start : start + len(data)] = data
+        return slabs.DONE, len(data)
+
+    def leave_slot(self) -> None:
+        """Somebody may hold the batch that lies in the slot: write the next one elsewhere."""
+        self._env.batch.choose(0, carry=True)
+        self._changes = -1
+
+    def _change(self) -> None:
+        asked = self._asked
+        self._spin_ns = asked[slabs.SPIN]
+        # a message that moves is a reset: of some of the sub-environments, perhaps
+        self._env.batch.choose(asked[slabs.SLOT], carry=bool(asked[slabs.MESSAGE]))
+        if asked[slabs.CPU] != self._cpu:
+            self._keep_to(asked[slabs.CPU])
+        codes = asked[slabs.DTYPES : slabs.DTYPES + len(self._layout.actions)].tolist()
+        if codes != self._codes:
+            self._codes = codes
+            pairs = zip(self._layout.actions, codes, strict=True)
+            self._views = [
+                slabs.view(self._request, leaf, slabs.ACTION_DTYPES[code]) for leaf, code in pairs
+            ]
+
+    def _keep_to(self, cpu: int) -> None:
+        self._cpu = cpu
+        with contextlib.suppress(OSError):  # it may have gone, or not be ours
+            os.sched_setaffinity(0, {cpu - 1} if cpu else range(os.cpu_count() or 1))
+
+    def infos(self) -> dict[Any, Any]:
+        """The last step's infos."""
+        return join(self._pairs, self._layout.count, sliced=self._env.sliced)
+
+
+def _raised_frame(error: BaseException) -> Any:
+    """The encoded exception; without its traceback where that does not fit."""
+    message = raised(error, "step")
+    [frame] = m.pack(message, 0)
+    if len(frame) > slabs.INFO_BYTES:
+        [frame] = m.pack(replace(message, traceback=""), 0)
+    return frame

@@ -1,0 +1,282 @@
+"""The env host: holds the live vector environments of one jail and answers for them.
+
+One small function per message, found in a table. It speaks length-prefixed packets over one
+inherited stream, on the main thread (a repository may set signal handlers), and dies with it.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+from array import array
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import cloudpickle  # type: ignore[import-untyped]
+import numpy as np
+
+from envhub_worker.lockdown.spec import JailSpec
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.manifest import encode_env, encode_manifest
+from envhub_worker.protocol.spaces import batches
+from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
+from envhub_worker.runner import loader, manifest
+from envhub_worker.runner.deferred import standing_in
+from envhub_worker.runner.exceptions import raised
+from envhub_worker.runner.infos import join
+from envhub_worker.runner.lane import Lane
+from envhub_worker.runner.sync_envs import SubEnvs
+from envhub_worker.runner.tasks import ResultError, Task, tasks_of
+
+_ANCILLARY_BYTES = socket.CMSG_SPACE(8 * array("i").itemsize)
+_RECHECK_MS = 2
+
+
+def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
+    """Serve until the other side closes the stream. Runs confined, as the jail's main program."""
+    host = Host(spec.snapshot, spec.entry)
+    reader = PacketReader()
+    poller = select.poll()
+    poller.register(stream, select.POLLIN)
+    timeout: int | None = None
+    while True:
+        ready = [fd for fd, _ in poller.poll(timeout)]
+        lane = host.lane
+        if stream.fileno() in ready:
+            if not _serve(stream, reader, host):
+                return 0
+            if host.lane is not lane and host.lane is not None:
+                poller.register(host.lane.bell, select.POLLIN)
+        elif lane is not None and ready:
+            if not lane.wake():
+                poller.unregister(lane.bell)
+        elif lane is not None:
+            lane.serve()
+        # a request may cross with our going to sleep: look again soon, once
+        timeout = _RECHECK_MS if ready and host.lane is not None else None
+
+
+def _serve(stream: socket.socket, reader: PacketReader, host: Host) -> bool:
+    """Answer what has come; False at the end of the stream."""
+    data, ancillary, _, _ = stream.recvmsg(reader.chunk, _ANCILLARY_BYTES)
+    host.descriptors = [fd for part in ancillary for fd in array("i", part[2])]
+    for packet in reader.feed(data):
+        _send(stream, packet.request_id, host.answer(packet))
+    return bool(data)
+
+
+def _send(stream: socket.socket, request_id: int, frames: list[Any]) -> None:
+    buffers = [memoryview(buffer).cast("B") for buffer in pack_packet(request_id, frames)]
+    while buffers:
+        sent = stream.sendmsg(buffers[:512])
+        while buffers and sent >= buffers[0].nbytes:
+            sent -= buffers.pop(0).nbytes
+        if sent:
+            buffers[0] = buffers[0][sent:]
+
+
+class Host:
+    """The state of one host: the repository's tasks and the environments built of them."""
+
+    def __init__(self, snapshot: str, entry: str) -> None:
+        self._snapshot = snapshot
+        self._entry = entry
+        self._tasks: dict[tuple[str, Any], Task] = {}
+        self._envs: dict[int, Any] = {}
+        self._stage = ""
+        self.lane: Lane | None = None
+        self.descriptors: list[int] = []
+
+    def answer(self, packet: Packet, *, by_lane: bool = False) -> list[Any]:
+        """The reply's frames; whatever the repository raises becomes ``Raised``."""
+        try:
+            # the caller's own arguments may be pickled: this is the only place that unpickles
+            request_id, request = m.unpack(packet.frames, unpickler=cloudpickle.loads)
+        except Exception as error:  # of a class that is not to be had here, for instance
+            return m.pack(raised(error, "arguments"), 0)
+        self._stage = type(request).__name__.lower()
+        if self.lane is not None and not by_lane:
+            if isinstance(request, m.FetchInfos) and self.lane.unsent:
+                return self.lane.unsent
+            if isinstance(request, m.Reset) and request.env == self.lane.number:
+                self.lane.leave_slot()
+        try:
+            reply = _HANDLERS[type(request)](self, request)
+            if by_lane and isinstance(reply, m.ResetDone):
+                reply = m.Value(reply.info)  # the observation lies in the slab already
+            return m.pack(reply, request_id)
+        except ResultError as error:
+            return m.pack(raised(error, "return"), request_id)
+        except BaseException as error:
+            return m.pack(raised(error, self._stage), request_id)
+
+    def load(self, request: m.Load) -> m.Message:
+        """Import the repository, call ``make_env``, describe what came back."""
+        return m.Loaded(encode_manifest(manifest.describe(self._load(request))))
+
+    def load_task(self, request: m.LoadTask) -> m.Message:
+        """Import the repository, call ``make_env``, and describe nothing: it is known."""
+        self._load(request)
+        task = self._tasks.get((request.suite, request.task))
+        return m.Value(None if task is None else (task.num_envs, task.recording is not None))
+
+    def _load(self, request: m.Load | m.LoadTask) -> list[Task]:
+        self._stage = "import"
+        make_env = loader.import_entry(self._snapshot, self._entry, os.environ["HOME"])
+        self._stage = "make_env"
+        with standing_in():
+            result = loader.call_make_env(make_env, request)
+
+        def again() -> Any:
+            one = m.Load(1, request.use_async_envs, request.cfg, request.env_kwargs)
+            return loader.call_make_env(make_env, one)
+
+        tasks = tasks_of(result, request.n_envs, request.use_async_envs, again)
+        self._tasks = {(task.suite, task.task): task for task in tasks}
+        return tasks
+
+    def build(self, request: m.Build) -> m.Message:
+        """Build a slice of a task."""
+        task = self._tasks[request.suite, request.task]
+        env = self._envs[request.env] = task.build(request.start, request.stop)
+        live = Task(task.suite, task.task, vector=env)
+        return m.Built(encode_env(manifest.describe_vector(live, env)))
+
+    def reset(self, request: m.Reset) -> m.Message:
+        """``VectorEnv.reset``."""
+        env = self._envs[request.env]
+        if isinstance(env, SubEnvs):
+            pairs = env.run_reset(request.seeds, request.options, request.mask)
+            return m.ResetDone(
+                env.batch.observation(), join(pairs, env.num_envs, sliced=env.sliced)
+            )
+        options = request.options
+        if request.mask is not None:
+            options = {**(options or {}), "reset_mask": request.mask}
+        observation, info = env.reset(seed=request.seeds, options=options)
+        return m.ResetDone(observation, info)
+
+    def step(self, request: m.Step) -> m.Message:
+        """``VectorEnv.step``."""
+        env = self._envs[request.env]
+        if not isinstance(env, SubEnvs):
+            actions, space = request.actions, getattr(env, "single_action_space", None)
+            if space is not None and batches.restores(space):
+                actions = batches.restore_batch(space, actions)
+            return m.StepDone(*env.step(actions))
+        infos = join(env.run_step(request.actions), env.num_envs, sliced=env.sliced)
+        batch = env.batch
+        flags = (batch.rewards, batch.terminations, batch.truncations)
+        return m.StepDone(batch.observation(), *flags, infos)
+
+    def revive(self, request: m.Revive) -> m.Message:
+        """Begin anew in the place of sub-environments that died: see ``m.Revive``."""
+        env = self._envs[request.env]
+        if isinstance(env, SubEnvs):
+            infos = join(env.run_revive(request.seeds), env.num_envs, sliced=env.sliced)
+            batch = env.batch
+            flags = (batch.rewards, batch.terminations, batch.truncations)
+            return m.StepDone(batch.observation(), *flags, infos)
+        observation, info = env.reset(seed=request.seeds)
+        no, yes = np.zeros(env.num_envs, np.bool_), np.ones(env.num_envs, np.bool_)
+        return m.StepDone(observation, np.zeros(env.num_envs), no, yes, info)
+
+    def attach(self, request: m.Attach) -> m.Message:
+        """Serve an environment's steps over slabs from now on."""
+        env = self._envs[request.env]
+        if not isinstance(env, SubEnvs) or env.reward_shape:
+            return m.Value(False)
+        self.lane = Lane(env, request, self.descriptors, partial(self.answer, by_lane=True))
+        return m.Value(True)
+
+    def fetch_infos(self, request: m.FetchInfos) -> m.Message:
+        """The last step's infos, which did not fit the slab."""
+        return m.Value({} if self.lane is None else self.lane.infos())
+
+    def fetch_infos_apart(self, request: m.FetchInfosApart) -> m.Message:
+        """The last reset's or step's infos, as each sub-environment gave them."""
+        env = self._envs[request.env]
+        return m.Value(tuple(env.pairs) if isinstance(env, SubEnvs) else ())
+
+    def call(self, request: m.Call) -> m.Message:
+        """``VectorEnv.call``."""
+        results = _caller(self._envs[request.env])(request.name, *request.args, **request.kwargs)
+        return m.Value(tuple(results) if isinstance(results, list) else results)
+
+    def set_attr(self, request: m.SetAttr) -> m.Message:
+        """``VectorEnv.set_attr``."""
+        env = self._envs[request.env]
+        if hasattr(env, "set_attr"):
+            env.set_attr(request.name, list(request.values))
+        else:
+            setattr(env, request.name, request.values[0])
+        return m.Value(None)
+
+    def render(self, request: m.Render) -> m.Message:
+        """``VectorEnv.render``."""
+        return m.Value(self._envs[request.env].render())
+
+    def get_own(self, request: m.GetOwn) -> m.Message:
+        """An attribute of the vector environment, or of what it wraps."""
+        value = _own(self._envs[request.env], request.name)
+        return m.Method() if callable(value) else m.Value(value)
+
+    def call_own(self, request: m.CallOwn) -> m.Message:
+        """A method of the vector environment, or of what it wraps."""
+        method = _own(self._envs[request.env], request.name)
+        return m.Value(method(*request.args, **request.kwargs))
+
+    def get_random(self, request: m.GetRandom) -> m.Message:
+        """The states of the random number generators: of all sub-environments, or just one."""
+        generators = self._envs[request.env].np_random
+        if not isinstance(generators, tuple):
+            return m.Value(generators.bit_generator.state)
+        return m.Value(tuple(generator.bit_generator.state for generator in generators))
+
+    def close(self, request: m.Close) -> m.Message:
+        """``VectorEnv.close``."""
+        env = self._envs.pop(request.env, None)
+        if env is not None:
+            env.close()
+        return m.Value(None)
+
+
+def _caller(env: Any) -> Callable[..., Any]:
+    """``env.call``, or for a vector environment without one, its own attribute."""
+    if hasattr(env, "call"):
+        return env.call  # type: ignore[no-any-return]
+
+    def call(name: str, *args: Any, **kwargs: Any) -> Any:
+        value = _own(env, name)
+        return value(*args, **kwargs) if callable(value) else value
+
+    return call
+
+
+def _own(env: Any, name: str) -> Any:
+    try:
+        return getattr(env, name)
+    except AttributeError:
+        return getattr(getattr(env, "unwrapped", env), name)
+
+
+_HANDLERS: dict[type[m.Message], Callable[[Host, Any], m.Message]] = {
+    m.Load: Host.load,
+    m.LoadTask: Host.load_task,
+    m.Build: Host.build,
+    m.Reset: Host.reset,
+    m.Step: Host.step,
+    m.Revive: Host.revive,
+    m.Call: Host.call,
+    m.SetAttr: Host.set_attr,
+    m.Render: Host.render,
+    m.GetOwn: Host.get_own,
+    m.CallOwn: Host.call_own,
+    m.GetRandom: Host.get_random,
+    m.Close: Host.close,
+    m.Attach: Host.attach,
+    m.FetchInfos: Host.fetch_infos,
+    m.FetchInfosApart: Host.fetch_infos_apart,
+}

@@ -1,0 +1,265 @@
+"""The worker's own loop over plain sub-environments: ``SyncVectorEnv``, written into given memory.
+
+Observations, rewards and flags go straight to where they are read: no stacking, no deep copy.
+Everything but ``reset`` and ``step`` is ``SyncVectorEnv``'s own. The parity suite compares the two
+bit by bit. Followed: ``gymnasium.vector.SyncVectorEnv`` 1.4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from operator import itemgetter
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import SyncVectorEnv
+from gymnasium.vector.utils import concatenate, create_empty_array, iterate
+
+from envhub_worker.protocol.shared_memory import slabs
+from envhub_worker.protocol.spaces import batches
+from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
+from envhub_worker.runner.infos import Pairs
+
+Store = Callable[[int, Any], None]
+
+
+class Batch:
+    """Where the results of one batch lie: arrays of its own, or views of a slab.
+
+    Attributes:
+        rewards: float64 ``(count, *reward_shape)``.
+        terminations, truncations: bool ``(count,)``.
+        store: Writes a sub-environment's observation into its row.
+        rows: Where each observation goes as it is, if its dtype and shape are the row's; None
+            each where the space is no array.
+    """
+
+    def __init__(self, space: gym.Space[Any], count: int, reward_shape: tuple[int, ...]) -> None:
+        self._space = space
+        self._count = count
+        self._members: list[Any] = [None] * count
+        self.rewards = np.zeros((count, *reward_shape))
+        self.terminations = np.zeros(count, np.bool_)
+        self.truncations = np.zeros(count, np.bool_)
+        self.rows: list[Any] = [None] * count
+        self._slots: list[tuple[list[Any], Store, list[Any]]] = []
+        self._slot = 0
+        self._left: int | None = None
+        layout = slabs.observation_layout(space, count, 1)
+        if layout is None:
+            self.store: Store = self._members.__setitem__
+        else:
+            self.write_to([[np.zeros(leaf.shape, leaf.dtype) for leaf in layout.leaves]])
+
+    def write_to(self, slots: list[list[Any]]) -> None:
+        """Write observations into these leaves from now on: one list for each slot."""
+        self._slots = [
+            (leaves, _writer(self._space, iter(leaves)), self._rows_of(leaves)) for leaves in slots
+        ]
+        self.choose(0)
+
+    def _rows_of(self, leaves: list[Any]) -> list[Any]:
+        if not isinstance(self._space, ARRAY_SPACES):
+            return [None] * self._count
+        return [leaves[0][index, ...] for index in range(self._count)]
+
+    def choose(self, slot: int, *, carry: bool = False) -> None:
+        """Write the next observations into another slot; ``carry`` takes the last ones along."""
+        if slot != self._slot:
+            self._left = self._slot
+        self._slot = slot
+        if carry:
+            self.carry(0)
+        _, self.store, self.rows = self._slots[slot]
+
+    def carry(self, start: int) -> None:
+        """Take the rows from ``start`` on along from the slot that was left, if one was."""
+        left, self._left = self._left, None
+        if left is not None:
+            for ours, theirs in zip(self._slots[self._slot][0], self._slots[left][0], strict=True):
+                ours[start:] = theirs[start:]
+
+    def stay(self) -> None:
+        """All rows have been written: what was left is of no concern any more."""
+        self._left = None
+
+    def observation(self) -> Any:
+        """The batched observation; views of the arrays that the next step writes."""
+        if self._slots:
+            return slabs.assembler(self._space)(self._slots[self._slot][0])
+        empty: Any = create_empty_array(self._space, n=self._count, fn=np.zeros)
+        return concatenate(self._space, self._members, empty)
+
+
+class SubEnvs(SyncVectorEnv):
+    """Plain sub-environments, driven with ``SyncVectorEnv``'s semantics.
+
+    Attributes:
+        batch: Where ``reset`` and ``step`` leave their results.
+        reward_shape: Of one sub-environment's reward; ``()`` but for multi-objective ones.
+        sliced: Whether there are others elsewhere, in other processes.
+        pairs: The infos of the last reset or step, as each sub-environment gave them.
+    """
+
+    def __init__(
+        self,
+        env_fns: Sequence[Callable[[], Any]],
+        autoreset_mode: str,
+        sync: bool,
+        *,
+        sliced: bool = False,
+    ) -> None:
+        super().__init__(env_fns, copy=False, autoreset_mode=autoreset_mode)
+        # AsyncVectorEnv stacks vector rewards, SyncVectorEnv refuses them
+        self.reward_shape = () if sync else _reward_shape(self.envs[0])
+        self.batch = Batch(self.single_observation_space, self.num_envs, self.reward_shape)
+        self._done = [False] * self.num_envs
+        self._flagged: list[int] = []  # whose flags are not both False
+        self._mode = autoreset_mode
+        self.sliced = sliced
+        self.pairs: Pairs = []
+        self._restores = batches.restores(self.single_action_space)
+        self._plain_actions = isinstance(self.single_action_space, ARRAY_SPACES)
+
+    def run_reset(self, seeds: Any, options: dict[str, Any] | None, mask: Any) -> Pairs:
+        """Reset the sub-environments that the mask names, or all; returns the infos.
+
+        Args:
+            seeds: One seed or None each, or None.
+            options: The same object for each.
+            mask: bool ``(num_envs,)`` or None. A shard's part of it may be all False.
+        """
+        chosen = range(self.num_envs) if mask is None else np.flatnonzero(mask).tolist()
+        for index in chosen:
+            self._done[index] = False
+            self.batch.terminations[index] = self.batch.truncations[index] = False
+        infos: Pairs = []
+        self.pairs = infos
+        for index in chosen:
+            seed = None if seeds is None else seeds[index]
+            observation, info = self.envs[index].reset(seed=seed, options=options)
+            self.batch.store(index, observation)
+            if info:
+                infos.append((index, info))
+        return infos
+
+    def run_revive(self, seeds: Any) -> Pairs:
+        """Reset all in the place of others, whose episodes are truncated; returns the infos.
+
+        Their last observations died with them: the fresh ones stand for those, too.
+        """
+        infos = self.run_reset(seeds, None, None)
+        self.batch.rewards[...] = 0.0
+        self.batch.truncations[...] = True
+        self._flagged = list(range(self.num_envs))
+        if self._mode == "SameStep":
+            fresh = iterate(self.observation_space, self.batch.observation())
+            finals = [(i, {"final_obs": row, "final_info": {}}) for i, row in enumerate(fresh)]
+            self.pairs = sorted([*finals, *infos], key=itemgetter(0))
+            return self.pairs
+        self._done = [True] * self.num_envs
+        return infos
+
+    def run_step(self, actions: Any) -> Pairs:
+        """Step every sub-environment, or reset it where its episode is over; returns the infos.
+
+        Args:
+            actions: A batch for the action space; rows are handed out as they are.
+        """
+        if self._mode == "Disabled" and any(self._done):
+            raise AssertionError(f"self._autoreset_envs={np.array(self._done)!r}")
+        batch, same_step, count = self.batch, self._mode == "SameStep", self.num_envs
+        store, rows, rewards = batch.store, batch.rows, batch.rewards
+        dtype, shape = (None, None) if rows[0] is None else (rows[0].dtype, rows[0].shape)
+        array = np.ndarray
+        terminations, truncations = batch.terminations, batch.truncations
+        for index in self._flagged:
+            terminations[index] = truncations[index] = False
+        flagged = self._flagged = []
+        done = [False] * count
+        infos: Pairs = []
+        self.pairs = infos
+        index = 0
+        each = zip(range(count), self._each(actions), self.envs, self._done, rows, strict=True)
+        try:
+            for index, action, env, over, row in each:
+                if over:
+                    observation, info = env.reset()
+                    rewards[index] = 0.0
+                else:
+                    observation, reward, terminated, truncated, info = env.step(action)
+                    rewards[index] = reward
+                    if terminated or truncated:
+                        flagged.append(index)
+                        terminations[index] = terminated
+                        truncations[index] = truncated
+                        if same_step:
+                            infos.append((index, {"final_obs": observation, "final_info": info}))
+                            observation, info = env.reset()
+                        else:
+                            done[index] = True
+                if (
+                    type(observation) is array
+                    and observation.dtype is dtype
+                    and observation.shape == shape
+                ):
+                    row[...] = observation
+                else:
+                    store(index, observation)
+                if info:
+                    infos.append((index, info))
+        except BaseException:
+            batch.carry(index)  # who was not asked any more has his last observation still
+            raise
+        batch.stay()
+        self._done = done
+        return infos
+
+    def _each(self, actions: Any) -> Iterator[Any]:
+        if self._restores:
+            actions = batches.restore_batch(self.single_action_space, actions)
+        return iter(actions) if self._plain_actions else iterate(self.action_space, actions)
+
+
+def _reward_shape(env: Any) -> tuple[int, ...]:
+    """MO-Gymnasium's environments declare a ``reward_space``."""
+    try:
+        return tuple(env.get_wrapper_attr("reward_space").shape)
+    except (AttributeError, TypeError):
+        return ()
+
+
+def _writer(space: gym.Space[Any], leaves: Iterator[Any]) -> Store:
+    """Writes one member of the space into row ``index`` of the leaves."""
+    if isinstance(space, spaces.Dict):
+        by_key = [(key, _writer(sub, leaves)) for key, sub in space.spaces.items()]
+
+        def write_dict(index: int, member: Any) -> None:
+            for key, write in by_key:
+                write(index, member[key])
+
+        return write_dict
+    if isinstance(space, spaces.Tuple):
+        in_order = [_writer(sub, leaves) for sub in space.spaces]
+
+        def write_tuple(index: int, member: Any) -> None:
+            for position, write in enumerate(in_order):
+                write(index, member[position])
+
+        return write_tuple
+    return _leaf_writer(next(leaves))
+
+
+def _leaf_writer(rows: Any) -> Store:
+    dtype, shape = rows.dtype, rows.shape[1:]
+    each = [rows[index, ...] for index in range(len(rows))]
+
+    def write(index: int, member: Any) -> None:
+        if type(member) is np.ndarray and member.dtype is dtype and member.shape == shape:
+            each[index][...] = member
+        else:  # the casts that SyncVectorEnv permits, and its errors for the others
+            np.stack([member], out=rows[index : index + 1])
+
+    return write

@@ -1,0 +1,181 @@
+"""Brings whatever ``make_env`` returned into one form: tasks by suite and task id.
+
+Followed: LeRobot's ``_normalize_hub_result``, and what it gets wrong: a single ``Env`` with
+``n_envs > 1``, ``{suite: VectorEnv}``, ``{suite: [env, ...]}``, duck-typed vector environments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import VectorEnv
+
+from envhub_worker.protocol.manifest import TaskId
+from envhub_worker.runner.deferred import Recording, recording
+from envhub_worker.runner.sync_envs import SubEnvs
+
+EnvFn = Callable[[], Any]
+Picker = Callable[[Any], Any]
+_DUCK = ("num_envs", "reset", "step", "close")
+
+
+class ResultError(Exception):
+    """``make_env`` returned something that is not an environment."""
+
+
+@dataclass
+class Task:
+    """One entry of the mapping: a recording that can be built in slices, or a live environment."""
+
+    suite: str
+    task: TaskId
+    recording: Recording | None = None
+    vector: Any = None
+    probe: Any = None
+    """The first sub-environment, when it has been built to learn its spaces."""
+
+    @property
+    def num_envs(self) -> int:
+        """The number of sub-environments."""
+        return len(self.recording.env_fns) if self.recording else int(self.vector.num_envs)
+
+    def build(self, start: int, stop: int) -> Any:
+        """A vector environment of the sub-environments ``start`` to ``stop``."""
+        if self.recording is None:
+            return self.vector
+        env_fns = list(self.recording.env_fns[start:stop])
+        if start == 0 and self.probe is not None:
+            first, self.probe = self.probe, None
+            env_fns[0] = lambda: first
+        sliced = stop - start < len(self.recording.env_fns)
+        return SubEnvs(env_fns, self.recording.autoreset_mode, self.recording.sync, sliced=sliced)
+
+    def learn_spaces(self) -> Any:
+        """A vector environment, or one sub-environment, to read spaces and metadata from."""
+        if self.recording is None:
+            return self.vector
+        if self.probe is None:
+            self.probe = self.recording.env_fns[0]()
+        return self.probe
+
+    def forget_probe(self) -> None:
+        """Close the sub-environment that was built for its spaces."""
+        if self.probe is not None:
+            self.probe.close()
+            self.probe = None
+
+
+def tasks_of(result: Any, n_envs: int, use_async_envs: bool, again: EnvFn) -> list[Task]:
+    """The tasks in ``make_env``'s result.
+
+    Args:
+        result: What ``make_env(n_envs, use_async_envs)`` returned.
+        n_envs: What the caller asked for.
+        use_async_envs: What the caller asked for.
+        again: Calls ``make_env`` with ``n_envs=1``, for one more single ``Env``.
+
+    Raises:
+        ResultError: The result, or something in it, is not an environment.
+    """
+    make = _Maker(n_envs, use_async_envs, again)
+    if not isinstance(result, Mapping):
+        return [make.task(_suite_name(result), 0, result, lambda value: value)]
+    tasks = [make.task(suite, task, env, pick) for suite, task, env, pick in _entries(result)]
+    if not tasks:
+        raise ResultError("make_env returned an empty mapping; it holds no environment")
+    return tasks
+
+
+def _entries(result: Mapping[Any, Any]) -> Iterator[tuple[str, TaskId, Any, Picker]]:
+    for suite, group in result.items():
+        if not isinstance(suite, str):
+            raise ResultError(f"a suite's name is a str, make_env used {_described(suite)}")
+        if isinstance(group, Mapping):
+            for task, env in group.items():
+                yield suite, _task_id(task), env, _picker(suite, task)
+        elif isinstance(group, (list, tuple)):
+            for index, env in enumerate(group):
+                yield suite, index, env, _picker(suite, index)
+        else:
+            yield suite, 0, group, _picker(suite)
+
+
+def _picker(*path: Any) -> Picker:
+    def pick(result: Any) -> Any:
+        for key in path:
+            result = result[key]
+        return result
+
+    return pick
+
+
+def _task_id(task: Any) -> TaskId:
+    if isinstance(task, (int, np.integer)) and not isinstance(task, bool):
+        return int(task)
+    if isinstance(task, str):
+        return task
+    raise ResultError(f"a task id is an int or a str, make_env used {_described(task)}")
+
+
+class _Maker:
+    """Makes tasks; single environments are multiplied by calling ``make_env`` again."""
+
+    def __init__(self, n_envs: int, use_async_envs: bool, again: EnvFn) -> None:
+        self._n_envs = n_envs
+        self._sync = not use_async_envs
+        self._again = again
+        self._seen: list[Any] = []
+
+    def task(self, suite: str, task: TaskId, env: Any, pick: Picker) -> Task:
+        if isinstance(env, VectorEnv) or _is_duck(env):
+            made = recording(env)
+            return Task(suite, task, recording=made, vector=None if made else env)
+        if isinstance(env, gym.Env):
+            return Task(suite, task, recording=self._multiplied(env, pick))
+        raise ResultError(
+            f"make_env must return a gymnasium VectorEnv, an Env, or a mapping "
+            f"{{suite: {{task_id: VectorEnv}}}}; for suite {suite!r}, task {task!r} it returned "
+            f"{_described(env)}"
+        )
+
+    def _multiplied(self, first: Any, pick: Picker) -> Recording:
+        def another() -> Any:
+            env = pick(self._again())
+            if any(env is seen for seen in self._seen):
+                raise ResultError(
+                    f"make_env returns the same Env object each time, so n_envs={self._n_envs} "
+                    "cannot be honoured; use n_envs=1, or return a VectorEnv"
+                )
+            self._seen.append(env)
+            return env
+
+        self._seen.append(first)
+        env_fns: list[EnvFn] = [lambda: first, *[another] * (self._n_envs - 1)]
+        return Recording(
+            env_fns=env_fns,
+            sync=self._sync,
+            observation_mode="same",
+            autoreset_mode="NextStep",
+            arguments={},
+        )
+
+
+def _is_duck(env: Any) -> bool:
+    return not isinstance(env, (gym.Env, type)) and all(hasattr(env, name) for name in _DUCK)
+
+
+def _suite_name(env: Any) -> str:
+    spec = getattr(env, "spec", None) if isinstance(env, (gym.Env, VectorEnv)) else None
+    return str(getattr(spec, "id", None) or "hub_env")
+
+
+def _described(value: Any) -> str:
+    if value is None:
+        return "None"
+    text = repr(value)
+    kind = f"{type(value).__module__}.{type(value).__qualname__}"
+    return f"{text[:80]} (a {kind})"

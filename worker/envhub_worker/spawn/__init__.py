@@ -1,0 +1,1 @@
+"""From a zygote to a jail: fork, hand over, start."""

@@ -1,0 +1,270 @@
+"""The first process of a jail: it sets the jail up, starts hosts in it, and ends them all.
+
+Trusted code. It reads its jail's specification from its control channel, which is the first
+message, ``{"spec": S, "scratch": folder | null, "cgroup": kind | null}`` with the descriptors of
+``cgroups.Group.open``; then requests::
+
+    {"op": "start", "host": N} + [the host's stream, further descriptors...]
+    {"op": "kill", "host": N}
+
+Events::
+
+    {"event": "ready", "report": [layer...]}
+    {"event": "failed", "layer": L, "reason": R, "fix": F}                  and it exits
+    {"event": "host_started", "host": N, "report": [layer...]} + [the host's pidfd]
+    {"event": "host_exited", "host": N, "code": C | null, "signal": S | null, "reason": R,
+     "detail": D}
+
+The end of the channel ends the jail.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import socket
+import sys
+import traceback
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+from envhub_worker.channel import Channel, close_fds
+from envhub_worker.lockdown.context import Common, JailContext
+from envhub_worker.lockdown.limits.monitor import Guard
+from envhub_worker.lockdown.mechanisms import process, reap
+from envhub_worker.lockdown.plan import HostFacts, plan
+from envhub_worker.lockdown.report import Layer, LayerUnavailableError
+from envhub_worker.lockdown.seccomp import notify
+from envhub_worker.lockdown.spec import JailSpec
+from envhub_worker.lockdown.stages import jail
+from envhub_worker.spawn import runner_entry
+
+
+def run(control: int, output: int, common: Common) -> NoReturn:
+    """Be the init of a jail in this freshly forked child of the zygote. Never returns."""
+    code = 1
+    try:
+        process.reset_signals(reap.HANDLED)
+        # Without a pid namespace init must live long enough to end what it started.
+        signum = signal.SIGKILL if common.namespaced else signal.SIGTERM
+        process.die_with_parent(common.pid, signum)
+        os.dup2(output, 1)
+        os.dup2(output, 2)
+        process.close_all_but({0, 1, 2, control})
+        process.become_subreaper()
+        Init(Channel(socket.socket(fileno=control)), common).run()
+        code = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stderr.flush()
+        os._exit(code)
+
+
+@dataclass
+class _Host:
+    """A host as its init knows it.
+
+    Attributes:
+        number: The server's number for it.
+        status: Where it reports, until it is confined.
+        ended: (reason, detail) of the end that we gave it.
+    """
+
+    number: int
+    status: Channel | None
+    ended: tuple[str, str] | None = None
+
+
+class Init:
+    """The loop: requests from the server, reports of hosts, limits, and deaths."""
+
+    def __init__(self, channel: Channel, common: Common) -> None:
+        self._channel = channel
+        self._common = common
+        self._hosts: dict[int, _Host] = {}
+        self._listeners: set[int] = set()
+        self._running = True
+        self._poller = select.poll()
+        self._joins: list[int] = []
+
+    def run(self) -> None:
+        """Set the jail up and serve until the channel ends."""
+        received = self._channel.receive()
+        if received is None:
+            return
+        wakeup = reap.child_signals(self._stop)
+        try:
+            self._set_up(*received)
+            self._loop(wakeup)
+        except LayerUnavailableError as error:
+            self._channel.send({"event": "failed", **error.to_wire()})
+        finally:
+            reap.kill_descendants(keep=())
+
+    def _set_up(self, message: dict[str, Any], fds: list[int]) -> None:
+        spec = JailSpec.from_wire(message["spec"])
+        events, *self._joins = fds or [-1]
+        facts = HostFacts(
+            machine=os.uname().machine,
+            root=self._common.config.user is not None,
+            landlock_abi=self._common.landlock_abi,
+            memory=message["cgroup"] or "watchdog",
+        )
+        wanted = plan(spec.confinement, facts)
+        scratch, view = jail.enter(spec, self._common, message["scratch"])
+        self._jail = JailContext(
+            spec=spec,
+            common=self._common,
+            plan=wanted,
+            scratch=scratch,
+            processes=jail.process_limit(spec.confinement.limits, wanted.namespaced),
+        )
+        self._guard = Guard(self._jail, events)
+        working = Layer("working-view", True, f"the snapshot, writable as {view}")
+        report = [layer.to_wire() for layer in (*wanted.layers, working)]
+        self._channel.send({"event": "ready", "report": report})
+
+    def _stop(self, *_: object) -> None:
+        self._running = False
+
+    def _loop(self, wakeup: int) -> None:
+        self._poller.register(self._channel, select.POLLIN)
+        self._poller.register(wakeup, select.POLLIN)
+        while self._running:
+            ready = [fd for fd, _ in self._poller.poll(self._patience())]
+            for fd in ready:
+                if fd == wakeup:
+                    reap.drain(wakeup)
+                elif fd == self._channel.fileno():
+                    self._serve()
+                elif fd in self._listeners:
+                    self._answer(fd)
+                else:
+                    self._read_reports(fd)
+            if wakeup in ready:
+                self._reap()
+            if self._hosts:
+                self._look()
+
+    def _patience(self) -> float | None:
+        """Milliseconds until the next look at the limits; a jail without hosts needs none."""
+        return self._guard.seconds_left() * 1000 + 1 if self._hosts else None
+
+    def _look(self) -> None:
+        if self._guard.seconds_left() == 0:
+            # A host that is still locking itself down runs our code, and cannot be measured yet.
+            starting = [pid for pid, host in self._hosts.items() if host.status is not None]
+            over = self._guard.look(reap.descendants(os.getpid(), starting))
+            if over is not None:
+                for host in self._hosts.values():
+                    host.ended = host.ended or over
+                reap.kill_descendants(keep=())
+
+    def _serve(self) -> None:
+        received = self._channel.receive()
+        if received is None:
+            self._running = False
+            return
+        message, fds = received
+        if message["op"] == "start":
+            self._start(message["host"], fds)
+        else:
+            self._kill(message["host"])
+
+    def _start(self, number: int, fds: list[int]) -> None:
+        status, theirs = Channel.pair()
+        order = runner_entry.Order(
+            parent=os.getpid(),
+            jail=self._jail,
+            fds=fds,
+            hosts=len(self._hosts) + 1,
+            joins=self._joins,
+            status=theirs.fileno(),
+        )
+        pid = os.fork()
+        if pid == 0:
+            runner_entry.run(order)
+        self._guard.ignore(fds)
+        close_fds(fds)
+        theirs.close()
+        self._hosts[pid] = _Host(number, status)
+        self._poller.register(status, select.POLLIN)
+
+    def _kill(self, number: int) -> None:
+        for pid, host in self._hosts.items():
+            if host.number == number:
+                host.ended = host.ended or ("killed", "")
+                # Not reaped yet, so the pid is still its own. Stopped, it cannot fork away.
+                os.kill(pid, signal.SIGSTOP)
+                reap.kill_below(pid)
+                os.kill(pid, signal.SIGKILL)
+
+    def _answer(self, listener: int) -> None:
+        if not notify.serve(listener):
+            self._poller.unregister(listener)
+            self._listeners.discard(listener)
+            os.close(listener)
+
+    def _read_reports(self, fd: int) -> None:
+        for pid, host in self._hosts.items():
+            if host.status is not None and host.status.fileno() == fd:
+                self._read_report(pid, host, host.status)
+
+    def _read_report(self, pid: int, host: _Host, status: Channel) -> None:
+        messages, ended = status.drain()
+        for message, fds in messages:
+            if "layer" in message:
+                raise LayerUnavailableError(**message)
+            if "broker" in message:
+                self._listeners.update(fds)
+                self._poller.register(fds[0], select.POLLIN)
+            else:
+                self._tell_started(pid, host, message["report"])
+        if ended:  # or it died before it was confined: its exit says so
+            self._poller.unregister(status)
+            status.close()
+            host.status = None
+
+    def _tell_started(self, pid: int, host: _Host, report: list[dict[str, Any]]) -> None:
+        pidfd = os.pidfd_open(pid)  # not reaped yet: even if it has ended, it is this one
+        fields = {"host": host.number, "report": report}
+        self._channel.send({"event": "host_started", **fields}, [pidfd])
+        os.close(pidfd)
+
+    def _reap(self) -> None:
+        ended = [(pid, status) for pid, status in reap.reap(self._before_reaping)]
+        for pid, status in ended:
+            host = self._hosts.pop(pid, None)
+            if host is not None:
+                self._tell_exit(host, status)
+                self._end_orphans(pid)
+        if ended and not self._hosts:
+            reap.kill_descendants(keep=())  # daemons do not outlive the last host
+
+    def _end_orphans(self, session: int) -> None:
+        """End what a host leaves behind, while others go on. Daemons end with the last host."""
+        for pid in reap.descendants(os.getpid(), keep=self._hosts):
+            with contextlib.suppress(ProcessLookupError):
+                if os.getsid(pid) == session:
+                    os.kill(pid, signal.SIGKILL)
+
+    def _before_reaping(self, pid: int) -> None:
+        host = self._hosts.get(pid)
+        if host is not None and host.status is not None:
+            self._read_report(pid, host, host.status)
+
+    def _tell_exit(self, host: _Host, status: int) -> None:
+        fields = process.exit_fields(status)
+        reason, detail = host.ended or self._reason(fields["signal"])
+        event = {"event": "host_exited", "host": host.number, "reason": reason, "detail": detail}
+        self._channel.send({**event, **fields})
+
+    def _reason(self, signum: int | None) -> tuple[str, str]:
+        if signum is None:
+            return "exit", ""
+        if signum == signal.SIGXCPU:
+            return "cpu-limit", f"{self._jail.spec.confinement.limits.cpu_s} CPU seconds used"
+        return self._guard.killed_by_kernel() or ("signal", "")

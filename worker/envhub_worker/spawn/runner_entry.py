@@ -1,0 +1,132 @@
+"""A host, from its fork to the first line of the code that serves it.
+
+Everything here runs before anything of the repository does. The order is the point: what needs
+a privilege comes before its drop, and the syscall filter comes last.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import random
+import runpy
+import socket
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NoReturn
+
+import numpy as np
+
+from envhub_worker.channel import Channel
+from envhub_worker.lockdown.context import JailContext
+from envhub_worker.lockdown.limits import cgroups
+from envhub_worker.lockdown.mechanisms import process, reap
+from envhub_worker.lockdown.mechanisms.environment import jail_environment
+from envhub_worker.lockdown.report import Layer, LayerUnavailableError
+from envhub_worker.lockdown.spec import JailSpec
+from envhub_worker.lockdown.stages import runner
+from envhub_worker.spawn import blas
+
+_SELF_TEST = Layer("self-test", True, "the denials above were tried and held")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """What init asks a new host to be.
+
+    Attributes:
+        parent: Init's pid.
+        jail: The jail.
+        fds: The stream to the server, then whatever the server passes through.
+        hosts: How many the jail has, this one included.
+        joins: Where to join the jail's control group, if it has one.
+        status: Socket for the report to init; closed before the target runs.
+    """
+
+    parent: int
+    jail: JailContext
+    fds: list[int]
+    hosts: int
+    joins: list[int]
+    status: int
+
+
+def run(order: Order) -> NoReturn:
+    """Confine this freshly forked process, report, and run the target. Never returns."""
+    code = 1
+    try:
+        code = _run(order)
+    except SystemExit as error:
+        code = _exit_code(error)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        # Not sys.exit: the zygote's atexit handlers and init's frames are not ours to run.
+        _flush()
+        os._exit(code & 0xFF)
+
+
+def _run(order: Order) -> int:
+    init = Channel(socket.socket(fileno=order.status))
+    try:
+        confine(order, init)
+    except LayerUnavailableError as error:
+        init.send(error.to_wire())
+        return 1
+    blas.restore_threads(order.jail.common.set_blas_threads, order.hosts)
+    init.send({"report": [_SELF_TEST.to_wire()]})
+    init.close()
+    stream = socket.socket(fileno=order.fds[0])
+    main = _resolve(order.jail.common.config.target)
+    return int(main(stream, order.jail.spec, order.fds[1:]) or 0)
+
+
+def _resolve(target: str) -> Callable[[socket.socket, JailSpec, list[int]], int | None]:
+    place, _, function = target.partition(":")
+    if place.endswith(".py"):
+        return runpy.run_path(place)[function]  # type: ignore[no-any-return]
+    return getattr(importlib.import_module(place), function)  # type: ignore[no-any-return]
+
+
+def confine(order: Order, init: Channel) -> None:
+    """Give up everything that the jail does not need."""
+    process.die_with_parent(order.parent)
+    os.setsid()
+    cgroups.join(order.joins)
+    process.reset_signals(reap.HANDLED)
+    descriptors = {0, 1, 2, order.status, *order.fds}
+    process.close_all_but(descriptors)
+    _forget_the_zygote(order.jail)
+    runner.enter(order.jail, descriptors, init)
+
+
+def _forget_the_zygote(jail: JailContext) -> None:
+    """Own environment, folders and random numbers; a fork shares them all with its siblings."""
+    scratch, granted = jail.scratch, jail.spec.confinement.environment
+    built = jail_environment(os.environ, granted, scratch.home, scratch.temporary)
+    os.environ.clear()
+    os.environ.update(built)
+    os.chdir(scratch.work)
+    os.umask(0o022)
+    tempfile.tempdir = None
+    random.seed()
+    # One number: an array, as numpy takes by itself, costs a tenth of the whole spawn.
+    np.random.seed(int.from_bytes(os.urandom(4), "little"))
+
+
+def _exit_code(error: SystemExit) -> int:
+    if error.code is None or isinstance(error.code, int):
+        return error.code or 0
+    sys.stderr.write(f"{error.code}\n")
+    return 1
+
+
+def _flush() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except BaseException:
+            continue  # the stranger may have replaced or closed it

@@ -1,0 +1,186 @@
+"""The zygote: a clean, single-threaded interpreter that preloads and only forks.
+
+It is executed with ``-I``, a built environment and named descriptors, never runs a stranger's
+code and never sees what a jail is for: a jail's specification, with the secrets that its caller
+may grant, goes straight from the server to the jail's init, so that no later fork inherits it.
+
+argv: the descriptor of its control channel, and ``ahead`` if what every host needs shall be
+imported at once, and not only when it is confined. The first message on the channel is its
+configuration (a command line can be read by every jail), with the fields of ``ZygoteConfig``. Then
+requests::
+
+    {"op": "spawn", "id": N} + [init's control socket, the jail's output pipe]
+
+Events::
+
+    {"event": "ready"} + [pidfd of the zygote]
+    {"event": "spawned", "id": N} + [pidfd of the init]
+    {"event": "exited", "id": N, "code": C | null, "signal": S | null}
+
+The end of the channel ends the zygote and everything below it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import importlib
+import io
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import cast
+
+from envhub_worker.channel import Channel, close_fds
+from envhub_worker.lockdown.context import Common, ZygoteConfig
+from envhub_worker.lockdown.mechanisms import namespaces, process, reap
+from envhub_worker.lockdown.report import LayerUnavailableError
+from envhub_worker.lockdown.stages import zygote
+from envhub_worker.spawn import blas, jail_init
+
+# What nearly every host imports anyway. pyzmq is left out on purpose: a jail holds no ZeroMQ
+# socket, and a context started here would not survive the fork.
+_PRELOAD = (
+    "cloudpickle",
+    "ctypes",
+    "gymnasium",
+    "gymnasium.spaces",
+    "gymnasium.vector",
+    "gymnasium.wrappers",
+    "msgpack",
+    "numpy",
+    "numpy.random",
+    "tempfile",
+    "typing",
+)
+_JAIL = "envhub_worker.runner.runner"
+_END_S = 5.0
+
+
+def main(argv: Sequence[str]) -> int:
+    """Preload, then fork an init for each request until the server goes away."""
+    control = int(argv[0])
+    process.close_all_but({0, 1, 2, control})
+    channel = Channel(socket.socket(fileno=control))
+    gc.disable()  # what is imported stays, and to look through it again and again takes a tenth
+    if argv[1:] == ["ahead"]:
+        preload(_JAIL)
+    received = channel.receive()
+    if received is None:
+        return 0
+    config = ZygoteConfig.from_wire(received[0])
+    process.die_with_parent(config.parent, signal.SIGTERM)
+    try:
+        common = zygote.enter(config)
+    except LayerUnavailableError as error:
+        refuse(channel, error)
+        return 0
+    process.become_subreaper()
+    # what a repository prints must not lie in a buffer when its process dies
+    cast(io.TextIOWrapper, sys.stdout).reconfigure(line_buffering=True)
+    preload(config.target)
+    common = replace(common, set_blas_threads=blas.find_setter())
+    gc.freeze()  # without looking through it: there is next to nothing that could go
+    gc.enable()
+    Zygote(channel, common).run()
+    return 0
+
+
+def preload(target: str) -> None:
+    """Import what every host needs, the code that serves it included: ours, and inert."""
+    for module in _PRELOAD:
+        importlib.import_module(module)
+    place, _, _ = target.partition(":")
+    if not place.endswith(".py"):
+        importlib.import_module(place)
+
+
+def refuse(channel: Channel, error: LayerUnavailableError) -> None:
+    """Answer every request, on the init's own channel, with what this host cannot enforce."""
+    while received := channel.receive():
+        message, (control, output) = received
+        jail_init = Channel(socket.socket(fileno=control))
+        jail_init.send({"event": "failed", **error.to_wire()})
+        jail_init.close()
+        os.close(output)
+        channel.send({"event": "exited", "id": message["id"], "code": 1, "signal": None})
+
+
+class Zygote:
+    """The loop: requests from the server, and the deaths of inits."""
+
+    def __init__(self, channel: Channel, common: Common) -> None:
+        self._channel = channel
+        self._common = common
+        self._inits: dict[int, int] = {}
+        self._running = True
+
+    def run(self) -> None:
+        """Serve until the channel ends or SIGTERM comes; then end everything below."""
+        wakeup = reap.child_signals(self._stop)
+        poller = select.poll()
+        poller.register(self._channel, select.POLLIN)
+        poller.register(wakeup, select.POLLIN)
+        self._tell_ready()
+        while self._running:
+            ready = [fd for fd, _ in poller.poll()]
+            if wakeup in ready:
+                reap.drain(wakeup)
+                self._reap()
+            if self._channel.fileno() in ready:
+                self._serve()
+        self._end()
+
+    def _tell_ready(self) -> None:
+        # Our own death is told by this handle; the pid that the server started may only wait.
+        pidfd = os.pidfd_open(os.getpid())
+        self._channel.send({"event": "ready"}, [pidfd])
+        os.close(pidfd)
+
+    def _stop(self, *_: object) -> None:
+        self._running = False
+
+    def _serve(self) -> None:
+        received = self._channel.receive()
+        if received is None:
+            self._running = False
+        else:
+            message, fds = received
+            self._spawn(message["id"], fds)
+
+    def _spawn(self, jail: int, fds: list[int]) -> None:
+        control, output = fds
+        pid = namespaces.fork_in_new_pid_namespace() if self._common.namespaced else os.fork()
+        if pid == 0:
+            jail_init.run(control, output, self._common)
+        close_fds(fds)
+        self._inits[pid] = jail
+        pidfd = os.pidfd_open(pid)
+        self._channel.send({"event": "spawned", "id": jail}, [pidfd])
+        os.close(pidfd)
+
+    def _reap(self) -> None:
+        gone = False
+        for pid, status in reap.reap():
+            jail = self._inits.pop(pid, None)
+            if jail is not None:
+                gone = True
+                fields = process.exit_fields(status)
+                self._channel.send({"event": "exited", "id": jail, **fields})
+        if gone:
+            # An init that was killed leaves its orphans to us.
+            reap.kill_descendants(keep=self._inits)
+
+    def _end(self) -> None:
+        # Every init sees its own channel end; give it the time to end its jail.
+        deadline = time.monotonic() + _END_S
+        while self._inits and time.monotonic() < deadline:
+            self._reap()
+            time.sleep(0.005)
+        with contextlib.suppress(ChildProcessError):
+            reap.kill_descendants(keep=())

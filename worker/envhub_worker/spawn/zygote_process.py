@@ -1,0 +1,77 @@
+"""The process of a zygote, from its start until it hears what it is for.
+
+What a server needs first is a zygote, and that takes longest: so ``serve --ahead`` starts one
+before anything else is imported. It is in the server's own interpreter, imports what every host
+needs, and waits.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from envhub_worker import bootstrap
+from envhub_worker.channel import Channel
+from envhub_worker.lockdown.mechanisms.environment import zygote_environment
+
+_END_S = 8.0
+
+
+class ZygoteProcess:
+    """Owns the process, its channel, and a private folder.
+
+    Args:
+        python: Its interpreter.
+        runtime_dir: An existing folder of the server's own.
+        ahead: Import before the configuration comes, and so before any confinement: only in an
+            interpreter from which the server has imported the same.
+
+    Attributes:
+        channel: Its first message is the configuration.
+        folder: Goes with ``close`` of whoever uses it.
+        log: Both outputs.
+        pid: Of what was started, which may only wait for the zygote.
+    """
+
+    def __init__(self, python: str, runtime_dir: Path, *, ahead: bool = False) -> None:
+        self.python = python
+        self.folder = runtime_dir / f"zygote-{os.urandom(4).hex()}"
+        self.folder.mkdir(mode=0o700)
+        self.log = self.folder / "log"
+        self.channel, theirs = Channel.pair()
+        arguments = [str(theirs.fileno()), *(["ahead"] if ahead else [])]
+        with theirs, open(self.log, "ab") as log:
+            self._process = subprocess.Popen(
+                bootstrap.command(python, "zygote", *arguments),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                cwd="/",
+                env=zygote_environment(os.environ, python),
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,
+            )
+        self.pid = self._process.pid
+
+    @classmethod
+    def ahead(cls, runtime_dir: Path) -> ZygoteProcess:
+        """One that imports at once."""
+        return cls(sys.executable, runtime_dir, ahead=True)
+
+    def wait(self) -> int:
+        """Its exit code; it is killed if it does not end by itself soon."""
+        try:
+            return self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            return self._process.wait()
+
+    def discard(self) -> None:
+        """Nobody is going to use it."""
+        self.channel.close()
+        self._process.kill()
+        self._process.wait()
+        self.log.unlink(missing_ok=True)
+        self.folder.rmdir()

@@ -1,0 +1,1 @@
+"""The jails of a server: opened, asked, watched and ended."""

@@ -1,0 +1,61 @@
+"""For how long nobody has asked anything of a jail.
+
+Steps by the fast lane do not pass the server. But their slabs do, on their way to the host: the
+client counts its requests in one, which a host cannot write, and the host its replies in another.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from time import monotonic
+
+from envhub_worker.channel import close_fds
+from envhub_worker.protocol.shared_memory.words import SEQUENCE
+
+_WORD = 8
+
+
+class Idleness:
+    """The clock of one jail.
+
+    Args:
+        limit_s: How long is too long.
+    """
+
+    def __init__(self, limit_s: float) -> None:
+        self.limit_s = limit_s
+        self._slabs: dict[int, list[int]] = {}
+        self._seen: list[int] = []
+        self.begin()
+
+    def begin(self) -> None:
+        """Something was asked, or answered."""
+        self._since = monotonic()
+
+    def watch(self, host: int, fds: Sequence[int]) -> None:
+        """Count a host's steps, too. Takes the descriptors over: request slab and reply slab."""
+        self.forget(host)
+        self._slabs[host] = list(fds)
+
+    def forget(self, host: int) -> None:
+        """A host has gone, or there was none."""
+        close_fds(self._slabs.pop(host, []))
+
+    def close(self) -> None:
+        """Give all descriptors back."""
+        for host in list(self._slabs):
+            self.forget(host)
+
+    def passed(self, busy: bool) -> bool:
+        """Whether it was too long; ``busy``: some host owes an answer to a message."""
+        asked = [_sequence(request) for request, _ in self._slabs.values()]
+        told = [_sequence(reply) for _, reply in self._slabs.values()]
+        if busy or asked != told or asked + told != self._seen:
+            self._seen = asked + told
+            self.begin()
+        return monotonic() - self._since >= self.limit_s
+
+
+def _sequence(slab: int) -> int:
+    return int.from_bytes(os.pread(slab, _WORD, SEQUENCE * _WORD), "little")

@@ -1,0 +1,149 @@
+"""What a worker server remembers of its jails, and of who waits for what of them."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from time import monotonic
+from typing import NamedTuple, Protocol
+
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.spawn.jail_handle import Jail
+from envhub_worker.supervisor.idle_timer import Idleness
+from envhub_worker.supervisor.output_tail import OutputTail
+from envhub_worker.supervisor.runner_stream import HostLink
+
+
+class Asker(NamedTuple):
+    """Who asked: the reply goes to this identity under this id. Jails belong to its session.
+
+    ``key`` was proved in the handshake; empty where none is needed.
+    """
+
+    identity: bytes
+    request_id: int
+    session: bytes = b""
+    key: bytes = b""
+
+
+@dataclass
+class Opening:
+    """An ``OpenJail`` or ``StartHosts`` whose hosts have not all come up."""
+
+    asker: Asker
+    waiting: set[int]
+    hosts: tuple[int, ...]
+
+
+@dataclass(slots=True)
+class Pending:
+    """A ``Relay`` that hosts still owe answers to."""
+
+    asker: Asker
+    operation: str
+    replies: list[list[Buffer] | None]
+    dead: set[int] = field(default_factory=set)
+    since: float = field(default_factory=monotonic)
+
+    def lost(self, index: int, death: m.Died) -> None:
+        """In the place of a host's answer: how it died."""
+        self.dead.add(index)
+        self.replies[index] = m.pack(for_operation(death, self.operation), 0)
+
+
+@dataclass
+class JailEntry:
+    """A jail and everything that waits for it."""
+
+    number: int
+    name: str
+    session: bytes
+    jail: Jail
+    spawner: tuple[object, ...]
+    output: OutputTail
+    links: dict[int, HostLink] = field(default_factory=dict)
+    pids: dict[int, int] = field(default_factory=dict)
+    report: tuple[object, ...] = ()
+    opening: list[Opening] = field(default_factory=list)
+    closing: list[Asker] = field(default_factory=list)
+    kept: bool = False
+    idle: Idleness | None = None
+    lost: dict[int, m.Died] = field(default_factory=dict)
+    death: m.Died | None = None
+    released: bool = False
+
+    def __post_init__(self) -> None:
+        # kept, because closing a descriptor makes it forget its number
+        self.control = self.jail.fileno()
+
+
+class Answers(Protocol):
+    """Where replies go."""
+
+    def reply(self, asker: Asker, message: m.Message, payload: Sequence[Buffer] = ()) -> None:
+        """Answer a request."""
+
+    def refuse(
+        self, asker: Asker, error: str, message: str, layer: str = "", fix: str = ""
+    ) -> None:
+        """Answer that it is not done."""
+
+
+def waiting(entry: JailEntry) -> list[Pending]:
+    """Everything that hosts owe an answer to; they owe it no more."""
+    found = {}
+    for link in entry.links.values():
+        for pending, _ in link.pending.values():
+            found[id(pending)] = pending
+        link.pending.clear()
+    return list(found.values())
+
+
+def owes(entry: JailEntry, host: int) -> int:
+    """How many answers a host owes; one that has died owes none any more."""
+    link = entry.links.get(host)
+    return 0 if link is None else len(link.pending)
+
+
+def for_operation(death: m.Died, operation: str) -> m.Died:
+    """A death, told to who waited for this."""
+    return replace(death, operation=operation)
+
+
+def signal_name(number: int | None) -> str | None:
+    """``"SIGKILL"`` for 9. Trust: a jail may choose one that has no name, such as 40."""
+    if number is None:
+        return None
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+_STATES = {"R": "running", "S": "waiting", "D": "waiting", "T": "stopped", "t": "stopped"}
+
+
+def _state_of(pid: int) -> str:
+    """What the kernel says that a host is doing: of a busy environment nobody else can tell."""
+    try:
+        with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as file:
+            # the command may hold anything, parentheses and blanks included
+            return _STATES.get(file.read().rpartition(")")[2].split()[0], "gone")
+    except (OSError, IndexError):
+        return "gone"
+
+
+def status_of(entry: JailEntry) -> dict[str, object]:
+    """What a jail is doing, for ``Status``."""
+    owed = [pending for link in entry.links.values() for pending, _ in link.pending.values()]
+    oldest = min(owed, key=lambda pending: pending.since, default=None)
+    return {
+        "jail": entry.number,
+        "name": entry.name,
+        "pids": tuple(entry.pids.values()),
+        "states": tuple(_state_of(pid) for pid in entry.pids.values()),
+        "busy_s": 0.0 if oldest is None else monotonic() - oldest.since,
+        "operation": "" if oldest is None else oldest.operation,
+    }

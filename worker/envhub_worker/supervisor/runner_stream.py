@@ -1,0 +1,130 @@
+"""The server's end of the stream to one host: bounded both ways, never blocking."""
+
+from __future__ import annotations
+
+import collections
+import socket
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.limits import LARGE_BYTES, WireLimits
+from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
+
+MAX_PENDING = 16
+"""Requests that one host may owe: a client waits for its answer before it asks again, but a
+late one after a timeout may still be under way."""
+_MAX_IOVECS = 512
+
+
+@dataclass
+class HostLink:
+    """One host's stream.
+
+    Attributes:
+        pending: By the ids of the requests that it owes an answer to, oldest first.
+        watched: Whether somebody waits until it can be written to.
+    """
+
+    sock: socket.socket
+    limits: WireLimits
+    pending: collections.OrderedDict[int, Any] = field(default_factory=collections.OrderedDict)
+    watched: bool = False
+    _unsent: collections.deque[memoryview] = field(default_factory=collections.deque)
+
+    def __post_init__(self) -> None:
+        self.sock.setblocking(False)
+        self._reader = PacketReader(self.limits, self._check_owed)
+
+    def fileno(self) -> int:
+        """The stream's descriptor."""
+        return self.sock.fileno()
+
+    @property
+    def wants_write(self) -> bool:
+        """Whether something waits to be sent."""
+        return bool(self._unsent)
+
+    def send(
+        self, request_id: int, frames: Sequence[Buffer], owner: Any, fds: Sequence[int] = ()
+    ) -> None:
+        """Queue a request and send what the socket takes. ``fds`` go along; they stay yours."""
+        if fds:
+            self._send_fds(request_id, frames, fds)
+            self.pending[request_id] = owner
+            return
+        self.pending[request_id] = owner
+        buffers = pack_packet(request_id, frames)
+        if sum(map(len, buffers)) < LARGE_BYTES:
+            buffers = [b"".join(buffers)]
+        self._unsent += [memoryview(buffer).cast("B") for buffer in buffers if buffer]
+        self.flush()
+
+    def _send_fds(self, request_id: int, frames: Sequence[Buffer], fds: Sequence[int]) -> None:
+        """Descriptors belong to a place in the stream, so their small packet goes in one piece."""
+        if self._unsent:
+            raise RuntimeError("the host is still being sent another request")
+        data = b"".join(map(bytes, pack_packet(request_id, frames)))
+        try:
+            sent = socket.send_fds(self.sock, [data], fds)
+        except OSError:
+            return  # it is gone: its exit answers
+        if sent != len(data):
+            raise RuntimeError("the host does not read its stream")
+
+    def flush(self) -> None:
+        """Send what the socket takes. A host that is gone is noticed by its exit."""
+        while self._unsent:
+            batch = [self._unsent[i] for i in range(min(len(self._unsent), _MAX_IOVECS))]
+            try:
+                self._drop(self.sock.sendmsg(batch, (), socket.MSG_NOSIGNAL))
+            except BlockingIOError:
+                return
+            except OSError:
+                self._unsent.clear()
+
+    def _drop(self, sent: int) -> None:
+        while self._unsent and sent >= self._unsent[0].nbytes:
+            sent -= self._unsent.popleft().nbytes
+        if sent:
+            self._unsent[0] = self._unsent[0][sent:]
+
+    def receive(self) -> list[tuple[Packet, Any]] | None:
+        """The replies that have arrived with their owners, or None at the end of the stream.
+
+        Raises:
+            RemoteProtocolError: The host sent what nobody asked for. Trust: it is hostile.
+        """
+        try:
+            data = self.sock.recv(self._reader.chunk)
+        except BlockingIOError:
+            return []
+        except OSError:
+            return None
+        if not data:
+            return None
+        answers = []
+        try:
+            for packet in self._reader.feed(data):
+                answers.append((packet, self._owner(packet)))
+        except RemoteProtocolError:
+            # what came before the offence is dropped with it: its owners hear of the death
+            self.pending.update((packet.request_id, owner) for packet, owner in answers)
+            raise
+        return answers
+
+    def _check_owed(self, request_id: int) -> None:
+        """Before there is memory for what nobody asked for."""
+        expected = next(iter(self.pending), None)
+        if request_id != expected:
+            raise RemoteProtocolError(f"the host answered request {request_id}, it owes {expected}")
+
+    def _owner(self, packet: Packet) -> Any:
+        return self.pending.pop(packet.request_id)
+
+    def close(self) -> None:
+        """Close the stream. Idempotent."""
+        self._unsent.clear()
+        self.sock.close()
