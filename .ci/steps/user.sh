@@ -33,7 +33,7 @@ half() {
 # both in the background: what is tested by && or || goes on after an error
 (half 1 tests/integration --ignore-glob='*/test_confinement*') &
 first=$!
-(half 2 tests/attacks tests/integration/test_confinement*.py tests/unit/test_spawner.py) \
+(half 2 tests/attacks tests/integration/test_confinement*.py tests/unit/worker/test_spawner.py) \
   >"$CI_WORK/second" 2>&1 &
 second=$!
 failed=0

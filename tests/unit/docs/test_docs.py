@@ -20,9 +20,9 @@ from envhub_worker.protocol.limits import DEFAULT_LIMITS, MAX_NUM_ENVS
 from envhub_worker.protocol.manifest import MAX_ENVS
 from envhub_worker.protocol.names import MAX_NAME
 from tests.support import settings
-from tests.unit.test_imports import folder
+from tests.unit.docs.test_imports import folder
 
-CHECKOUT = Path(__file__).resolve().parents[2]
+CHECKOUT = Path(__file__).resolve().parents[3]
 DOCUMENTS = sorted([*CHECKOUT.glob("*.md"), *(CHECKOUT / "docs").rglob("*.md")])
 README = (CHECKOUT / "README.md").read_text()
 PROTOCOL = (CHECKOUT / "docs" / "protocol.md").read_text()

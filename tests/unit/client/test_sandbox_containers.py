@@ -21,7 +21,7 @@ from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from envhub_worker.lockdown.seccomp import policy as seccomp_policy
-from tests.unit.test_imports import folder, modules
+from tests.unit.docs.test_imports import folder, modules
 
 DOCKER = Engine("docker", "/usr/bin/docker", "28", rootless=False)
 PODMAN = Engine("podman", "/usr/bin/podman", "5", rootless=True)
@@ -273,7 +273,7 @@ def test_only_the_native_word_size_is_permitted() -> None:
 
 def test_the_profile_for_ones_own_containers_is_the_same() -> None:
     """The file that the documents name, for either machine."""
-    path = Path(__file__).resolve().parents[2] / "examples" / "deployment" / "seccomp.json"
+    path = Path(__file__).resolve().parents[3] / "examples" / "deployment" / "seccomp.json"
     architectures = sorted(seccomp_profile.ARCHITECTURES.values())
     assert json.loads(path.read_text()) == {
         **seccomp_profile.profile("x86_64"),

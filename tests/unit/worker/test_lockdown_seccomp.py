@@ -24,9 +24,9 @@ from envhub_worker.lockdown.seccomp.policy import (
     table,
 )
 from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
-from tests.unit.bpf_machine import run
+from tests.unit.worker.bpf_machine import run
 
-GOLDEN = Path(__file__).parent / "golden"
+GOLDEN = Path(__file__).parents[1] / "golden"
 ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 I386 = 0x40000003
 NOT_SUPPORTED = 0x00050000 | errno.EAFNOSUPPORT

@@ -217,7 +217,7 @@ def test_killed_builder_leaves_nothing_that_is_believed(slot: store.Slot) -> Non
         "slot = t.store.Slot(Path(sys.argv[1]), t.COMMIT, 'x')\n"
         "t.store.publish(slot, t.records(), die, {})\n"
     )
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     done = subprocess.run([sys.executable, "-c", code, str(slot.folder)], cwd=root, check=False)
     assert done.returncode == -9
     (left,) = slot.folder.iterdir()

@@ -18,7 +18,7 @@ from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolErro
 from tests.support.compare import assert_same
 from tests.support.wire import deep
 
-GOLDEN = Path(__file__).parent / "golden" / "messages"
+GOLDEN = Path(__file__).parents[1] / "golden" / "messages"
 REQUEST_ID = 7
 
 # One message of each class, with every kind of content that its fields may have.

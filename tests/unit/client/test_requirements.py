@@ -11,7 +11,7 @@ from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.hub import requirements
 from envhub_sandbox.hub.requirements import Lock
 from envhub_sandbox.sandboxes.docker import image
-from tests.unit.test_image import project
+from tests.unit.docs.test_image import project
 
 __all__ = ["project"]
 

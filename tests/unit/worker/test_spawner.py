@@ -307,7 +307,7 @@ with spawner_in(Path({folder!r}), confinement) as spawner:
 def test_killed_server_leaves_no_process(folder: Path, confinement: Confinement) -> None:
     """SIGKILL of the server ends zygote, init, host and a daemon of the jail."""
     mark = str(folder / "mark")
-    kit = str(Path(__file__).parents[1] / "integration")
+    kit = str(Path(__file__).parents[2] / "integration")
     daemon = DAEMON.format(mark=mark)
     profile = confinement.profile
     source = SERVER.format(kit=kit, folder=str(folder), profile=profile, daemon=daemon)

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from tests.unit.test_imports import WORKERS_OWN
+from tests.unit.docs.test_imports import WORKERS_OWN
 
-CHECKOUT = Path(__file__).resolve().parents[2]
+CHECKOUT = Path(__file__).resolve().parents[3]
 _IMPORTED_AS = {"pyzmq": "zmq"}
 
 

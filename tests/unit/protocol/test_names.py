@@ -22,7 +22,7 @@ from envhub_worker.protocol.facts import MAX_METADATA, read_metadata, read_spec
 from envhub_worker.protocol.names import GYMNASIUMS, PROBED, is_servable
 from tests.support.curious import names_asked_for
 from tests.support.protocol_names import names_that_libraries_call
-from tests.unit.test_manifest import an_env, read, with_env
+from tests.unit.protocol.test_manifest import an_env, read, with_env
 
 HONEST = ("hub_config", "task_description", "task", "language", "_ensure", "_max_episode_steps")
 

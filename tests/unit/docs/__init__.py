@@ -1,0 +1,1 @@
+"""Documents and structure, held against the code."""
