@@ -49,8 +49,8 @@ def rows(text: str) -> list[list[str]]:
 
 
 def code_words(text: str) -> list[str]:
-    """What stands in backquotes."""
-    return re.findall(r"`([^`]+)`", text)
+    """What stands in backquotes, outside of blocks of code."""
+    return re.findall(r"`([^`]+)`", re.sub(r"^```.*?^```$", "", text, flags=re.M | re.S))
 
 
 def sources() -> str:
@@ -271,6 +271,19 @@ def test_named_files_exist(document: Path) -> None:
         top, _, rest = path.removeprefix("worker/").partition("/")
         root = folder(top) if top in ("envhub_worker", "envhub_sandbox") else CHECKOUT / top
         assert (root / rest).exists(), word
+
+
+def test_the_map_has_every_package() -> None:
+    """Every folder of the two packages, and every module that stands beside them."""
+    words = set(code_words((CHECKOUT / "docs" / "architecture.md").read_text()))
+    missing = set()
+    for package, place in (("envhub_sandbox", ""), ("envhub_worker", "worker/")):
+        root = folder(package)
+        parts = [init.parent for init in root.rglob("__init__.py") if init.parent != root]
+        modules = [file for file in root.glob("*.py") if not file.name.startswith("__")]
+        named = {f"{place}{package}/{part.relative_to(root)}" for part in [*parts, *modules]}
+        missing |= named - words
+    assert missing == set()
 
 
 # said nowhere in the project: they name people's machines and tools, not the project
