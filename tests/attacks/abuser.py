@@ -84,8 +84,9 @@ def push(fd):
 """
 ENV = """
 import gymnasium as gym, numpy as np, os, signal, time
-from envhub_worker.jail import host
-from envhub_worker.protocol import messages as m, slabs
+from envhub_worker.runner import runner as host
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.shared_memory import slabs
 
 ABUSE_AND_ANSWER, ABUSE_AND_HANG, DIE = 1, 2, 3
 lanes, kept = [], []

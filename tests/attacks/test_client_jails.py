@@ -39,7 +39,7 @@ GROWTH = 192 * MIB
 
 _ENV = """
 import gymnasium as gym, numpy as np, os, socket, struct, time
-from envhub_worker.jail import host
+from envhub_worker.runner import runner as host
 from envhub_worker.protocol import messages as m
 
 FRAMES = {frames!r}

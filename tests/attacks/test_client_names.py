@@ -287,7 +287,7 @@ def test_sub_environments_run_nothing_when_looked_at(liar: LyingServer, folder: 
 _TRAP = """
 import gymnasium as gym, numpy as np
 from gymnasium.envs.registration import EnvSpec
-from envhub_worker.jail import describe
+from envhub_worker.runner import manifest as describe
 
 class Trap(gym.vector.SyncVectorEnv):
     hub_config = {{"robot": "so100"}}

@@ -56,7 +56,7 @@ SHARED = {
 """
 KEEPER = """
 import ctypes, gymnasium as gym, numpy as np, os
-from envhub_worker.jail import host
+from envhub_worker.runner import runner as host
 from envhub_worker.protocol import messages as m
 
 honest, kept = host.Host.attach, []

@@ -25,8 +25,9 @@ FORGED = 666.0
 _ENV = """
 import ctypes, gymnasium as gym, numpy as np, os, stat, tempfile, time
 from pathlib import Path
-from envhub_worker.jail import host
-from envhub_worker.protocol import messages as m, slabs
+from envhub_worker.runner import runner as host
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.shared_memory import slabs
 
 MODE, ALIAS = {mode!r}, {alias!r}
 honest, attach = host.Host.answer, host.Host.attach

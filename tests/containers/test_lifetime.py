@@ -30,8 +30,8 @@ from tests.support.samples import sample
 _CLIENT = """
 import json, os, sys
 from envhub_sandbox import make_env
-from envhub_sandbox.sandboxes.docker import DockerSandbox
-from envhub_sandbox.sandboxes.identity import identity_of
+from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
+from envhub_sandbox.sandboxes.owner import identity_of
 docker = DockerSandbox(image=sys.argv[2], engine=sys.argv[3])
 suites = make_env(sys.argv[1], n_envs=2, sandbox=docker)
 env = suites.env

@@ -649,10 +649,11 @@ sys.path.insert(0, {kit!r})
 from pathlib import Path
 from confinement_kit import *
 from envhub_worker.protocol.confinement import Confinement
-from envhub_worker.spawner import Failed
-from envhub_worker.lockdown import bpf, namespaces, process, seccomp
-from envhub_worker.lockdown.bpf import LOAD, RETURN, JUMP_EQUAL, Branch, Do, Label
-from envhub_worker.lockdown.syscalls import number
+from envhub_worker.spawn.jail_handle import Failed
+from envhub_worker.lockdown.seccomp import bpf, filter as seccomp
+from envhub_worker.lockdown.mechanisms import namespaces, process
+from envhub_worker.lockdown.seccomp.bpf import LOAD, RETURN, JUMP_EQUAL, Branch, Do, Label
+from envhub_worker.lockdown.seccomp.syscalls import number
 {restrict}
 with open_folder() as folder, cell_in(folder, Confinement(profile={profile!r})) as cell:
     while not any(isinstance(event, (Failed, HostStarted)) for event in cell.events):

@@ -12,7 +12,7 @@ from envhub_worker import bootstrap
 
 FORBID = """
 import sys
-from envhub_worker.lockdown import namespaces
+from envhub_worker.lockdown.mechanisms import namespaces
 import os
 namespaces.enter_user_namespace(os.getuid(), os.getgid())
 namespaces.forbid_what_is_counted()

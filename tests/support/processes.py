@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 
@@ -9,9 +10,18 @@ import psutil
 
 
 def descendants() -> set[int]:
-    """Pids of every live process below this one; zombies do not count."""
-    children = psutil.Process().children(recursive=True)
-    return {child.pid for child in children if _alive(child)}
+    """Pids of every live process below this one; zombies do not count.
+
+    Nor does what ``multiprocessing`` has started for this very process, for a test that compared
+    with Gymnasium's ``AsyncVectorEnv``: it stays as long as we do.
+    """
+    below: set[int] = set()
+    for child in psutil.Process().children():
+        if _alive(child) and not _is_multiprocessings(child):
+            below.add(child.pid)
+            with contextlib.suppress(psutil.NoSuchProcess):
+                below.update(one.pid for one in child.children(recursive=True) if _alive(one))
+    return below
 
 
 def eventually(claim: Callable[[], bool], deadline_s: float = 90.0) -> bool:
@@ -22,6 +32,14 @@ def eventually(claim: Callable[[], bool], deadline_s: float = 90.0) -> bool:
             return False
         time.sleep(0.05)
     return True
+
+
+def _is_multiprocessings(process: psutil.Process) -> bool:
+    try:
+        words = " ".join(process.cmdline())
+    except psutil.Error:
+        return False
+    return "multiprocessing.resource_tracker" in words or "multiprocessing.forkserver" in words
 
 
 def _alive(process: psutil.Process) -> bool:

@@ -226,7 +226,7 @@ def test_sockets_that_nobody_has_count_in_a_network_of_their_own() -> None:
     """The kernel counts them for the network namespace, those under way in a socket included."""
     script = (
         "import os, socket\n"
-        "from envhub_worker.lockdown import kernel\n"
+        "from envhub_worker.lockdown.mechanisms import kernel\n"
         "from envhub_worker.lockdown.limits.watchdog import MemoryWatch, socket_bytes\n"
         "kernel.unshare(kernel.CLONE_NEWUSER | kernel.CLONE_NEWNET)\n"
         "watch = MemoryWatch(2**62, None, own_network=True)\n"
