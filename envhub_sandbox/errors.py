@@ -11,14 +11,16 @@
       PolicyError (ValueError)
       BundleError (ValueError)
       ActionError (ValueError)
+        ActionTypeError (TypeError)
       ObservationError (ValueError)
       SandboxUnavailableError
-      DependencyError
+      DependencyError (ImportError)
       LoadError
+        LoadAttributeError (AttributeError), LoadValueError (ValueError), ...
       WorkerError
         WorkerStartupError
         WorkerDiedError
-        WorkerTimeoutError (TimeoutError)
+        WorkerTimeoutError (TimeoutError, multiprocessing.TimeoutError)
       ProtocolError
         LocalProtocolError
         RemoteProtocolError
@@ -26,6 +28,7 @@
           VersionMismatchError
       RemoteEnvError
         RemoteAttributeError (AttributeError), RemoteValueError (ValueError), ...
+        RemoteResetNeeded (gymnasium.error.ResetNeeded), ...
 
 A remote exception arrives as text. ``remote_error`` maps its builtin ancestor through a fixed
 table, so ``except AttributeError`` keeps working although nothing of the worker is imported.
@@ -33,7 +36,11 @@ table, so ``except AttributeError`` keeps working although nothing of the worker
 
 from __future__ import annotations
 
+import multiprocessing
 import shlex
+import sys
+from functools import cache
+from typing import Any
 
 from envhub_worker.protocol.errors import (
     EnvHubError,
@@ -46,6 +53,7 @@ from envhub_worker.protocol.errors import (
 
 __all__ = [
     "ActionError",
+    "ActionTypeError",
     "BundleError",
     "DependencyError",
     "EnvHubError",
@@ -105,6 +113,10 @@ class ActionError(EnvHubError, ValueError):
     """Actions of a wrong shape, dtype or structure. Nothing was sent; the env is still usable."""
 
 
+class ActionTypeError(ActionError, TypeError):
+    """What cannot be a batch of anything, such as a single number."""
+
+
 class ObservationError(EnvHubError, ValueError):
     """With ``validate=True``: an observation is outside of its space. The env is still usable.
 
@@ -123,8 +135,10 @@ class SandboxUnavailableError(EnvHubError):
     """This host cannot enforce the policy; the text names the layer, the reason and the fix."""
 
 
-class DependencyError(EnvHubError):
+class DependencyError(EnvHubError, ImportError):
     """The repository needs a package that the worker's interpreter does not have."""
+
+    __str__ = Exception.__str__  # ImportError's does not look at args
 
 
 class LoadError(EnvHubError):
@@ -176,7 +190,7 @@ class WorkerDiedError(WorkerError):
         self.request = request
 
 
-class WorkerTimeoutError(WorkerError, TimeoutError):
+class WorkerTimeoutError(WorkerError, TimeoutError, multiprocessing.TimeoutError):
     """The worker did not answer in time. ``reset()`` brings the environment back.
 
     Attributes:
@@ -247,18 +261,33 @@ _BUILTINS: tuple[type[Exception], ...] = (
 )
 
 
-def _twin(builtin: type[Exception]) -> type[RemoteEnvError]:
+def _twin(kind: type[Exception], ours: type[EnvHubError] = RemoteEnvError) -> type[EnvHubError]:
     # str() must stay ours: KeyError would print a repr, OSError its errno pair.
     body = {
-        "__doc__": f"The repository's code raised a {builtin.__name__}.",
+        "__doc__": f"The repository's code raised a {kind.__name__}.",
         "__module__": __name__,
         "__str__": Exception.__str__,
     }
-    return type(f"Remote{builtin.__name__}", (RemoteEnvError, builtin), body)
+    prefix = "Load" if ours is LoadError else "Remote"
+    return type(f"{prefix}{kind.__name__}", (ours, kind), body)
 
 
-_TWINS = {builtin.__name__: _twin(builtin) for builtin in _BUILTINS}
-globals().update({twin.__name__: twin for twin in _TWINS.values()})
+_TWINS: dict[str, Any] = {builtin.__name__: _twin(builtin) for builtin in _BUILTINS}
+_LOADS: dict[str, Any] = {builtin.__name__: _twin(builtin, LoadError) for builtin in _BUILTINS}
+globals().update({twin.__name__: twin for twin in [*_TWINS.values(), *_LOADS.values()]})
+_GYMNASIUM = "gymnasium.error"
+
+
+@cache
+def _gymnasiums() -> dict[str, Any]:
+    """Twins of Gymnasium's own errors, by full name; of those that are made of a text alone."""
+    module = sys.modules.get(_GYMNASIUM)  # whoever has an environment has it
+    base = getattr(module, "Error", Exception)
+    return {
+        f"{_GYMNASIUM}.{name}": _twin(kind)
+        for name, kind in vars(module).items()
+        if isinstance(kind, type) and issubclass(kind, base) and kind.__init__ is base.__init__
+    }
 
 
 def _builtin_of(cls: type[RemoteEnvError]) -> str:
@@ -266,8 +295,18 @@ def _builtin_of(cls: type[RemoteEnvError]) -> str:
 
 
 def remote_error(builtin: str, type_name: str, message: str, traceback: str = "") -> RemoteEnvError:
-    """The exception for a remote failure: the builtin's twin, or plain ``RemoteEnvError``."""
-    return _TWINS.get(builtin, RemoteEnvError)(type_name, message, traceback)
+    """The exception for a remote failure: its class's twin, or plain ``RemoteEnvError``."""
+    twin = _TWINS.get(builtin, RemoteEnvError)
+    if type_name.startswith(_GYMNASIUM) and _GYMNASIUM in sys.modules:
+        twin = _gymnasiums().get(type_name, twin)
+    error: RemoteEnvError = twin(type_name, message, traceback)
+    return error
+
+
+def load_error(builtin: str, message: str) -> LoadError:
+    """The exception for a repository that raised while it was loaded, which is that builtin too."""
+    error: LoadError = _LOADS.get(builtin, LoadError)(message)
+    return error
 
 
 def name_source(error: EnvHubError, label: str) -> None:

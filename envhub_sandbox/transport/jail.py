@@ -15,6 +15,7 @@ from envhub_sandbox.errors import (
     RemoteProtocolError,
     WorkerDiedError,
     WorkerError,
+    load_error,
     remote_error,
 )
 from envhub_sandbox.transport.connection import WorkerClient, death, expect
@@ -287,7 +288,7 @@ def raised(reply: m.Raised) -> EnvHubError:
         return LoadError(reply.message)
     else:
         trace = f"\nRemote traceback:\n{reply.traceback.rstrip()}" if reply.traceback else ""
-        error = LoadError(f"{what}: {reply.type_name}: {reply.message}{trace}")
+        error = load_error(reply.builtin, f"{what}: {reply.type_name}: {reply.message}{trace}")
     error.__cause__ = cause
     return error
 

@@ -15,7 +15,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from envhub_sandbox.errors import ActionError
+from envhub_sandbox.errors import ActionError, ActionTypeError
 from envhub_worker.protocol.shared_memory.slabs import DTYPE_CODES
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
 
@@ -42,7 +42,7 @@ def batch_of(space: gym.Space[Any], value: Any, count: int, where: str = "action
     try:
         members = tuple(value)
     except TypeError:
-        raise ActionError(
+        raise ActionTypeError(
             f"{where}: expected {count} members of {space}, got {_named(value)}"
         ) from None
     if len(members) != count:
@@ -59,7 +59,8 @@ def _batch_of_arrays(space: gym.Space[Any], value: Any, count: int, where: str =
     shape = (count, *(space.shape or ()))
     dtype = np.dtype(space.dtype)
     if array.shape != shape or array.dtype.kind not in _kinds_for(space):
-        raise ActionError(
+        kind = ActionError if array.shape else ActionTypeError
+        raise kind(
             f"{where}: expected {dtype} of shape {shape} for {space} in {count} sub-environments, "
             f"got {array.dtype} of shape {array.shape}"
         )
@@ -69,7 +70,7 @@ def _batch_of_arrays(space: gym.Space[Any], value: Any, count: int, where: str =
 @batch_of.register(spaces.Dict)
 def _batch_of_dicts(space: spaces.Dict, value: Any, count: int, where: str = "actions") -> Any:
     if not isinstance(value, Mapping):
-        raise ActionError(f"{where}: expected a mapping for {space}, got {_named(value)}")
+        raise ActionTypeError(f"{where}: expected a mapping for {space}, got {_named(value)}")
     missing = [key for key in space.spaces if key not in value]
     if missing:
         raise ActionError(f"{where}: {missing} missing; the space is {space}")

@@ -7,6 +7,7 @@ the results.
 from __future__ import annotations
 
 import html
+import warnings
 import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, cast
@@ -15,6 +16,7 @@ import numpy as np
 from gymnasium.error import (
     AlreadyPendingCallError,
     ClosedEnvironmentError,
+    Error,
     NoAsyncCallError,
 )
 from gymnasium.vector import VectorEnv
@@ -28,6 +30,8 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.names import is_servable
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
+_NOT_CALLED = frozenset({"reset", "step", "close"})
+"""What ``AsyncVectorEnv.call`` refuses: it would take one sub-environment from under the others."""
 Bounds = tuple[int, int]
 
 
@@ -61,6 +65,10 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         self.metadata = from_manifest.metadata(manifest)
         self.render_mode = manifest.render_mode
         self.spec = from_manifest.spec(manifest, remote.repository.label)
+        if manifest.shardable:  # another one's are its own, if it has them
+            self.autoreset_mode = self.metadata.get("autoreset_mode")
+            self.copy = remote.repository.copy
+            self.observation_mode = "same"
         # a proxy that nobody holds any more must not keep processes alive
         weakref.finalize(self, remote.close).atexit = False
 
@@ -185,6 +193,10 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
         """Send the call; ``call_wait`` returns its results."""
         self._refuse_if_busy("call_async")
+        if name in _NOT_CALLED and not self._manifest.sync:
+            raise ValueError(
+                f"Trying to call function `{name}` with `call`, use `{name}` directly instead."
+            )
         self._submit("call", lambda number, _: m.Call(number, name, args, kwargs))
 
     def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
@@ -264,6 +276,13 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
     def close(self, **kwargs: Any) -> None:
         """Close the sub-environments and end their processes, in bounded time. Idempotent."""
+        if self._waiting is not None and not self.closed:
+            warnings.warn(
+                f"Calling `close` while waiting for a pending call to `{self._waiting}` "
+                "to complete.",
+                UserWarning,
+                stacklevel=2,
+            )
         self.closed = True
         self._remote.close()
 
@@ -382,13 +401,19 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             return [int(seed) + index for index in range(self.num_envs)]
         if seed is None:
             return None
-        seeds = [None if one is None else int(one) for one in seed]
+        seeds = [None if one is None else _seed(one) for one in seed]
         if len(seeds) != self.num_envs:
             raise ValueError(
                 "If seeds are passed as a list the length must match "
                 f"num_envs={self.num_envs} but got length={len(seeds)}."
             )
         return seeds
+
+
+def _seed(given: Any) -> int:
+    if not isinstance(given, (int, np.integer)):
+        raise Error(f"Seed must be a python integer, actual type: {type(given)}")
+    return int(given)
 
 
 class SubEnvironment:

@@ -7,6 +7,7 @@ import copy
 import pickle
 from typing import Any
 
+import gymnasium as gym
 import pytest
 
 from envhub_sandbox import errors
@@ -81,7 +82,32 @@ def test_long_texts_are_cut() -> None:
 )
 def test_failures_to_load_say_so(reply: m.Raised, expected: type[Exception]) -> None:
     """What fails before there is an environment is an error of loading."""
-    assert type(raised(reply)) is expected
+    assert isinstance(raised(reply), expected)
+
+
+@pytest.mark.parametrize("name", ["ValueError", "RuntimeError", "KeyError", "FileNotFoundError"])
+def test_failures_to_load_are_the_builtin_that_they_were(name: str) -> None:
+    """``except ValueError`` catches what ``make_env`` raised, as it would in this process."""
+    error = raised(a_raised(stage="make_env", builtin=name))
+    assert isinstance(error, errors.LoadError)
+    assert isinstance(error, getattr(builtins, name))
+    assert str(error).endswith("mypkg.Oops: no\nRemote traceback:\nTraceback ...")
+    assert type(pickle.loads(pickle.dumps(error))) is type(error)
+
+
+def test_a_missing_package_is_an_import_error() -> None:
+    """As it would be in this process."""
+    assert issubclass(errors.DependencyError, ImportError)
+
+
+def test_gymnasiums_own_errors_are_themselves() -> None:
+    """``except gymnasium.error.ResetNeeded`` works; what has no such name is looked up nowhere."""
+    error = raised(a_raised(builtin="Exception", type_name="gymnasium.error.ResetNeeded"))
+    assert isinstance(error, gym.error.ResetNeeded)
+    assert isinstance(error, errors.RemoteEnvError)
+    assert isinstance(pickle.loads(pickle.dumps(error)), gym.error.ResetNeeded)
+    for name in ("gymnasium.error.logger", "gymnasium.error.Nothing", "gymnasium.error_"):
+        assert type(raised(a_raised(builtin="Nothing", type_name=name))) is errors.RemoteEnvError
 
 
 def test_errors_can_be_copied_and_pickled() -> None:

@@ -37,14 +37,12 @@ class Recording:
     Attributes:
         env_fns: One function per sub-environment.
         sync: Whether it is a ``SyncVectorEnv``.
-        observation_mode: As in Gymnasium.
         autoreset_mode: ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``.
         arguments: All arguments, for building it after all.
     """
 
     env_fns: list[Callable[[], gym.Env[Any, Any]]]
     sync: bool
-    observation_mode: Any
     autoreset_mode: str
     arguments: dict[str, Any]
 
@@ -102,12 +100,15 @@ def _record(
     arguments.pop("self", None)
     if any(arguments.get(name) is not None for name in _FOREIGN_ARGUMENTS):
         return None
+    if arguments.get("observation_mode", "same") != "same":
+        return (
+            None  # the sub-environments' spaces differ, and only all of them make the batched one
+        )
     env_fns = arguments["env_fns"] = list(arguments["env_fns"])
     mode = arguments.get("autoreset_mode", "NextStep")
     return Recording(
         env_fns=env_fns,
         sync=cls is SyncVectorEnv,
-        observation_mode=arguments.get("observation_mode", "same"),
         autoreset_mode=gym.vector.AutoresetMode(mode).value,
         arguments=arguments,
     )

@@ -158,7 +158,6 @@ class _Maker:
         return Recording(
             env_fns=env_fns,
             sync=self._sync,
-            observation_mode="same",
             autoreset_mode="NextStep",
             arguments={},
         )
