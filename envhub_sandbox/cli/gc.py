@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import reported
-
-if TYPE_CHECKING:
-    from envhub_sandbox.sandboxes.docker.prune import Leftover
 
 
 def gc(
@@ -43,7 +40,3 @@ def gc(
             done = "removed" if one in removed else "found" if dry_run else "could not remove"
             console().print(f"{done}: {one.kind} {safe_line(one.name, 300)}", soft_wrap=True)
         say(f"{len(found)} left behind, {len(removed)} removed.")
-
-
-def _item(one: Leftover, removed: bool) -> dict[str, object]:
-    return {"kind": one.kind, "name": one.name, "removed": removed}

@@ -37,7 +37,6 @@ from envhub_worker.protocol.keys import KEY_BYTES, key_text
 from envhub_worker.supervisor.jails import Jails
 from envhub_worker.supervisor.records import Asker, JailEntry
 
-TICK_S = 1.0
 _HANDSHAKE_MS = 5_000
 _HEARTBEAT_MS = 15_000
 _HEARTBEAT_TIMEOUT_MS = 60_000

@@ -1,7 +1,7 @@
 """Length-prefixed frames on the stream between the server and a jail's host. No I/O here.
 
-A packet is ``count: u32, reserved: u32, request id: u64``, then ``count`` lengths as ``u64``,
-then the frames. The reader checks every number before it allocates: the peer is hostile.
+A packet is ``count: u64, request id: u64``, then ``count`` lengths as ``u64``, then
+the frames. The reader checks every number before it allocates: the peer is hostile.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 
-_PREFIX = struct.Struct("<IIQ")
+_PREFIX = struct.Struct("<QQ")
 _MAX_ID = 2**63
 
 
@@ -34,7 +34,7 @@ _LARGE_CHUNK = 1 << 20
 def pack_packet(request_id: int, frames: Sequence[Buffer]) -> list[Buffer]:
     """The buffers to write, in order; large frames are not copied."""
     lengths = [memoryview(frame).nbytes for frame in frames]
-    head = _PREFIX.pack(len(frames), 0, request_id)
+    head = _PREFIX.pack(len(frames), request_id)
     return [head + struct.pack(f"<{len(lengths)}Q", *lengths), *frames]
 
 
@@ -79,8 +79,8 @@ def _head_bytes(data: memoryview | bytearray, limits: WireLimits) -> int:
     """How long the head is that the data begins with, as far as it says so."""
     if len(data) < _PREFIX.size:
         return _PREFIX.size
-    count, reserved, request_id = _PREFIX.unpack_from(data)
-    if count == 0 or count > limits.frames or reserved or request_id >= _MAX_ID:
+    count, request_id = _PREFIX.unpack_from(data)
+    if count == 0 or count > limits.frames or request_id >= _MAX_ID:
         raise RemoteProtocolError(f"a packet of {count} frames is outside 1..the limit")
     return _PREFIX.size + 8 * int(count)
 
@@ -92,7 +92,7 @@ def _read_head(
     check: Callable[[int], None] | None,
 ) -> tuple[int, tuple[int, ...]]:
     """A whole head's request id, and the lengths of its frames."""
-    request_id = _PREFIX.unpack_from(data)[2]
+    request_id = _PREFIX.unpack_from(data)[1]
     if check is not None:
         check(request_id)
     lengths = struct.unpack_from(f"<{(size - _PREFIX.size) // 8}Q", data, _PREFIX.size)

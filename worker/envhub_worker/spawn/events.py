@@ -7,11 +7,6 @@ from typing import Any
 
 
 @dataclass(frozen=True)
-class ZygoteReady:
-    """The zygote has preloaded and forks from now on."""
-
-
-@dataclass(frozen=True)
 class ZygoteDied:
     """The zygote has gone, and every jail with it.
 
@@ -75,9 +70,4 @@ class HostExited:
     detail: str = ""
 
 
-@dataclass(frozen=True)
-class Disconnected:
-    """The jail's control channel has ended: its init is going or gone."""
-
-
-JailEvent = Ready | Failed | HostStarted | HostExited | Disconnected
+JailEvent = Ready | Failed | HostStarted | HostExited

@@ -27,44 +27,32 @@ from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.spawn.events import (
-    Disconnected,
     Failed,
     HostExited,
     HostStarted,
     JailEvent,
     Ready,
     ZygoteDied,
-    ZygoteReady,
 )
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 
 __all__ = [
     "HOST_TARGET",
-    "Disconnected",
     "Failed",
     "HostExited",
     "HostStarted",
     "Jail",
     "JailEvent",
     "JailExited",
-    "JailSpawned",
     "Ready",
     "Spawner",
     "SpawnerEvent",
     "ZygoteDied",
-    "ZygoteReady",
 ]
 
 _END_S = 8.0
 _LOG_TAIL_BYTES = 8192
 HOST_TARGET = "envhub_worker.runner.runner:main"
-
-
-@dataclass(frozen=True)
-class JailSpawned:
-    """The init of ``jail`` exists."""
-
-    jail: Jail
 
 
 @dataclass(frozen=True)
@@ -76,7 +64,7 @@ class JailExited:
     signal: int | None
 
 
-SpawnerEvent = ZygoteReady | ZygoteDied | JailSpawned | JailExited
+SpawnerEvent = ZygoteDied | JailExited
 
 
 class Spawner:
@@ -163,21 +151,20 @@ class Spawner:
             return []
         self._channel.flush()
         messages, ended = self._channel.drain()
-        events = [self._take(message, fds) for message, fds in messages]
+        events = [event for message, fds in messages for event in self._take(message, fds)]
         return events + self._died() if ended else events
 
-    def _take(self, message: dict[str, Any], fds: list[int]) -> SpawnerEvent:
+    def _take(self, message: dict[str, Any], fds: list[int]) -> list[SpawnerEvent]:
         kind = message["event"]
         if kind == "ready":
             self._pidfd = fds[0]
-            return ZygoteReady()
+            return []
         if kind == "spawned":
-            jail = self._jails[message["id"]]
-            jail._attach(fds[0])
-            return JailSpawned(jail)
+            self._jails[message["id"]]._attach(fds[0])
+            return []
         jail = self._jails.pop(message["id"])
         jail._release()
-        return JailExited(jail, message["code"], message["signal"])
+        return [JailExited(jail, message["code"], message["signal"])]
 
     def _died(self) -> list[SpawnerEvent]:
         self._exited = True
@@ -339,7 +326,6 @@ class Jail:
         if ended:
             self._channel.close()
             self._close_host_pidfds(list(self._host_pidfds))
-            events.append(Disconnected())
         return events
 
     def _translate(self, message: dict[str, Any], fds: list[int]) -> list[JailEvent]:

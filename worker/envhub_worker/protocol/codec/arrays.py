@@ -36,7 +36,6 @@ MAX_STRING_ITEM_BYTES = 1024 * 1024
 
 _FIXED = ("?", "<i1", "<i2", "<i4", "<i8", "<u1", "<u2", "<u4", "<u8", "<f2", "<f4", "<f8")
 _DTYPES: tuple[np.dtype[Any], ...] = tuple(np.dtype(text) for text in (*_FIXED, "<c8", "<c16"))
-_BOOL = 0
 _TEXT, _BYTES, _DATETIME, _TIMEDELTA = range(len(_DTYPES), len(_DTYPES) + 4)
 _SIZED = {"U": _TEXT, "S": _BYTES, "M": _DATETIME, "m": _TIMEDELTA}
 _UNITS = ("generic", "Y", "M", "W", "D", "h", "m", "s", "ms", "us", "ns", "ps", "fs", "as")

@@ -62,7 +62,6 @@ MESSAGE = 20
 DTYPES = 24
 """Request: the dtype code of each action leaf, one word each, up to ``MAX_LEAVES``."""
 MAX_LEAVES = 64
-MAX_SLOTS = 16
 HEADER_WORDS = DTYPES + MAX_LEAVES
 HEADER_BYTES = HEADER_WORDS * 8
 
