@@ -6,11 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.confinement import GIB, MIB, Confinement
+from envhub_worker.protocol.confinement import GIB, MIB, PROFILES, Confinement
 from envhub_worker.supervisor.records import Asker
-
-PROFILES = ("strict", "no-userns", "container")
-"""The strongest first."""
 
 
 class RefusedError(Exception):

@@ -26,13 +26,13 @@ from envhub_worker.access import keys
 from envhub_worker.access.connection_limit import MAX_CONNECTIONS
 from envhub_worker.access.gate import RemoteGate, Rules
 from envhub_worker.access.keys import AuthorizedClients, KeyPair
-from envhub_worker.access.quotas import PROFILES, Permissions, Quotas
+from envhub_worker.access.quotas import Permissions, Quotas
 from envhub_worker.access.rate_limited_log import Log
 from envhub_worker.access.uploads import Uploads
 from envhub_worker.lockdown import probe, surroundings
 from envhub_worker.lockdown.mechanisms import landlock
 from envhub_worker.lockdown.mechanisms.scratch import remove_tree
-from envhub_worker.protocol.confinement import GIB, MIB
+from envhub_worker.protocol.confinement import GIB, MIB, PROFILES
 from envhub_worker.protocol.keys import key_text
 from envhub_worker.server import Server
 

@@ -10,17 +10,13 @@ from dataclasses import dataclass
 
 from envhub_worker.lockdown.report import Layer, LayerUnavailableError
 from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
-from envhub_worker.protocol.confinement import MIB, Confinement
-
-PROFILES = ("strict", "no-userns", "container")
-NETWORKS = ("none", "loopback", "host")
+from envhub_worker.protocol.confinement import LEAST_LANDLOCK, MIB, NETWORKS, PROFILES, Confinement
 
 #: What the kernel counts per user and nobody can bound per jail.
 SHARED_QUOTAS = "pages of pipes, descriptors under way in sockets, epoll watches"
 
-# Without a mount namespace Landlock must itself guard truncation, and without a pid namespace
-# signals: from these ABIs on it does. Before the second one, init sends the jail's signals.
-_LANDLOCK_FOR_TRUNCATION = 3
+# Without a pid namespace Landlock must itself guard signals: from this ABI on it does. Before it,
+# init sends the jail's signals.
 _LANDLOCK_FOR_SIGNALS = 6
 
 
@@ -115,8 +111,7 @@ def _check_seccomp(facts: HostFacts) -> None:
 
 
 def _wants_landlock(confinement: Confinement, facts: HostFacts) -> bool:
-    needed = {"strict": 1, "no-userns": _LANDLOCK_FOR_TRUNCATION, "container": 0}
-    least = needed[confinement.profile]
+    least = LEAST_LANDLOCK[confinement.profile]
     if facts.landlock_abi < least:
         have = f"ABI {facts.landlock_abi}" if facts.landlock_abi else "none"
         raise LayerUnavailableError(

@@ -15,12 +15,12 @@ from typing import Any
 from envhub_worker import __version__
 from envhub_worker.lockdown import probe
 from envhub_worker.lockdown.mechanisms import landlock
+from envhub_worker.protocol.confinement import LEAST_LANDLOCK
 
 ENVIRONMENT = Path("/opt/environment/bin/python")
 """The interpreter of jails in an image that was derived for a repository."""
 _CGROUPS = Path("/sys/fs/cgroup")
 _NAMESPACED = frozenset({"user-namespace", "namespaces", "mount-namespace", "landlock", "seccomp"})
-_LANDLOCK_FOR_NO_USERNS = 3
 
 
 def announcement() -> str:
@@ -59,7 +59,7 @@ def profiles(layers: list[dict[str, Any]], landlock_abi: int) -> list[str]:
     """Which profiles' layers are all there; a pure function of what ``probe`` found."""
     there = {layer["layer"] for layer in layers if layer["available"]}
     found = ["strict"] if there >= _NAMESPACED else []
-    if "seccomp" in there and landlock_abi >= _LANDLOCK_FOR_NO_USERNS:
+    if "seccomp" in there and landlock_abi >= LEAST_LANDLOCK["no-userns"]:
         found.append("no-userns")
     return [*found, "container"] if "seccomp" in there else found
 

@@ -7,7 +7,11 @@ from dataclasses import dataclass, field
 MIB = 1024 * 1024
 GIB = 1024 * MIB
 PROFILES = ("strict", "no-userns", "container")
+"""The strongest first."""
 NETWORKS = ("none", "loopback", "host")
+LEAST_LANDLOCK = {"strict": 1, "no-userns": 3, "container": 0}
+"""The Landlock ABI that a profile needs. Without a mount namespace Landlock must itself guard
+truncation, which it does from the third on."""
 
 
 @dataclass(frozen=True, kw_only=True)
