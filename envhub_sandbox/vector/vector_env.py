@@ -427,7 +427,8 @@ class SubEnvironment:
         self._index = index
         self.action_space = vector.single_action_space
         self.observation_space = vector.single_observation_space
-        self.metadata = vector.metadata
+        metadata = vector.metadata.items()  # the mode is the vector environment's alone
+        self.metadata = {key: value for key, value in metadata if key != "autoreset_mode"}
         self.render_mode = vector.render_mode
         self.spec = vector.spec
 

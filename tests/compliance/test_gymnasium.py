@@ -215,6 +215,7 @@ def test_facts(make: Make, mode: AutoresetMode) -> None:
     """Attributes that wrappers read."""
     env = make(carts(2), autoreset_mode=mode)
     assert env.metadata["autoreset_mode"] is mode
+    assert "autoreset_mode" not in env.envs[0].metadata
     assert env.num_envs == 2
     assert env.get_attr("gravity") == (9.8, 9.8)
 
