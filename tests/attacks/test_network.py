@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+from pathlib import Path
 
 import psutil
 import pytest
@@ -94,6 +95,23 @@ def test_addresses_of_the_host_are_not_told(arena: Arena) -> None:
         lambda run: any(mac in run.text for mac in macs),
         impossible="" if macs else "this host has no network device besides lo",
     )
+
+
+@pytest.mark.parametrize("table", ["tcp", "unix"])
+def test_tables_of_the_hosts_sockets_are_not_told(arena: Arena, home: Path, table: str) -> None:
+    """Who talks to whom, and what the socket files are called, is in /proc as well."""
+    path = home / f"{token()}.sock"
+    with (
+        listening(socket.AF_INET, socket.SOCK_STREAM, ("127.0.0.1", 0)) as inet,
+        listening(socket.AF_UNIX, socket.SOCK_STREAM, str(path)),
+    ):
+        mark = f" 0100007F:{inet.port:04X} " if table == "tcp" else path.name
+        arena.attack(
+            f"read the host's table of sockets: {table}",
+            "network_table",
+            lambda run: mark in run.text,
+            name=table,
+        )
 
 
 def test_vsock_does_not_get_out(arena: Arena) -> None:

@@ -9,7 +9,7 @@ from envhub_worker.channel import Channel
 from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.limits import rlimits
 from envhub_worker.lockdown.mechanisms import capabilities, landlock, process
-from envhub_worker.lockdown.mechanisms.landlock import DEVICE, READ, WRITE, Rule
+from envhub_worker.lockdown.mechanisms.landlock import DEVICE, READ, READ_DIR, WRITE, Rule
 from envhub_worker.lockdown.seccomp import filter
 from envhub_worker.lockdown.stages import selftest
 
@@ -34,6 +34,12 @@ _HOST_FILES = (
     "/proc/uptime",
     "/proc/version",
 )
+# Of a process's own folder in /proc. Not net, nor task, below which it lies again: without a
+# network namespace it lists the connections, neighbours and socket files of the whole host.
+_OWN_FILES = """
+    auxv cgroup cmdline comm environ fd fdinfo io limits maps mem mountinfo mounts oom_score
+    oom_score_adj smaps smaps_rollup stat statm status
+"""
 
 
 def enter(jail: JailContext, descriptors: Iterable[int], init: Channel) -> None:
@@ -79,12 +85,15 @@ def rules(jail: JailContext, pid: int) -> list[Rule]:
     """
     common, scratch = jail.common, jail.scratch
     readable = [*common.trees, jail.spec.snapshot]
-    readable += ["/proc", "/etc", "/dev"] if common.namespaced else [*_HOST_FILES, f"/proc/{pid}"]
+    own = f"/proc/{pid}"
+    own_files = [f"{own}/{name}" for name in _OWN_FILES.split()]
+    readable += ["/proc", "/etc", "/dev"] if common.namespaced else [*_HOST_FILES, *own_files]
     writable = [scratch.home, scratch.temporary, scratch.work]
     if scratch.shared_memory is not None:
         writable.append(scratch.shared_memory)
     return [
         *(Rule(path, READ) for path in readable),
+        *([] if common.namespaced else [Rule(own, READ_DIR)]),
         *(Rule(path, WRITE) for path in writable),
         *(Rule(path, DEVICE) for path in common.devices),
     ]
