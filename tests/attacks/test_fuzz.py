@@ -116,8 +116,8 @@ def test_a_memory_that_fails_is_noticed(
     """What is read once and never again is noticed; so it was with keys that are no text."""
     assert first_wrong(recorded, "unpack") == ""
     for spot in inside.FORMS:
-        monkeypatch.setattr(*spot, m.recurring.Forms())
-    monkeypatch.setattr(m.recurring, "Incoming", forgetful)
+        monkeypatch.setattr(*spot, m.templates.Forms())
+    monkeypatch.setattr(m.templates, "Incoming", forgetful)
     assert first_wrong(recorded, "unpack") == "another end"
 
 

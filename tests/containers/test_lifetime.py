@@ -55,12 +55,12 @@ class Client:
     identity: str
     container: str
 
-    def keeper(self) -> psutil.Process:
+    def monitor(self) -> psutil.Process:
         """The process that keeps its container."""
         [found] = [
             child
             for child in psutil.Process(self.process.pid).children(recursive=True)
-            if any("keeper.py" in word for word in child.cmdline())
+            if any("monitor.py" in word for word in child.cmdline())
         ]
         return found
 
@@ -92,13 +92,14 @@ def client(engine: Engine, then: str = "wait") -> Iterator[Client]:
 
 def test_closing_leaves_nothing(docker: DockerSandbox, engine: Engine) -> None:
     """No container, no process, no folder."""
+    assert nothing_left(engine)  # of others that linger
     with make_env(sample("counter"), sandbox=docker) as suites:
         suites.env.reset(seed=0)
         assert len(containers_of(engine, identity_of(os.getpid()))) == 1
         assert len(folders()) == 1
     assert nothing_left(engine)
     assert folders() == []
-    assert not [pid for pid in descendants() if "keeper.py" in _command(pid)]
+    assert not [pid for pid in descendants() if "monitor.py" in _command(pid)]
 
 
 def _command(pid: int) -> str:
@@ -121,7 +122,7 @@ def test_a_container_ends_with_its_client(engine: Engine, how: str) -> None:
 
 
 def test_a_fork_of_the_client_does_not_keep_its_container(engine: Engine) -> None:
-    """The lifeline is held by nobody but the keeper: a child of the trainer may live on."""
+    """The lifeline is held by nobody but the monitor: a child of the trainer may live on."""
     with client(engine, "fork") as made:
         assert eventually(lambda: len(_forks(made.process.pid)) == 1)
         [fork] = _forks(made.process.pid)
@@ -133,16 +134,16 @@ def test_a_fork_of_the_client_does_not_keep_its_container(engine: Engine) -> Non
 
 def _forks(pid: int) -> list[int]:
     children = psutil.Process(pid).children()
-    return [child.pid for child in children if "keeper.py" not in _command(child.pid)]
+    return [child.pid for child in children if "monitor.py" not in _command(child.pid)]
 
 
-def test_client_and_keeper_killed_together_leave_no_container(engine: Engine) -> None:
+def test_client_and_monitor_killed_together_leave_no_container(engine: Engine) -> None:
     """The container's stdin ends with whoever held it; only a folder stays, for ``gc``."""
     with client(engine) as made:
-        keeper = made.keeper()
-        keeper.suspend()
+        monitor = made.monitor()
+        monitor.suspend()
         made.process.kill()
-        keeper.kill()
+        monitor.kill()
         assert nothing_left(engine, made.identity)
         [folder] = folders(made.identity)
         found = [one for one in prune.find() if one.name == str(folder)]

@@ -40,13 +40,13 @@ def test_an_image_of_something_else_is_no_worker(
     engine: Engine, docker: DockerSandbox, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A program that announces nothing is not connected to."""
-    real = docker_module.containers.run_arguments
+    real = docker_module.run_arguments.run_arguments
 
     def other(engine: Engine, wanted: docker_module.Container) -> list[str]:
         arguments = real(engine, wanted)
         return [*arguments[: arguments.index(wanted.image) + 1], "health"]
 
-    monkeypatch.setattr(docker_module.containers, "run_arguments", other)
+    monkeypatch.setattr(docker_module.run_arguments, "run_arguments", other)
     with pytest.raises(Exception, match="ended at once"):
         make_env(sample("counter"), sandbox=docker).env.reset()
     assert nothing_left(engine)
@@ -68,7 +68,7 @@ def test_a_wall_that_is_missing_is_noticed(
     docker: DockerSandbox, engine: Engine, monkeypatch: pytest.MonkeyPatch, flag: str, layer: str
 ) -> None:
     """An engine that ignores a flag, as some do with a warning, gets no repository to run."""
-    real = docker_module.containers.run_arguments
+    real = docker_module.run_arguments.run_arguments
 
     def without(engine: Engine, wanted: docker_module.Container) -> list[str]:
         words = real(engine, wanted)
@@ -82,7 +82,7 @@ def test_a_wall_that_is_missing_is_noticed(
             dropped = [*dropped[:at], *dropped[at + 2 :]]  # --memory-swap means nothing alone
         return dropped
 
-    monkeypatch.setattr(docker_module.containers, "run_arguments", without)
+    monkeypatch.setattr(docker_module.run_arguments, "run_arguments", without)
     with pytest.raises(SandboxUnavailableError, match=f"container-{layer} does not hold"):
         make_env(sample("counter"), sandbox=docker).env.reset()
     assert nothing_left(engine)

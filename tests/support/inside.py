@@ -258,9 +258,9 @@ def packet(frames: Sequence[Buffer]) -> bytes:
     return writer._packet(frames)
 
 
-def keeper_script() -> Path:
+def monitor_script() -> Path:
     """The script that ends a container after its client."""
-    return sandbox._KEEPER
+    return sandbox._MONITOR
 
 
 def is_own_group(path: Path) -> bool:

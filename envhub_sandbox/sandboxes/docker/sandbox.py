@@ -40,7 +40,7 @@ from envhub_sandbox.sandboxes.lingering import Lingering
 from envhub_sandbox.sandboxes.owner import identity_of
 from envhub_sandbox.sandboxes.refcount import Sharing
 
-_KEEPER = Path(__file__).with_name("monitor.py")
+_MONITOR = Path(__file__).with_name("monitor.py")
 _STARTUP_S = 120.0
 _STOP_S = 45.0
 _ANNOUNCEMENT_BYTES = 65536
@@ -290,7 +290,7 @@ def _execute(
     try:
         return subprocess.Popen(
             [
-                *(sys.executable, "-I", "-S", str(_KEEPER), str(ourselves), str(ready)),
+                *(sys.executable, "-I", "-S", str(_MONITOR), str(ourselves), str(ready)),
                 *(str(folder), wanted.name, "--", engine.command),
                 *run_arguments.run_arguments(engine, wanted),
             ],
@@ -307,7 +307,7 @@ def _execute(
 
 
 def _answer(ready: int, process: subprocess.Popen[bytes]) -> bytes:
-    """The keeper's one line."""
+    """The monitor's one line."""
     readable, _, _ = select.select([ready], [], [], _STARTUP_S)
     answer = os.read(ready, _ANNOUNCEMENT_BYTES + 1) if readable else b""
     if not answer:

@@ -1,4 +1,4 @@
-"""The keeper of a container, with a script for an engine."""
+"""The monitor of a container, with a script for an engine."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ _SERVES = f"echo 'WARNING: something that engines say' >&2; {_ANNOUNCES}; cat >/
 
 @dataclass
 class Kept:
-    """A keeper that runs, and its client.
+    """A monitor that runs, and its client.
 
     Attributes:
         said: The document that it wrote.
         log: What the engine was called with, a line a call.
     """
 
-    keeper: subprocess.Popen[bytes]
+    monitor: subprocess.Popen[bytes]
     client: subprocess.Popen[bytes]
     said: dict[str, object]
     folder: Path
@@ -46,14 +46,14 @@ class Kept:
 
     def ends(self) -> bool:
         """Whether it ends and cleans up."""
-        self.keeper.wait(60)
+        self.monitor.wait(60)
         calls = self.log.read_text().splitlines()
         return not self.folder.exists() and calls[-1] == "rm --force --volumes envhub-test"
 
 
 @contextlib.contextmanager
 def kept(tmp_path: Path, what: str) -> Iterator[Kept]:
-    """A keeper whose engine does ``what`` when it is to run a container."""
+    """A monitor whose engine does ``what`` when it is to run a container."""
     folder, log, engine = tmp_path / "folder", tmp_path / "calls", tmp_path / "engine"
     folder.mkdir()
     engine.write_text(_ENGINE.format(folder=tmp_path, log=log, what=what))
@@ -61,19 +61,19 @@ def kept(tmp_path: Path, what: str) -> Iterator[Kept]:
     client = subprocess.Popen([sys.executable, "-S", "-c", "input()"], stdin=subprocess.PIPE)
     pidfd, (ready, ready_end) = os.pidfd_open(client.pid), os.pipe()
     words = [str(pidfd), str(ready_end), str(folder), "envhub-test", "--", str(engine), "run"]
-    keeper = subprocess.Popen(
-        [sys.executable, "-I", "-S", str(inside.keeper_script()), *words],
+    monitor = subprocess.Popen(
+        [sys.executable, "-I", "-S", str(inside.monitor_script()), *words],
         pass_fds=(pidfd, ready_end),
     )
     os.close(ready_end)
     os.close(pidfd)
     try:
         assert select.select([ready], [], [], 60)[0]
-        yield Kept(keeper, client, json.loads(os.read(ready, 65536)), folder, log)
+        yield Kept(monitor, client, json.loads(os.read(ready, 65536)), folder, log)
     finally:
         os.close(ready)
-        keeper.kill()
-        keeper.wait()
+        monitor.kill()
+        monitor.wait()
         client.communicate()
 
 
@@ -83,7 +83,7 @@ def test_the_container_ends_with_its_client(tmp_path: Path, how: str) -> None:
     with kept(tmp_path, _SERVES) as made:
         assert made.said == {"envhub-worker": "0"}
         if how == "it is told to":
-            made.keeper.terminate()
+            made.monitor.terminate()
         elif how == "the client is killed":
             made.client.kill()
         else:
@@ -91,17 +91,17 @@ def test_the_container_ends_with_its_client(tmp_path: Path, how: str) -> None:
         assert made.ends()
 
 
-def test_the_keeper_ends_with_its_container(tmp_path: Path) -> None:
+def test_the_monitor_ends_with_its_container(tmp_path: Path) -> None:
     """Which is how the client learns of that end."""
     with kept(tmp_path, f"{_ANNOUNCES}; sleep 0.2") as made:
         assert made.ends()
 
 
-def test_the_lifeline_is_cut_when_the_keeper_is_killed(tmp_path: Path) -> None:
+def test_the_lifeline_is_cut_when_the_monitor_is_killed(tmp_path: Path) -> None:
     """Nobody else holds the container's stdin."""
     with kept(tmp_path, _SERVES) as made:
         pid = int((tmp_path / "calls.pid").read_text())
-        made.keeper.send_signal(signal.SIGKILL)
+        made.monitor.send_signal(signal.SIGKILL)
         assert eventually(lambda: not os.path.exists(f"/proc/{pid}"))
 
 
@@ -119,12 +119,12 @@ def test_a_server_that_talks_much_does_not_wait_for_a_reader(tmp_path: Path) -> 
     talks = f"{_ANNOUNCES}; head -c 3000000 /dev/zero; echo done >{tmp_path / 'calls.talked'}; cat"
     with kept(tmp_path, talks) as made:
         assert eventually((tmp_path / "calls.talked").exists)
-        made.keeper.terminate()
+        made.monitor.terminate()
         assert made.ends()
 
 
 def test_a_container_that_ignores_the_end_of_its_stdin_is_removed(tmp_path: Path) -> None:
     """By the engine's own means, after some patience."""
     with kept(tmp_path, f"{_ANNOUNCES}; exec sleep 300") as made:
-        made.keeper.terminate()
+        made.monitor.terminate()
         assert made.ends()
