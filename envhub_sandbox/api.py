@@ -236,7 +236,7 @@ class _Maker:
             Prewarming(list(suites.values()), self._prewarm)
         return EnvSuites(
             envs,
-            lambda: provenance_of(repository.snapshot, manifest, repository.report),
+            lambda: provenance_of(repository.snapshot, manifest, repository.latest_report),
             shared.close if shared else lambda: None,
             repository.recipe,
         )

@@ -116,6 +116,10 @@ class Repository:
         store: The folder that snapshots lie in.
         lane: ``"auto"`` or ``"frames"``.
         copy: Whether observations are copied for the caller, or lent.
+
+    Attributes:
+        latest_report: The layers of the jail that was opened last, for the provenance of what was
+            made. Which of them hold for an environment, only its own jail says.
     """
 
     def __init__(
@@ -137,7 +141,7 @@ class Repository:
         self.python = python
         self.lane = lane
         self.copy = copy
-        self.report: list[dict[str, Any]] = []
+        self.latest_report: list[dict[str, Any]] = []
         self.recipe: Recipe | None = None
         self._sandbox = sandbox
         self.interpreter = python
@@ -216,10 +220,11 @@ class Repository:
             return
         assert self.recipe is not None
         manifest = None if loaded is None else loaded.manifest
+        report = self.latest_report if loaded is None else loaded.jail.report
         crash = Crash(
             error=error,
             label=self.label,
-            provenance=provenance_of(self.snapshot, manifest, self.report),
+            provenance=provenance_of(self.snapshot, manifest, report),
             load=self.arguments.message(),
             options=self.recipe.options,
             task=task,
@@ -292,7 +297,7 @@ class Repository:
                 follower = OutputFollower(lambda: self._connected(server), jail.number, wanted)
                 jail.before_end = follower.stop
             around = server.layers if isinstance(server, EnclosedServer) else ()
-            self.report = [*map(dict, around), *jail.report]
+            jail.report = self.latest_report = [*map(dict, around), *jail.report]
             if known is None:
                 return self._load(jail, server, deadline)
             loaded = LoadedJail(jail, known.manifest, {}, set(), server)

@@ -30,6 +30,8 @@ from envhub_worker.protocol.manifest import EnvManifest
 _INTERRUPT_S = 10.0
 """How long ``close`` waits at most for another thread to notice that the jail has gone: no longer
 than it waits for the environment's own ``close``."""
+_WITHOUT_A_JAIL = frozenset({State.EXPIRED, State.DEAD, State.FOREIGN, State.CLOSED})
+"""It may not have been given back yet."""
 
 
 class Tenant:
@@ -91,6 +93,13 @@ class Tenant:
     def closed(self) -> bool:
         """Whether it is closed for good."""
         return self.lifecycle.state is State.CLOSED
+
+    def report(self) -> list[dict[str, Any]]:
+        """The layers of the jail that it lives in; none where it does not live in any."""
+        loaded = self._loaded  # another thread may give it back
+        if loaded is None or self.lifecycle.state in _WITHOUT_A_JAIL:
+            return []
+        return loaded.jail.report
 
     def stats(self) -> dict[str, Any]:
         """Counters, and where it is in its life."""

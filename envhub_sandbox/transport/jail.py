@@ -61,7 +61,8 @@ class RemoteJail:
         number: The server's number for it.
         hosts: Its hosts' numbers; sub-environments are spread over them in this order.
         kept: Whether it goes on without a host that has died.
-        report: One mapping per layer of the confinement: ``layer``, ``enforced``, ``detail``.
+        report: One mapping per layer of the confinement: ``layer``, ``enforced``, ``detail``; of
+            a container around it too.
         before_end: Runs before it is ended; brings what it has printed last.
     """
 

@@ -46,7 +46,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         num_envs: Number of sub-environments.
         closed: Whether ``close`` has been called.
         metadata: With ``"autoreset_mode"``, as in Gymnasium.
-        sandbox_report: What confines it: one mapping per layer, once it runs.
+        sandbox_report: What confines it: one mapping per layer, while it runs.
     """
 
     def __init__(self, remote: RemoteEnv) -> None:
@@ -259,8 +259,8 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
     @property
     def sandbox_report(self) -> list[dict[str, Any]]:
-        """One mapping per layer: ``layer``, ``enforced``, ``detail``. Empty before it runs."""
-        return [dict(layer) for layer in self._remote.repository.report]
+        """One mapping per layer: ``layer``, ``enforced``, ``detail``. None unless it runs."""
+        return [dict(layer) for layer in self._remote.report()]
 
     def stats(self) -> dict[str, Any]:
         """Counters, at any moment, from any thread; asks nothing of the worker.

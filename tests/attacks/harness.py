@@ -175,8 +175,9 @@ class Arena:
         """Run a payload in a jail of its own; the jail lives as long as the context."""
         run = Run(new_alias(), True)
         with self.environment(policy, limits) as env:
+            env.reset()
+            self.report = env.sandbox_report  # before the payload, which may be the jail's end
             call(env, run, payload, arguments)
-            self.report = env.sandbox_report
             yield run
 
     @contextlib.contextmanager

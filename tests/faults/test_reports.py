@@ -1,0 +1,44 @@
+"""What confines an environment is its own jail's to say, for as long as it lives in one."""
+
+from __future__ import annotations
+
+import pytest
+
+from envhub_sandbox import errors, make_env
+from tests.support.samples import sample
+
+
+def test_a_task_that_does_not_run_is_not_confined() -> None:
+    """Others of its repository may run, and may have run; the provenance still says how."""
+    with make_env(sample("many_tasks"), prewarm=0) as suites:
+        [first, second, *_] = [env for tasks in suites.values() for env in tasks.values()]
+        assert first.sandbox_report == []
+        first.reset()
+        assert {layer["layer"] for layer in first.sandbox_report} >= {"seccomp", "rlimits"}
+        assert second.sandbox_report == []
+        first.close()
+        assert first.sandbox_report == []
+        assert suites.provenance["layers"]
+
+
+@pytest.mark.usefixtures("neighbour")
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+def test_a_jail_that_was_lost_confines_nobody(lane: str) -> None:
+    """Until a reset has brought another; after a mere delay it is still the same one."""
+    policy = {"restart": "on_reset"}
+    with make_env(sample("echo"), lane=lane, policy=policy) as suites:
+        env = suites.env
+        env.reset()
+        report = env.sandbox_report
+        assert report
+        env.step_async([[1.0, 0.2]])
+        with pytest.raises(errors.WorkerTimeoutError):
+            env.step_wait(timeout=0.02)
+        assert env.sandbox_report == report
+        env.reset()
+        with pytest.raises(errors.WorkerDiedError):
+            env.step([[1.0, -1.0]])
+        assert env.sandbox_report == []
+        env.reset()
+        assert env.sandbox_report == report
+    assert env.sandbox_report == []
