@@ -160,7 +160,8 @@ def test_more_bytes_than_may_be_in_flight_are_refused(alice: Any, mallory: Peer)
 
 def test_what_is_no_request_is_refused(mallory: Peer) -> None:
     """Replies, descriptors, and messages for hosts."""
-    for message in (m.Done(), m.Deposit(b"", 1, 1), m.Close(1), m.Welcome(2, "", 1)):
+    replies = m.Done(), m.Welcome(2, "", 1), m.Sessions(({"client": "nobody"},))
+    for message in (*replies, m.Deposit(b"", 1, 1), m.Close(1)):
         assert "is no request" in mallory.refused(message).message
 
 

@@ -22,7 +22,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerError
 from envhub_worker.access import keys
 from envhub_worker.access.connection_limit import Doorman
-from envhub_worker.access.gate import RemoteGate, Rules
+from envhub_worker.access.gate import Asked, RemoteGate, Rules
 from envhub_worker.access.keys import AuthorizedClients
 from envhub_worker.access.quotas import Permissions, Quotas, RefusedError
 from envhub_worker.access.rate_limited_log import LINES, PERIOD_S, Log
@@ -151,7 +151,7 @@ def test_a_message_without_a_proved_key_is_refused(tmp_path: Path) -> None:
         gate.greet(sessions, b"", b"name")
     asker = Asker(b"id", 1, b"x" * 40, b"")
     with pytest.raises(RefusedError, match="not authorised"):
-        gate.check(asker, m.GetSessions(), 0, sessions, None)  # type: ignore[arg-type]
+        gate.authorize(Asked(asker, m.GetSessions(), (), sessions, None))  # type: ignore[arg-type]
 
 
 def test_captured_bytes_are_worth_nothing(server: Listening, repository: Path, good: Any) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import zmq
 
 from envhub_worker import __version__, multipart
-from envhub_worker.access.gate import Gate, LocalGate
+from envhub_worker.access.gate import Asked, Gate, LocalGate
 from envhub_worker.access.quotas import RefusedError
 from envhub_worker.access.sessions import Sessions
 from envhub_worker.lockdown.mechanisms.scratch import remove_tree
@@ -153,23 +153,18 @@ class Server:
         if not asker.session:
             self.refuse(asker, "HelloError", "say Hello first")
             return
-        size = sum(map(len, payload))
-        request = self._gate.check(asker, request, size, self._sessions, self._jails)
+        asked = Asked(asker, request, payload, self._sessions, self._jails)
+        request = self._gate.authorize(asked)
         if isinstance(request, m.Relay):
             self._jails.relay(asker, request, payload)
         elif isinstance(request, m.Agree):
             self._agree(asker, request)
         elif handler := _HANDLERS.get(type(request)):
             handler(self._jails, asker, request)
+        elif special := self._gate.handlers.get(type(request)):
+            self.reply(asker, special(asked._replace(request=request)))
         else:
-            self._serve_specially(asker, request, payload)
-
-    def _serve_specially(self, asker: Asker, request: m.Message, payload: list[Any]) -> None:
-        reply = self._gate.serve(asker, request, payload, self._jails)
-        if reply is None:
             self.refuse(asker, "LocalProtocolError", f"{type(request).__name__} is no request")
-        else:
-            self.reply(asker, reply)
 
     def reply(self, asker: Asker, message: m.Message, payload: Sequence[Buffer] = ()) -> None:
         """Answer a request."""

@@ -7,9 +7,10 @@ have proved a key, and still may neither name a path of this machine nor take it
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from types import MappingProxyType
+from typing import Any, NamedTuple, Protocol
 
 import zmq
 
@@ -48,14 +49,30 @@ ANYBODY = bytes(KEY_BYTES)
 """The key of clients that have none, behind ``--insecure-loopback``."""
 
 
+class Asked(NamedTuple):
+    """A request, who asks, and what it is asked of."""
+
+    asker: Asker
+    request: m.Message
+    payload: Sequence[bytes]
+    sessions: Sessions
+    jails: Jails
+
+
+Handler = Callable[[Asked], m.Message]
+"""Carries a request out that is permitted; returns the reply."""
+
+
 class Gate(Protocol):
     """Decides what a client may.
 
     Attributes:
+        handlers: The requests that only this gate knows.
         compresses: Whether frames are worth compressing.
         idle_s: How long the jails of a client that says nothing live on; 0 for ever.
     """
 
+    handlers: Mapping[type[m.Message], Handler]
     compresses: bool
     idle_s: int
 
@@ -69,15 +86,8 @@ class Gate(Protocol):
     def greet(self, sessions: Sessions, key: bytes, name: bytes) -> None:
         """A session begins, or is found again; raises ``RefusedError``."""
 
-    def check(
-        self, asker: Asker, request: m.Message, size: int, sessions: Sessions, jails: Jails
-    ) -> m.Message:
-        """The request as it may be carried out; raises ``RefusedError``."""
-
-    def serve(
-        self, asker: Asker, request: m.Message, payload: Sequence[bytes], jails: Jails
-    ) -> m.Message | None:
-        """The reply to a request that only this gate knows; None for others."""
+    def authorize(self, asked: Asked) -> m.Message:
+        """The request as it may be carried out, never a reply; raises ``RefusedError``."""
 
     def answered(self, asker: Asker) -> None:
         """A request was answered."""
@@ -92,6 +102,7 @@ class Gate(Protocol):
 class LocalGate:
     """The folder of the socket is the gate: whoever can reach it is the user."""
 
+    handlers: Mapping[type[m.Message], Handler] = MappingProxyType({})
     compresses = False
     idle_s = 0
 
@@ -106,17 +117,9 @@ class LocalGate:
     def greet(self, sessions: Sessions, key: bytes, name: bytes) -> None:
         """Everybody is welcome."""
 
-    def check(
-        self, asker: Asker, request: m.Message, size: int, sessions: Sessions, jails: Jails
-    ) -> m.Message:
+    def authorize(self, asked: Asked) -> m.Message:
         """Everything is permitted."""
-        return request
-
-    def serve(
-        self, asker: Asker, request: m.Message, payload: Sequence[bytes], jails: Jails
-    ) -> m.Message | None:
-        """There is nothing that only it knows."""
-        return None
+        return asked.request
 
     def answered(self, asker: Asker) -> None:
         """Nothing is counted."""
@@ -164,6 +167,12 @@ class RemoteGate:
         self._in_flight = InFlight()
         self._closers: list[Callable[[], None]] = []
         self._doorman: Doorman | None = None
+        self.handlers: Mapping[type[m.Message], Handler] = {
+            m.OfferSnapshot: self._offer,
+            m.PutBlob: self._put,
+            m.KeepAlive: self._keep,
+            m.GetSessions: self._tell_sessions,
+        }
 
     # --- the socket ----------------------------------------------------------------------------
 
@@ -224,22 +233,17 @@ class RemoteGate:
                 "WorkerError", f"your key has {quota} sessions, which is the server's quota"
             )
 
-    def check(
-        self, asker: Asker, request: m.Message, size: int, sessions: Sessions, jails: Jails
-    ) -> m.Message:
+    def authorize(self, asked: Asked) -> m.Message:
         """Hold a request against keys and quotas."""
-        key = asker.key
-        self._refuse_unless_authorized(key)
-        if isinstance(request, m.KeepAlive):
-            self._keep(asker, request, sessions)
-        elif isinstance(request, m.OpenJail):
-            return self._check_open(key, request, jails)
-        elif isinstance(request, m.StartHosts):
-            check_jail(_uses(jails, key), Use(0, request.hosts), self._rules.quotas)
+        asker, request = asked.asker, asked.request
+        self._refuse_unless_authorized(asker.key)
+        if isinstance(request, m.OpenJail):
+            return self._authorize_open(asker.key, request, asked.jails)
+        if isinstance(request, m.StartHosts):
+            check_jail(_uses(asked.jails, asker.key), Use(0, request.hosts), self._rules.quotas)
         elif isinstance(request, m.Relay):
-            self._in_flight.add(key, asker, size, self._rules.quotas.inflight_bytes)
-        elif isinstance(request, m.GetSessions):
-            return m.Sessions(tuple(self._sessions_of(key, sessions, jails)))
+            size = sum(map(len, asked.payload))
+            self._in_flight.add(asker.key, asker, size, self._rules.quotas.inflight_bytes)
         return request
 
     def _is_known(self, key: bytes) -> bool:
@@ -252,7 +256,7 @@ class RemoteGate:
         if not self._is_known(key):
             raise RefusedError("WorkerError", "your key is not authorised any more")
 
-    def _check_open(self, key: bytes, request: m.OpenJail, jails: Jails) -> m.OpenJail:
+    def _authorize_open(self, key: bytes, request: m.OpenJail, jails: Jails) -> m.OpenJail:
         try:
             confinement = confinement_from_wire(request.confinement)
         except ProtocolError as error:
@@ -271,27 +275,30 @@ class RemoteGate:
             request.name[:512], "", tree, request.entry, request.confinement, request.hosts
         )
 
-    def _keep(self, asker: Asker, request: m.KeepAlive, sessions: Sessions) -> None:
-        session = sessions.find(asker.identity, asker.key)
-        if session is not None and all(type(jail) is int for jail in request.jails[:4096]):
-            sessions.keep(session, request.jails[:4096])
+    def _offer(self, asked: Asked) -> m.Message:
+        asker, request = asked.asker, asked.request
+        assert isinstance(request, m.OfferSnapshot)
+        in_use = {entry.jail.spec.snapshot for entry in asked.jails.open_ones()}
+        return self._uploads.offer(asker.session, asker.key, request, in_use)
 
-    def serve(
-        self, asker: Asker, request: m.Message, payload: Sequence[bytes], jails: Jails
-    ) -> m.Message | None:
-        """Take snapshots; say who is here."""
-        key = asker.key
-        if isinstance(request, m.OfferSnapshot):
-            in_use = {entry.jail.spec.snapshot for entry in jails.open_ones()}
-            return self._uploads.offer(asker.session, key, request, in_use)
-        if isinstance(request, m.PutBlob):
-            if len(payload) != 1:
-                raise RefusedError("LocalProtocolError", "PutBlob has one frame")
-            self._uploads.put(asker.session, key, request, payload[0])
-            return m.Done()
-        if isinstance(request, m.Sessions):
-            return request
-        return m.Done() if isinstance(request, m.KeepAlive) else None
+    def _put(self, asked: Asked) -> m.Message:
+        asker, request = asked.asker, asked.request
+        assert isinstance(request, m.PutBlob)
+        if len(asked.payload) != 1:
+            raise RefusedError("LocalProtocolError", "PutBlob has one frame")
+        self._uploads.put(asker.session, asker.key, request, asked.payload[0])
+        return m.Done()
+
+    def _keep(self, asked: Asked) -> m.Message:
+        request = asked.request
+        assert isinstance(request, m.KeepAlive)
+        session = asked.sessions.find(asked.asker.identity, asked.asker.key)
+        if session is not None and all(type(jail) is int for jail in request.jails[:4096]):
+            asked.sessions.keep(session, request.jails[:4096])
+        return m.Done()
+
+    def _tell_sessions(self, asked: Asked) -> m.Message:
+        return m.Sessions(tuple(self._sessions_of(asked.asker.key, asked.sessions, asked.jails)))
 
     def answered(self, asker: Asker) -> None:
         """Its bytes are no longer in flight."""
