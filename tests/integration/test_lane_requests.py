@@ -11,8 +11,11 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvError
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.jail import RemoteJail
 from envhub_worker.protocol.shared_memory import slabs
+from tests.support import inside
 from tests.support.compare import assert_same
+from tests.support.samples import sample
 
 REPOSITORY = '''
 import gymnasium as gym
@@ -178,3 +181,17 @@ def test_a_signal_without_a_name_is_told(talker: Path) -> None:
         with pytest.raises(Exception, match="signal 40"):
             suites.env.call("signal")
         others.env.step([0])
+
+
+def test_what_a_request_is_called_decides_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Descriptors go with the request that follows them, whatever its label for people says."""
+    exchange = RemoteJail.exchange
+
+    def renamed(jail: RemoteJail, _: str, *rest: Any) -> Any:
+        return exchange(jail, "beginning", *rest)
+
+    monkeypatch.setattr(RemoteJail, "exchange", renamed)
+    with make_env(sample("counter"), n_envs=2, num_workers=2) as suites:
+        suites.env.reset(seed=0)
+        assert inside.lane(suites.env) is not None
+        suites.env.step(suites.env.action_space.sample())

@@ -240,8 +240,9 @@ class Status(Message):
 @_message(16)
 @dataclass(frozen=True, slots=True)
 class Deposit(Message):
-    """Over the descriptor socket: descriptors for a host, which its next ``Attach`` brings to it.
+    """Over the descriptor socket: descriptors for a host, which the next request brings to it.
 
+    That has to be an ``Attach``; the server, which decodes no such message, does not look.
     Reply, over the same socket: one byte, with a pidfd of the jail.
     """
 

@@ -51,8 +51,6 @@ MAX_HOSTS = 64
 """Hosts of one jail: one per useful core, not one per sub-environment."""
 MAX_IDLE_ZYGOTES = 2
 """Without a jail, when another is started. A client mostly has one policy, or two in turns."""
-ATTACH = "attach"
-"""The operation that brings a host its descriptors."""
 MAX_JAILS = 256
 """Open jails of one server."""
 MAX_DEAD = 256
@@ -218,7 +216,7 @@ class Jails:
                 pending.lost(index, entry.lost[host])
                 continue
             link = entry.links[host]
-            fds = self._deposits.take(entry.number, host) if request.operation == ATTACH else []
+            fds = self._deposits.take(entry.number, host)
             try:
                 link.send(next(self._packet_ids), frames, (pending, index), fds)
                 if entry.idle is not None and fds:
