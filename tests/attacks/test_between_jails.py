@@ -16,6 +16,7 @@ import pytest
 
 from tests.attacks.harness import Arena, Run, call, new_alias, token
 from tests.attacks.victim import Victim, victim
+from tests.support.interpreter import can_run
 from tests.support.processes import eventually
 
 FAMILY = "Other jails"
@@ -181,3 +182,24 @@ def test_limits_and_priority_of_another_jail_stay(arena: Arena) -> None:
             pid=target.pid,
             nice=19,
         )
+
+
+@pytest.mark.parametrize(
+    ("arena", "shared"),
+    [("strict", False), *([("container", True)] if can_run("container") else [])],
+    indirect=["arena"],
+)
+def test_shared_memory_of_another_jail(arena: Arena, shared: bool) -> None:
+    """A container has one /dev/shm for all of its jails, as the threat model says of it."""
+    secret, path = token(), Path(f"/dev/shm/envhub-{new_alias()}")
+    wrote, read = Run(new_alias(), True), Run(new_alias(), True)
+    try:
+        with arena.environment() as other, arena.environment() as env:
+            call(other, wrote, "create_file", {"path": str(path), "text": secret})
+            call(other, read, "read_file", {"path": str(path)})
+            assert secret in read.text, wrote.text
+            read = Run(new_alias(), True)
+            call(env, read, "read_file", {"path": str(path)})
+            assert (read.value == secret) == shared, read.text
+    finally:
+        path.unlink(missing_ok=True)
