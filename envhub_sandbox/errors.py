@@ -42,6 +42,7 @@ import sys
 from functools import cache
 from typing import Any
 
+from envhub_worker.protocol.confinement import Reason
 from envhub_worker.protocol.errors import (
     EnvHubError,
     LocalProtocolError,
@@ -159,8 +160,12 @@ class WorkerDiedError(WorkerError):
     Attributes:
         exit_code: The exit code, or None when a signal ended it.
         signal: The name of the signal (``"SIGKILL"``), or None.
-        reason: ``"exit"``, ``"signal"``, ``"out-of-memory"``, ``"cpu-limit"``, ``"disk-limit"``,
-            ``"protocol"``, ``"zygote"``, ``"server"``, ``"killed"`` or ``"idle"``.
+        reason: ``"exit"``, ``"signal"``, ``"out-of-memory"``, ``"cpu-limit"``, ``"disk-limit"``;
+            ``"protocol"``: it broke the rules of the wire; ``"zygote"``: the process that forks
+            workers ended; ``"unavailable"``: it could not be confined; ``"killed"``: it was
+            closed, or given up; ``"idle"``: nobody had used it for long; ``"server"``: the worker
+            server ended; ``"connection"``: the one to another host was lost; ``"gone"``: the
+            server does not know it any more.
         log_tail: The last lines of its output, control characters escaped.
         request: The operation that it was serving (``"step"``), or None.
         detail: The numbers, where a limit was the reason.
@@ -174,7 +179,7 @@ class WorkerDiedError(WorkerError):
         *,
         exit_code: int | None = None,
         signal: str | None = None,
-        reason: str = "exit",
+        reason: Reason = "exit",
         log_tail: str = "",
         request: str | None = None,
         detail: str = "",
@@ -185,7 +190,7 @@ class WorkerDiedError(WorkerError):
         self.detail = detail
         self.exit_code = exit_code
         self.signal = signal
-        self.reason = reason
+        self.reason: Reason = reason
         self.log_tail = log_tail
         self.request = request
 

@@ -24,6 +24,7 @@ from envhub_sandbox.transport.tcp import Far, Link
 from envhub_worker.protocol import compression
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.confinement import Reason
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimits
 from envhub_worker.protocol.text import printable
 from envhub_worker.protocol.untrusted import UNTRUSTED
@@ -292,7 +293,7 @@ _REFUSALS: dict[str, type[Exception]] = {
 }
 
 
-_REASONS = {
+_REASONS: dict[Reason, str] = {
     "exit": "it exited",
     "signal": "a signal ended it",
     "out-of-memory": "it ran out of memory",
@@ -302,6 +303,7 @@ _REASONS = {
     "killed": "it was closed",
     "zygote": "the process that forks workers ended",
     "idle": "the server ended it",
+    "unavailable": "it could not be confined",
 }
 
 

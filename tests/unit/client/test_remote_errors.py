@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import copy
 import pickle
+import re
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +15,7 @@ from envhub_sandbox import errors
 from envhub_sandbox.transport.connection import death, expect, refusal
 from envhub_sandbox.transport.jail import check, raised
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.confinement import REASONS
 
 ESCAPE = "\x1b]0;owned\x07\x1b[2J\r"
 
@@ -198,3 +200,13 @@ def test_check_raises_what_a_reply_says() -> None:
     check(m.Value(3))
     with pytest.raises(errors.RemoteEnvError):
         check(a_raised())
+
+
+def test_every_reason_of_a_death_is_told() -> None:
+    """In the public docstring, and in words wherever the server gives it."""
+    attributes = str(errors.WorkerDiedError.__doc__)
+    told = attributes.partition("reason:")[2].partition("log_tail:")[0]
+    assert re.findall(r'``"([a-z-]+)"``', told) == list(REASONS)
+    for reason in REASONS[: REASONS.index("server")]:
+        text = str(death(m.Died(-1, reason, None, None, "", "", "step")))
+        assert not text.endswith(f": {reason}")

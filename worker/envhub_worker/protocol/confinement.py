@@ -1,8 +1,10 @@
-"""What a jail is permitted, as it travels from the client's ``Policy`` to the lockdown."""
+"""What a jail is permitted, as it travels from the client's ``Policy`` to the lockdown, and how
+it may end."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal, get_args
 
 MIB = 1024 * 1024
 GIB = 1024 * MIB
@@ -12,6 +14,23 @@ NETWORKS = ("none", "loopback", "host")
 LEAST_LANDLOCK = {"strict": 1, "no-userns": 3, "container": 0}
 """The Landlock ABI that a profile needs. Without a mount namespace Landlock must itself guard
 truncation, which it does from the third on."""
+Reason = Literal[
+    "exit",
+    "signal",
+    "out-of-memory",
+    "cpu-limit",
+    "disk-limit",
+    "protocol",
+    "zygote",
+    "unavailable",
+    "killed",
+    "idle",
+    "server",
+    "connection",
+    "gone",
+]
+"""Why a process or a jail has ended; the last three are the client's own, of what it lost."""
+REASONS: tuple[Reason, ...] = get_args(Reason)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,6 +21,7 @@ import msgpack  # type: ignore[import-untyped]
 from envhub_worker.protocol.codec import templates
 from envhub_worker.protocol.codec.codec import Buffer, decode_parts, encode, split
 from envhub_worker.protocol.codec.kinds import DOCUMENT_BYTES
+from envhub_worker.protocol.confinement import Reason
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.untrusted import UNTRUSTED
@@ -56,6 +57,7 @@ _ACCEPTED: dict[str, frozenset[type] | None] = {
     "int": frozenset({int}),
     "bool": frozenset({bool}),
     "str": frozenset({str}),
+    "Reason": frozenset({str}),
     "bytes": frozenset({bytes}),
     "int | None": frozenset({int, type(None)}),
     "str | None": frozenset({str, type(None)}),
@@ -181,7 +183,7 @@ class Died(Message):
     """A process of the jail ended. Trust: ``tail`` is the jail's own output, escaped."""
 
     host: int
-    reason: str
+    reason: Reason
     exit_code: int | None
     signal: str | None
     detail: str

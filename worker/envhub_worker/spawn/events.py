@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from envhub_worker.protocol.confinement import Reason
+
 
 @dataclass(frozen=True)
 class ZygoteDied:
@@ -58,15 +60,14 @@ class HostExited:
         host_id: From ``Jail.start_host``.
         code: Its exit code, or None.
         signal: The number of the signal that ended it, or None.
-        reason: ``"exit"``, ``"signal"``, ``"out-of-memory"``, ``"cpu-limit"``, ``"disk-limit"``
-            or ``"killed"``.
+        reason: Why.
         detail: The numbers, where a limit was the reason.
     """
 
     host_id: int
     code: int | None
     signal: int | None
-    reason: str
+    reason: Reason
     detail: str = ""
 
 

@@ -39,6 +39,7 @@ from envhub_worker.lockdown.report import Layer, LayerUnavailableError
 from envhub_worker.lockdown.seccomp import notify
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.lockdown.stages import jail
+from envhub_worker.protocol.confinement import Reason
 from envhub_worker.spawn import runner_entry
 
 
@@ -75,7 +76,7 @@ class _Host:
 
     number: int
     status: Channel | None
-    ended: tuple[str, str] | None = None
+    ended: tuple[Reason, str] | None = None
 
 
 class Init:
@@ -262,7 +263,7 @@ class Init:
         event = {"event": "host_exited", "host": host.number, "reason": reason, "detail": detail}
         self._channel.send({**event, **fields})
 
-    def _reason(self, signum: int | None) -> tuple[str, str]:
+    def _reason(self, signum: int | None) -> tuple[Reason, str]:
         if signum is None:
             return "exit", ""
         if signum == signal.SIGXCPU:

@@ -16,7 +16,7 @@ from envhub_worker.lockdown.limits.watchdog import (
     seconds_to_next_look,
     unlinked_bytes,
 )
-from envhub_worker.protocol.confinement import MIB
+from envhub_worker.protocol.confinement import MIB, Reason
 
 # Counting files may take long; it then happens the more seldom.
 _DISK_SHARE = 20
@@ -53,7 +53,7 @@ class Guard:
         """Do not count these files: they are the client's."""
         self._memory.ignore(fds)
 
-    def look(self, pids: Collection[int]) -> tuple[str, str] | None:
+    def look(self, pids: Collection[int]) -> tuple[Reason, str] | None:
         """(reason, detail) when the jail must end, else None."""
         now = time.monotonic()
         verdict = None
@@ -63,7 +63,7 @@ class Guard:
             verdict = self._look_at_disk(self._folder, pids)
         return verdict
 
-    def killed_by_kernel(self) -> tuple[str, str] | None:
+    def killed_by_kernel(self) -> tuple[Reason, str] | None:
         """Whether the kernel has ended a process of the control group for its memory."""
         if self._events < 0 or cgroups.oom_kills(self._events) <= self._seen_kills:
             return None
@@ -71,11 +71,11 @@ class Guard:
         limit = self._limits.memory_bytes // MIB
         return "out-of-memory", f"over {limit} MiB: the kernel ended one of its processes"
 
-    def _look_at_events(self) -> tuple[str, str] | None:
+    def _look_at_events(self) -> tuple[Reason, str] | None:
         self._memory_due = time.monotonic() + _EVENTS_LOOK_S
         return self.killed_by_kernel()
 
-    def _look_at_memory(self, pids: Collection[int]) -> tuple[str, str] | None:
+    def _look_at_memory(self, pids: Collection[int]) -> tuple[Reason, str] | None:
         used, hidden = self._memory.look(pids)
         for pid in hidden:
             # It runs a program that nobody may read, so that nobody can measure it.
@@ -87,7 +87,7 @@ class Guard:
             return None
         return "out-of-memory", f"{used // MIB} MiB in use, {limit // MIB} MiB permitted"
 
-    def _look_at_disk(self, folder: str, pids: Collection[int]) -> tuple[str, str] | None:
+    def _look_at_disk(self, folder: str, pids: Collection[int]) -> tuple[Reason, str] | None:
         before = time.monotonic()
         size, files = folder_usage(folder, self._limits.disk_files)
         size += unlinked_bytes(pids, os.stat(folder).st_dev)
