@@ -20,6 +20,10 @@ from tests.support.samples import sample
 _ONLY_SERVER = 3  # the server, and its zygote's two
 
 
+_BEFORE: set[int] = set()
+"""What ran below this process before the test: other tests' Hubs, say."""
+
+
 @pytest.fixture(autouse=True)
 def _known() -> None:
     """Its manifest is remembered, and no server is there, when a test begins."""
@@ -27,6 +31,13 @@ def _known() -> None:
         pass
     stop_idle()
     assert eventually(lambda: not _servers())
+    _BEFORE.clear()
+    _BEFORE.update(descendants())
+
+
+def started() -> set[int]:
+    """Pids of everything below this process that a test has started."""
+    return descendants() - _BEFORE
 
 
 def used(server_idle_s: float | None, **options: object) -> None:
@@ -51,19 +62,19 @@ def _servers() -> set[int]:
 def test_the_next_environment_finds_the_same_server() -> None:
     """After the first was closed: the same process, with no jail in it in between."""
     used(600)
-    assert eventually(lambda: len(descendants()) == _ONLY_SERVER)
+    assert eventually(lambda: len(started()) == _ONLY_SERVER)
     [server] = _servers()
     used(600)
     assert _servers() == {server}
-    assert eventually(lambda: len(descendants()) == _ONLY_SERVER)
+    assert eventually(lambda: len(started()) == _ONLY_SERVER)
     stop_idle()
-    assert not descendants()
+    assert not started()
 
 
 def test_it_goes_when_its_time_has_come() -> None:
     """With everything below it, and by itself."""
     used(0.3)
-    assert eventually(lambda: not descendants())
+    assert eventually(lambda: not started())
     used(600)
     assert _servers()
     stop_idle()
@@ -72,7 +83,7 @@ def test_it_goes_when_its_time_has_come() -> None:
 def test_with_no_time_it_ends_with_the_last_environment() -> None:
     """And every environment gets a server of its own."""
     used(0)
-    assert not descendants()
+    assert not started()
 
 
 def test_a_suite_that_is_not_closed_holds_it() -> None:
@@ -92,7 +103,7 @@ def test_a_suite_that_is_not_closed_holds_it() -> None:
     assert _servers() == {server}
     second.close()
     third.close()
-    assert eventually(lambda: not descendants())
+    assert eventually(lambda: not started())
     suites.close()
 
 
@@ -102,7 +113,7 @@ def test_a_suite_that_nobody_holds_lets_it_go() -> None:
     suites.env.reset()
     assert _servers()
     del suites
-    assert eventually(lambda: not descendants())
+    assert eventually(lambda: not started())
 
 
 def test_a_hundred_times_open_and_closed_leaves_one_server_and_nothing_else() -> None:
@@ -110,7 +121,7 @@ def test_a_hundred_times_open_and_closed_leaves_one_server_and_nothing_else() ->
     used(600)
     [server] = _servers()
     process = psutil.Process(server)
-    assert eventually(lambda: len(descendants()) == _ONLY_SERVER)
+    assert eventually(lambda: len(started()) == _ONLY_SERVER)
     ours, its = _descriptors(os.getpid()), process.num_fds()
     threads = threading.active_count()
     for _ in range(100):
@@ -119,7 +130,7 @@ def test_a_hundred_times_open_and_closed_leaves_one_server_and_nothing_else() ->
     assert eventually(lambda: threading.active_count() <= threads)
     assert eventually(lambda: _descriptors(os.getpid()) <= ours)
     assert eventually(lambda: process.num_fds() <= its)
-    assert eventually(lambda: len(descendants()) == _ONLY_SERVER)
+    assert eventually(lambda: len(started()) == _ONLY_SERVER)
     stop_idle()
 
 
@@ -127,7 +138,7 @@ def test_opening_while_the_time_comes_works() -> None:
     """Whichever comes first: there is a server, and it answers."""
     for attempt in range(12):
         used(0.001 * attempt)
-    assert eventually(lambda: not descendants())
+    assert eventually(lambda: not started())
 
 
 def test_a_server_that_dies_while_it_lingers_is_replaced() -> None:
@@ -139,7 +150,7 @@ def test_a_server_that_dies_while_it_lingers_is_replaced() -> None:
     used(0)
     assert eventually(lambda: not psutil.pid_exists(server))
     stop_idle()
-    assert not descendants()
+    assert not started()
 
 
 def test_ever_new_policies_do_not_fill_it_with_zygotes(tmp_path: Path) -> None:
@@ -149,7 +160,7 @@ def test_ever_new_policies_do_not_fill_it_with_zygotes(tmp_path: Path) -> None:
         folder.mkdir()
         used(600, policy={"readable": (str(folder),)})
     # two that were there already, the last one, and the server
-    assert eventually(lambda: len(descendants()) <= 1 + 3 * (_ONLY_SERVER - 1))
+    assert eventually(lambda: len(started()) <= 1 + 3 * (_ONLY_SERVER - 1))
     stop_idle()
 
 
