@@ -36,7 +36,10 @@ def generator(state: object) -> np.random.Generator:
     if wrong is not None:
         raise RemoteProtocolError(f"the worker sent a broken generator state: {wrong}")
     bits = getattr(np.random, name)()
-    bits.state = state
+    try:
+        bits.state = state
+    except (TypeError, ValueError, OverflowError) as error:  # newer releases check more themselves
+        raise RemoteProtocolError(f"numpy refuses the worker's generator state: {error}") from error
     return np.random.Generator(bits)
 
 
@@ -68,6 +71,10 @@ def _misfit(form: _Form, value: Any, where: str) -> str | None:
 
 def _below(limit: int) -> _Check:
     return lambda value: type(value) is int and 0 <= value < limit
+
+
+def _is_position(value: Any) -> bool:
+    return type(value) is int and 1 <= value <= 4  # of the next draw: 4 fills the buffer first
 
 
 def _words(count: int) -> _Check:
@@ -102,7 +109,7 @@ _FORMS: dict[str, _Form] = {
         **_NAMED,
         "state": {"counter": _words(4), "key": _words(2)},
         "buffer": _words(4),
-        "buffer_pos": _below(4 + 1),
+        "buffer_pos": _is_position,
         **_HALF,
     },
     "SFC64": {**_NAMED, "state": {"state": _words(4)}, **_HALF},

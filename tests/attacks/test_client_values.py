@@ -158,6 +158,7 @@ STATES: dict[str, Any] = {
     "a field more": mt19937(more=1),
     "a buffer's index before it": philox(buffer_pos=-64),
     "a buffer's index behind it": philox(buffer_pos=5),
+    "a buffer's index that it never has": philox(buffer_pos=0),
     "a flag of two": philox(has_uint32=2),
     "a word of 33 bits": philox(uinteger=2**32),
     "a negative word": philox(uinteger=-1),

@@ -14,6 +14,7 @@ from tests.support.samples import sample
 
 _HEAD = f"""
 import os, signal, sys, threading, time
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup it is ignored, and that is inherited
 from envhub_sandbox import make_env, errors
 os.environ["TZ"] = os.environ["TMPDIR"]  # marks everybody below us, and not this process
 REPOSITORY = {str(sample("faulty"))!r}
