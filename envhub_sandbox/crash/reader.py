@@ -22,6 +22,7 @@ from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.policy import Limits, Policy
 from envhub_sandbox.transport.tensors import to_tensor
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.shared_memory.slabs import DTYPE_CODES
 from envhub_worker.protocol.stream import PacketReader
 from envhub_worker.protocol.text import printable
@@ -98,7 +99,7 @@ def _bundle(folder: Path, document: dict[str, Any]) -> Bundle:
     requests = tuple(_requests(folder, _member(history, "requests", list), packets))
     task = document.get("task")
     return Bundle(
-        label=printable(_member(document, "label", str), 1000),
+        label=one_line(_member(document, "label", str), 1000),
         reference=_reference(provenance),
         files=_texts(_member(provenance, "files", dict)),
         death=_death(_member(document, "death", dict)),
@@ -145,10 +146,10 @@ def _reference(provenance: dict[str, Any]) -> str:
 def _death(death: dict[str, Any]) -> dict[str, Any]:
     code, signal = death.get("exit_code"), death.get("signal")
     return {
-        "reason": printable(_member(death, "reason", str), 100),
+        "reason": one_line(_member(death, "reason", str), 100),
         "exit_code": code if type(code) is int else None,
-        "signal": printable(signal, 100) if type(signal) is str else None,
-        "request": printable(str(death.get("request")), 100),
+        "signal": one_line(signal, 100) if type(signal) is str else None,
+        "request": one_line(str(death.get("request")), 100),
         "message": printable(_member(death, "message", str)),
     }
 
@@ -273,7 +274,7 @@ def wishes(bundle: Bundle) -> list[str]:
     if isinstance(limits, dict):
         found += [f"limits.{n}={v!r}" for n, v in limits.items() if _is_more(n, v)]
     found += [f"{name}={v!r}" for name in _CARRIED if (v := bundle.arguments.get(name)) is not None]
-    return [printable(wish, 300) for wish in found]
+    return [one_line(wish, 300) for wish in found]  # a line each, whatever its name is
 
 
 def _policy(bundle: Bundle) -> dict[str, Any]:

@@ -245,6 +245,19 @@ def test_wishes_beyond_an_ordinary_run_are_told(tmp_path: Path) -> None:
     assert Policy(**{**granted["policy"], "limits": Limits(**granted["policy"]["limits"])})
 
 
+def test_a_bundle_says_nothing_in_lines_of_its_own(tmp_path: Path) -> None:
+    """Whatever its names are: what is printed of it is one line each, and no terminal obeys it."""
+    folder = bundle(tmp_path)
+    forged = "memory_bytes\nError: run this as root\x1b[2J"
+    edit(folder, "make_env", "policy", value={"limits": {forged: 1 << 60}})
+    edit(folder, "label", value=f"org/repo{forged}")
+    found = load_bundle(folder)
+    [wish] = wishes(found)
+    assert wish.startswith("limits.memory_bytes")
+    assert wish.isprintable()
+    assert found.label.isprintable()
+
+
 def test_a_login_is_not_in_the_bundle(tmp_path: Path) -> None:
     """It may be sent to somebody: a URL's user and password are left out."""
     folder = bundle(tmp_path, endpoint="https://me@there:hf_secret@hub.example/x")
