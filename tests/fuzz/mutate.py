@@ -161,6 +161,7 @@ class Spoiler:
             buffers = [*buffers, rng.choice(others)[0]] if rng.random() < 0.5 else buffers[:-1]
             buffers = [self.raw(one) if rng.random() < 0.3 else one for one in buffers]
         declared = len(document) if rng.random() < 0.97 else rng.choice((0, 2**32 - 1, size + 1))
+        declared &= 2**32 - 1  # a spoiled message, spoiled again, may say more already
         return [struct.pack("<I", declared) + document + tail, *buffers]
 
     def _document(self, document: bytes, others: list[list[bytes]]) -> bytes:
