@@ -10,6 +10,7 @@ from gymnasium.error import ClosedEnvironmentError
 from gymnasium.vector import AutoresetMode
 
 from envhub_sandbox import EnvSuites, make_env
+from envhub_sandbox.sandboxes.lingering import stop_idle
 from tests.support.compare import assert_same
 from tests.support.processes import descendants, eventually
 from tests.support.samples import make_env_of, reference, sample
@@ -162,17 +163,20 @@ class TestManyTasks:
 
     def test_processes_only_for_the_task_in_use(self, suites: EnvSuites) -> None:
         """However many tasks: never more than those of one in use, and of the next one."""
-        before = len(descendants())
-        counts = []
+        before, counts = descendants(), []
         for task, env in suites["rooms"].items():
             env.reset(seed=task)
             env.step([1, 0, 1, 0])
-            counts.append(len(descendants()))
+            counts.append(len(descendants() - before))
             env.close()
             if task == 5:
                 break
-        assert max(counts) <= before + 2 * 4 + 2
-        assert eventually(lambda: len(descendants()) <= before + 2)
+        server, jail = 3, 4
+        assert max(counts) <= server + 2 * jail
+        assert eventually(lambda: len(descendants() - before) <= server + jail)
+        suites.close()
+        stop_idle()
+        assert eventually(lambda: descendants() <= before)
 
     def test_sub_environments_run_in_processes_of_their_own(self, suites: EnvSuites) -> None:
         """With ``use_async_envs`` the sub-environments do not share a process with each other."""
