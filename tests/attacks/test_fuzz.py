@@ -1,6 +1,7 @@
 """Lies made from what real workers have said: a bounded number here, longer by ``tests.fuzz``.
 
-The seed is drawn anew each time and printed; what fails says how to do it again.
+The seed here is the same each time, so that who changes nothing breaks nothing; new lies are told by
+the command, which draws a seed and prints it. What fails says how to do it again.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from tests.support import inside
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = 250
+SEED = 1
 MANY = 2000
 KINDS = {"Loaded", "Built", "ResetDone", "StepDone", "Value", "Raised", "Relayed", "JailOpened"}
 
@@ -52,7 +54,7 @@ def test_the_recording_has_every_kind(corpus: Path) -> None:
 
 def test_lies_are_taken_rightly_or_refused(corpus: Path) -> None:
     """Nothing comes out but right values and errors of ours, in bounded memory and time."""
-    run = fuzz(corpus, "--examples", EXAMPLES)
+    run = fuzz(corpus, "--examples", EXAMPLES, "--seed", SEED)
     print(run.stdout)
     assert run.returncode == 0, run.stdout + run.stderr
     lines = [line for line in run.stdout.splitlines() if " lies: " in line]
