@@ -1,7 +1,7 @@
 """Lies made from what real workers have said: a bounded number here, longer by ``tests.fuzz``.
 
-The seed here is the same each time, so that who changes nothing breaks nothing; new lies are told by
-the command, which draws a seed and prints it. What fails says how to do it again.
+The seed here is the same each time, so that who changes nothing breaks nothing. New lies are told
+by the command, which draws a seed and prints it. What fails says how to do it again.
 """
 
 from __future__ import annotations
