@@ -139,11 +139,13 @@ def status_of(entry: JailEntry) -> dict[str, object]:
     """What a jail is doing, for ``Status``."""
     owed = [pending for link in entry.links.values() for pending, _ in link.pending.values()]
     oldest = min(owed, key=lambda pending: pending.since, default=None)
+    # in the order of the hosts: they come up side by side, and say so in any order
+    pids = tuple(entry.pids[host] for host in sorted(entry.pids))
     return {
         "jail": entry.number,
         "name": entry.name,
-        "pids": tuple(entry.pids.values()),
-        "states": tuple(_state_of(pid) for pid in entry.pids.values()),
+        "pids": pids,
+        "states": tuple(map(_state_of, pids)),
         "busy_s": 0.0 if oldest is None else monotonic() - oldest.since,
         "operation": "" if oldest is None else oldest.operation,
     }
