@@ -7,6 +7,8 @@ import os
 import socket
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -61,15 +63,22 @@ def test_a_containers_folder_is_left_behind_when_its_client_is(tmp_path: Path, d
     assert found(tmp_path) == {"envhub-docker-dead0000"}
 
 
-def test_a_servers_folder_is_left_behind_when_nobody_listens(tmp_path: Path) -> None:
+@pytest.fixture
+def short() -> Iterator[Path]:
+    """A folder with a name that a socket's may begin with, wherever temporary files go."""
+    with tempfile.TemporaryDirectory(prefix="envhub-test-", dir="/tmp") as folder:
+        yield Path(folder)
+
+
+def test_a_servers_folder_is_left_behind_when_nobody_listens(short: Path) -> None:
     """At the socket in it; one that is only being made has none yet."""
     for name in ("listens0", "deserted", "starting", "no_log00"):
         log = {} if name == "no_log00" else {"server.log": ""}
-        folder(tmp_path, f"envhub-{name}", log)
-    with bound(tmp_path / "envhub-listens0" / "fds"):
+        folder(short, f"envhub-{name}", log)
+    with bound(short / "envhub-listens0" / "fds"):
         for name in ("deserted", "no_log00"):
-            bound(tmp_path / f"envhub-{name}" / "fds").close()
-        assert found(tmp_path) == {"envhub-deserted"}
+            bound(short / f"envhub-{name}" / "fds").close()
+        assert found(short) == {"envhub-deserted"}
 
 
 def test_a_link_is_not_followed(tmp_path: Path, dead: str) -> None:

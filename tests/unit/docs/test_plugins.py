@@ -45,7 +45,7 @@ def run(folder: Path, checkout: Path, *arguments: str) -> str:
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *arguments],
         cwd=folder,
-        env={"PYTHONPATH": str(checkout)},  # and not CI
+        env={"PYTHONPATH": str(checkout), "TMPDIR": str(folder)},  # and not CI
         capture_output=True,
         text=True,
         timeout=120,
