@@ -10,7 +10,7 @@
         actions-<dtype>.npy   (steps, num_envs, ...), one file a dtype
 
 Nothing in it is pickled. It is built under another name and renamed into place; only its owner
-may read it; the oldest give way to the newest. ``bundles`` reads it.
+may read it; the oldest give way to the newest. ``reader`` reads it.
 """
 
 from __future__ import annotations

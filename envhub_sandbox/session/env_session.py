@@ -2,7 +2,7 @@
 
 ``vector_env`` asks it for replies and knows nothing of jails; ``Lifecycle`` says what is legal.
 Sub-environments are spread over shards; every request goes to all of them in one message. Its
-life in jails is in ``tenant``, what becomes of it when one dies in ``mortal``.
+life in jails is in ``lease``, what becomes of it when one dies in ``recovery``.
 """
 
 from __future__ import annotations

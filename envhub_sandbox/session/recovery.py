@@ -1,6 +1,6 @@
 """An environment whose processes may die or be late: how that is told, and how it is survived.
 
-Who of the others has answered is in ``survivors``, what the fresh are asked in ``reviving``.
+Who of the others has answered is in ``survivors``, what the fresh are asked in ``reseed``.
 """
 
 from __future__ import annotations

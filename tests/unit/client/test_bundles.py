@@ -29,7 +29,7 @@ COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
 
 def bundle(folder: Path, **options: Any) -> Path:
-    """A bundle of a reset and three steps, as ``crashes`` writes it."""
+    """A bundle of a reset and three steps, as ``writer`` writes it."""
     manifest: Any = SimpleNamespace(single_action_space=spaces.Discrete(5), num_envs=2)
     history = History(manifest, 100)
     history.requested(lambda number, bounds: m.Reset(0, [1, 2], None, None))

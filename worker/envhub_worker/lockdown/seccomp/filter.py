@@ -1,4 +1,4 @@
-"""The system call filter: ``seccomp_policy``'s table as a program, and its installation."""
+"""The system call filter: ``policy``'s table as a program, and its installation."""
 
 from __future__ import annotations
 

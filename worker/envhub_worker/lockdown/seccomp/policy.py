@@ -126,7 +126,7 @@ def table(
         namespaced: A mount, pid and IPC namespace hold the jail, so that paths, processes and
             IPC objects of the host are out of reach anyway.
         network: ``"none"``, ``"loopback"`` or ``"host"``.
-        brokered: Init sends the jail's signals: see ``broker``.
+        brokered: Init sends the jail's signals: see ``notify``.
         measured: No control group counts the jail's memory: see ``watchdog``.
         scoped: Landlock keeps the abstract sockets of the network namespace out of reach.
     """
