@@ -28,7 +28,10 @@ def find_setter() -> Callable[[int], None] | None:
     with open("/proc/self/maps") as maps:
         paths = {line.split(maxsplit=5)[5].strip() for line in maps if "openblas" in line}
     for path in sorted(paths):
-        library = ctypes.CDLL(path)
+        try:
+            library = ctypes.CDLL(path)
+        except OSError:  # root's zygote is another user by now, who may not read it
+            continue
         for name in _SETTERS:
             if hasattr(library, name):
                 setter = getattr(library, name)
