@@ -226,6 +226,7 @@ def test_health_asks_the_server_and_not_only_its_port(tmp_path: Path) -> None:
         command = [*WORKER, "health", "--state-dir", str(server.state)]
         assert subprocess.run(command, timeout=60, check=False).returncode == 0
         assert "refused" not in server.said()
+        assert "unknown key" not in server.said()
         server.process.send_signal(signal.SIGSTOP)
         assert subprocess.run(command, timeout=60, check=False).returncode == 1
         server.process.send_signal(signal.SIGCONT)
