@@ -1,0 +1,21 @@
+"""What runs a repository: an interpreter of this machine, and the packages that it gets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Runtime:
+    """An interpreter and a folder of packages.
+
+    Attributes:
+        python: Absolute path of the interpreter. It belongs to the machine and is trusted; empty
+            for the worker server's own.
+        packages: Absolute path of a folder as ``uv pip install --target`` makes it, whose code is
+            as little trusted as the repository's: nothing of it runs outside of a jail. Empty for
+            the packages that the interpreter itself has, which are trusted as it is.
+    """
+
+    python: str
+    packages: str = ""
