@@ -69,8 +69,8 @@ def ours() -> tuple[End, End]:
     watch.bell(back)
     fd, heard = back.fileno(), there.theirs
     client = there.ring, lambda: watch.wait(None)
-    host = (lambda: os.write(fd, _RING)), _poll(heard, lambda: os.read(heard, 8))
-    return client, host
+    runner = (lambda: os.write(fd, _RING)), _poll(heard, lambda: os.read(heard, 8))
+    return client, runner
 
 
 MECHANISMS: dict[str, Callable[[], tuple[End, End]]] = {

@@ -25,7 +25,7 @@ from envhub_sandbox.session import lane_requests, survivors
 from envhub_sandbox.session.recovery import MessageFor, Mortal
 from envhub_sandbox.session.results import StepResult
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import HostsDiedError, check, typed
+from envhub_sandbox.transport.jail import RunnersDiedError, check, typed
 from envhub_sandbox.transport.shared_memory.lane import JailGoneError, Outcome
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
@@ -62,8 +62,8 @@ class RemoteEnv(Mortal):
             if self.lifecycle.state is State.IDLE:
                 self._start()
             requests = [
-                (host, message_for(self._number, bounds))
-                for host, bounds in zip(self._hosts, self.bounds, strict=True)
+                (runner, message_for(self._number, bounds))
+                for runner, bounds in zip(self._runners, self.bounds, strict=True)
             ]
             sent = self._send(operation, requests)
             self._remember(message_for, requests[0][1], sent)
@@ -82,7 +82,7 @@ class RemoteEnv(Mortal):
             deadline = Deadline(timeout_s)
             try:
                 replies = self._collect(deadline)
-            except HostsDiedError as deaths:
+            except RunnersDiedError as deaths:
                 replies = self._survive_request(deaths, deadline)
             for reply in replies:
                 check(reply)
@@ -148,11 +148,11 @@ class RemoteEnv(Mortal):
 
     def _step_requests(self, actions: Any) -> list[tuple[int, m.Message]]:
         if len(self.bounds) == 1:
-            return [(self._hosts[0], m.Step(self._number, actions))]
+            return [(self._runners[0], m.Step(self._number, actions))]
         parts = batches.split(self.manifest.single_action_space, actions, self.bounds)
         return [
-            (host, m.Step(self._number, part))
-            for host, part in zip(self._hosts, parts, strict=True)
+            (runner, m.Step(self._number, part))
+            for runner, part in zip(self._runners, parts, strict=True)
         ]
 
     def collect_step(self, timeout_s: float | None) -> StepResult:
@@ -167,7 +167,7 @@ class RemoteEnv(Mortal):
                 for reply in replies:
                     check(reply)
                 return self._stepped([typed(reply, m.StepDone) for reply in replies], deadline)
-            except HostsDiedError as deaths:
+            except RunnersDiedError as deaths:
                 with self._turn("step"), self._judging():
                     return self._survive_step(deaths, deadline)
             except BaseException:
@@ -208,10 +208,10 @@ class RemoteEnv(Mortal):
 
     def _infos_apart(self, deadline: Deadline) -> dict[Any, Any]:
         """The last infos, of shards that do not agree about them."""
-        self._send("step", [(host, m.FetchInfosApart(self._number)) for host in self._hosts])
+        self._send("step", [(runner, m.FetchInfosApart(self._number)) for runner in self._runners])
         try:
             replies = self._collect(deadline)
-        except HostsDiedError as deaths:
+        except RunnersDiedError as deaths:
             self._pending = None  # the next request meets the deaths
             self._moved(Event.REPLY)
             raise deaths.first from None
@@ -229,12 +229,12 @@ class RemoteEnv(Mortal):
                 return survivors.wait(self._place, deadline)
             raise self._cause_of_death() from None
 
-    def _fetch_infos(self, host: int, deadline: Deadline) -> m.Message:
-        self._send("step", [(host, m.FetchInfos(self._number))])
+    def _fetch_infos(self, runner: int, deadline: Deadline) -> m.Message:
+        self._send("step", [(runner, m.FetchInfos(self._number))])
         try:
             [reply] = self._collect(deadline)
-        except HostsDiedError as deaths:
-            asked = [self._hosts.index(host)]
+        except RunnersDiedError as deaths:
+            asked = [self._runners.index(runner)]
             raise survivors.among_all(deaths, asked, len(self.bounds)) from None
         return reply
 
@@ -275,7 +275,7 @@ class RemoteEnv(Mortal):
                 self._receive_by_lane(deadline)
             else:
                 loaded.jail.receive(pending[0], deadline)
-        except HostsDiedError:
+        except RunnersDiedError:
             pass  # the reset that follows meets them
         except (WorkerDiedError, WorkerTimeoutError) as error:
             if pending is not None:
@@ -321,13 +321,13 @@ class RemoteEnv(Mortal):
     def _send(
         self, operation: str, requests: Sequence[tuple[int, m.Message]]
     ) -> list[list[Buffer]]:
-        """Send each host its message; returns the frames of each."""
+        """Send each runner its message; returns the frames of each."""
         assert self._loaded is not None
         self._asked_ns = perf_counter_ns()
         jail = self._loaded.jail
-        packed = [(host, jail.pack(message)) for host, message in requests]
+        packed = [(runner, jail.pack(message)) for runner, message in requests]
         messages = [frames for _, frames in packed]
-        # what may have to be repeated in a fresh host goes by the server, who knows the dead
+        # what may have to be repeated in a fresh runner goes by the server, who knows the dead
         if self._lane and not self._revives and lane_requests.takes(operation, messages):
             self._tell(operation, messages)
             return messages
@@ -381,7 +381,7 @@ class RemoteEnv(Mortal):
             self.counters.timeouts += 1
             self._moved(Event.TIMEOUT)
             raise self._late(self._pending[1], deadline) from error
-        except HostsDiedError:
+        except RunnersDiedError:
             raise
         except EnvHubError as error:
             if isinstance(error, WorkerDiedError) and error.reason == "idle":

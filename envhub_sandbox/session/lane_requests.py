@@ -1,4 +1,4 @@
-"""Requests that go straight to the hosts, by the fast lane, and what comes back with a step.
+"""Requests that go straight to the runners, by the fast lane, and what comes back with a step.
 
 Functions over a place; whoever calls them knows what state the environment is in.
 """
@@ -40,27 +40,27 @@ def _size(frames: Sequence[Buffer]) -> int:
 
 
 def tell(place: Place, operation: str, messages: Sequence[Sequence[Buffer]]) -> None:
-    """Send each shard's host its message."""
+    """Send each shard's runner its message."""
     assert place.lane is not None
     packets = [b"".join(pack_packet(0, frames)) for frames in messages]
     place.lane.tell(packets, moves=operation == "reset")
 
 
 def answers(place: Place, operation: str, deadline: Deadline) -> list[m.Message]:
-    """What the hosts answer; what did not fit the lane is fetched.
+    """What the runners answer; what did not fit the lane is fetched.
 
     Raises:
         WorkerTimeoutError: The deadline came first.
         JailGoneError: The jail has ended.
-        RemoteProtocolError: A host broke the rules.
+        RemoteProtocolError: A runner broke the rules.
     """
     lane, jail = place.lane, place.loaded.jail
     assert lane is not None
     lane.wait_for_all(deadline)
     replies: list[m.Message] = []
-    for host, answer in zip(place.hosts, lane.answers(), strict=True):
+    for runner, answer in zip(place.runners, lane.answers(), strict=True):
         if answer is None:
-            asked = [(host, m.FetchInfos(place.number))]
+            asked = [(runner, m.FetchInfos(place.number))]
             [answer] = jail.receive(jail.send(operation, asked), deadline)
         replies.append(answer)
     return replies
@@ -90,13 +90,14 @@ def infos(
     results: Results,
     fetch: Callable[[int], m.Message],
 ) -> list[dict[Any, Any]]:
-    """A step's infos, shard by shard; ``fetch`` asks the host whose infos did not fit.
+    """A step's infos, shard by shard; ``fetch`` asks the runner whose infos did not fit.
 
     Raises:
         RemoteEnvError: The environment raised.
     """
     assert place.lane is not None
-    shards = zip(outcomes, place.lane.shards, place.hosts, strict=True)
+    shards = zip(outcomes, place.lane.shards, place.runners, strict=True)
     return [
-        results.lane_info(outcome, shard, partial(fetch, host)) for outcome, shard, host in shards
+        results.lane_info(outcome, shard, partial(fetch, runner))
+        for outcome, shard, runner in shards
     ]

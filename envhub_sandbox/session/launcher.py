@@ -75,7 +75,7 @@ class Known:
     Attributes:
         manifest: All of it.
         task: The environment that a jail is wanted for.
-        shards: Over how many hosts it is going to be spread.
+        shards: Over how many runners it is going to be spread.
     """
 
     manifest: Manifest
@@ -85,12 +85,12 @@ class Known:
 
 @dataclass
 class LoadedJail:
-    """An open jail whose first host has called ``make_env``.
+    """An open jail whose first runner has called ``make_env``.
 
     Attributes:
         jail: The jail.
         manifest: What ``make_env`` returned, checked.
-        loaded: Hosts that have called it.
+        loaded: Runners that have called it.
         changed: Whether it returned something else in one of them than the manifest says.
     """
 
@@ -255,7 +255,7 @@ class Repository:
         self._sandbox.release(server, self.timeouts.server_idle_s)
 
     def open(self, deadline: Deadline, known: Known | None = None) -> LoadedJail:
-        """Fork a jail and have its first host call ``make_env``.
+        """Fork a jail and have its first runner call ``make_env``.
 
         Args:
             deadline: For all of it.
@@ -285,7 +285,7 @@ class Repository:
                 server.bring(client, deadline)
             # all at once, where they will load what is known: else it is asked for, and then again
             known = known if client.version >= _FIRST_WITH_LOAD_TASK else None
-            order = replace(self._order(server), hosts=known.shards if known else 1)
+            order = replace(self._order(server), runners=known.shards if known else 1)
             jail = open_jail(client, order, self.wire_limits, deadline)
         except BaseException:
             client.close()
@@ -301,7 +301,7 @@ class Repository:
             if known is None:
                 return self._load(jail, server, deadline)
             loaded = LoadedJail(jail, known.manifest, {}, set(), server)
-            self.load(loaded, jail.hosts, deadline, known.task)
+            self.load(loaded, jail.runners, deadline, known.task)
             return loaded
         except BaseException:
             jail.close(Deadline(_CLOSE_S))
@@ -323,18 +323,18 @@ class Repository:
             snapshot=snapshot,
             entry=self.snapshot.path,
             confinement=asdict(confinement),
-            hosts=1,
+            runners=1,
         )
 
     def _load(self, jail: RemoteJail, server: WorkerServer, deadline: Deadline) -> LoadedJail:
-        host = jail.hosts[0]
-        [reply] = jail.exchange("make_env", [(host, self.arguments.message())], deadline)
+        runner = jail.runners[0]
+        [reply] = jail.exchange("make_env", [(runner, self.arguments.message())], deadline)
         if not isinstance(reply, m.Loaded):
             raise LoadError(f"the worker answered Load with {type(reply).__name__}")
         elements = self.policy.limits.elements
         in_time = partial(_refuse_late, deadline)
         manifest = decode_manifest(reply.manifest, max_elements=elements, check=in_time)
-        return LoadedJail(jail, manifest, reply.manifest, {host}, server)
+        return LoadedJail(jail, manifest, reply.manifest, {runner}, server)
 
     def _wanted_output(self) -> Wanted:
         """Where the next jail's output goes: each has a file of its own."""
@@ -357,30 +357,30 @@ class Repository:
     def spread(
         self, loaded: LoadedJail, shards: int, deadline: Deadline, task: EnvManifest
     ) -> list[int]:
-        """The first ``shards`` hosts of a jail, forked and loaded if they are not yet."""
+        """The first ``shards`` runners of a jail, forked and loaded if they are not yet."""
         jail = loaded.jail
-        if len(jail.hosts) < shards:
-            jail.start_hosts(shards - len(jail.hosts), deadline)
-        hosts = jail.hosts[:shards]
-        fresh = [host for host in hosts if host not in loaded.loaded]
+        if len(jail.runners) < shards:
+            jail.start_runners(shards - len(jail.runners), deadline)
+        runners = jail.runners[:shards]
+        fresh = [runner for runner in runners if runner not in loaded.loaded]
         if fresh:
             self.load(loaded, fresh, deadline, task)
-        return hosts
+        return runners
 
     def load(
-        self, loaded: LoadedJail, hosts: list[int], deadline: Deadline, task: EnvManifest
+        self, loaded: LoadedJail, runners: list[int], deadline: Deadline, task: EnvManifest
     ) -> None:
-        """Have hosts of a jail call ``make_env``, for a task that is known."""
+        """Have runners of a jail call ``make_env``, for a task that is known."""
         jail = loaded.jail
         if jail.client.version < _FIRST_WITH_LOAD_TASK:
             load = self.arguments.message()
-            jail.exchange("make_env", [(host, load) for host in hosts], deadline)
+            jail.exchange("make_env", [(runner, load) for runner in runners], deadline)
         else:
             again = self.arguments.message_for(task)
-            replies = jail.exchange("make_env", [(host, again) for host in hosts], deadline)
+            replies = jail.exchange("make_env", [(runner, again) for runner in runners], deadline)
             found = [typed(reply, m.Value).value for reply in replies]
             loaded.changed |= not all(_is_what(value, task) for value in found)
-        loaded.loaded.update(hosts)
+        loaded.loaded.update(runners)
 
     def connect(self, loaded: LoadedJail, deadline: Deadline) -> LoadedJail:
         """A further connection to an open jail; environments that share one wait apart."""
@@ -412,7 +412,7 @@ class Repository:
             self._release(loaded.server)
 
     def states(self, loaded: LoadedJail) -> tuple[str, ...]:
-        """What a jail's hosts are doing, one word each; asked over a connection of its own.
+        """What a jail's runners are doing, one word each; asked over a connection of its own.
 
         The late reply may come at any moment on the jail's own connection, and would be dropped.
         """

@@ -68,7 +68,7 @@ class Tenant:
         self._restarts = Restarts(jails.repository.policy)
         self._place: Place | None = None
         self._loaded: LoadedJail | None = None
-        self._hosts: list[int] = []
+        self._runners: list[int] = []
         self._number = 0
         self._lane: FastLane | None = None
         self._pending: tuple[int, str] | None = None  # a request's id, and what was asked
@@ -246,7 +246,7 @@ class Tenant:
     def _settle(self, place: Place) -> None:
         self._place, self._loaded, self._lane = place, place.loaded, place.lane
         self.counters.connected(place.loaded.jail.client)
-        self._hosts, self._number = place.hosts, place.number
+        self._runners, self._number = place.runners, place.number
 
     # --- moving out ----------------------------------------------------------------------------
 
@@ -322,7 +322,7 @@ class Tenant:
     def _close_politely(self, loaded: LoadedJail) -> None:
         """Let the repository's ``close`` run; whatever it does, the processes end after it."""
         deadline = Deadline(self.repository.timeouts.close_s)
-        requests = [(host, m.Close(self._number)) for host in self._hosts]
+        requests = [(runner, m.Close(self._number)) for runner in self._runners]
         with contextlib.suppress(EnvHubError):
             loaded.jail.receive(loaded.jail.send("close", requests), deadline)
 

@@ -1,4 +1,4 @@
-"""Building an environment in a jail: a slice of it in each host, and the fast lane to them."""
+"""Building an environment in a jail: a slice of it in each runner, and the fast lane to them."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ class Place:
 
     Attributes:
         loaded: Its jail.
-        hosts: One for each shard.
+        runners: One for each shard.
         number: What it is called there.
         lane: The way of its steps, where there is a fast one.
     """
 
     loaded: LoadedJail
-    hosts: list[int]
+    runners: list[int]
     number: int
     lane: FastLane | None
 
@@ -52,7 +52,7 @@ class Builder:
         self._repository = jails.repository
         self._manifest = manifest
         self._bounds = bounds
-        # hosts of a jail that several environments share die with it, for all of them
+        # runners of a jail that several environments share die with it, for all of them
         own = not isinstance(jails, SharedJail)
         self._own = own
         self._keeps = own and jails.repository.policy.restart == "transparent"
@@ -71,42 +71,42 @@ class Builder:
         idle_s = self._repository.timeouts.idle_s
         if idle_s is not None and idle_s < float("inf"):
             loaded.jail.expire(idle_s, deadline)
-        hosts = self._repository.spread(loaded, len(self._bounds), deadline, self._manifest)
+        runners = self._repository.spread(loaded, len(self._bounds), deadline, self._manifest)
         self._check_manifest(loaded)
-        place = Place(loaded, hosts, self._number, None)
-        shards = range(len(hosts))
+        place = Place(loaded, runners, self._number, None)
+        shards = range(len(runners))
         self._build(place, shards, deadline)
         return replace(place, lane=self._open_lane(place, deadline))
 
     def rebuild(self, place: Place, dead: Sequence[int], deadline: Deadline) -> Place:
-        """Build some shards again, each in a fresh host in the same jail.
+        """Build some shards again, each in a fresh runner in the same jail.
 
         Raises:
             LoadError, RemoteEnvError: The repository failed this time.
             WorkerError: They died again, or took too long.
         """
-        jail, hosts = place.loaded.jail, list(place.hosts)
-        gone = [hosts[index] for index in dead]
-        fresh = jail.replace_hosts(gone, deadline)
+        jail, runners = place.loaded.jail, list(place.runners)
+        gone = [runners[index] for index in dead]
+        fresh = jail.replace_runners(gone, deadline)
         place.loaded.loaded.difference_update(gone)
-        for index, host in zip(dead, fresh, strict=True):
-            hosts[index] = host
+        for index, runner in zip(dead, fresh, strict=True):
+            runners[index] = runner
         self._repository.load(place.loaded, fresh, deadline, self._manifest)
         self._check_manifest(place.loaded)
-        place = replace(place, hosts=hosts)
+        place = replace(place, runners=runners)
         self._build(place, dead, deadline)
         if place.lane is not None:
             for index in dead:
                 place.lane.renew(index)
             if not self._attach(place.lane, place, dead, deadline):
-                raise RemoteProtocolError("a fresh host refuses the fast lane that others take")
+                raise RemoteProtocolError("a fresh runner refuses the fast lane that others take")
         return place
 
     def _build(self, place: Place, shards: Sequence[int], deadline: Deadline) -> None:
         wanted = self._manifest
         builds = [
             (
-                place.hosts[index],
+                place.runners[index],
                 m.Build(place.number, wanted.suite, wanted.task, *self._bounds[index]),
             )
             for index in shards
@@ -124,18 +124,18 @@ class Builder:
             self._refuse()
 
     def _open_lane(self, place: Place, deadline: Deadline) -> FastLane | None:
-        """Agree with the hosts on slabs and doorbells; None where frames have to serve."""
+        """Agree with the runners on slabs and doorbells; None where frames have to serve."""
         server, manifest = place.loaded.server, self._manifest
         if server.fd_path is None or not manifest.shardable or self._repository.lane == "frames":
             return None
         if not self._own:
-            return None  # a host has one lane, and these environments share theirs
+            return None  # a runner has one lane, and these environments share theirs
         copy = self._repository.copy
         lane = FastLane.for_spaces(manifest, self._bounds, server.process_fd, copy=copy)
         if lane is None:
             return None
         try:
-            agreed = self._attach(lane, place, range(len(place.hosts)), deadline)
+            agreed = self._attach(lane, place, range(len(place.runners)), deadline)
         except BaseException:
             lane.close()
             raise
@@ -149,16 +149,16 @@ class Builder:
         jail, path = place.loaded.jail, place.loaded.server.fd_path
         assert path is not None
         for index in shards:
-            shard, host = lane.shards[index], place.hosts[index]
+            shard, runner = lane.shards[index], place.runners[index]
             try:
-                pidfd = deposit(path, SESSION, jail.number, host, shard.fds)
-            except OSError as error:  # the host has gone, or the server
+                pidfd = deposit(path, SESSION, jail.number, runner, shard.fds)
+            except OSError as error:  # the runner has gone, or the server
                 text = "the worker process died before its first request"
                 raise WorkerDiedError(text, request="make_env") from error
-            lane.watch_host(index, pidfd)
+            lane.watch_runner(index, pidfd)
             shard.handed_over()
         messages = [
-            (place.hosts[index], lane.attach_message(place.number, index)) for index in shards
+            (place.runners[index], lane.attach_message(place.number, index)) for index in shards
         ]
         replies = jail.exchange("attach", messages, deadline)
         return all(typed(reply, m.Value).value is True for reply in replies)

@@ -26,7 +26,7 @@ from envhub_sandbox.session.reseed import Frames, SeedBook, Settings, marked, re
 from envhub_sandbox.session.results import Results, StepResult
 from envhub_sandbox.session.survivors import Requests
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
-from envhub_sandbox.transport.jail import HostsDiedError, check, typed
+from envhub_sandbox.transport.jail import RunnersDiedError, check, typed
 from envhub_sandbox.transport.shared_memory.sharding import PaceBook
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Event, State
@@ -42,7 +42,7 @@ _CAUSE_POLL_S = 0.01
 class Mortal(Tenant):
     """What becomes of one environment, and of its pending request, when processes of it die.
 
-    With ``restart="transparent"`` a death is survived: the dead shards come back in fresh hosts,
+    With ``restart="transparent"`` a death is survived: the dead shards come back in fresh runners,
     and the others go on. Otherwise it is told. It is made of what a ``Tenant`` is made of.
     """
 
@@ -148,8 +148,8 @@ class Mortal(Tenant):
 
     # --- a request that is survived ------------------------------------------------------------
 
-    def _survive_request(self, deaths: HostsDiedError, deadline: Deadline) -> list[m.Message]:
-        """A reset is done in fresh hosts; anything else is not repeated.
+    def _survive_request(self, deaths: RunnersDiedError, deadline: Deadline) -> list[m.Message]:
+        """A reset is done in fresh runners; anything else is not repeated.
 
         Raises:
             WorkerDiedError: It was something else; the next step or reset brings them back.
@@ -165,7 +165,7 @@ class Mortal(Tenant):
             replies[index] = replace(done, info=marked(done.info, self._size(index)))
         return [reply for reply in replies if reply is not None]
 
-    def _survive_step(self, deaths: HostsDiedError, deadline: Deadline) -> StepResult:
+    def _survive_step(self, deaths: RunnersDiedError, deadline: Deadline) -> StepResult:
         """The step's results, with fresh observations in the rows of the dead."""
         started = perf_counter_ns()
         parts = self._of_survivors(deaths, deadline)
@@ -174,7 +174,7 @@ class Mortal(Tenant):
         self.counters.stepped(perf_counter_ns() - started)
         return self.results.step([typed(part, m.StepDone) for part in parts if part is not None])
 
-    def _of_survivors(self, deaths: HostsDiedError, deadline: Deadline) -> list[m.Message | None]:
+    def _of_survivors(self, deaths: RunnersDiedError, deadline: Deadline) -> list[m.Message | None]:
         """What the others answered; None where nobody did.
 
         Raises:
@@ -203,8 +203,8 @@ class Mortal(Tenant):
 
     # --- the fresh in place of the dead --------------------------------------------------------
 
-    def _revive(self, deaths: HostsDiedError, requests: Requests) -> dict[int, m.Message]:
-        """Bring dead shards back; returns what their fresh hosts answer to the last request."""
+    def _revive(self, deaths: RunnersDiedError, requests: Requests) -> dict[int, m.Message]:
+        """Bring dead shards back; returns what their fresh runners answer to the last request."""
         self._moved(Event.LOSS)
         self._keep_crash(deaths.first)
         try:
@@ -229,7 +229,7 @@ class Mortal(Tenant):
         self._moved(Event.REVIVAL)
         return replies
 
-    def _bring_back(self, deaths: HostsDiedError, requests: Requests) -> dict[int, m.Message]:
+    def _bring_back(self, deaths: RunnersDiedError, requests: Requests) -> dict[int, m.Message]:
         assert self._pending is not None
         if any(death.reason == "protocol" for death in deaths.deaths.values()):
             raise deaths.first  # whoever breaks the rules is given no second chance
@@ -248,7 +248,7 @@ class Mortal(Tenant):
         return self._ask_anew(dead, requests)
 
     def _rebuild(self, dead: list[int] | None, deadline: Deadline) -> None:
-        """Some shards in fresh hosts of the same jail, or None: all of them in a fresh jail."""
+        """Some shards in fresh runners of the same jail, or None: all of them in a fresh jail."""
         if dead is None:
             self._leave()
             self._move_into(self._jails.take(deadline), deadline)
@@ -267,7 +267,7 @@ class Mortal(Tenant):
             raise self._late("reset", deadline) from error
 
     def _remember(self, message_for: MessageFor, message: m.Message, sent: list[Frames]) -> None:
-        """What was asked may have to be asked again, and fresh hosts need seeds.
+        """What was asked may have to be asked again, and fresh runners need seeds.
 
         Args:
             message_for: Makes it again.

@@ -1,6 +1,6 @@
-"""What ``restart="transparent"`` promises: rows of a shard that died, in its fresh host.
+"""What ``restart="transparent"`` promises: rows of a shard that died, in its fresh runner.
 
-Nothing here asks anybody: it makes the requests for a fresh host and reads its replies.
+Nothing here asks anybody: it makes the requests for a fresh runner and reads its replies.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def derived_seed(seed: int | None, restart: int) -> int | None:
 
 
 def resets(message: m.Reset, derived: Any) -> list[m.Message]:
-    """What a fresh host is asked in the place of one that died in a reset.
+    """What a fresh runner is asked in the place of one that died in a reset.
 
     The reset itself; where it is one of some sub-environments only, all are reset before.
 
@@ -117,7 +117,7 @@ def _filled(seeds: Any, derived: Any) -> Any:
 
 
 def truncated(reply: m.StepDone, count: int) -> m.StepDone:
-    """A fresh host's rows of the step in which another died. Trust: its flags are not asked."""
+    """A fresh runner's rows of the step in which another died. Trust: its flags are not asked."""
     return m.StepDone(
         reply.observation,
         np.zeros(getattr(reply.rewards, "shape", (count,))),

@@ -1,4 +1,4 @@
-"""When hosts of a kept jail have died: how, what the others answered, and what fresh ones say."""
+"""When runners of a kept jail have died: how, what the others answered, and what fresh ones say."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from envhub_sandbox.session.placement import Place
 from envhub_sandbox.session.reseed import Frames
 from envhub_sandbox.session.results import Results
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import HostsDiedError, typed
+from envhub_sandbox.transport.jail import RunnersDiedError, typed
 from envhub_sandbox.transport.shared_memory.lane import Outcome
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest import EnvManifest
@@ -19,14 +19,14 @@ from envhub_worker.protocol.spaces import batches
 _CAUSE_S = 10.0
 
 Requests = Callable[[int], list[m.Message]]
-"""What a shard's fresh host is asked, one after the other."""
+"""What a shard's fresh runner is asked, one after the other."""
 
 
 def wait(place: Place, deadline: Deadline) -> list[Outcome]:
     """After ``JailGoneError``: all outcomes of a step, if nobody has died before its answer.
 
     Raises:
-        HostsDiedError: Some have; all the others have answered.
+        RunnersDiedError: Some have; all the others have answered.
         WorkerDiedError: The jail has ended.
         WorkerTimeoutError: The deadline came before the answer of one that lives.
     """
@@ -39,33 +39,33 @@ def wait(place: Place, deadline: Deadline) -> list[Outcome]:
     if not dead:
         return outcomes
     jail = place.loaded.jail
-    asked = [(place.hosts[index], m.FetchInfos(place.number)) for index in dead]
+    asked = [(place.runners[index], m.FetchInfos(place.number)) for index in dead]
     try:  # the server knows how, at the latest when they have been reaped
         jail.receive(jail.send("step", asked), Deadline(_CAUSE_S))
-    except HostsDiedError as deaths:
-        raise among_all(deaths, dead, len(place.hosts)) from None
+    except RunnersDiedError as deaths:
+        raise among_all(deaths, dead, len(place.runners)) from None
     raise RemoteProtocolError("the worker says that a process lives which has died")
 
 
-def among_all(deaths: HostsDiedError, asked: Sequence[int], shards: int) -> HostsDiedError:
+def among_all(deaths: RunnersDiedError, asked: Sequence[int], shards: int) -> RunnersDiedError:
     """The deaths of those that were asked, as deaths among all shards."""
     if deaths.jail_gone:
         return deaths
     by_shard = {asked[place]: death for place, death in deaths.deaths.items()}
-    return HostsDiedError([None] * shards, by_shard)
+    return RunnersDiedError([None] * shards, by_shard)
 
 
-def all_died(error: WorkerError, shards: int) -> HostsDiedError:
+def all_died(error: WorkerError, shards: int) -> RunnersDiedError:
     """The jail has ended, and all shards with it."""
     if not isinstance(error, WorkerDiedError):  # a sibling has given the jail up
         error = WorkerDiedError(str(error), reason="killed")
     nobody: list[m.Message | None] = [None] * shards
-    return HostsDiedError(nobody, dict.fromkeys(range(shards), error), jail_gone=True)
+    return RunnersDiedError(nobody, dict.fromkeys(range(shards), error), jail_gone=True)
 
 
 def answers_by_lane(
     place: Place,
-    deaths: HostsDiedError,
+    deaths: RunnersDiedError,
     manifest: EnvManifest,
     bounds: Sequence[tuple[int, int]],
     results: Results,
@@ -86,7 +86,7 @@ def answers_by_lane(
     flags = lane.flags()
     for index in [index for index in range(len(bounds)) if index not in deaths.deaths]:
         shard = lane.shards[index]
-        fetch = partial(_fetch_infos, place, place.hosts[index], deadline)
+        fetch = partial(_fetch_infos, place, place.runners[index], deadline)
         try:
             info = results.lane_info(shard.outcome(), shard, fetch)
         except WorkerDiedError as error:
@@ -97,8 +97,8 @@ def answers_by_lane(
     return parts
 
 
-def _fetch_infos(place: Place, host: int, deadline: Deadline) -> m.Message:
-    asked = [(host, m.FetchInfos(place.number))]
+def _fetch_infos(place: Place, runner: int, deadline: Deadline) -> m.Message:
+    asked = [(runner, m.FetchInfos(place.number))]
     [reply] = place.loaded.jail.exchange("step", asked, deadline)
     return reply
 
@@ -109,7 +109,7 @@ def set_again(
     settings: Sequence[tuple[str, Sequence[Frames]]],
     deadline: Deadline,
 ) -> list[str]:
-    """Set attributes in the fresh hosts of some shards; the names of those whose setter raised.
+    """Set attributes in the fresh runners of some shards; the names of those whose setter raised.
 
     Raises:
         WorkerError: One died again, or took too long.
@@ -117,7 +117,7 @@ def set_again(
     """
     failed = []
     for name, frames in settings:
-        asked = [(place.hosts[index], frames[index]) for index in dead]
+        asked = [(place.runners[index], frames[index]) for index in dead]
         replies = place.loaded.jail.ask("set_attr", asked, deadline)
         if any(isinstance(reply, m.Raised) for reply in replies):
             failed.append(name)
@@ -130,15 +130,15 @@ def set_again(
 def ask_anew(
     place: Place, dead: Sequence[int], requests: Requests, deadline: Deadline
 ) -> dict[int, m.Message]:
-    """Ask the fresh hosts of some shards; what each answers to its last request.
+    """Ask the fresh runners of some shards; what each answers to its last request.
 
     Raises:
         RemoteEnvError: The repository raised this time.
         WorkerError: One died again, or took too long.
     """
-    hosts = [place.hosts[index] for index in dead]
+    runners = [place.runners[index] for index in dead]
     replies: list[m.Message] = []
     for messages in zip(*map(requests, dead), strict=True):
-        asked = list(zip(hosts, messages, strict=True))
+        asked = list(zip(runners, messages, strict=True))
         replies = place.loaded.jail.exchange("reset", asked, deadline)
     return dict(zip(dead, replies, strict=True))

@@ -137,7 +137,7 @@ class WorkerClient:
     def send(self, message: m.Message, payload: Sequence[Buffer] = ()) -> int:
         """Send a request; returns its id."""
         self.check_process()
-        if self.version == 1 and _FIRST_OF_VERSION_2 <= message.kind < m.FIRST_HOST_KIND:
+        if self.version == 1 and _FIRST_OF_VERSION_2 <= message.kind < m.FIRST_RUNNER_KIND:
             raise VersionMismatchError(
                 f"the worker speaks protocol 1, and {type(message).__name__} needs 2: upgrade it"
             )

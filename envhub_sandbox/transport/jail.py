@@ -1,4 +1,4 @@
-"""The client's end of one open jail: messages to its hosts, and the jail's end."""
+"""The client's end of one open jail: messages to its runners, and the jail's end."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from envhub_worker.protocol.text import printable
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 
-class HostsDiedError(WorkerDiedError):
-    """Hosts of a kept jail have died; the others have answered.
+class RunnersDiedError(WorkerDiedError):
+    """Runners of a kept jail have died; the others have answered.
 
     Never seen by a user: he is told ``first``, or nothing.
 
     Attributes:
-        replies: In the order of the request; None where a host has died.
+        replies: In the order of the request; None where a runner has died.
         deaths: How, by its place in the request.
         jail_gone: Whether the jail has ended, too.
     """
@@ -59,8 +59,8 @@ class RemoteJail:
 
     Attributes:
         number: The server's number for it.
-        hosts: Its hosts' numbers; sub-environments are spread over them in this order.
-        kept: Whether it goes on without a host that has died.
+        runners: Its runners' numbers; sub-environments are spread over them in this order.
+        kept: Whether it goes on without a runner that has died.
         report: One mapping per layer of the confinement: ``layer``, ``enforced``, ``detail``; of
             a container around it too.
         before_end: Runs before it is ended; brings what it has printed last.
@@ -70,34 +70,34 @@ class RemoteJail:
         self,
         client: WorkerClient,
         number: int,
-        hosts: Sequence[int],
+        runners: Sequence[int],
         report: list[dict[str, Any]],
         limits: WireLimits,
     ) -> None:
         self.client = client
         self.number = number
-        self.hosts = list(hosts)
+        self.runners = list(runners)
         self.kept = False
         self.report = report
         self.before_end: Callable[[], None] = _nothing
         self._limits = limits
-        self._asked: dict[int, int] = {}  # how many hosts, by request
+        self._asked: dict[int, int] = {}  # how many runners, by request
 
     def through(self, client: WorkerClient) -> RemoteJail:
         """The same jail over another connection of ours."""
-        jail = RemoteJail(client, self.number, self.hosts, self.report, self._limits)
+        jail = RemoteJail(client, self.number, self.runners, self.report, self._limits)
         jail.before_end = self.before_end
         return jail
 
-    def start_hosts(self, count: int, deadline: Deadline) -> list[int]:
-        """Fork further hosts; returns their numbers."""
-        reply, _ = self.client.request(m.StartHosts(self.number, count), deadline=deadline)
-        started = _hosts(expect(reply, m.JailOpened), count)
-        self.hosts += started
+    def start_runners(self, count: int, deadline: Deadline) -> list[int]:
+        """Fork further runners; returns their numbers."""
+        reply, _ = self.client.request(m.StartRunners(self.number, count), deadline=deadline)
+        started = _runners(expect(reply, m.JailOpened), count)
+        self.runners += started
         return started
 
     def keep(self, deadline: Deadline) -> None:
-        """From now on it goes on without a host that dies."""
+        """From now on it goes on without a runner that dies."""
         reply, _ = self.client.request(m.KeepJail(self.number), deadline=deadline)
         expect(reply, m.Done)
         self.kept = True
@@ -107,36 +107,36 @@ class RemoteJail:
         message = m.ExpireIdle(self.number, max(1, int(idle_s * 1000)))
         expect(self.client.request(message, deadline=deadline)[0], m.Done)
 
-    def replace_hosts(self, dead: Sequence[int], deadline: Deadline) -> list[int]:
-        """Fork a host in the place of each that has died; returns the new numbers, in order."""
-        self.hosts = [host for host in self.hosts if host not in dead]
-        return self.start_hosts(len(dead), deadline)
+    def replace_runners(self, dead: Sequence[int], deadline: Deadline) -> list[int]:
+        """Fork a runner in the place of each that has died; returns the new numbers, in order."""
+        self.runners = [runner for runner in self.runners if runner not in dead]
+        return self.start_runners(len(dead), deadline)
 
     def pack(self, message: m.Message) -> list[Buffer]:
-        """The frames of a message to a host."""
+        """The frames of a message to a runner."""
         # the only way in for the caller's own objects; nothing is ever unpickled here
         return m.pack(message, 0, pickler=cloudpickle.dumps, limits=self._limits)
 
     def send(self, operation: str, requests: Sequence[tuple[int, m.Message]]) -> int:
-        """Send one message to each of some hosts, in one request; returns its id."""
-        return self.relay(operation, [(host, self.pack(message)) for host, message in requests])
+        """Send one message to each of some runners, in one request; returns its id."""
+        return self.relay(operation, [(runner, self.pack(message)) for runner, message in requests])
 
     def relay(self, operation: str, requests: Sequence[tuple[int, list[Buffer]]]) -> int:
         """``send`` for messages that are packed."""
-        parts = tuple((host, len(frames)) for host, frames in requests)
+        parts = tuple((runner, len(frames)) for runner, frames in requests)
         payload = [frame for _, frames in requests for frame in frames]
         request_id = self.client.send(m.Relay(self.number, operation, parts), payload)
         self._asked[request_id] = len(parts)
         return request_id
 
     def receive(self, request_id: int, deadline: Deadline) -> list[m.Message]:
-        """The hosts' replies, in the order of the request.
+        """The runners' replies, in the order of the request.
 
         Raises:
             WorkerTimeoutError: The deadline came first.
             WorkerDiedError: The jail ended.
-            HostsDiedError: Hosts of a kept jail did.
-            RemoteProtocolError: A host broke the rules.
+            RunnersDiedError: Runners of a kept jail did.
+            RemoteProtocolError: A runner broke the rules.
         """
         reply, payload = self.client.receive(request_id, deadline)
         asked = self._asked.pop(request_id, None)
@@ -145,18 +145,18 @@ class RemoteJail:
                 reply = expect(reply, m.Relayed)
             parts = _cut(payload, reply.parts)
             if len(parts) != asked:
-                raise RemoteProtocolError(f"{asked} hosts were asked, {len(parts)} answered")
+                raise RemoteProtocolError(f"{asked} runners were asked, {len(parts)} answered")
             if isinstance(reply, m.RelayedPartly):
                 raise self._died(reply.dead, parts)
             return [self._unpack(part) for part in parts]
 
-    def _died(self, dead: Sequence[int], parts: list[list[Buffer]]) -> HostsDiedError:
-        """Who has died is the server's word, which no host can say."""
+    def _died(self, dead: Sequence[int], parts: list[list[Buffer]]) -> RunnersDiedError:
+        """Who has died is the server's word, which no runner can say."""
         if not dead or not set(dead) <= set(range(len(parts))):
-            raise RemoteProtocolError("the worker names dead hosts that were not asked")
+            raise RemoteProtocolError("the worker names dead runners that were not asked")
         deaths = {index: death(typed(self._unpack(parts[index]), m.Died)) for index in dead}
         living = [None if i in deaths else self._unpack(part) for i, part in enumerate(parts)]
-        return HostsDiedError(living, deaths)
+        return RunnersDiedError(living, deaths)
 
     def _unpack(self, frames: Sequence[Buffer]) -> m.Message:
         return m.unpack(frames, limits=self._limits, tensors=to_tensor)[1]
@@ -164,8 +164,8 @@ class RemoteJail:
     def exchange(
         self, operation: str, requests: Sequence[tuple[int, m.Message]], deadline: Deadline
     ) -> list[m.Message]:
-        """``ask`` for messages that are not packed; a host's exception is raised."""
-        packed = [(host, self.pack(message)) for host, message in requests]
+        """``ask`` for messages that are not packed; a runner's exception is raised."""
+        packed = [(runner, self.pack(message)) for runner, message in requests]
         replies = self.ask(operation, packed, deadline)
         for reply in replies:
             check(reply)
@@ -177,7 +177,7 @@ class RemoteJail:
         """``relay`` and ``receive``; of deaths, the first is raised."""
         try:
             return self.receive(self.relay(operation, requests), deadline)
-        except HostsDiedError as error:
+        except RunnersDiedError as error:
             raise error.first from None
 
     def output(self, operation: str, deadline: Deadline) -> str:
@@ -224,31 +224,34 @@ def open_jail(
     """
     reply, _ = client.request(request, deadline=deadline)
     opened = expect(reply, m.JailOpened)
-    hosts = _hosts(opened, request.hosts)
+    runners = _runners(opened, request.runners)
     report = [dict(layer) for layer in opened.report if isinstance(layer, dict)]
     client.hold(opened.jail)
-    return RemoteJail(client, opened.jail, hosts, report, limits)
+    return RemoteJail(client, opened.jail, runners, report, limits)
 
 
-def _hosts(opened: m.JailOpened, count: int) -> list[int]:
-    """The numbers of as many hosts as were asked for."""
-    hosts = list(opened.hosts)
-    if not all(type(host) is int for host in hosts) or not len(set(hosts)) == len(hosts) == count:
-        raise RemoteProtocolError(f"the worker did not start {count} hosts, each with a number")
-    return hosts
+def _runners(opened: m.JailOpened, count: int) -> list[int]:
+    """The numbers of as many runners as were asked for."""
+    runners = list(opened.runners)
+    if (
+        not all(type(runner) is int for runner in runners)
+        or not len(set(runners)) == len(runners) == count
+    ):
+        raise RemoteProtocolError(f"the worker did not start {count} runners, each with a number")
+    return runners
 
 
 def check(reply: m.Message) -> None:
-    """Raise what a host's reply says went wrong.
+    """Raise what a runner's reply says went wrong.
 
     Raises:
         EnvHubError: What the repository raised.
-        RemoteProtocolError: A host spoke in the server's name.
+        RemoteProtocolError: A runner spoke in the server's name.
     """
     if isinstance(reply, m.Raised):
         raise raised(reply)
-    if reply.kind < m.FIRST_HOST_KIND:
-        raise RemoteProtocolError(f"a host sent {type(reply).__name__}")
+    if reply.kind < m.FIRST_RUNNER_KIND:
+        raise RemoteProtocolError(f"a runner sent {type(reply).__name__}")
 
 
 def typed(reply: m.Message, kind: type[m.M]) -> m.M:

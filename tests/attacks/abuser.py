@@ -84,13 +84,13 @@ def push(fd):
 """
 ENV = """
 import gymnasium as gym, numpy as np, os, signal, time
-from envhub_worker.runner import runner as host
+from envhub_worker.runner import runner
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 
 ABUSE_AND_ANSWER, ABUSE_AND_HANG, DIE = 1, 2, 3
 lanes, kept = [], []
-honest = host.Host.attach
+honest = runner.Runner.attach
 
 def remember(self, request):
     kept.extend(map(os.dup, self.descriptors))
@@ -98,7 +98,7 @@ def remember(self, request):
     lanes.append(self.lane)
     return reply
 
-host._HANDLERS[m.Attach] = remember
+runner._HANDLERS[m.Attach] = remember
 
 def answer(lane):
     lane._told[slabs.OUTCOME], lane._told[slabs.LENGTH] = slabs.DONE, 0

@@ -42,8 +42,8 @@ class Asked:
 
     Attributes:
         request_id: Id of the client's message.
-        request: The message for the host, or for the server where there is no host in it.
-        relayed: Whether it was for the host.
+        request: The message for the runner, or for the server where there is no runner in it.
+        relayed: Whether it was for the runner.
         honest: The honest answer.
     """
 
@@ -53,7 +53,7 @@ class Asked:
     honest: m.Message
 
     def answer(self, message: m.Message | Frames, request_id: int | None = None) -> Frames:
-        """An answer to this request: the server's own, or the host's wrapped as it is relayed."""
+        """An answer to this request: the server's own, or the runner's wrapped as it is relayed."""
         number = self.request_id if request_id is None else request_id
         if not self.relayed:
             assert isinstance(message, m.Message)
@@ -180,14 +180,14 @@ def step_done(**changes: Any) -> m.StepDone:
 
 
 def honest(request: m.Message) -> m.Message:
-    """What an honest server or host answers."""
+    """What an honest server or runner answers."""
     if isinstance(request, (m.Reset, m.Step)):
         done = step_done()
         return done if isinstance(request, m.Step) else m.ResetDone(done.observation, {})
     answers: dict[type[m.Message], m.Message] = {
         m.Hello: m.Welcome(m.VERSION, "0", os.getpid()),
         m.OpenJail: m.JailOpened(1, (1,), ()),
-        m.StartHosts: m.JailOpened(1, (2,), ()),
+        m.StartRunners: m.JailOpened(1, (2,), ()),
         m.CloseJail: m.Done(),
         m.ReadOutput: m.Output(""),
         m.GetStatus: m.Status(()),

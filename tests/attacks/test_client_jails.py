@@ -1,4 +1,4 @@
-"""A hostile host in a real jail: the repository replaces our code next to it, and lies.
+"""A hostile runner in a real jail: the repository replaces our code next to it, and lies.
 
 Jail and repository share a process, so that nothing our code does there can be relied on. What
 counts is what the server and the client make of it.
@@ -39,12 +39,12 @@ GROWTH = 192 * MIB
 
 _ENV = """
 import gymnasium as gym, numpy as np, os, socket, struct, time
-from envhub_worker.runner import runner as host
+from envhub_worker.runner import runner
 from envhub_worker.protocol import messages as m
 
 FRAMES = {frames!r}
 MODE = {mode!r}
-honest = host.Host.answer
+honest = runner.Runner.answer
 
 class Plain(gym.Env):
     observation_space = gym.spaces.Box(-1, 1, (3,), np.float32)
@@ -68,12 +68,12 @@ def lie(self, packet):
         os._exit(0)
     answer = m.pack(m.Value(None), request_id)
     stream = next(fd for fd in range(3, 64) if is_stream(fd))
-    one = b"".join(map(bytes, host.pack_packet(packet.request_id, answer)))
+    one = b"".join(map(bytes, runner.pack_packet(packet.request_id, answer)))
     if MODE == "twice":
         os.write(stream, one)
     if MODE == "other id":
         return_id = packet.request_id + 1
-        os.write(stream, b"".join(map(bytes, host.pack_packet(return_id, answer))))
+        os.write(stream, b"".join(map(bytes, runner.pack_packet(return_id, answer))))
     if MODE == "dribble":
         for byte in one[:8]:
             os.write(stream, bytes([byte]))
@@ -88,7 +88,7 @@ def is_stream(fd):
     except OSError:
         return False
 
-host.Host.answer = lie
+runner.Runner.answer = lie
 
 def make_env(n_envs=1, use_async_envs=False):
     return gym.vector.SyncVectorEnv([Plain] * n_envs)
@@ -96,7 +96,7 @@ def make_env(n_envs=1, use_async_envs=False):
 
 
 def liar(folder: Path, mode: str, frames: list[Buffer] | None = None) -> str:
-    """A repository whose host lies about steps."""
+    """A repository whose runner lies about steps."""
     raw = [bytes(frame) for frame in frames or []]
     return str(write_repository(folder / "liar", _ENV.format(frames=raw, mode=mode)))
 
@@ -181,7 +181,7 @@ def test_rule_breakers_lose_their_jail(arena: Arena, neighbour: Any, home: Path,
 def test_silence_from_a_jail_ends_at_the_deadline(
     arena: Arena, neighbour: Any, home: Path, mode: str
 ) -> None:
-    """A host that does not answer, or a byte at a time, costs the time that was given."""
+    """A runner that does not answer, or a byte at a time, costs the time that was given."""
     started = time.monotonic()
     error, _ = lies_to(arena, liar(home, mode), step_s=0.5, close_s=0.5)
     assert isinstance(error, WorkerTimeoutError)

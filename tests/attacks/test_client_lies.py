@@ -86,7 +86,7 @@ def test_canary_sings(tmp_path: Path) -> None:
 
 
 def relayed(answer: m.Message | Frames) -> Callable[[Asked], list[Frames]]:
-    """A lie of a host's: one answer under the right id."""
+    """A lie of a runner's: one answer under the right id."""
     return lambda asked: [asked.answer(answer)]
 
 
@@ -439,7 +439,7 @@ DOCUMENTS: dict[str, Callable[[], Frames]] = {
 
 @pytest.mark.parametrize("what", list(DOCUMENTS))
 def test_malformed_answers_are_refused(liar: LyingServer, folder: str, what: str) -> None:
-    """Whatever stands where the host's answer belongs, decoding it is bounded and harmless."""
+    """Whatever stands where the runner's answer belongs, decoding it is bounded and harmless."""
     frames = DOCUMENTS[what]()
     liar.lies[m.Reset] = relayed(frames)
     with opened(liar, folder) as suites:
@@ -478,7 +478,7 @@ def test_malformed_answers_of_the_server_are_refused(
 def test_answers_of_another_kind_are_refused(
     liar: LyingServer, folder: str, reply: m.Message
 ) -> None:
-    """A host that answers with another message, be it the server's, gets no further with it."""
+    """A runner that answers with another message, be it the server's, gets no further with it."""
     liar.lies[m.Step] = relayed(reply)
     with opened(liar, folder) as suites:
         suites.env.reset()
@@ -571,13 +571,13 @@ def test_parts_that_do_not_add_up_are_refused(
         m.JailOpened(1, (), ()),
         m.Value(None),
     ],
-    ids=["version", "painted-refusal", "unknown-refusal", "no-hosts", "other"],
+    ids=["version", "painted-refusal", "unknown-refusal", "no-runners", "other"],
 )
 @pytest.mark.parametrize("request_kind", [m.Hello, m.OpenJail], ids=lambda kind: kind.__name__)
 def test_handshake_lies_are_refused(
     liar: LyingServer, folder: str, request_kind: type[m.Message], reply: m.Message
 ) -> None:
-    """A lie about the version, the jail or its hosts ends make_env, in printable words."""
+    """A lie about the version, the jail or its runners ends make_env, in printable words."""
     liar.lies[request_kind] = lambda asked: [asked.answer(reply)]
     error = refuses(lambda: opened(liar, folder))
     assert "\x1b" not in str(error)

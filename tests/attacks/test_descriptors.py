@@ -56,16 +56,16 @@ SHARED = {
 """
 KEEPER = """
 import ctypes, gymnasium as gym, numpy as np, os
-from envhub_worker.runner import runner as host
+from envhub_worker.runner import runner
 from envhub_worker.protocol import messages as m
 
-honest, kept = host.Host.attach, []
+honest, kept = runner.Runner.attach, []
 
 def keep(self, request):
     kept.extend(map(os.dup, self.descriptors))
     return honest(self, request)
 
-host._HANDLERS[m.Attach] = keep
+runner._HANDLERS[m.Attach] = keep
 
 class Keeper(gym.Env):
     observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
@@ -157,17 +157,19 @@ def test_every_descriptor_of_a_jail_is_known(arena: Arena, home: Path) -> None:
         env = suites.env
         env.reset()
         [kept] = env.call("name", alias)
-        [host] = pids_named(alias)
+        [runner] = pids_named(alias)
         names = {0: "stdin", 1: "stdout", 2: "stderr"} | {int(fd): kept[fd] for fd in kept}
-        held = {fd: open_file(host, fd) for fd in descriptors(host)}
+        held = {fd: open_file(runner, fd) for fd in descriptors(runner)}
         # what is kept are copies: of what serves the lane, and of the slabs, which it has closed
         copies = {
-            fd for fd in held if fd not in names and any(same(host, fd, host, at) for at in names)
+            fd
+            for fd in held
+            if fd not in names and any(same(runner, fd, runner, at) for at in names)
         }
         [stream] = set(held) - set(names) - copies
         names[stream] = "stream"
         found = {
-            name if ": " in name else f"{name}: {held[fd]}": sharers(host, fd, held[fd])
+            name if ": " in name else f"{name}: {held[fd]}": sharers(runner, fd, held[fd])
             for fd, name in names.items()
         }
     # only root can look into init and the zygote: they have made themselves opaque to their user
@@ -194,16 +196,18 @@ def same(pid: int, fd: int, other: int, theirs: int) -> bool:
     return bool(found == 0)
 
 
-def sharers(host: int, fd: int, kind: str) -> set[str]:
-    """Who holds it besides the host: the client, the server, the jail's init, or the zygote."""
-    init, found = psutil.Process(host).ppid(), set()
+def sharers(runner: int, fd: int, kind: str) -> set[str]:
+    """Who holds it besides the runner: the client, the server, the jail's init, or the zygote."""
+    init, found = psutil.Process(runner).ppid(), set()
     names = {os.getpid(): "client", init: "init", **dict.fromkeys(servers()[1:], "server")}
     for process in [psutil.Process(), *psutil.Process().children(recursive=True)]:
-        if process.pid == host or (USER != "root" and process.pid not in {os.getpid(), *servers()}):
+        if process.pid == runner or (
+            USER != "root" and process.pid not in {os.getpid(), *servers()}
+        ):
             continue
         for theirs in descriptors(process.pid):
             with contextlib.suppress(FileNotFoundError):  # closed meanwhile
-                if open_file(process.pid, theirs) == kind and same(host, fd, process.pid, theirs):
+                if open_file(process.pid, theirs) == kind and same(runner, fd, process.pid, theirs):
                     found.add(names.get(process.pid, "zygote"))
     return found
 

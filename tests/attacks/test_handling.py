@@ -86,7 +86,7 @@ def opened(liar: LyingServer, folder: Path, **options: Any) -> EnvSuites:
 
 
 def relayed(answer: m.Message) -> Callable[[Asked], list[Frames]]:
-    """A lie of a host's: one answer under the right id."""
+    """A lie of a runner's: one answer under the right id."""
     return lambda asked: [asked.answer(answer)]
 
 
@@ -232,7 +232,7 @@ def test_keys_that_are_no_text_harm_nobody(
             other.step(ACTIONS)
 
 
-HOSTS: dict[str, tuple[Any, ...]] = {
+RUNNERS: dict[str, tuple[Any, ...]] = {
     "a list": ([],),
     "a text": ("1",),
     "none": (None,),
@@ -240,17 +240,17 @@ HOSTS: dict[str, tuple[Any, ...]] = {
 }
 
 
-@pytest.mark.parametrize("what", list(HOSTS))
-def test_hosts_without_numbers_are_refused(liar: LyingServer, tmp_path: Path, what: str) -> None:
+@pytest.mark.parametrize("what", list(RUNNERS))
+def test_runners_without_numbers_are_refused(liar: LyingServer, tmp_path: Path, what: str) -> None:
     """The server's own words are read as carefully."""
-    liar.lies[m.OpenJail] = lambda asked: [asked.answer(m.JailOpened(1, HOSTS[what], ()))]
+    liar.lies[m.OpenJail] = lambda asked: [asked.answer(m.JailOpened(1, RUNNERS[what], ()))]
     with pytest.raises(RemoteProtocolError):
         opened(liar, tmp_path / "it")
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3])
-def test_as_many_answers_as_hosts(liar: LyingServer, tmp_path: Path, parts: int) -> None:
-    """One host was asked."""
+def test_as_many_answers_as_runners(liar: LyingServer, tmp_path: Path, parts: int) -> None:
+    """One runner was asked."""
     frames = m.pack(step_done(), 1)
 
     def lie(asked: Asked) -> list[Frames]:

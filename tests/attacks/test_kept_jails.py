@@ -1,7 +1,7 @@
-"""A hostile host in a jail that outlives it: ``restart="transparent"``; one of two shards lies.
+"""A hostile runner in a jail that outlives it: ``restart="transparent"``; one of two shards lies.
 
-What a host says, or leaves behind that goes on saying it, must count for nobody else: neither for
-its sibling, nor for the server, nor for the host that comes in its place.
+What a runner says, or leaves behind that goes on saying it, must count for nobody else: neither for
+its sibling, nor for the server, nor for the runner that comes in its place.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ FORGED = 666.0
 _ENV = """
 import ctypes, gymnasium as gym, numpy as np, os, stat, tempfile, time
 from pathlib import Path
-from envhub_worker.runner import runner as host
+from envhub_worker.runner import runner
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 
 MODE, ALIAS = {mode!r}, {alias!r}
-honest, attach = host.Host.answer, host.Host.attach
+honest, attach = runner.Runner.answer, runner.Runner.attach
 state = {{"liar": False, "ghost": None}}
 
 class Plain(gym.Env):
@@ -45,7 +45,7 @@ class Plain(gym.Env):
     def step(self, action):
         self.steps += 1
         if state["liar"] and MODE == "slab" and once():
-            haunt(host_of["lane"])
+            haunt(runner_of["lane"])
         return np.array([float(self.steps)]), float(self.steps), False, False, {{}}
 
 def once():
@@ -63,7 +63,7 @@ def forged():
     return m.StepDone(row.reshape(1, 1), row, no, no, {{}})
 
 def packet(packet_id, message):
-    return b"".join(map(bytes, host.pack_packet(packet_id, m.pack(message, 0))))
+    return b"".join(map(bytes, runner.pack_packet(packet_id, m.pack(message, 0))))
 
 def stream():
     return next(fd for fd in range(3, 64) if is_socket(fd))
@@ -80,7 +80,7 @@ def haunt(lane=None, first=0):
         os._exit(0)
     os.setsid()
     name_me()
-    time.sleep(0.5)  # what comes before the death is noticed is the host's own lie
+    time.sleep(0.5)  # what comes before the death is noticed is the runner's own lie
     for number in range(1, 100_000):
         try:
             if lane is None:
@@ -92,11 +92,11 @@ def haunt(lane=None, first=0):
             pass
         time.sleep(0.001)
 
-host_of = {{}}
+runner_of = {{}}
 
 def remember(self, request):
     reply = attach(self, request)
-    host_of["lane"] = self.lane
+    runner_of["lane"] = self.lane
     return reply
 
 def lie(self, received):
@@ -125,9 +125,9 @@ def lie(self, received):
         haunt(first=number)
     return honest(self, received)
 
-host.Host.answer = lie
-host.Host.attach = remember
-host._HANDLERS[m.Attach] = remember
+runner.Runner.answer = lie
+runner.Runner.attach = remember
+runner._HANDLERS[m.Attach] = remember
 
 def make_env(n_envs=1, use_async_envs=False):
     return gym.vector.AsyncVectorEnv([Plain] * n_envs)
@@ -135,7 +135,7 @@ def make_env(n_envs=1, use_async_envs=False):
 
 
 def stepping(arena: Arena, folder: Path, mode: str, alias: str = "", lane: str = "frames") -> Any:
-    """Two sub-environments in a host each; the second one's host lies."""
+    """Two sub-environments in a runner each; the second one's runner lies."""
     text = _ENV.format(mode=mode, alias=alias, forged=FORGED)
     return make_env(
         str(write_repository(folder / "liar", text)),
@@ -156,8 +156,8 @@ def test_forged_rows_are_the_forgers_own(arena: Arena, home: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", ["died", "partly"])
-def test_hosts_cannot_speak_of_deaths(arena: Arena, home: Path, mode: str) -> None:
-    """Only the server says who has died: a host that does is a liar, and nothing is reset."""
+def test_runners_cannot_speak_of_deaths(arena: Arena, home: Path, mode: str) -> None:
+    """Only the server says who has died: a runner that does is a liar, and nothing is reset."""
     with stepping(arena, home, mode) as suites:
         suites.env.reset()
         with pytest.raises(RemoteProtocolError):
@@ -167,7 +167,7 @@ def test_hosts_cannot_speak_of_deaths(arena: Arena, home: Path, mode: str) -> No
 
 @pytest.mark.parametrize("mode", ["twice", "sibling's"])
 def test_liars_are_given_no_second_chance(arena: Arena, home: Path, mode: str) -> None:
-    """An answer to what was not asked ends the host, and it is not brought back."""
+    """An answer to what was not asked ends the runner, and it is not brought back."""
     with stepping(arena, home, mode) as suites:
         suites.env.reset()
         with pytest.raises(EnvHubError) as caught:
@@ -190,10 +190,10 @@ def test_a_torn_answer_is_nobodys(arena: Arena, home: Path) -> None:
 
 
 @pytest.mark.parametrize(("mode", "lane"), [("ghost", "frames"), ("slab", "auto")])
-def test_what_a_host_leaves_behind_speaks_for_nobody(
+def test_what_a_runner_leaves_behind_speaks_for_nobody(
     arena: Arena, home: Path, mode: str, lane: str
 ) -> None:
-    """A daemon with the dead host's stream and slabs goes on answering: nobody listens."""
+    """A daemon with the dead runner's stream and slabs goes on answering: nobody listens."""
     alias = new_alias()
     try:
         with stepping(arena, home, mode, alias, lane) as suites:

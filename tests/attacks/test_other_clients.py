@@ -236,9 +236,9 @@ def test_deposits_need_the_session(arena: Arena, monkeypatch: pytest.MonkeyPatch
     known: list[tuple[str, bytes, int, int]] = []
     deposit = placement.deposit
 
-    def noted(path: str, session: bytes, jail: int, host: int, fds: Any) -> int:
-        known.append((path, session, jail, host))
-        return deposit(path, session, jail, host, fds)
+    def noted(path: str, session: bytes, jail: int, runner: int, fds: Any) -> int:
+        known.append((path, session, jail, runner))
+        return deposit(path, session, jail, runner, fds)
 
     monkeypatch.setattr(placement, "deposit", noted)
     with arena.environment() as env, ExitStack() as held:
@@ -246,8 +246,8 @@ def test_deposits_need_the_session(arena: Arena, monkeypatch: pytest.MonkeyPatch
         fds = [os.memfd_create("mine") for _ in range(5)]
         for fd in fds:
             held.callback(os.close, fd)
-        path, session, jail, host = known[-1]
-        os.close(deposit(path, session, jail, host, fds))  # the control: with it they are taken
+        path, session, jail, runner = known[-1]
+        os.close(deposit(path, session, jail, runner, fds))  # the control: with it they are taken
         for guess in (
             b"",
             os.urandom(len(session)),
@@ -255,4 +255,4 @@ def test_deposits_need_the_session(arena: Arena, monkeypatch: pytest.MonkeyPatch
             session[:-1] + bytes([session[-1] ^ 1]),
         ):
             with pytest.raises(OSError, match="did not take"):
-                deposit(path, guess, jail, host, fds)
+                deposit(path, guess, jail, runner, fds)

@@ -33,9 +33,9 @@ def test_what_watches_a_jail_cannot_be_stopped_by_it(arena: Arena) -> None:
 
 def watchers(run: Run) -> list[int]:
     """The pids between this process and the one that runs the payload."""
-    [host] = run.pids()
+    [runner] = run.pids()
     found: list[int] = []
-    for process in psutil.Process(host).parents():
+    for process in psutil.Process(runner).parents():
         if process.pid == os.getpid():
             return found
         found.append(process.pid)

@@ -166,7 +166,7 @@ def test_processes_stop_at_the_containers_limit(walls: Walls) -> None:
 
 
 def test_no_process_in_a_container_has_a_capability(docker: DockerSandbox, engine: Engine) -> None:
-    """Read from outside, of the server, the zygote and the hosts alike; none is root."""
+    """Read from outside, of the server, the zygote and the runners alike; none is root."""
     with make_env(str(HOSTILE), sandbox=docker) as suites:
         suites.env.reset(seed=0)
         found = pids_in(engine, container_of(suites.env))

@@ -37,9 +37,9 @@ def made(
     )
 
 
-def ended(hosts: list[int]) -> bool:
+def ended(runners: list[int]) -> bool:
     """Whether all of these processes have gone, sooner or later."""
-    return eventually(lambda: not any(map(psutil.pid_exists, hosts)))
+    return eventually(lambda: not any(map(psutil.pid_exists, runners)))
 
 
 @lanes
@@ -82,12 +82,12 @@ def test_who_works_is_not_idle(lane: str) -> None:
     with made(lane, idle_s=idle_s) as suites:
         env = suites.env
         env.reset()
-        hosts = pids(env)
+        runners = pids(env)
         until = time.monotonic() + 2 * idle_s + 1.5  # the server looks once a second
         while time.monotonic() < until:
             env.step(ALL_LIVE)
             time.sleep(0.05)
-        assert pids(env) == hosts
+        assert pids(env) == runners
 
 
 @lanes
@@ -105,9 +105,9 @@ def test_without_it_nothing_ends() -> None:
     with made(idle_s=None) as suites:
         env = suites.env
         env.reset()
-        hosts = pids(env)
+        runners = pids(env)
         time.sleep(2.0)
-        assert pids(env) == hosts
+        assert pids(env) == runners
 
 
 def test_other_tasks_go_on() -> None:

@@ -75,7 +75,7 @@ def test_nothing_remains_after(number: signal.Signals, moment: str, folder: Path
     )
     assert line(client) == "there"
     if moment == "make":
-        assert eventually(lambda: len(Traces.of(folder).processes) >= 4)  # init and host
+        assert eventually(lambda: len(Traces.of(folder).processes) >= 4)  # init and runner
     client.send_signal(number)
     finish(client)
     assert is_clean(folder), left(folder)
@@ -233,7 +233,7 @@ def test_proxy_that_nobody_holds_ends_its_processes(folder: Path) -> None:
         """,
     )
     assert line(client) == "collected"
-    jails = 5  # the server, its zygote's two, and keeper's init and host
+    jails = 5  # the server, its zygote's two, and keeper's init and runner
     assert eventually(lambda: len(Traces.of(folder).processes) <= jails), left(folder)
     client.kill()
     finish(client)

@@ -358,11 +358,11 @@ def test_the_end_of_the_jail_takes_all_rows(lane: str) -> None:
         env = suites.env
         env.reset(seed=SEED)
         jail = inside.jail(env).number
-        hosts = inside.pids(env)
-        init = psutil.Process(hosts[0]).parent()
+        runners = inside.pids(env)
+        init = psutil.Process(runners[0]).parent()
         assert init is not None
         init.kill()
-        assert eventually(lambda: not any(map(psutil.pid_exists, hosts)))
+        assert eventually(lambda: not any(map(psutil.pid_exists, runners)))
         observation, _, _, truncated, info = env.step(ALL_LIVE)
         assert truncated.all()
         assert restarted(info, slice(4))

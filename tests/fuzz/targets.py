@@ -17,7 +17,7 @@ from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.session.results import Results
 from envhub_sandbox.transport.connection import death, expect
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import HostsDiedError, RemoteJail, check, open_jail
+from envhub_sandbox.transport.jail import RemoteJail, RunnersDiedError, check, open_jail
 from envhub_sandbox.vector import from_manifest
 from envhub_sandbox.vector.generators import generator
 from envhub_worker.protocol import messages as m
@@ -310,38 +310,38 @@ class _Server:
 
 
 def relay(dice: Dice) -> None:
-    """As many messages as hosts were asked, or deaths of some of these; or an error."""
+    """As many messages as runners were asked, or deaths of some of these; or an error."""
     rng = dice.rng
-    hosts = rng.choice((1, 2))
-    host_replies = [rng.choice(dice.corpus) for _ in range(hosts)]
-    counts = tuple(map(len, host_replies))
+    runners = rng.choice((1, 2))
+    runner_replies = [rng.choice(dice.corpus) for _ in range(runners)]
+    counts = tuple(map(len, runner_replies))
     died = m.Died(1, "exit", 3, None, "", "", "step")
     answers: list[m.Message] = [
         m.Relayed(counts), m.RelayedPartly(counts, (0,)), died,
         m.Refused("SandboxUnavailableError", "x", "y", "z"),
-        m.JailOpened(1, tuple(range(hosts)), ()),
+        m.JailOpened(1, tuple(range(runners)), ()),
     ]  # fmt: skip
     if rng.random() < 0.3:
-        host_replies[0] = [bytes(frame) for frame in m.pack(died, 1)]
+        runner_replies[0] = [bytes(frame) for frame in m.pack(died, 1)]
     reply = spoiled_message(dice, rng.choice(answers))
-    payload = [frame for frames in host_replies for frame in frames]
+    payload = [frame for frames in runner_replies for frame in frames]
     if rng.random() < 0.3:
         payload = payload[: rng.randrange(len(payload) + 1)]
     server: Any = _Server(lambda: (reply, payload))
-    jail = RemoteJail(server, 1, range(hosts), [], DEFAULT_LIMITS)
+    jail = RemoteJail(server, 1, range(runners), [], DEFAULT_LIMITS)
     jail.kept = rng.random() < 0.5
     if isinstance(reply, m.JailOpened):
-        asked = m.OpenJail("", "", "", "", {}, hosts)
+        asked = m.OpenJail("", "", "", "", {}, runners)
         opened = open_jail(server, asked, DEFAULT_LIMITS, Deadline(None))
-        demand(len({*opened.hosts}) == hosts, "other hosts")
+        demand(len({*opened.runners}) == runners, "other runners")
         return
-    request = jail.relay("step", [(host, []) for host in range(hosts)])
+    request = jail.relay("step", [(runner, []) for runner in range(runners)])
     try:
         found = jail.receive(request, Deadline(None))
-    except HostsDiedError as error:
-        demand(set(error.deaths) <= set(range(hosts)), "the death of nobody")
+    except RunnersDiedError as error:
+        demand(set(error.deaths) <= set(range(runners)), "the death of nobody")
         raise
-    demand(len(found) == hosts, "more answers than hosts")
+    demand(len(found) == runners, "more answers than runners")
     for one in found:
         check(one)
 

@@ -1,4 +1,4 @@
-"""Runs Python source in a host of a real jail, and the same source without one as the control."""
+"""Runs Python source in a runner of a real jail, and the same source without one as the control."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from typing import Any
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.spawn.jail_handle import (
-    HostExited,
-    HostStarted,
     Jail,
     JailExited,
     Ready,
+    RunnerExited,
+    RunnerStarted,
     Spawner,
     ZygoteDied,
 )
@@ -45,7 +45,7 @@ def execute(source: str) -> dict[str, Any]:
 
 
 def serve_source(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
-    """In the host: answer one line of JSON (source) with one line of JSON, until the end."""
+    """In the runner: answer one line of JSON (source) with one line of JSON, until the end."""
     global STREAM, FDS
     STREAM, FDS = stream, fds
     with stream.makefile("rw") as lines:
@@ -81,27 +81,27 @@ class Cell:
         self.streams: dict[int, Any] = {}
 
     def start(self, fds: tuple[int, ...] = ()) -> int:
-        """Start a host; its id."""
-        host, stream = self.jail.start_host(fds)
+        """Start a runner; its id."""
+        runner, stream = self.jail.start_runner(fds)
         stream.settimeout(DEADLINE_S)
-        self.streams[host] = stream.makefile("rw")
+        self.streams[runner] = stream.makefile("rw")
         stream.close()
-        return host
+        return runner
 
-    def run(self, source: str, host: int = 1) -> dict[str, Any]:
-        """Run ``source`` in ``host``; see ``execute``."""
-        lines = self.streams[host]
+    def run(self, source: str, runner: int = 1) -> dict[str, Any]:
+        """Run ``source`` in ``runner``; see ``execute``."""
+        lines = self.streams[runner]
         lines.write(json.dumps(source) + "\n")
         lines.flush()
         try:
             answer = lines.readline()
         except ConnectionError:
             answer = ""
-        return json.loads(answer or '{"error": "the host has gone"}')
+        return json.loads(answer or '{"error": "the runner has gone"}')
 
-    def hang_up(self, host: int = 1) -> None:
-        """Close the host's stream, so that it ends."""
-        self.streams.pop(host).close()
+    def hang_up(self, runner: int = 1) -> None:
+        """Close the runner's stream, so that it ends."""
+        self.streams.pop(runner).close()
 
     def pump(self, timeout_s: float = 0.05) -> None:
         """Collect events and output."""
@@ -139,7 +139,7 @@ class Cell:
 
 @contextmanager
 def spawner_in(folder: Path, confinement: Confinement, **options: Any) -> Iterator[Spawner]:
-    """A spawner whose hosts run ``serve_source``."""
+    """A spawner whose runners run ``serve_source``."""
     options.setdefault("target", TARGET)
     confinement = with_kit(confinement)
     options.setdefault("readable_roots", [str(folder)])
@@ -178,7 +178,7 @@ def make_snapshot(folder: Path, link: str | None = None) -> str:
 
 @contextmanager
 def cell_in(folder: Path, confinement: Confinement, **options: Any) -> Iterator[Cell]:
-    """A cell with one host that runs what it is told."""
+    """A cell with one runner that runs what it is told."""
     with spawner_in(folder, confinement, **options) as spawner:
         cell = new_cell(spawner, make_snapshot(folder), confinement)
         cell.start()
@@ -187,7 +187,7 @@ def cell_in(folder: Path, confinement: Confinement, **options: Any) -> Iterator[
 
 
 def new_cell(spawner: Spawner, snapshot: str, confinement: Confinement) -> Cell:
-    """A further jail of ``spawner``, without hosts."""
+    """A further jail of ``spawner``, without runners."""
     spec = JailSpec(
         snapshot=snapshot, entry="env.py", confinement=with_kit(confinement), name="test"
     )
@@ -205,10 +205,10 @@ def wait_until(condition: Any, what: str) -> None:
 __all__ = [
     "KIT",
     "Cell",
-    "HostExited",
-    "HostStarted",
     "JailExited",
     "Ready",
+    "RunnerExited",
+    "RunnerStarted",
     "cell_in",
     "execute",
     "make_snapshot",

@@ -24,8 +24,8 @@ from envhub_worker.spawn.jail_handle import Failed
 from tests.integration.confinement_kit import (
     KIT,
     Cell,
-    HostExited,
-    HostStarted,
+    RunnerExited,
+    RunnerStarted,
     cell_in,
     make_snapshot,
     new_cell,
@@ -330,13 +330,13 @@ if not pid:
     os._exit(0)
 os.waitpid(pid, 0)
 """
-        host = cell.start()
+        runner = cell.start()
         cell.run("import signal; signal.signal(signal.SIGUSR1, signal.SIG_IGN)", 1)
-        cell.run("import signal; signal.signal(signal.SIGUSR1, signal.SIG_IGN)", host)
-        cell.run(source, host)
+        cell.run("import signal; signal.signal(signal.SIGUSR1, signal.SIG_IGN)", runner)
+        cell.run(source, runner)
         assert process.poll() is None
-        assert cell.run("result = 1", host) == {"result": 1}
-        cell.hang_up(host)
+        assert cell.run("result = 1", runner) == {"result": 1}
+        cell.hang_up(runner)
 
 
 def test_processes_outside_keep_limits_and_priority(cell: Cell) -> None:
@@ -404,7 +404,7 @@ def test_command_lines_outside_are_out_of_reach(cell: Cell) -> None:
 
 
 def test_init_is_out_of_reach(cell: Cell) -> None:
-    """The host's parent cannot be ended, stopped, traced, limited or read."""
+    """The runner's parent cannot be ended, stopped, traced, limited or read."""
     source = """
 import os, resource, signal
 init, held = os.getppid(), []
@@ -423,13 +423,13 @@ result = held
 """
     held = cell.run(source)["result"]
     assert held == ["limit", "memory", "environ", "descriptors", "signal", "signal", "signal"]
-    host = cell.start()
-    assert cell.run("result = 'init lives'", host) == {"result": "init lives"}
-    cell.hang_up(host)
+    runner = cell.start()
+    assert cell.run("result = 'init lives'", runner) == {"result": "init lives"}
+    cell.hang_up(runner)
 
 
 def test_jail_sees_only_its_own_processes(cells: dict[str, Cell]) -> None:
-    """Under strict, /proc has init, the host and what it starts."""
+    """Under strict, /proc has init, the runner and what it starts."""
     source = "import os; result = [int(n) for n in os.listdir('/proc') if n.isdigit()]"
     assert os.getpid() in unconfined(source)["result"]
     assert max(cells["strict"].run(source)["result"]) < 100
@@ -517,7 +517,7 @@ def test_escape_is_denied(cell: Cell, escape: str) -> None:
 
 @pytest.mark.skipif(os.uname().machine != "x86_64", reason="these ways in exist on x86-64 only")
 @pytest.mark.parametrize("way", ["x32", "int80"])
-def test_other_system_call_tables_end_the_host(cell: Cell, way: str) -> None:
+def test_other_system_call_tables_end_the_runner(cell: Cell, way: str) -> None:
     """x32 numbers and int 0x80 mean other calls than the filter looked at: SIGSYS."""
     if way == "x32":
         source = CALL + "call(0x40000000 | 39)"
@@ -530,13 +530,13 @@ page.write(code)
 ctypes.CFUNCTYPE(ctypes.c_int)(ctypes.addressof(ctypes.c_char.from_buffer(page)))()
 result = "came back"
 """
-    host = cell.start()
-    assert cell.run(source, host) == {"error": "the host has gone"}
-    ended: list[HostExited] = []
+    runner = cell.start()
+    assert cell.run(source, runner) == {"error": "the runner has gone"}
+    ended: list[RunnerExited] = []
 
     def gone() -> bool:
         cell.pump()
-        ended[:] = [e for e in cell.events if isinstance(e, HostExited) and e.host_id == host]
+        ended[:] = [e for e in cell.events if isinstance(e, RunnerExited) and e.runner_id == runner]
         return bool(ended)
 
     wait_until(gone, "no exit event")
@@ -544,7 +544,7 @@ result = "came back"
 
 
 def test_capabilities_and_privileges_are_gone(cell: Cell) -> None:
-    """As the kernel says it of the host; an exec brings nothing back."""
+    """As the kernel says it of the runner; an exec brings nothing back."""
     source = """
 import subprocess
 with open("/proc/self/status") as status:
@@ -564,17 +564,17 @@ def test_root_becomes_nobody_it_knows(cell: Cell) -> None:
     """As root, the jail runs as a user that owns and runs nothing; never as uid 0."""
     assert cell.run("import os; result = os.getuid()")["result"] != 0
     if os.geteuid() == 0:
-        pid = cell.wait_for(HostStarted).pid
+        pid = cell.wait_for(RunnerStarted).pid
         assert os.stat(f"/proc/{pid}").st_uid > 60000
 
 
-def test_pid_of_a_host_is_the_one_outside(cell: Cell) -> None:
+def test_pid_of_a_runner_is_the_one_outside(cell: Cell) -> None:
     """For whoever watches the processes of this machine."""
-    started = cell.wait_for(HostStarted)
+    started = cell.wait_for(RunnerStarted)
     assert "zygote" in Path(f"/proc/{started.pid}/cmdline").read_text()
 
 
-def test_command_line_of_a_host_tells_nothing(cell: Cell) -> None:
+def test_command_line_of_a_runner_tells_nothing(cell: Cell) -> None:
     """The zygote's configuration, with the paths of the server, is not in it."""
     source = "result = open('/proc/self/cmdline').read().split(chr(0))"
     arguments = cell.run(source)["result"]
@@ -621,7 +621,7 @@ socket.create_connection({listener.getsockname()!r}).sendall(b"hello")
         with open_folder() as folder, cell_in(folder, confinement) as cell:
             assert cell.run(source) == {"result": None}
             assert reached(listener)
-            report = cell.wait_for(HostStarted).report
+            report = cell.wait_for(RunnerStarted).report
             missing = {layer["layer"] for layer in report if not layer["enforced"]}
             assert missing & {"network", "network-namespace"}
             assert denied(cell.run("import socket; socket.socket(socket.AF_NETLINK, 3)"))
@@ -640,7 +640,7 @@ def test_denial_that_does_not_hold_aborts(profile: str) -> None:
             failed = cell.wait_for(Failed)
             assert failed.layer == "self-test"
             assert "files outside cannot be read" in failed.reason
-            assert not [event for event in cell.events if isinstance(event, HostStarted)]
+            assert not [event for event in cell.events if isinstance(event, RunnerStarted)]
 
 
 RESTRICTED = """
@@ -656,12 +656,12 @@ from envhub_worker.lockdown.seccomp.bpf import LOAD, RETURN, JUMP_EQUAL, Branch,
 from envhub_worker.lockdown.seccomp.syscalls import number
 {restrict}
 with open_folder() as folder, cell_in(folder, Confinement(profile={profile!r})) as cell:
-    while not any(isinstance(event, (Failed, HostStarted)) for event in cell.events):
+    while not any(isinstance(event, (Failed, RunnerStarted)) for event in cell.events):
         cell.pump()
     for event in cell.events:
         if isinstance(event, Failed):
             print(event.layer, "|", event.reason, "|", event.fix)
-        elif isinstance(event, HostStarted):
+        elif isinstance(event, RunnerStarted):
             print("started", [l["layer"] for l in event.report if not l["enforced"]])
 """
 NO_USER_NAMESPACES = """
@@ -753,10 +753,10 @@ victim = subprocess.Popen(["sleep", "1000"])
 with open_folder() as folder, cell_in(folder, Confinement(profile="container")) as cell:
     print(cell.run(f"victim = {victim.pid}" + SOURCE))
     print(cell.run("import os; os.abort()"))
-    print(cell.wait_for(HostExited).signal)
-    host = cell.start()
-    print(cell.run("result = 'again'", host))
-    report = cell.wait_for(HostStarted).report
+    print(cell.wait_for(RunnerExited).signal)
+    runner = cell.start()
+    print(cell.run("result = 'again'", runner))
+    report = cell.wait_for(RunnerStarted).report
     print([layer["enforced"] for layer in report if layer["layer"] == "signals"])
 print(victim.poll())
 victim.kill()
@@ -777,7 +777,7 @@ def test_init_sends_signals_where_landlock_does_not_keep_them_inside() -> None:
     assert done.stderr == ""
     assert done.stdout.splitlines() == [
         "{'result': [4, 'group', -15, -9, [1, 1, 1, 3]]}",
-        "{'error': 'the host has gone'}",
+        "{'error': 'the runner has gone'}",
         "6",
         "{'result': 'again'}",
         "[True]",

@@ -12,8 +12,8 @@ from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.protocol.confinement import MIB, Confinement, Limits
 from tests.integration.confinement_kit import (
     Cell,
-    HostExited,
-    HostStarted,
+    RunnerExited,
+    RunnerStarted,
     cell_in,
     new_cell,
     open_folder,
@@ -62,7 +62,7 @@ def limited(profile: str, **limits: int) -> Iterator[Cell]:
     """A cell under ``limits``."""
     confinement = Confinement(profile=profile, limits=Limits(**limits))
     with open_folder() as folder, cell_in(folder, confinement) as cell:
-        cell.wait_for(HostStarted)
+        cell.wait_for(RunnerStarted)
         yield cell
 
 
@@ -87,8 +87,8 @@ def counted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
     [HEAP, SHARED, MEMFD, SYSTEM_V],
     ids=["heap", "shared-anonymous", "memfd", "system-v"],
 )
-def test_memory_bomb_ends_the_host(bomb: str, profile: str, counted: str) -> None:
-    """Every kind of memory counts, or cannot be had: the host ends as out of memory, and knows."""
+def test_memory_bomb_ends_the_runner(bomb: str, profile: str, counted: str) -> None:
+    """Every kind of memory counts, or cannot be had: the runner ends as out of memory and knows."""
     if bomb is not SYSTEM_V or profile == "strict":
         assert unconfined(bomb) == {"result": "filled"}
     with limited(profile, memory_bytes=MEMORY) as cell:
@@ -99,8 +99,8 @@ def test_memory_bomb_ends_the_host(bomb: str, profile: str, counted: str) -> Non
         if bomb in UNMEASURABLE and counted == "watchdog":
             assert answer["error"] == UNMEASURABLE[bomb]
             return
-        assert answer == {"error": "the host has gone"}
-        exited = cell.wait_for(HostExited)
+        assert answer == {"error": "the runner has gone"}
+        exited = cell.wait_for(RunnerExited)
         assert exited.reason == "out-of-memory"
         assert exited.detail
 
@@ -108,8 +108,8 @@ def test_memory_bomb_ends_the_host(bomb: str, profile: str, counted: str) -> Non
 def test_memory_of_all_processes_counts_together(profile: str, counted: str) -> None:
     """Seven children that are each below the limit are over it together."""
     with limited(profile, memory_bytes=MEMORY) as cell:
-        assert cell.run(MANY_PROCESSES) == {"error": "the host has gone"}
-        assert cell.wait_for(HostExited).reason in ("out-of-memory", "signal")
+        assert cell.run(MANY_PROCESSES) == {"error": "the runner has gone"}
+        assert cell.wait_for(RunnerExited).reason in ("out-of-memory", "signal")
 
 
 SHARED_BY_FORKS = """
@@ -148,7 +148,7 @@ def test_fork_bomb_stops_at_the_limit() -> None:
     """A jail has as many processes as it may, and not one more."""
     with limited("strict", processes=60) as cell:
         children, errno = cell.run(FORKS)["result"]
-        assert children == 59  # and the host
+        assert children == 59  # and the runner
         assert errno
 
 
@@ -208,14 +208,14 @@ def test_scratch_folders_share_one_quota() -> None:
 
 
 @needs("no-userns")
-def test_disk_fill_ends_the_host_without_a_mount_namespace() -> None:
-    """There is no quota there; init counts and ends the host."""
+def test_disk_fill_ends_the_runner_without_a_mount_namespace() -> None:
+    """There is no quota there; init counts and ends the runner."""
     source = FILL.format(folder=HOME, mib=15) + "\nimport time\n"
     more = source.replace('"big"', '"more"') + "time.sleep(1000)"
     with limited("no-userns", disk_bytes=20 * MIB) as cell:
         assert cell.run(source) == {"result": [15, 0]}
-        assert cell.run(more) == {"error": "the host has gone"}
-        assert cell.wait_for(HostExited).reason == "disk-limit"
+        assert cell.run(more) == {"error": "the runner has gone"}
+        assert cell.wait_for(RunnerExited).reason == "disk-limit"
 
 
 INODES = """
@@ -275,7 +275,7 @@ result = os.WTERMSIG(status)
 
 
 def test_limits_cannot_be_raised_again(profile: str) -> None:
-    """A host is no more able to than any other process without privilege."""
+    """A runner is no more able to than any other process without privilege."""
     source = """
 import resource
 soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -285,8 +285,8 @@ resource.setrlimit(resource.RLIMIT_NOFILE, (hard + 1, hard + 1))
         assert cell.run(source)["error"] == "ValueError"
 
 
-def test_output_flood_does_not_block_the_host(profile: str) -> None:
-    """Whoever reads the pipe keeps what it wants; the host writes on."""
+def test_output_flood_does_not_block_the_runner(profile: str) -> None:
+    """Whoever reads the pipe keeps what it wants; the runner writes on."""
     with limited(profile) as cell:
         flood = "import os\nfor _ in range(64): os.write(1, b'x' * 65536)\nresult = 'done'"
         stream = cell.streams[1]

@@ -44,31 +44,31 @@ def outcome(cell: Cell, source: str) -> object:
     return answer["result"]
 
 
-def in_fresh_host(cell: Cell, source: str) -> object:
-    """Like ``outcome``, in a host of its own: for what can be set once per process."""
-    host = cell.start()
-    answer = cell.run(source, host)
+def in_fresh_runner(cell: Cell, source: str) -> object:
+    """Like ``outcome``, in a runner of its own: for what can be set once per process."""
+    runner = cell.start()
+    answer = cell.run(source, runner)
     cell.pump()
-    cell.hang_up(host)
+    cell.hang_up(runner)
     assert "result" in answer, (answer, cell.output[-3000:].decode())
     return answer["result"]
 
 
 def test_numpy_uses_blas_threads(cell: Cell) -> None:
-    """The zygote is single-threaded; a host has the threads that its cores allow."""
+    """The zygote is single-threaded; a runner has the threads that its cores allow."""
     source = """
 import os, numpy
 a = numpy.random.rand(400, 400)
 result = [float(numpy.abs(a @ numpy.linalg.inv(a) - numpy.eye(400)).max()) < 1e-6,
           len(os.listdir('/proc/self/task')), len(os.sched_getaffinity(0))]
 """
-    right, threads, cores = in_fresh_host(cell, source)
+    right, threads, cores = in_fresh_runner(cell, source)
     assert right
     if cores > 2:
         assert threads > 1
 
 
-def test_only_host_of_a_jail_has_all_blas_threads() -> None:
+def test_only_runner_of_a_jail_has_all_blas_threads() -> None:
     """As many as a fresh interpreter would have."""
     with open_folder() as folder, cell_in(folder, STRICT) as cell:
         threads = outcome(cell, "import os; result = len(os.listdir('/proc/self/task'))")
@@ -141,7 +141,7 @@ def test_multiprocessing(strict: Cell, method: str) -> None:
     """Pools, queues, locks (SemLock) and shared arrays, by every start method."""
     source = WORK + MULTIPROCESSING.format(method=method)
     expected = [[0, 1, 4, 9], "from the child", 0, [0.0, 2.5, 0.0]]
-    assert in_fresh_host(strict, source) == expected
+    assert in_fresh_runner(strict, source) == expected
 
 
 def test_shared_memory_and_managers(strict: Cell) -> None:
@@ -162,7 +162,7 @@ with mp.get_context("fork").Manager() as manager:
     result = [value, dict(shared)]
 """
     )
-    assert in_fresh_host(strict, source) == [7, {"a": 1, "b": 2}]
+    assert in_fresh_runner(strict, source) == [7, {"a": 1, "b": 2}]
 
 
 @needs("no-userns")
@@ -175,7 +175,7 @@ child = mp.get_context("fork").Process(target=lambda: theirs.send("hello"))
 child.start(); got = ours.recv(); child.join()
 result = [got, child.exitcode]
 """
-    assert in_fresh_host(bare, source) == ["hello", 0]
+    assert in_fresh_runner(bare, source) == ["hello", 0]
 
 
 @pytest.mark.parametrize("shared", [True, False])
@@ -191,7 +191,7 @@ for _ in range(20):
 envs.close()
 result = list(observations.shape)
 """
-    assert in_fresh_host(strict, source) == [3, 4]
+    assert in_fresh_runner(strict, source) == [3, 4]
 
 
 def test_files_of_every_kind(cell: Cell) -> None:
@@ -276,7 +276,7 @@ frame = env.render()
 result = [list(frame.shape), int(frame.max()) > 0]
 env.close()
 """
-    assert in_fresh_host(strict, source) == [[64, 64, 3], True]
+    assert in_fresh_runner(strict, source) == [[64, 64, 3], True]
 
 
 def test_pygame_draws_without_a_display(cell: Cell) -> None:
@@ -290,7 +290,7 @@ screen.fill((255, 0, 0))
 result = [list(pygame.surfarray.array3d(screen).shape), pygame.display.get_driver()]
 pygame.quit()
 """
-    assert in_fresh_host(cell, source) == [[20, 10, 3], "dummy"]
+    assert in_fresh_runner(cell, source) == [[20, 10, 3], "dummy"]
 
 
 def test_torch_computes_and_trains(strict: Cell) -> None:
@@ -309,7 +309,7 @@ torch.save(layer.state_dict(), path)
 torch.load(path)
 result = [bool(layer.weight.grad.abs().sum() > 0), batches]
 """
-    assert in_fresh_host(strict, source) == [True, [6.0, 22.0]]
+    assert in_fresh_runner(strict, source) == [True, [6.0, 22.0]]
 
 
 def test_imageio_writes_a_video_with_ffmpeg(strict: Cell) -> None:
@@ -321,7 +321,7 @@ frames = [numpy.full((64, 64, 3), n, numpy.uint8) for n in range(0, 100, 10)]
 imageio.mimsave("video.mp4", frames, fps=10)
 result = os.path.getsize("video.mp4") > 100
 """
-    assert in_fresh_host(strict, source) is True
+    assert in_fresh_runner(strict, source) is True
 
 
 def test_loopback_network_is_the_jails_own() -> None:

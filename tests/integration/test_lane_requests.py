@@ -1,4 +1,4 @@
-"""Requests that go straight to the hosts, and answers too large for that: nothing is mixed up."""
+"""Requests that go straight to the runners, and answers too large for that: nothing is mixed up."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_an_operation_has_one_deadline(
 ) -> None:
     """However many shards have answers to be fetched: no fetch starts the clock anew.
 
-    Or else hosts that answer each at the last moment would make a step last as long as they please.
+    Or else runners that answer at the last moment would make a step last as long as they please.
     """
     made: list[float | None] = []
     initialize = Deadline.__init__

@@ -99,10 +99,10 @@ def test_another_clients_jail_is_not_there(alice: Any, mallory: Peer) -> None:
     """By number and session, which are Alice's own; to Alice it is there, as the control."""
     jail = inside.jail(alice)
     for request in (
-        m.StartHosts(jail.number, 1),
+        m.StartRunners(jail.number, 1),
         m.ReadOutput(jail.number, ""),
         m.KeepJail(jail.number),
-        m.Relay(jail.number, "step", ((jail.hosts[0], 1),)),
+        m.Relay(jail.number, "step", ((jail.runners[0], 1),)),
     ):
         payload = (b"x",) if isinstance(request, m.Relay) else ()
         assert "there is no jail" in mallory.refused(request, *payload).message
@@ -132,7 +132,7 @@ def test_only_ones_own_sessions_are_shown(alice: Any, mallory: Peer) -> None:
         ({"confinement": asdict(Confinement(readable=("/",)))}, "readable"),
         ({"confinement": asdict(Confinement(network="host"))}, "--allow-network"),
         ({"confinement": asdict(Confinement(profile="nothing"))}, "no confinement"),
-        ({"hosts": 10_000}, "hosts"),
+        ({"runners": 10_000}, "runners"),
     ],
 )
 def test_a_jail_cannot_be_asked_more_than_a_policy_may(
@@ -145,7 +145,7 @@ def test_a_jail_cannot_be_asked_more_than_a_policy_may(
         "snapshot": "sha256:" + "0" * 64,
         "entry": "env.py",
         "confinement": asdict(Confinement()),
-        "hosts": 1,
+        "runners": 1,
         **changes,
     }
     assert complaint in mallory.refused(m.OpenJail(**order)).message
@@ -159,7 +159,7 @@ def test_more_bytes_than_may_be_in_flight_are_refused(alice: Any, mallory: Peer)
 
 
 def test_what_is_no_request_is_refused(mallory: Peer) -> None:
-    """Replies, descriptors, and messages for hosts."""
+    """Replies, descriptors, and messages for runners."""
     replies = m.Done(), m.Welcome(2, "", 1), m.Sessions(({"client": "nobody"},))
     for message in (*replies, m.Deposit(b"", 1, 1), m.Close(1)):
         assert "is no request" in mallory.refused(message).message

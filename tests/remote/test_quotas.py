@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from envhub_worker.access.quotas import (
     check_policy,
 )
 from envhub_worker.access.sessions import MAX_HELD, Sessions
+from envhub_worker.cli import listen
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.supervisor.records import Asker
@@ -58,17 +60,25 @@ def test_a_policy_needs_the_operators_permission(
 
 
 def test_the_sums_of_a_key_are_bounded() -> None:
-    """Jails, hosts and memory limits of everything that is open, and the new one."""
-    quotas = Quotas(jails=2, hosts=4, memory_bytes=100)
+    """Jails, runners and memory limits of everything that is open, and the new one."""
+    quotas = Quotas(jails=2, runners=4, memory_bytes=100)
     check_jail([Use(40, 2)], Use(60, 2), quotas)
     for uses, more, what in (
         ([Use(1, 1), Use(1, 1)], Use(1, 1), "jails"),
-        ([Use(1, 2)], Use(1, 3), "hosts"),
-        ([Use(1, 4)], Use(0, 1), "hosts"),
+        ([Use(1, 2)], Use(1, 3), "runners"),
+        ([Use(1, 4)], Use(0, 1), "runners"),
         ([Use(50, 1)], Use(51, 1), "memory"),
     ):
         with pytest.raises(RefusedError, match=what):
             check_jail(uses, more, quotas)
+
+
+@pytest.mark.parametrize("name", ["--max-runners", "--max-hosts"])
+def test_the_quota_of_runners_has_its_former_name_too(name: str) -> None:
+    """Who wrote the option down when runners were called hosts is understood."""
+    parser = argparse.ArgumentParser()
+    listen.add_arguments(parser)
+    assert parser.parse_args([name, "3"]).max_runners == 3
 
 
 def test_bytes_in_flight_are_bounded_until_they_are_answered() -> None:

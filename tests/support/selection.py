@@ -19,7 +19,7 @@ _ATTACKS = (
     "descriptors.py::test_noise_on_the_stream_ends_only_its_jail[strict-ff",
     "doorbells.py::test_a_client_that_is_answered_is_not_held[strict-fill",
     "files.py::test_private_files_cannot_be_read[strict",
-    "kept_jails.py::test_hosts_cannot_speak_of_deaths[strict",
+    "kept_jails.py::test_runners_cannot_speak_of_deaths[strict",
     "kernel.py::test_no_user_namespace_can_be_made[strict",
     "kernel.py::test_nothing_can_be_mounted[strict",
     "network.py::test_tcp_does_not_get_out[strict",

@@ -211,7 +211,7 @@ class Server:
 
 _HANDLERS: dict[type[m.Message], Callable[[Jails, Asker, Any], None]] = {
     m.OpenJail: Jails.open,
-    m.StartHosts: Jails.start_more,
+    m.StartRunners: Jails.start_more,
     m.KeepJail: Jails.keep,
     m.ExpireIdle: Jails.expire,
     m.CloseJail: Jails.close_jail,

@@ -30,11 +30,11 @@ _EVENTS = 8
 _AT_ONCE = socket.MSG_DONTWAIT | getattr(socket, "MSG_NOSIGNAL", 0)
 
 
-class HostBell:
-    """The doorbell that we ring, and a host hears.
+class RunnerBell:
+    """The doorbell that we ring, and a runner hears.
 
     Attributes:
-        theirs: The host's end.
+        theirs: The runner's end.
     """
 
     def __init__(self) -> None:
@@ -44,7 +44,7 @@ class HostBell:
         self.theirs = self._theirs.fileno()
 
     def handed_over(self) -> None:
-        """The host has its copy. Idempotent."""
+        """The runner has its copy. Idempotent."""
         self._theirs.close()
 
     def ring(self) -> None:
@@ -61,13 +61,13 @@ class HostBell:
 
 
 class OwnBell:
-    """The doorbell that a host rings, and we hear. It is watched, and neither read nor written."""
+    """The doorbell that a runner rings and we hear. It is watched, and neither read nor written."""
 
     def __init__(self) -> None:
         self._fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
 
     def fileno(self) -> int:
-        """Its descriptor, for the host and for ``Watch``."""
+        """Its descriptor, for the runner and for ``Watch``."""
         return self._fd
 
     def close(self) -> None:

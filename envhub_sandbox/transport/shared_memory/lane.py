@@ -1,4 +1,4 @@
-"""The client's end of the fast lane: steps over shared memory, straight to the jail's hosts.
+"""The client's end of the fast lane: steps over shared memory, straight to the jail's runners.
 
 Each shard has two sealed memfds and a doorbell each way (``doorbell``). A step costs one wake-up
 per shard and one copy out. Trust: the jail writes the reply slab whenever it likes, so every word
@@ -19,7 +19,7 @@ from typing import Any
 from envhub_sandbox.errors import RemoteProtocolError, WorkerTimeoutError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.shared_memory.affinity import CPUS, Cores
-from envhub_sandbox.transport.shared_memory.doorbell import HostBell, OwnBell, Watch
+from envhub_sandbox.transport.shared_memory.doorbell import OwnBell, RunnerBell, Watch
 from envhub_sandbox.transport.shared_memory.memfd import SEAL_FUTURE_WRITE, slab
 from envhub_sandbox.transport.shared_memory.observations import RING, ObservationSlab
 from envhub_sandbox.transport.shared_memory.sharding import (
@@ -44,7 +44,7 @@ _CONNECT_S = 5.0
 _PACE_STEPS = 256
 """Steps after which what they took is worth remembering."""
 _SAMPLE_EVERY = 64
-"""Steps between two samples; the hosts measure every 32nd."""
+"""Steps between two samples; the runners measure every 32nd."""
 _SAMPLES = 64
 # elsewhere a core may see the sequence word before the data it announces: sleep, do not poll
 _ORDERED_STORES = platform.machine() in ("x86_64", "AMD64")
@@ -70,7 +70,7 @@ class LaneShard:
         observations: The descriptor of the slab that all shards share.
 
     Attributes:
-        fds: What the host gets: three slabs, its doorbell, ours.
+        fds: What the runner gets: three slabs, its doorbell, ours.
         bell: Our doorbell, to be watched.
     """
 
@@ -78,10 +78,10 @@ class LaneShard:
         self.layout = layout
         self._request, request_fd = slab("request", layout.request_bytes, SEAL_FUTURE_WRITE)
         self._reply, reply_fd = slab("reply", layout.reply_bytes)
-        self._host_bell, self.bell = HostBell(), OwnBell()
-        self._ring = self._host_bell.ring
+        self._runner_bell, self.bell = RunnerBell(), OwnBell()
+        self._ring = self._runner_bell.ring
         self._slab_fds = [request_fd, reply_fd]
-        bells = [self._host_bell.theirs, self.bell.fileno()]
+        bells = [self._runner_bell.theirs, self.bell.fileno()]
         self.fds = [request_fd, reply_fd, observations, *bells]
         self._asks = slabs.words(self._request)
         self._tells = slabs.words(self._reply)
@@ -93,10 +93,10 @@ class LaneShard:
         self.sequence = 0
 
     def handed_over(self) -> None:
-        """The host has its copies of the descriptors; the maps keep ours alive."""
+        """The runner has its copies of the descriptors; the maps keep ours alive."""
         while self._slab_fds:
             os.close(self._slab_fds.pop())
-        self._host_bell.handed_over()
+        self._runner_bell.handed_over()
 
     def ask(self, leaves: Sequence[Any], slot: int, spin_ns: int, cpu: int = 0) -> None:
         """Write a shard's actions and announce them; its observations are to go to ``slot``."""
@@ -167,7 +167,7 @@ class LaneShard:
 
     @property
     def busy_ns(self) -> int:
-        """What the last measured step took the host. Trust: it says so itself."""
+        """What the last measured step took the runner. Trust: it says so itself."""
         return self._tells[slabs.BUSY]
 
     def park(self, parked: int) -> None:
@@ -219,7 +219,7 @@ class LaneShard:
     def close(self) -> None:
         """Give everything back."""
         self.handed_over()
-        self._host_bell.close()
+        self._runner_bell.close()
         self.bell.close()
         self._asks.release()
         self._tells.release()
@@ -291,17 +291,17 @@ class FastLane:
         return cls(manifest, bounds, observed, known, process_fd)
 
     def attach_message(self, env: int, shard: int) -> m.Attach:
-        """What tells a shard's host which rows of the batch are its own."""
+        """What tells a shard's runner which rows of the batch are its own."""
         layout = self.observations.layout
         return m.Attach(env, self._bounds[shard][0], layout.count, layout.slots)
 
-    def watch_host(self, index: int, pidfd: int) -> None:
-        """End waits when a shard's host ends, or all of its jail. Takes the descriptor over."""
+    def watch_runner(self, index: int, pidfd: int) -> None:
+        """End waits when a shard's runner ends, or all of its jail. Takes the descriptor over."""
         self._pidfds[index] = pidfd
         self._watch.death(pidfd)
 
     def renew(self, index: int) -> None:
-        """Give a shard whose host has died slabs that the dead one never saw."""
+        """Give a shard whose runner has died slabs that the dead one never saw."""
         old, pidfd = self.shards[index], self._pidfds.pop(index)
         self._watch.forget(pidfd)
         os.close(pidfd)
@@ -436,7 +436,7 @@ class FastLane:
 
 
 def _answers(shard: LaneShard, pidfd: int, deadline: Deadline) -> bool:
-    """Whether a shard's answer comes before its host's death."""
+    """Whether a shard's answer comes before its runner's death."""
     watch = Watch()
     watch.bell(shard.bell)
     watch.death(pidfd)
@@ -455,8 +455,8 @@ def _answers(shard: LaneShard, pidfd: int, deadline: Deadline) -> bool:
         watch.close()
 
 
-def deposit(path: str, session: bytes, jail: int, host: int, fds: Sequence[int]) -> int:
-    """Hand descriptors to the server for a host; returns a pidfd of the jail, or of the host.
+def deposit(path: str, session: bytes, jail: int, runner: int, fds: Sequence[int]) -> int:
+    """Hand descriptors to the server for a runner; returns a pidfd of the jail, or of the runner.
 
     Raises:
         OSError: The server did not take them.
@@ -464,7 +464,7 @@ def deposit(path: str, session: bytes, jail: int, host: int, fds: Sequence[int])
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
         connection.settimeout(_CONNECT_S)
         connection.connect(path)
-        [frame] = m.pack(m.Deposit(session, jail, host), 0)
+        [frame] = m.pack(m.Deposit(session, jail, runner), 0)
         socket.send_fds(connection, [frame], list(fds))
         data, received, _, _ = socket.recv_fds(connection, 16, 1)
     if data != b"k" or len(received) != 1:

@@ -37,7 +37,7 @@ class ObservationSlab:
         layout: Where everything lies.
 
     Attributes:
-        fd: Its descriptor, for the hosts.
+        fd: Its descriptor, for the runners.
         layout: Where everything lies.
         chosen: The slot of the last batch.
     """
@@ -71,7 +71,7 @@ class ObservationSlab:
         return self.chosen
 
     def leave(self) -> None:
-        """The next batch comes another way: the hosts leave the slot that somebody may hold."""
+        """The next batch comes another way: the runners leave the slot that somebody may hold."""
         self.chosen = _SPARE
 
     def take(self) -> Any:

@@ -4,7 +4,7 @@ A wake-up costs some ten microseconds, so a reply that is nearly there is best w
 With every core busy the same spinning takes the core from whoever computes the reply. So both
 ways are tried in turn, seldom, and the faster one is used; the interval between trials doubles
 while the answer stays the same. One decision serves both sides: the client's wait for the reply
-and the host's wait for the next request.
+and the runner's wait for the next request.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ ESCAPE = "\x1b]0;owned\x07\x1b[2J\r"
 
 
 def a_raised(**changed: str) -> m.Raised:
-    """What a host says about an exception, with some fields changed."""
+    """What a runner says about an exception, with some fields changed."""
     fields = {
         "builtin": "ValueError",
         "type_name": "mypkg.Oops",
@@ -58,7 +58,7 @@ def test_other_names_mean_nothing(name: str) -> None:
 @pytest.mark.parametrize("field", ["type_name", "message", "traceback"])
 @pytest.mark.parametrize("stage", ["step", "import", "make_env", "return"])
 def test_escape_sequences_are_not_obeyed(field: str, stage: str) -> None:
-    """Text of a hostile host is escaped here: the host's own care is not relied on."""
+    """Text of a hostile runner is escaped here: the runner's own care is not relied on."""
     error: BaseException | None = raised(a_raised(stage=stage, **{field: f"a{ESCAPE}b"}))
     while error is not None:
         for text in (str(error), *map(str, vars(error).values())):
@@ -129,18 +129,18 @@ SERVERS = [
 
 
 @pytest.mark.parametrize("message", SERVERS, ids=lambda message: type(message).__name__)
-def test_a_host_cannot_speak_in_the_servers_name(message: m.Message) -> None:
-    """A death or a refusal inside a host's reply is a broken rule, not news."""
-    with pytest.raises(errors.RemoteProtocolError, match="a host sent") as caught:
+def test_a_runner_cannot_speak_in_the_servers_name(message: m.Message) -> None:
+    """A death or a refusal inside a runner's reply is a broken rule, not news."""
+    with pytest.raises(errors.RemoteProtocolError, match="a runner sent") as caught:
         check(message)
     assert "\x1b" not in str(caught.value)
 
 
 def test_the_kinds_of_both_conversations_are_apart() -> None:
-    """What hosts may send begins at one number."""
-    hosts = {cls.__name__ for kind, cls in m.KINDS.items() if kind >= m.FIRST_HOST_KIND}
-    assert {"Loaded", "Built", "ResetDone", "StepDone", "Value", "Method", "Raised"} <= hosts
-    assert not hosts & {type(message).__name__ for message in SERVERS}
+    """What runners may send begins at one number."""
+    runners = {cls.__name__ for kind, cls in m.KINDS.items() if kind >= m.FIRST_RUNNER_KIND}
+    assert {"Loaded", "Built", "ResetDone", "StepDone", "Value", "Method", "Raised"} <= runners
+    assert not runners & {type(message).__name__ for message in SERVERS}
 
 
 @pytest.mark.parametrize(

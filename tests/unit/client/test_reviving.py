@@ -11,14 +11,14 @@ from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.session.reseed import SeedBook, derived_seed, resets, truncated
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import HostsDiedError, RemoteJail
+from envhub_sandbox.transport.jail import RemoteJail, RunnersDiedError
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 
 DIED = m.Died(2, "exit", 3, None, "", "last words", "step")
 ASKED = [(1, m.Render(1)), (2, m.Render(1))]
-"""What the two hosts of a jail are asked."""
+"""What the two runners of a jail are asked."""
 
 
 class Told:
@@ -38,7 +38,7 @@ class Told:
 
 
 def jail(reply: m.Message, *parts: m.Message, kept: bool = True) -> RemoteJail:
-    """A jail of two hosts whose server says this."""
+    """A jail of two runners whose server says this."""
     client = cast("WorkerClient", Told(reply, *parts))
     made = RemoteJail(client, 1, [1, 2], [], DEFAULT_LIMITS)
     made.kept = kept
@@ -48,7 +48,7 @@ def jail(reply: m.Message, *parts: m.Message, kept: bool = True) -> RemoteJail:
 def test_deaths_come_with_the_answers_of_the_others() -> None:
     """Each in its place: what lived has answered, and of the dead one knows how."""
     said = jail(m.RelayedPartly((1, 1), (1,)), m.Value(7), DIED)
-    with pytest.raises(HostsDiedError) as caught:
+    with pytest.raises(RunnersDiedError) as caught:
         said.receive(said.send("step", ASKED), Deadline(1))
     assert caught.value.replies == [m.Value(7), None]
     assert list(caught.value.deaths) == [1]
@@ -58,13 +58,13 @@ def test_deaths_come_with_the_answers_of_the_others() -> None:
     assert type(told.value) is WorkerDiedError
 
 
-def test_a_hosts_word_is_no_death() -> None:
-    """A ``Died`` in the place of a living host is an answer, and an illegal one."""
+def test_a_runners_word_is_no_death() -> None:
+    """A ``Died`` in the place of a living runner is an answer, and an illegal one."""
     said = jail(m.RelayedPartly((1, 1), (1,)), DIED, DIED)
-    with pytest.raises(HostsDiedError) as caught:
+    with pytest.raises(RunnersDiedError) as caught:
         said.receive(said.send("step", ASKED), Deadline(1))
     assert list(caught.value.deaths) == [1]
-    with pytest.raises(RemoteProtocolError, match="a host sent Died"):
+    with pytest.raises(RemoteProtocolError, match="a runner sent Died"):
         jail(m.Relayed((1, 1)), m.Value(7), DIED).exchange("step", ASKED, Deadline(1))
 
 

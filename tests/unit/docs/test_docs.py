@@ -59,18 +59,18 @@ def sources() -> str:
     return "\n".join(path.read_text() for root in packages for path in root.rglob("*.py"))
 
 
-@pytest.mark.parametrize("title", ["Client and server", "Client and host"])
+@pytest.mark.parametrize("title", ["Client and server", "Client and runner"])
 def test_protocol_lists_every_message_with_its_fields(title: str) -> None:
     """Kind, name and fields, in the order of the wire."""
     listed = {
         int(kind): (*code_words(name), code_words(fields))
         for kind, name, fields, _ in rows(section(PROTOCOL, title))
     }
-    hosts = title == "Client and host"
+    runners = title == "Client and runner"
     assert listed == {
         kind: (cls.__name__, [field.name for field in dataclasses.fields(cls)])  # type: ignore[arg-type]
         for kind, cls in m.KINDS.items()
-        if (kind >= m.FIRST_HOST_KIND) == hosts
+        if (kind >= m.FIRST_RUNNER_KIND) == runners
     }
 
 

@@ -28,7 +28,7 @@ SAMPLES: list[m.Message] = [
     m.Refused("SandboxUnavailableError", "no user namespaces", "user-namespace", "sysctl ..."),
     m.OpenJail("org/repo@abc:env.py", "", "/s", "env.py", {"limits": {"processes": 5}}, 2),
     m.JailOpened(3, (1, 2), ({"layer": "seccomp", "enforced": True, "detail": "x"},)),
-    m.StartHosts(3, 1),
+    m.StartRunners(3, 1),
     m.Relay(3, "step", ((1, 2), (2, 1))),
     m.Relayed((2, 1)),
     m.Died(1, "signal", None, "SIGKILL", "", "last words", "step"),

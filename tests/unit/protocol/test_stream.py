@@ -125,7 +125,7 @@ def test_lengths_at_the_limit_are_accepted() -> None:
 
 
 def test_declared_and_never_sent_costs_no_memory() -> None:
-    """A host that promises 256 MB and sends nothing does not make anybody touch them."""
+    """A runner that promises 256 MB and sends nothing does not make anybody touch them."""
     limits = WireLimits()
     reader = PacketReader(limits)
     before = resident_bytes()

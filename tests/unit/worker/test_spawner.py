@@ -1,4 +1,4 @@
-"""The server's side of zygote, inits and hosts, against real processes."""
+"""The server's side of zygote, inits and runners, against real processes."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from envhub_worker.spawn.jail_handle import Spawner, ZygoteDied
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from tests.integration.confinement_kit import (
     Cell,
-    HostExited,
-    HostStarted,
     JailExited,
     Ready,
+    RunnerExited,
+    RunnerStarted,
     cell_in,
     make_snapshot,
     new_cell,
@@ -50,7 +50,7 @@ def folder() -> Iterator[Path]:
 
 @pytest.fixture
 def cell(folder: Path, confinement: Confinement) -> Iterator[Cell]:
-    """A jail with one host."""
+    """A jail with one runner."""
     with cell_in(folder, confinement) as cell:
         yield cell
 
@@ -69,17 +69,19 @@ def processes_that_mention(text: str) -> list[int]:
     return found
 
 
-def test_host_runs_code_and_is_announced_with_its_layers(cell: Cell) -> None:
-    """Ready, then HostStarted with a report, and the stream reaches the host."""
+def test_runner_runs_code_and_is_announced_with_its_layers(cell: Cell) -> None:
+    """Ready, then RunnerStarted with a report, and the stream reaches the runner."""
     assert cell.run("result = 6 * 7") == {"result": 42}
     cell.wait_for(Ready)
-    started = cell.wait_for(HostStarted)
-    assert started.host_id == 1
+    started = cell.wait_for(RunnerStarted)
+    assert started.runner_id == 1
     assert {"no-new-privileges", "rlimits"} <= {layer["layer"] for layer in started.report}
     assert all(layer["enforced"] in (True, False) for layer in started.report)
 
 
-def test_host_sees_only_the_built_environment(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runner_sees_only_the_built_environment(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Nothing of the server's environment arrives; what is granted does."""
     names = cell.run("import os; result = sorted(os.environ)")["result"]
     assert "GRANTED" in names
@@ -88,7 +90,7 @@ def test_host_sees_only_the_built_environment(cell: Cell, monkeypatch: pytest.Mo
     assert "PYTEST_CURRENT_TEST" not in raw
 
 
-def test_host_holds_only_the_named_descriptors(folder: Path, confinement: Confinement) -> None:
+def test_runner_holds_only_the_named_descriptors(folder: Path, confinement: Confinement) -> None:
     """Standard streams, its stream and what was passed through; stdin is empty."""
     source = "import os, sys; result = [len(os.listdir('/proc/self/fd')), sys.stdin.read()]"
     read, write = os.pipe()
@@ -105,7 +107,7 @@ def test_host_holds_only_the_named_descriptors(folder: Path, confinement: Confin
     os.close(write)
 
 
-def test_host_has_private_home_and_shows_the_snapshot(cell: Cell) -> None:
+def test_runner_has_private_home_and_shows_the_snapshot(cell: Cell) -> None:
     """HOME, TMPDIR and the working directory are the jail's own; the snapshot shows through."""
     source = """
 import os, tempfile
@@ -120,8 +122,8 @@ result = [os.listdir(home), tempfile.gettempdir() == os.environ['TMPDIR'],
     assert not (Path(cell.jail.spec.snapshot) / "new.txt").exists()
 
 
-def test_hosts_draw_different_random_numbers(cell: Cell) -> None:
-    """A fork copies the generators' state: each host is reseeded."""
+def test_runners_draw_different_random_numbers(cell: Cell) -> None:
+    """A fork copies the generators' state: each runner is reseeded."""
     second = cell.start()
     source = "import random, numpy; result = [random.random(), float(numpy.random.rand())]"
     first_draw, second_draw = cell.run(source), cell.run(source, second)
@@ -129,7 +131,7 @@ def test_hosts_draw_different_random_numbers(cell: Cell) -> None:
     assert first_draw["result"][1] != second_draw["result"][1]
 
 
-def test_output_of_all_hosts_arrives(cell: Cell) -> None:
+def test_output_of_all_runners_arrives(cell: Cell) -> None:
     """Python's and C's output, stdout and stderr, of children too."""
     cell.run("import os, sys; os.write(1, b'one\\n'); os.write(2, b'two\\n'); print('three')")
     cell.run("import subprocess; subprocess.run(['/bin/echo', 'four'])")
@@ -138,31 +140,31 @@ def test_output_of_all_hosts_arrives(cell: Cell) -> None:
         cell.wait_for_output(text)
 
 
-def test_exit_code_of_a_host_is_told(cell: Cell) -> None:
-    """SystemExit inside the target ends the host with its code."""
+def test_exit_code_of_a_runner_is_told(cell: Cell) -> None:
+    """SystemExit inside the target ends the runner with its code."""
     cell.run("import os; os._exit(7)")
-    exited = cell.wait_for(HostExited)
+    exited = cell.wait_for(RunnerExited)
     assert (exited.code, exited.signal, exited.reason) == (7, None, "exit")
 
 
-def test_signal_that_ends_a_host_is_told(cell: Cell) -> None:
+def test_signal_that_ends_a_runner_is_told(cell: Cell) -> None:
     """A crash is a signal, not a code."""
     cell.run("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
-    exited = cell.wait_for(HostExited)
+    exited = cell.wait_for(RunnerExited)
     assert (exited.code, exited.signal) == (None, signal.SIGSEGV)
     assert exited.reason == "signal"
 
 
-def test_killed_host_takes_its_children_along(cell: Cell, folder: Path) -> None:
-    """kill_host ends the host and a child in a session of its own; others go on."""
+def test_killed_runner_takes_its_children_along(cell: Cell, folder: Path) -> None:
+    """kill_runner ends the runner and a child in a session of its own; others go on."""
     second = cell.start()
     mark = str(folder / "mark")
     child = f"['/bin/sh', '-c', 'sleep 1000; : {mark}']"
     cell.run(f"import subprocess; subprocess.Popen({child}, start_new_session=True)")
     wait_until(lambda: processes_that_mention(mark), "the child never came")
-    cell.jail.kill_host(1)
-    exited = cell.wait_for(HostExited)
-    assert (exited.host_id, exited.reason) == (1, "killed")
+    cell.jail.kill_runner(1)
+    exited = cell.wait_for(RunnerExited)
+    assert (exited.runner_id, exited.reason) == (1, "killed")
     wait_until(lambda: not processes_that_mention(mark), "the child lived on")
     assert cell.run("result = 1", second) == {"result": 1}
 
@@ -188,20 +190,20 @@ def test_killed_jail_leaves_no_daemon(cell: Cell, folder: Path) -> None:
     wait_until(lambda: not processes_that_mention(mark), "the daemon lived on")
 
 
-def test_last_host_takes_daemons_along(cell: Cell, folder: Path) -> None:
-    """When no host is left, nothing else of the jail runs on."""
+def test_last_runner_takes_daemons_along(cell: Cell, folder: Path) -> None:
+    """When no runner is left, nothing else of the jail runs on."""
     mark = str(folder / "mark")
     cell.run(DAEMON.format(mark=mark))
     wait_until(lambda: processes_that_mention(mark), "the daemon never came")
     cell.hang_up()
-    cell.wait_for(HostExited)
+    cell.wait_for(RunnerExited)
     wait_until(lambda: not processes_that_mention(mark), "the daemon lived on")
 
 
-def test_jail_can_start_hosts_after_its_last_one_ended(cell: Cell) -> None:
-    """A new host in the same jail replaces one that died."""
+def test_jail_can_start_runners_after_its_last_one_ended(cell: Cell) -> None:
+    """A new runner in the same jail replaces one that died."""
     cell.run("import os; os._exit(1)")
-    cell.wait_for(HostExited)
+    cell.wait_for(RunnerExited)
     second = cell.start()
     assert cell.run("result = 'again'", second) == {"result": "again"}
 
@@ -305,7 +307,7 @@ with spawner_in(Path({folder!r}), confinement) as spawner:
 
 
 def test_killed_server_leaves_no_process(folder: Path, confinement: Confinement) -> None:
-    """SIGKILL of the server ends zygote, init, host and a daemon of the jail."""
+    """SIGKILL of the server ends zygote, init, runner and a daemon of the jail."""
     mark = str(folder / "mark")
     kit = str(Path(__file__).parents[2] / "integration")
     daemon = DAEMON.format(mark=mark)
@@ -340,11 +342,11 @@ def alive(pid: int) -> bool:
 
 
 def test_cpu_limit_is_told(folder: Path, confinement: Confinement) -> None:
-    """A host that burns its CPU seconds ends with the reason cpu-limit."""
+    """A runner that burns its CPU seconds ends with the reason cpu-limit."""
     confinement = replace(confinement, limits=Limits(cpu_s=1))
     with cell_in(folder, confinement) as cell:
         cell.run("while True: pass")
-        assert cell.wait_for(HostExited).reason == "cpu-limit"
+        assert cell.wait_for(RunnerExited).reason == "cpu-limit"
 
 
 def test_requests_wait_for_the_zygote(folder: Path, confinement: Confinement) -> None:

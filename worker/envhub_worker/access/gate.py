@@ -240,8 +240,8 @@ class RemoteGate:
         self._refuse_unless_authorized(asker.key)
         if isinstance(request, m.OpenJail):
             return self._authorize_open(asker.key, request, asked.jails)
-        if isinstance(request, m.StartHosts):
-            check_jail(_uses(asked.jails, asker.key), Use(0, request.hosts), self._rules.quotas)
+        if isinstance(request, m.StartRunners):
+            check_jail(_uses(asked.jails, asker.key), Use(0, request.runners), self._rules.quotas)
         elif isinstance(request, m.Relay):
             size = sum(map(len, asked.payload))
             self._in_flight.add(asker.key, asker, size, self._rules.quotas.inflight_bytes)
@@ -268,12 +268,12 @@ class RemoteGate:
             raise RefusedError("PolicyError", f"the entry file {wrong}")
         check_jail(
             _uses(jails, key),
-            Use(confinement.limits.memory_bytes, request.hosts),
+            Use(confinement.limits.memory_bytes, request.runners),
             self._rules.quotas,
         )
         tree = self._uploads.tree(key, request.snapshot)
         return m.OpenJail(
-            request.name[:512], "", tree, request.entry, request.confinement, request.hosts
+            request.name[:512], "", tree, request.entry, request.confinement, request.runners
         )
 
     def _offer(self, asked: Asked) -> m.Message:

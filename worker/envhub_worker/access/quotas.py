@@ -25,7 +25,7 @@ class Quotas:
 
     Attributes:
         jails: Open jails.
-        hosts: Processes of environments in them.
+        runners: Processes of environments in them.
         memory_bytes: The sum of its open jails' memory limits.
         upload_bytes: Files of snapshots that it has brought here; the longest unused go first.
         upload_files: Files of one snapshot.
@@ -34,7 +34,7 @@ class Quotas:
     """
 
     jails: int = 64
-    hosts: int = 256
+    runners: int = 256
     memory_bytes: int = 512 * GIB
     upload_bytes: int = 8 * GIB
     upload_files: int = 20_000
@@ -62,7 +62,7 @@ class Use:
     """What the open jails of a key take: one entry a jail."""
 
     memory_bytes: int
-    hosts: int
+    runners: int
 
 
 def check_policy(request: m.OpenJail, confinement: Confinement, permitted: Permissions) -> None:
@@ -93,7 +93,7 @@ def check_policy(request: m.OpenJail, confinement: Confinement, permitted: Permi
 
 
 def check_jail(open_jails: Iterable[Use], more: Use, quotas: Quotas) -> None:
-    """Refuse a jail, or further hosts of one (then without memory), above the quotas.
+    """Refuse a jail, or further runners of one (then without memory), above the quotas.
 
     Raises:
         RefusedError: With the quota that it would break.
@@ -101,10 +101,10 @@ def check_jail(open_jails: Iterable[Use], more: Use, quotas: Quotas) -> None:
     uses = list(open_jails)
     jails = len(uses) + (more.memory_bytes > 0)
     memory = sum(use.memory_bytes for use in uses) + more.memory_bytes
-    hosts = sum(use.hosts for use in uses) + more.hosts
+    runners = sum(use.runners for use in uses) + more.runners
     for what, number, quota, option in (
         ("jails", jails, quotas.jails, "--max-jails"),
-        ("hosts", hosts, quotas.hosts, "--max-hosts"),
+        ("runners", runners, quotas.runners, "--max-runners"),
         ("bytes of memory limits", memory, quotas.memory_bytes, "--max-memory"),
     ):
         if number > quota:

@@ -62,17 +62,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--weakest-profile", choices=PROFILES, default=_weakest_profile())
     parser.add_argument("--allow-network", action="store_true", help="permit network='host'")
     parser.add_argument("--allow-gpu", action="store_true", help="permit gpu=True")
-    for option, default, unit in (
-        ("--max-jails", quotas.jails, ""),
-        ("--max-hosts", quotas.hosts, ""),
-        ("--max-sessions", quotas.sessions, ""),
-        ("--max-upload-files", quotas.upload_files, ""),
-        ("--max-memory", quotas.memory_bytes // GIB, " GiB"),
-        ("--max-upload", quotas.upload_bytes // MIB, " MiB"),
-        ("--max-inflight", quotas.inflight_bytes // MIB, " MiB"),
+    for names, default, unit in (
+        (("--max-jails",), quotas.jails, ""),
+        (("--max-runners", "--max-hosts"), quotas.runners, ""),
+        (("--max-sessions",), quotas.sessions, ""),
+        (("--max-upload-files",), quotas.upload_files, ""),
+        (("--max-memory",), quotas.memory_bytes // GIB, " GiB"),
+        (("--max-upload",), quotas.upload_bytes // MIB, " MiB"),
+        (("--max-inflight",), quotas.inflight_bytes // MIB, " MiB"),
     ):
         parser.add_argument(
-            option, type=_count, default=default, help=f"of one key (default: {default}{unit})"
+            *names, type=_count, default=default, help=f"of one key (default: {default}{unit})"
         )
 
 
@@ -278,7 +278,7 @@ def _gate(arguments: argparse.Namespace, state: Path, identity: Identity) -> Rem
     operators = frozenset[bytes]() if pair is None else frozenset({pair.public})
     quotas = Quotas(
         jails=arguments.max_jails,
-        hosts=arguments.max_hosts,
+        runners=arguments.max_runners,
         memory_bytes=arguments.max_memory * GIB,
         upload_bytes=arguments.max_upload * MIB,
         upload_files=arguments.max_upload_files,

@@ -1,4 +1,4 @@
-"""What the stages of lockdown hand down: zygote to init, init to host."""
+"""What the stages of lockdown hand down: zygote to init, init to runner."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class ZygoteConfig:
 
     Attributes:
         parent: The server's pid.
-        target: What a host runs once it is confined, as ``"module:function"``.
+        target: What a runner runs once it is confined, as ``"module:function"``.
         profile: The profile of its jails.
         network: Their network.
         gpu: Whether they get the GPU.
@@ -81,7 +81,7 @@ class Common:
 
 @dataclass(frozen=True, kw_only=True)
 class JailContext:
-    """What init knows and its hosts need.
+    """What init knows and its runners need.
 
     Attributes:
         spec: The jail.

@@ -4,7 +4,7 @@ A message is the value ``[kind, id, field, ...]`` in the codec's encoding: one m
 raw buffers. ``id`` ties a reply to its request. Two conversations share this file:
 
 - client and worker server (over ZeroMQ), to open and close jails and to relay;
-- client and jail host (inside ``Relay``), about environments. The server never decodes these.
+- client and jail runner (inside ``Relay``), about environments. The server never decodes these.
 
 ``unpack`` checks the kind, the number of fields and each field's type, so that a decoded message
 is what its class says. Trust: what comes from a jail is hostile.
@@ -36,8 +36,8 @@ OLDEST_VERSION = 1
 """The oldest version that this code still speaks."""
 _HEAD_BYTES = 64
 """Enough for the length of a document, its kind and its id."""
-FIRST_HOST_KIND = 32
-"""Kinds from here on are between client and jail host; a host may send no other."""
+FIRST_RUNNER_KIND = 32
+"""Kinds from here on are between client and jail runner; a runner may send no other."""
 
 
 class Message:
@@ -133,35 +133,35 @@ class OpenJail(Message):
     snapshot: str
     entry: str
     confinement: dict[str, object]
-    hosts: int
+    runners: int
 
 
 @_message(5)
 @dataclass(frozen=True, slots=True)
 class JailOpened(Message):
-    """The jail's number and its hosts' numbers."""
+    """The jail's number and its runners' numbers."""
 
     jail: int
-    hosts: tuple[int, ...]
+    runners: tuple[int, ...]
     report: tuple[object, ...]
     """One mapping per layer: ``layer``, ``enforced``, ``detail``."""
 
 
 @_message(6)
 @dataclass(frozen=True, slots=True)
-class StartHosts(Message):
-    """Fork further hosts in an open jail. Reply: ``JailOpened`` with just the new ones."""
+class StartRunners(Message):
+    """Fork further runners in an open jail. Reply: ``JailOpened`` with just the new ones."""
 
     jail: int
-    hosts: int
+    runners: int
 
 
 @_message(7)
 @dataclass(frozen=True, slots=True)
 class Relay(Message):
-    """Hand the frames that follow to hosts: ``parts`` is ``((host, frames), ...)``.
+    """Hand the frames that follow to runners: ``parts`` is ``((runner, frames), ...)``.
 
-    Reply: ``Relayed`` once every host has answered, or ``Died``.
+    Reply: ``Relayed`` once every runner has answered, or ``Died``.
     """
 
     jail: int
@@ -172,7 +172,7 @@ class Relay(Message):
 @_message(8)
 @dataclass(frozen=True, slots=True)
 class Relayed(Message):
-    """The hosts' replies: ``parts`` is the number of frames of each, in the request's order."""
+    """The runners' replies: ``parts`` is the number of frames of each, in the request's order."""
 
     parts: tuple[int, ...]
 
@@ -182,7 +182,7 @@ class Relayed(Message):
 class Died(Message):
     """A process of the jail ended. Trust: ``tail`` is the jail's own output, escaped."""
 
-    host: int
+    runner: int
     reason: Reason
     exit_code: int | None
     signal: str | None
@@ -242,7 +242,7 @@ class Status(Message):
 @_message(16)
 @dataclass(frozen=True, slots=True)
 class Deposit(Message):
-    """Over the descriptor socket: descriptors for a host, which the next request brings to it.
+    """Over the descriptor socket: descriptors for a runner, which the next request brings to it.
 
     That has to be an ``Attach``; the server, which decodes no such message, does not look.
     Reply, over the same socket: one byte, with a pidfd of the jail.
@@ -250,16 +250,16 @@ class Deposit(Message):
 
     session: bytes
     jail: int
-    host: int
+    runner: int
 
 
 @_message(17)
 @dataclass(frozen=True, slots=True)
 class KeepJail(Message):
-    """From now on a host's death does not end the jail. Reply: ``Done``, or ``Died``.
+    """From now on a runner's death does not end the jail. Reply: ``Done``, or ``Died``.
 
-    A ``Relay`` to a host that has died, or dies before it answers, is then answered with
-    ``RelayedPartly``; further hosts can be started in its place.
+    A ``Relay`` to a runner that has died, or dies before it answers, is then answered with
+    ``RelayedPartly``; further runners can be started in its place.
     """
 
     jail: int
@@ -268,10 +268,10 @@ class KeepJail(Message):
 @_message(18)
 @dataclass(frozen=True, slots=True)
 class RelayedPartly(Message):
-    """As ``Relayed``, of a jail that is kept, where some hosts have died.
+    """As ``Relayed``, of a jail that is kept, where some runners have died.
 
     ``dead`` holds their places in the request; what stands there is the server's own ``Died``,
-    in one frame. What hosts send never counts as such, whatever it says.
+    in one frame. What runners send never counts as such, whatever it says.
     """
 
     parts: tuple[int, ...]
@@ -386,7 +386,7 @@ class OutputBytes(Message):
 @_message(30)
 @dataclass(frozen=True, slots=True)
 class ExpireIdle(Message):
-    """End a jail whose hosts do nothing for so many milliseconds. Reply: ``Done``, or ``Died``.
+    """End a jail whose runners do nothing for so many milliseconds. Reply: ``Done``, or ``Died``.
 
     Whoever asks anything of it afterwards is told ``Died`` with the reason ``"idle"``.
     """
@@ -395,7 +395,7 @@ class ExpireIdle(Message):
     idle_ms: int
 
 
-# --- client and jail host ----------------------------------------------------------------------
+# --- client and jail runner ----------------------------------------------------------------------
 
 
 @_message(32)
@@ -560,7 +560,7 @@ class Close(Message):
 class Attach(Message):
     """Serve an environment's steps over the slabs and doorbells that come along.
 
-    The descriptors: request slab, reply slab, observation slab, the host's doorbell, the
+    The descriptors: request slab, reply slab, observation slab, the runner's doorbell, the
     client's. The shard's rows of a batch of ``count`` begin at ``start``. Reply: ``Value``; False
     where the environment has no fixed layout.
     """

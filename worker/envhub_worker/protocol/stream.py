@@ -1,4 +1,4 @@
-"""Length-prefixed frames on the stream between the server and a jail's host. No I/O here.
+"""Length-prefixed frames on the stream between the server and a jail's runner. No I/O here.
 
 A packet is ``count: u64, request id: u64``, then ``count`` lengths as ``u64``, then
 the frames. The reader checks every number before it allocates: the peer is hostile.

@@ -1,6 +1,6 @@
 """Stand-ins for Gymnasium's vector classes while a repository's ``make_env`` runs.
 
-``SyncVectorEnv(...)`` and ``AsyncVectorEnv(...)`` then only write down their arguments. The host
+``SyncVectorEnv(...)`` and ``AsyncVectorEnv(...)`` then only write down their arguments. The runner
 builds the sub-environments that it needs and drives them itself, so a suite of many tasks costs
 nothing before it is used. The object is a real instance of its class: whoever looks into it (a
 wrapper, the repository itself) makes it build itself after all, and it is driven as it is.

@@ -108,7 +108,7 @@ def _package_of(root: Path, path: PurePosixPath) -> tuple[Path, list[str]]:
 def _make_importable(root: Path, folder: Path, scratch: str, package_path: Path) -> None:
     stub = Path(scratch) / "import" / PACKAGE
     stub.mkdir(parents=True, exist_ok=True)
-    # the hosts of a jail share the folder: none may import another's half-written file
+    # the runners of a jail share the folder: none may import another's half-written file
     draft = stub / f"{os.getpid()}.draft"
     draft.write_text(f"__path__ = [{os.fspath(package_path)!r}]\n")
     draft.replace(stub / "__init__.py")

@@ -1,4 +1,4 @@
-"""The env host: holds the live vector environments of one jail and answers for them.
+"""The runner: holds the live vector environments of one jail and answers for them.
 
 One small function per message, found in a table. It speaks length-prefixed packets over one
 inherited stream, on the main thread (a repository may set signal handlers), and dies with it.
@@ -36,34 +36,34 @@ _RECHECK_MS = 2
 
 def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
     """Serve until the other side closes the stream. Runs confined, as the jail's main program."""
-    host = Host(spec.snapshot, spec.entry)
+    runner = Runner(spec.snapshot, spec.entry)
     reader = PacketReader()
     poller = select.poll()
     poller.register(stream, select.POLLIN)
     timeout: int | None = None
     while True:
         ready = [fd for fd, _ in poller.poll(timeout)]
-        lane = host.lane
+        lane = runner.lane
         if stream.fileno() in ready:
-            if not _serve(stream, reader, host):
+            if not _serve(stream, reader, runner):
                 return 0
-            if host.lane is not lane and host.lane is not None:
-                poller.register(host.lane.bell, select.POLLIN)
+            if runner.lane is not lane and runner.lane is not None:
+                poller.register(runner.lane.bell, select.POLLIN)
         elif lane is not None and ready:
             if not lane.wake():
                 poller.unregister(lane.bell)
         elif lane is not None:
             lane.serve()
         # a request may cross with our going to sleep: look again soon, once
-        timeout = _RECHECK_MS if ready and host.lane is not None else None
+        timeout = _RECHECK_MS if ready and runner.lane is not None else None
 
 
-def _serve(stream: socket.socket, reader: PacketReader, host: Host) -> bool:
+def _serve(stream: socket.socket, reader: PacketReader, runner: Runner) -> bool:
     """Answer what has come; False at the end of the stream."""
     data, ancillary, _, _ = stream.recvmsg(reader.chunk, _ANCILLARY_BYTES)
-    host.descriptors = [fd for part in ancillary for fd in array("i", part[2])]
+    runner.descriptors = [fd for part in ancillary for fd in array("i", part[2])]
     for packet in reader.feed(data):
-        _send(stream, packet.request_id, host.answer(packet))
+        _send(stream, packet.request_id, runner.answer(packet))
     return bool(data)
 
 
@@ -77,8 +77,8 @@ def _send(stream: socket.socket, request_id: int, frames: list[Any]) -> None:
             buffers[0] = buffers[0][sent:]
 
 
-class Host:
-    """The state of one host: the repository's tasks and the environments built of them."""
+class Runner:
+    """The state of one runner: the repository's tasks and the environments built of them."""
 
     def __init__(self, snapshot: str, entry: str) -> None:
         self._snapshot = snapshot
@@ -262,21 +262,21 @@ def _own(env: Any, name: str) -> Any:
         return getattr(getattr(env, "unwrapped", env), name)
 
 
-_HANDLERS: dict[type[m.Message], Callable[[Host, Any], m.Message]] = {
-    m.Load: Host.load,
-    m.LoadTask: Host.load_task,
-    m.Build: Host.build,
-    m.Reset: Host.reset,
-    m.Step: Host.step,
-    m.Revive: Host.revive,
-    m.Call: Host.call,
-    m.SetAttr: Host.set_attr,
-    m.Render: Host.render,
-    m.GetOwn: Host.get_own,
-    m.CallOwn: Host.call_own,
-    m.GetRandom: Host.get_random,
-    m.Close: Host.close,
-    m.Attach: Host.attach,
-    m.FetchInfos: Host.fetch_infos,
-    m.FetchInfosApart: Host.fetch_infos_apart,
+_HANDLERS: dict[type[m.Message], Callable[[Runner, Any], m.Message]] = {
+    m.Load: Runner.load,
+    m.LoadTask: Runner.load_task,
+    m.Build: Runner.build,
+    m.Reset: Runner.reset,
+    m.Step: Runner.step,
+    m.Revive: Runner.revive,
+    m.Call: Runner.call,
+    m.SetAttr: Runner.set_attr,
+    m.Render: Runner.render,
+    m.GetOwn: Runner.get_own,
+    m.CallOwn: Runner.call_own,
+    m.GetRandom: Runner.get_random,
+    m.Close: Runner.close,
+    m.Attach: Runner.attach,
+    m.FetchInfos: Runner.fetch_infos,
+    m.FetchInfosApart: Runner.fetch_infos_apart,
 }

@@ -1,7 +1,7 @@
-"""Gives numpy's threads back to a host.
+"""Gives numpy's threads back to a runner.
 
 The zygote loads OpenBLAS with ``OPENBLAS_NUM_THREADS=1``: its threads would neither survive the
-fork nor allow a user namespace. OpenBLAS reads that variable once, when it is loaded, so a host
+fork nor allow a user namespace. OpenBLAS reads that variable once, when it is loaded, so a runner
 must ask the library itself.
 """
 
@@ -40,23 +40,23 @@ def find_setter() -> Callable[[int], None] | None:
     return None
 
 
-def thread_count(environment: Mapping[str, str], cores: int, hosts: int) -> int:
-    """How many threads a host gets.
+def thread_count(environment: Mapping[str, str], cores: int, runners: int) -> int:
+    """How many threads a runner gets.
 
     Args:
-        environment: The host's; the variables that OpenBLAS reads decide, where there is one.
+        environment: The runner's; the variables that OpenBLAS reads decide, where there is one.
         cores: That this process may use.
-        hosts: Of the jail, this one included: they share the cores.
+        runners: Of the jail, this one included: they share the cores.
     """
     for name in _VARIABLES:
         value = environment.get(name, "")
         if value.isdigit() and int(value) > 0:
             return int(value)
-    return max(1, min(cores // hosts, _MOST))
+    return max(1, min(cores // runners, _MOST))
 
 
-def restore_threads(setter: Callable[[int], None] | None, hosts: int) -> None:
+def restore_threads(setter: Callable[[int], None] | None, runners: int) -> None:
     """Start the threads that a fresh interpreter would have; call it when confined."""
-    count = thread_count(os.environ, len(os.sched_getaffinity(0)), hosts)
+    count = thread_count(os.environ, len(os.sched_getaffinity(0)), runners)
     if setter is not None and count > 1:
         setter(count)

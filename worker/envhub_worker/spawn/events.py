@@ -23,7 +23,7 @@ class ZygoteDied:
 
 @dataclass(frozen=True)
 class Ready:
-    """A host of the jail is confined. ``report``: every layer that holds for it."""
+    """A runner of the jail is confined. ``report``: every layer that holds for it."""
 
     report: list[dict[str, Any]]
 
@@ -38,37 +38,37 @@ class Failed:
 
 
 @dataclass(frozen=True)
-class HostStarted:
-    """A host is confined, has tested its denials, and now enters ``host.main``.
+class RunnerStarted:
+    """A runner is confined, has tested its denials, and now enters ``runner.main``.
 
     Attributes:
-        host_id: From ``Jail.start_host``.
+        runner_id: From ``Jail.start_runner``.
         pid: Its pid as this process sees it; 0 or less when it has already ended.
         report: Every layer that holds for it, the jail's own first.
     """
 
-    host_id: int
+    runner_id: int
     pid: int
     report: list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
-class HostExited:
-    """A host has ended.
+class RunnerExited:
+    """A runner has ended.
 
     Attributes:
-        host_id: From ``Jail.start_host``.
+        runner_id: From ``Jail.start_runner``.
         code: Its exit code, or None.
         signal: The number of the signal that ended it, or None.
         reason: Why.
         detail: The numbers, where a limit was the reason.
     """
 
-    host_id: int
+    runner_id: int
     code: int | None
     signal: int | None
     reason: Reason
     detail: str = ""
 
 
-JailEvent = Ready | Failed | HostStarted | HostExited
+JailEvent = Ready | Failed | RunnerStarted | RunnerExited

@@ -28,23 +28,23 @@ from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.spawn.events import (
     Failed,
-    HostExited,
-    HostStarted,
     JailEvent,
     Ready,
+    RunnerExited,
+    RunnerStarted,
     ZygoteDied,
 )
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 
 __all__ = [
-    "HOST_TARGET",
+    "RUNNER_TARGET",
     "Failed",
-    "HostExited",
-    "HostStarted",
     "Jail",
     "JailEvent",
     "JailExited",
     "Ready",
+    "RunnerExited",
+    "RunnerStarted",
     "Spawner",
     "SpawnerEvent",
     "ZygoteDied",
@@ -52,7 +52,7 @@ __all__ = [
 
 _END_S = 8.0
 _LOG_TAIL_BYTES = 8192
-HOST_TARGET = "envhub_worker.runner.runner:main"
+RUNNER_TARGET = "envhub_worker.runner.runner:main"
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Spawner:
         runtime_dir: Path,
         readable_roots: Sequence[str],
         python: str | None = None,
-        target: str = HOST_TARGET,
+        target: str = RUNNER_TARGET,
         ahead: ZygoteProcess | None = None,
     ) -> None:
         """Execute the zygote; it preloads in the background.
@@ -87,7 +87,7 @@ class Spawner:
             runtime_dir: An existing folder of the server's own.
             readable_roots: Where snapshots lie (the snapshot store).
             python: The interpreter of the jails, by absolute path; default: this one.
-            target: What a host runs once it is confined: ``"module:function"``, or
+            target: What a runner runs once it is confined: ``"module:function"``, or
                 ``"/a/file.py:function"``.
             ahead: A process to use, if it is one of this interpreter; else it is ended.
         """
@@ -267,7 +267,7 @@ class Jail:
         self._folder = folder
         self._count = 0
         self._pidfd = -1
-        self._host_pidfds: dict[int, int] = {}
+        self._runner_pidfds: dict[int, int] = {}
         self._killed = False
         self._report: list[dict[str, Any]] = []
         self._group: cgroups.Group | None = None
@@ -308,9 +308,9 @@ class Jail:
         """A pidfd of the jail's init, or -1 before it is known and after it has gone."""
         return self._pidfd
 
-    def host_pidfd(self, host_id: int) -> int:
-        """A pidfd of a host, or -1 before it has started and after it has gone."""
-        return self._host_pidfds.get(host_id, -1)
+    def runner_pidfd(self, runner_id: int) -> int:
+        """A pidfd of a runner, or -1 before it has started and after it has gone."""
+        return self._runner_pidfds.get(runner_id, -1)
 
     def fileno(self) -> int:
         """Readable when ``poll`` has something to say; -1 once the jail has gone."""
@@ -325,7 +325,7 @@ class Jail:
         events = [event for message, fds in messages for event in self._translate(message, fds)]
         if ended:
             self._channel.close()
-            self._close_host_pidfds(list(self._host_pidfds))
+            self._close_runner_pidfds(list(self._runner_pidfds))
         return events
 
     def _translate(self, message: dict[str, Any], fds: list[int]) -> list[JailEvent]:
@@ -335,40 +335,42 @@ class Jail:
             return []
         if kind == "failed":
             return [Failed(message["layer"], message["reason"], message["fix"])]
-        if kind == "host_started":
+        if kind == "runner_started":
             report = self._report + message["report"]
-            self._host_pidfds[message["host"]] = fds[0]
+            self._runner_pidfds[message["runner"]] = fds[0]
             pid = process.pid_of(fds[0])
-            return [Ready(report), HostStarted(message["host"], pid, report)]
-        self._close_host_pidfds([message["host"]])
-        names = ("host", "code", "signal", "reason", "detail")
-        return [HostExited(*(message[name] for name in names))]
+            return [Ready(report), RunnerStarted(message["runner"], pid, report)]
+        self._close_runner_pidfds([message["runner"]])
+        names = ("runner", "code", "signal", "reason", "detail")
+        return [RunnerExited(*(message[name] for name in names))]
 
-    def _close_host_pidfds(self, hosts: Sequence[int]) -> None:
-        close_fds([self._host_pidfds.pop(host) for host in hosts if host in self._host_pidfds])
+    def _close_runner_pidfds(self, runners: Sequence[int]) -> None:
+        close_fds(
+            [self._runner_pidfds.pop(runner) for runner in runners if runner in self._runner_pidfds]
+        )
 
-    def start_host(self, fds: Sequence[int] = ()) -> tuple[int, socket.socket]:
-        """Ask for a host in this jail; it starts once the jail is ready.
+    def start_runner(self, fds: Sequence[int] = ()) -> tuple[int, socket.socket]:
+        """Ask for a runner in this jail; it starts once the jail is ready.
 
         Args:
-            fds: Passed through to ``host.main``; they stay the caller's.
+            fds: Passed through to ``runner.main``; they stay the caller's.
 
         Returns:
-            The host's id and the server's end of its stream (``AF_UNIX``, ``SOCK_STREAM``).
-            When the jail or the host dies, the stream ends.
+            The runner's id and the server's end of its stream (``AF_UNIX``, ``SOCK_STREAM``).
+            When the jail or the runner dies, the stream ends.
         """
         self._count += 1
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         with theirs:
-            message = {"op": "start", "host": self._count}
+            message = {"op": "start", "runner": self._count}
             if self._channel.fileno() >= 0:
                 self._channel.send(message, [theirs.fileno(), *fds])
         return self._count, ours
 
-    def kill_host(self, host_id: int) -> None:
-        """End a host and what it started. ``HostExited`` follows."""
+    def kill_runner(self, runner_id: int) -> None:
+        """End a runner and what it started. ``RunnerExited`` follows."""
         if self._channel.fileno() >= 0:
-            self._channel.send({"op": "kill", "host": host_id})
+            self._channel.send({"op": "kill", "runner": runner_id})
 
     def kill(self) -> None:
         """End every process of the jail for certain. ``JailExited`` follows. Idempotent."""
@@ -391,7 +393,7 @@ class Jail:
         if self._pidfd >= 0:
             os.close(self._pidfd)
             self._pidfd = -1
-        self._close_host_pidfds(list(self._host_pidfds))
+        self._close_runner_pidfds(list(self._runner_pidfds))
         if self._group is not None:
             self._group.remove()
         if self._folder is not None:

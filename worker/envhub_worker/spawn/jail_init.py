@@ -1,18 +1,18 @@
-"""The first process of a jail: it sets the jail up, starts hosts in it, and ends them all.
+"""The first process of a jail: it sets the jail up, starts runners in it, and ends them all.
 
 Trusted code. It reads its jail's specification from its control channel, which is the first
 message, ``{"spec": S, "scratch": folder | null, "cgroup": kind | null}`` with the descriptors of
 ``cgroups.Group.open``; then requests::
 
-    {"op": "start", "host": N} + [the host's stream, further descriptors...]
-    {"op": "kill", "host": N}
+    {"op": "start", "runner": N} + [the runner's stream, further descriptors...]
+    {"op": "kill", "runner": N}
 
 Events::
 
     {"event": "ready", "report": [layer...]}
     {"event": "failed", "layer": L, "reason": R, "fix": F}                  and it exits
-    {"event": "host_started", "host": N, "report": [layer...]} + [the host's pidfd]
-    {"event": "host_exited", "host": N, "code": C | null, "signal": S | null, "reason": R,
+    {"event": "runner_started", "runner": N, "report": [layer...]} + [the runner's pidfd]
+    {"event": "runner_exited", "runner": N, "code": C | null, "signal": S | null, "reason": R,
      "detail": D}
 
 The end of the channel ends the jail.
@@ -65,8 +65,8 @@ def run(control: int, output: int, common: Common) -> NoReturn:
 
 
 @dataclass
-class _Host:
-    """A host as its init knows it.
+class _Runner:
+    """A runner as its init knows it.
 
     Attributes:
         number: The server's number for it.
@@ -80,12 +80,12 @@ class _Host:
 
 
 class Init:
-    """The loop: requests from the server, reports of hosts, limits, and deaths."""
+    """The loop: requests from the server, reports of runners, limits, and deaths."""
 
     def __init__(self, channel: Channel, common: Common) -> None:
         self._channel = channel
         self._common = common
-        self._hosts: dict[int, _Host] = {}
+        self._runners: dict[int, _Runner] = {}
         self._listeners: set[int] = set()
         self._running = True
         self._poller = select.poll()
@@ -147,21 +147,21 @@ class Init:
                     self._read_reports(fd)
             if wakeup in ready:
                 self._reap()
-            if self._hosts:
+            if self._runners:
                 self._look()
 
     def _patience(self) -> float | None:
-        """Milliseconds until the next look at the limits; a jail without hosts needs none."""
-        return self._guard.seconds_left() * 1000 + 1 if self._hosts else None
+        """Milliseconds until the next look at the limits; a jail without runners needs none."""
+        return self._guard.seconds_left() * 1000 + 1 if self._runners else None
 
     def _look(self) -> None:
         if self._guard.seconds_left() == 0:
-            # A host that is still locking itself down runs our code, and cannot be measured yet.
-            starting = [pid for pid, host in self._hosts.items() if host.status is not None]
+            # A runner that is still locking itself down runs our code, and cannot be measured yet.
+            starting = [pid for pid, runner in self._runners.items() if runner.status is not None]
             over = self._guard.look(reap.descendants(os.getpid(), starting))
             if over is not None:
-                for host in self._hosts.values():
-                    host.ended = host.ended or over
+                for runner in self._runners.values():
+                    runner.ended = runner.ended or over
                 reap.kill_descendants(keep=())
 
     def _serve(self) -> None:
@@ -171,9 +171,9 @@ class Init:
             return
         message, fds = received
         if message["op"] == "start":
-            self._start(message["host"], fds)
+            self._start(message["runner"], fds)
         else:
-            self._kill(message["host"])
+            self._kill(message["runner"])
 
     def _start(self, number: int, fds: list[int]) -> None:
         status, theirs = Channel.pair()
@@ -181,7 +181,7 @@ class Init:
             parent=os.getpid(),
             jail=self._jail,
             fds=fds,
-            hosts=len(self._hosts) + 1,
+            runners=len(self._runners) + 1,
             joins=self._joins,
             status=theirs.fileno(),
         )
@@ -191,13 +191,13 @@ class Init:
         self._guard.ignore(fds)
         close_fds(fds)
         theirs.close()
-        self._hosts[pid] = _Host(number, status)
+        self._runners[pid] = _Runner(number, status)
         self._poller.register(status, select.POLLIN)
 
     def _kill(self, number: int) -> None:
-        for pid, host in self._hosts.items():
-            if host.number == number:
-                host.ended = host.ended or ("killed", "")
+        for pid, runner in self._runners.items():
+            if runner.number == number:
+                runner.ended = runner.ended or ("killed", "")
                 # Not reaped yet, so the pid is still its own. Stopped, it cannot fork away.
                 os.kill(pid, signal.SIGSTOP)
                 reap.kill_below(pid)
@@ -210,11 +210,11 @@ class Init:
             os.close(listener)
 
     def _read_reports(self, fd: int) -> None:
-        for pid, host in self._hosts.items():
-            if host.status is not None and host.status.fileno() == fd:
-                self._read_report(pid, host, host.status)
+        for pid, runner in self._runners.items():
+            if runner.status is not None and runner.status.fileno() == fd:
+                self._read_report(pid, runner, runner.status)
 
-    def _read_report(self, pid: int, host: _Host, status: Channel) -> None:
+    def _read_report(self, pid: int, runner: _Runner, status: Channel) -> None:
         messages, ended = status.drain()
         for message, fds in messages:
             if "layer" in message:
@@ -223,44 +223,49 @@ class Init:
                 self._listeners.update(fds)
                 self._poller.register(fds[0], select.POLLIN)
             else:
-                self._tell_started(pid, host, message["report"])
+                self._tell_started(pid, runner, message["report"])
         if ended:  # or it died before it was confined: its exit says so
             self._poller.unregister(status)
             status.close()
-            host.status = None
+            runner.status = None
 
-    def _tell_started(self, pid: int, host: _Host, report: list[dict[str, Any]]) -> None:
+    def _tell_started(self, pid: int, runner: _Runner, report: list[dict[str, Any]]) -> None:
         pidfd = os.pidfd_open(pid)  # not reaped yet: even if it has ended, it is this one
-        fields = {"host": host.number, "report": report}
-        self._channel.send({"event": "host_started", **fields}, [pidfd])
+        fields = {"runner": runner.number, "report": report}
+        self._channel.send({"event": "runner_started", **fields}, [pidfd])
         os.close(pidfd)
 
     def _reap(self) -> None:
         ended = [(pid, status) for pid, status in reap.reap(self._before_reaping)]
         for pid, status in ended:
-            host = self._hosts.pop(pid, None)
-            if host is not None:
-                self._tell_exit(host, status)
+            runner = self._runners.pop(pid, None)
+            if runner is not None:
+                self._tell_exit(runner, status)
                 self._end_orphans(pid)
-        if ended and not self._hosts:
-            reap.kill_descendants(keep=())  # daemons do not outlive the last host
+        if ended and not self._runners:
+            reap.kill_descendants(keep=())  # daemons do not outlive the last runner
 
     def _end_orphans(self, session: int) -> None:
-        """End what a host leaves behind, while others go on. Daemons end with the last host."""
-        for pid in reap.descendants(os.getpid(), keep=self._hosts):
+        """End what a runner leaves behind, while others go on. Daemons end with the last runner."""
+        for pid in reap.descendants(os.getpid(), keep=self._runners):
             with contextlib.suppress(ProcessLookupError):
                 if os.getsid(pid) == session:
                     os.kill(pid, signal.SIGKILL)
 
     def _before_reaping(self, pid: int) -> None:
-        host = self._hosts.get(pid)
-        if host is not None and host.status is not None:
-            self._read_report(pid, host, host.status)
+        runner = self._runners.get(pid)
+        if runner is not None and runner.status is not None:
+            self._read_report(pid, runner, runner.status)
 
-    def _tell_exit(self, host: _Host, status: int) -> None:
+    def _tell_exit(self, runner: _Runner, status: int) -> None:
         fields = process.exit_fields(status)
-        reason, detail = host.ended or self._reason(fields["signal"])
-        event = {"event": "host_exited", "host": host.number, "reason": reason, "detail": detail}
+        reason, detail = runner.ended or self._reason(fields["signal"])
+        event = {
+            "event": "runner_exited",
+            "runner": runner.number,
+            "reason": reason,
+            "detail": detail,
+        }
         self._channel.send({**event, **fields})
 
     def _reason(self, signum: int | None) -> tuple[Reason, str]:

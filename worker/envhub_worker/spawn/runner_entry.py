@@ -1,4 +1,4 @@
-"""A host, from its fork to the first line of the code that serves it.
+"""A runner, from its fork to the first line of the code that serves it.
 
 Everything here runs before anything of the repository does. The order is the point: what needs
 a privilege comes before its drop, and the syscall filter comes last.
@@ -35,13 +35,13 @@ _SELF_TEST = Layer("self-test", True, "the denials above were tried and held")
 
 @dataclass(frozen=True, kw_only=True)
 class Order:
-    """What init asks a new host to be.
+    """What init asks a new runner to be.
 
     Attributes:
         parent: Init's pid.
         jail: The jail.
         fds: The stream to the server, then whatever the server passes through.
-        hosts: How many the jail has, this one included.
+        runners: How many the jail has, this one included.
         joins: Where to join the jail's control group, if it has one.
         status: Socket for the report to init; closed before the target runs.
     """
@@ -49,7 +49,7 @@ class Order:
     parent: int
     jail: JailContext
     fds: list[int]
-    hosts: int
+    runners: int
     joins: list[int]
     status: int
 
@@ -76,7 +76,7 @@ def _run(order: Order) -> int:
     except LayerUnavailableError as error:
         init.send(error.to_wire())
         return 1
-    blas.restore_threads(order.jail.common.set_blas_threads, order.hosts)
+    blas.restore_threads(order.jail.common.set_blas_threads, order.runners)
     init.send({"report": [_SELF_TEST.to_wire()]})
     init.close()
     stream = socket.socket(fileno=order.fds[0])

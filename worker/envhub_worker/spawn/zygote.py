@@ -4,7 +4,7 @@ It is executed with ``-I``, a built environment and named descriptors, never run
 code and never sees what a jail is for: a jail's specification, with the secrets that its caller
 may grant, goes straight from the server to the jail's init, so that no later fork inherits it.
 
-argv: the descriptor of its control channel, and ``ahead`` if what every host needs shall be
+argv: the descriptor of its control channel, and ``ahead`` if what every runner needs shall be
 imported at once, and not only when it is confined. The first message on the channel is its
 configuration (a command line can be read by every jail), with the fields of ``ZygoteConfig``. Then
 requests::
@@ -43,7 +43,7 @@ from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.stages import zygote
 from envhub_worker.spawn import blas, jail_init
 
-# What nearly every host imports anyway. pyzmq is left out on purpose: a jail holds no ZeroMQ
+# What nearly every runner imports anyway. pyzmq is left out on purpose: a jail holds no ZeroMQ
 # socket, and a context started here would not survive the fork.
 _PRELOAD = (
     "cloudpickle",
@@ -92,7 +92,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def preload(target: str) -> None:
-    """Import what every host needs, the code that serves it included: ours, and inert."""
+    """Import what every runner needs, the code that serves it included: ours, and inert."""
     for module in _PRELOAD:
         importlib.import_module(module)
     place, _, _ = target.partition(":")

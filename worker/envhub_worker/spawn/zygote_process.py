@@ -1,7 +1,7 @@
 """The process of a zygote, from its start until it hears what it is for.
 
 What a server needs first is a zygote, and that takes longest: so ``serve --ahead`` starts one
-before anything else is imported. It is in the server's own interpreter, imports what every host
+before anything else is imported. It is in the server's own interpreter, imports what every runner
 needs, and waits.
 """
 

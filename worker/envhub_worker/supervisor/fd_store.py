@@ -1,7 +1,7 @@
-"""The descriptor socket: how a client's slabs and doorbells get to a host.
+"""The descriptor socket: how a client's slabs and doorbells get to a runner.
 
 ZeroMQ carries no descriptors, so they come over a ``SOCK_SEQPACKET`` socket in the server's
-private folder and wait here until the next request to the host takes them along. That is its
+private folder and wait here until the next request to the runner takes them along. That is its
 ``Attach``, which the server does not decode. One request a connection: nobody can keep it busy.
 """
 
@@ -15,7 +15,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import ProtocolError
 
 FDS = 5
-"""Descriptors of one deposit: three slabs, the doorbell that the host hears, the one it rings."""
+"""Descriptors of one deposit: three slabs, the doorbell that the runner hears, the one it rings."""
 _REQUEST_BYTES = 4096
 _WAIT_S = 1.0
 
@@ -24,7 +24,7 @@ PidfdFor = Callable[[m.Deposit], int | None]
 
 
 class Deposits:
-    """Descriptors that wait for their host."""
+    """Descriptors that wait for their runner."""
 
     def __init__(self, path: str, pidfd_for: PidfdFor) -> None:
         self._pidfd_for = pidfd_for
@@ -59,16 +59,16 @@ class Deposits:
             if pidfd is None or len(fds) != FDS:
                 return
             assert isinstance(request, m.Deposit)
-            key = request.jail, request.host
+            key = request.jail, request.runner
             close_fds(self._waiting.pop(key, []))
             self._waiting[key], fds = fds, []
             socket.send_fds(connection, [b"k"], [pidfd])
         finally:
             close_fds(fds)
 
-    def take(self, jail: int, host: int) -> list[int]:
-        """The descriptors for a host; the caller closes them."""
-        return self._waiting.pop((jail, host), [])
+    def take(self, jail: int, runner: int) -> list[int]:
+        """The descriptors for a runner; the caller closes them."""
+        return self._waiting.pop((jail, runner), [])
 
     def drop(self, jail: int) -> None:
         """Close what waits for a jail that has ended."""

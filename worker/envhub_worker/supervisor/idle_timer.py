@@ -1,7 +1,8 @@
 """For how long nobody has asked anything of a jail.
 
-Steps by the fast lane do not pass the server. But their slabs do, on their way to the host: the
-client counts its requests in one, which a host cannot write, and the host its replies in another.
+Steps by the fast lane do not pass the server. But their slabs do, on their way to the runner: the
+client counts its requests in one, which a runner cannot write, and the runner its replies in
+another.
 """
 
 from __future__ import annotations
@@ -33,22 +34,22 @@ class Idleness:
         """Something was asked, or answered."""
         self._since = monotonic()
 
-    def watch(self, host: int, fds: Sequence[int]) -> None:
-        """Count a host's steps, too. Takes the descriptors over: request slab and reply slab."""
-        self.forget(host)
-        self._slabs[host] = list(fds)
+    def watch(self, runner: int, fds: Sequence[int]) -> None:
+        """Count a runner's steps, too. Takes the descriptors over: request slab and reply slab."""
+        self.forget(runner)
+        self._slabs[runner] = list(fds)
 
-    def forget(self, host: int) -> None:
-        """A host has gone, or there was none."""
-        close_fds(self._slabs.pop(host, []))
+    def forget(self, runner: int) -> None:
+        """A runner has gone, or there was none."""
+        close_fds(self._slabs.pop(runner, []))
 
     def close(self) -> None:
         """Give all descriptors back."""
-        for host in list(self._slabs):
-            self.forget(host)
+        for runner in list(self._slabs):
+            self.forget(runner)
 
     def passed(self, busy: bool) -> bool:
-        """Whether it was too long; ``busy``: some host owes an answer to a message."""
+        """Whether it was too long; ``busy``: some runner owes an answer to a message."""
         asked = [_sequence(request) for request, _ in self._slabs.values()]
         told = [_sequence(reply) for _, reply in self._slabs.values()]
         if busy or asked != told or asked + told != self._seen:

@@ -1,7 +1,7 @@
 """The jails of a worker server: opened, asked, watched, and ended.
 
-Trusted code. It never decodes what a host says: it checks sizes and order, and hands the frames
-on. A host that breaks the rules loses its jail.
+Trusted code. It never decodes what a runner says: it checks sizes and order, and hands the frames
+on. A runner that breaks the rules loses its jail.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.limits import WireLimits
 from envhub_worker.spawn.jail_handle import (
     Failed,
-    HostExited,
-    HostStarted,
     JailExited,
+    RunnerExited,
+    RunnerStarted,
     Spawner,
     ZygoteDied,
 )
@@ -45,10 +45,10 @@ from envhub_worker.supervisor.records import (
     status_of,
     waiting,
 )
-from envhub_worker.supervisor.runner_stream import MAX_PENDING, HostLink
+from envhub_worker.supervisor.runner_stream import MAX_PENDING, RunnerLink
 
-MAX_HOSTS = 64
-"""Hosts of one jail: one per useful core, not one per sub-environment."""
+MAX_RUNNERS = 64
+"""Runners of one jail: one per useful core, not one per sub-environment."""
 MAX_IDLE_ZYGOTES = 2
 """Without a jail, when another is started. A client mostly has one policy, or two in turns."""
 MAX_JAILS = 256
@@ -56,7 +56,7 @@ MAX_JAILS = 256
 MAX_DEAD = 256
 """Jails that have ended and are not closed, whose deaths are remembered."""
 MAX_LOST = 4096
-"""Hosts of a kept jail that may die: their deaths are remembered."""
+"""Runners of a kept jail that may die: their deaths are remembered."""
 
 
 class Jails:
@@ -67,7 +67,7 @@ class Jails:
         answers: Takes the replies.
         runtime_dir: An existing folder of the server's own.
         readable_roots: Where snapshots lie.
-        limits: Bounds on what a host may say.
+        limits: Bounds on what a runner may say.
         fd_path: The socket that takes descriptors.
         ahead: A process for the first zygote.
     """
@@ -107,10 +107,10 @@ class Jails:
     # --- requests ------------------------------------------------------------------------------
 
     def open(self, asker: Asker, request: m.OpenJail) -> None:
-        """Fork a jail for a snapshot, and its first hosts."""
-        if len(self.open_ones()) >= MAX_JAILS or not 1 <= request.hosts <= MAX_HOSTS:
+        """Fork a jail for a snapshot, and its first runners."""
+        if len(self.open_ones()) >= MAX_JAILS or not 1 <= request.runners <= MAX_RUNNERS:
             self._answers.refuse(
-                asker, "WorkerError", f"at most {MAX_JAILS} jails of 1 to {MAX_HOSTS} hosts"
+                asker, "WorkerError", f"at most {MAX_JAILS} jails of 1 to {MAX_RUNNERS} runners"
             )
             return
         confinement = confinement_from_wire(request.confinement)
@@ -133,30 +133,32 @@ class Jails:
         self._jails[entry.number] = entry
         self._watch(entry, entry.control, lambda: self._jail_events(entry))
         self._watch(entry, jail.output, lambda: self._read_output(entry))
-        self._start_hosts(asker, entry, request.hosts)
+        self._start_runners(asker, entry, request.runners)
 
-    def start_more(self, asker: Asker, request: m.StartHosts) -> None:
-        """Fork further hosts in an open jail."""
+    def start_more(self, asker: Asker, request: m.StartRunners) -> None:
+        """Fork further runners in an open jail."""
         entry = self._owned(asker, request.jail)
         if entry is None:
             return
-        if not 1 <= request.hosts <= MAX_HOSTS - len(entry.links):
-            self._answers.refuse(asker, "WorkerError", f"a jail has at most {MAX_HOSTS} hosts")
+        if not 1 <= request.runners <= MAX_RUNNERS - len(entry.links):
+            self._answers.refuse(asker, "WorkerError", f"a jail has at most {MAX_RUNNERS} runners")
             return
         if len(entry.lost) > MAX_LOST:
-            self._answers.refuse(asker, "WorkerError", f"{len(entry.lost)} of its hosts have died")
+            self._answers.refuse(
+                asker, "WorkerError", f"{len(entry.lost)} of its runners have died"
+            )
             return
-        self._start_hosts(asker, entry, request.hosts)
+        self._start_runners(asker, entry, request.runners)
 
-    def _start_hosts(self, asker: Asker, entry: JailEntry, count: int) -> None:
-        hosts = tuple(self._start_host(entry) for _ in range(count))
-        entry.opening.append(Opening(asker, set(hosts), hosts))
+    def _start_runners(self, asker: Asker, entry: JailEntry, count: int) -> None:
+        runners = tuple(self._start_runner(entry) for _ in range(count))
+        entry.opening.append(Opening(asker, set(runners), runners))
 
-    def _start_host(self, entry: JailEntry) -> int:
-        host, sock = entry.jail.start_host()
-        link = entry.links[host] = HostLink(sock, self._limits)
-        self._watch(entry, link.fileno(), lambda: self._host_ready(entry, host))
-        return host
+    def _start_runner(self, entry: JailEntry) -> int:
+        runner, sock = entry.jail.start_runner()
+        link = entry.links[runner] = RunnerLink(sock, self._limits)
+        self._watch(entry, link.fileno(), lambda: self._runner_ready(entry, runner))
+        return runner
 
     def _watch(self, entry: JailEntry, fd: int, callback: Callable[[], None]) -> None:
         """Whatever goes wrong with a jail is its own end, and not the server's."""
@@ -197,7 +199,7 @@ class Jails:
             spawner.close()
 
     def relay(self, asker: Asker, request: m.Relay, payload: list[bytes]) -> None:
-        """Hand the payload to hosts; the reply goes out once all of them have answered."""
+        """Hand the payload to runners; the reply goes out once all of them have answered."""
         entry = self._owned(asker, request.jail)
         if entry is None:
             return
@@ -207,20 +209,22 @@ class Jails:
                 asker, "LocalProtocolError", "the parts of Relay do not fit its frames"
             )
             return
-        if any(owes(entry, host) >= MAX_PENDING for host, _ in targets):
-            self._answers.refuse(asker, "WorkerError", f"a host owes {MAX_PENDING} answers already")
+        if any(owes(entry, runner) >= MAX_PENDING for runner, _ in targets):
+            self._answers.refuse(
+                asker, "WorkerError", f"a runner owes {MAX_PENDING} answers already"
+            )
             return
         pending = Pending(asker, request.operation, [None] * len(targets))
-        for index, (host, frames) in enumerate(targets):
-            if host in entry.lost:
-                pending.lost(index, entry.lost[host])
+        for index, (runner, frames) in enumerate(targets):
+            if runner in entry.lost:
+                pending.lost(index, entry.lost[runner])
                 continue
-            link = entry.links[host]
-            fds = self._deposits.take(entry.number, host)
+            link = entry.links[runner]
+            fds = self._deposits.take(entry.number, runner)
             try:
                 link.send(next(self._packet_ids), frames, (pending, index), fds)
                 if entry.idle is not None and fds:
-                    entry.idle.watch(host, [os.dup(fd) for fd in fds[:2]])
+                    entry.idle.watch(runner, [os.dup(fd) for fd in fds[:2]])
             finally:
                 close_fds(fds)
             self._follow_writes(link)
@@ -238,20 +242,20 @@ class Jails:
         for part in request.parts:
             if type(part) is not tuple or len(part) != 2:
                 return None
-            host, count = part
-            if type(host) is not int or host in asked:
+            runner, count = part
+            if type(runner) is not int or runner in asked:
                 return None
-            asked.add(host)
-            if host not in entry.links and host not in entry.lost:
+            asked.add(runner)
+            if runner not in entry.links and runner not in entry.lost:
                 return None
             if type(count) is not int or not 1 <= count <= len(payload) - start:
                 return None
-            targets.append((host, payload[start : start + count]))
+            targets.append((runner, payload[start : start + count]))
             start += count
         return targets if targets and start == len(payload) else None
 
     def keep(self, asker: Asker, request: m.KeepJail) -> None:
-        """From now on the death of a host is its own affair."""
+        """From now on the death of a runner is its own affair."""
         entry = self._owned(asker, request.jail)
         if entry is not None:
             entry.kept = True
@@ -276,12 +280,12 @@ class Jails:
         entry = self._jails.get(request.jail)
         if entry is None or entry.session != request.session or entry.death is not None:
             return None
-        if request.host not in entry.links:
+        if request.runner not in entry.links:
             return None
-        pidfd = entry.jail.host_pidfd(request.host) if entry.kept else entry.jail.pidfd
+        pidfd = entry.jail.runner_pidfd(request.runner) if entry.kept else entry.jail.pidfd
         return pidfd if pidfd >= 0 else None
 
-    def _follow_writes(self, link: HostLink) -> None:
+    def _follow_writes(self, link: RunnerLink) -> None:
         if link.wants_write != link.watched:
             link.watched = link.wants_write
             self._loop.watch_writes(link.fileno(), link.watched)
@@ -359,13 +363,13 @@ class Jails:
 
     # --- what happens --------------------------------------------------------------------------
 
-    def _host_ready(self, entry: JailEntry, host: int) -> None:
-        link = entry.links[host]
+    def _runner_ready(self, entry: JailEntry, runner: int) -> None:
+        link = entry.links[runner]
         link.flush()
         try:
             answers = link.receive()
         except ProtocolError as error:
-            self._host_died(entry, m.Died(host, "protocol", None, None, str(error), "", ""))
+            self._runner_died(entry, m.Died(runner, "protocol", None, None, str(error), "", ""))
             return
         if answers is None:
             self._loop.unwatch(link.fileno())
@@ -397,21 +401,21 @@ class Jails:
         if entry.jail.fileno() < 0:
             self._unwatch_control(entry)
         for event in events:
-            if isinstance(event, HostStarted):
-                self._host_started(entry, event)
+            if isinstance(event, RunnerStarted):
+                self._runner_started(entry, event)
             elif isinstance(event, Failed):
                 self._failed(entry, event)
-            elif isinstance(event, HostExited):
-                self._host_exited(entry, event)
+            elif isinstance(event, RunnerExited):
+                self._runner_exited(entry, event)
 
-    def _host_started(self, entry: JailEntry, event: HostStarted) -> None:
-        entry.pids[event.host_id] = event.pid
+    def _runner_started(self, entry: JailEntry, event: RunnerStarted) -> None:
+        entry.pids[event.runner_id] = event.pid
         entry.report = tuple(event.report)
         for opening in list(entry.opening):
-            opening.waiting.discard(event.host_id)
+            opening.waiting.discard(event.runner_id)
             if not opening.waiting:
                 entry.opening.remove(opening)
-                opened = m.JailOpened(entry.number, opening.hosts, entry.report)
+                opened = m.JailOpened(entry.number, opening.runners, entry.report)
                 self._answers.reply(opening.asker, opened)
 
     def _failed(self, entry: JailEntry, event: Failed) -> None:
@@ -422,38 +426,38 @@ class Jails:
         entry.opening.clear()
         self._end(entry, m.Died(-1, "unavailable", None, None, event.reason, "", ""))
 
-    def _host_exited(self, entry: JailEntry, event: HostExited) -> None:
+    def _runner_exited(self, entry: JailEntry, event: RunnerExited) -> None:
         how = signal_name(event.signal)
-        self._host_died(
-            entry, m.Died(event.host_id, event.reason, event.code, how, event.detail, "", "")
+        self._runner_died(
+            entry, m.Died(event.runner_id, event.reason, event.code, how, event.detail, "", "")
         )
 
-    def _host_died(self, entry: JailEntry, death: m.Died) -> None:
+    def _runner_died(self, entry: JailEntry, death: m.Died) -> None:
         """The end of its jail too, unless that is kept."""
         if not entry.kept:
             self._end(entry, death)
-        elif entry.death is None and death.host in entry.links:
+        elif entry.death is None and death.runner in entry.links:
             self._lose(entry, death)
 
     def _lose(self, entry: JailEntry, death: m.Died) -> None:
-        """Go on without a host: whoever waits for it hears how it died, and nobody else."""
+        """Go on without a runner: whoever waits for it hears how it died, and nobody else."""
         entry.output.read()
         death = replace(death, tail=entry.output.text())
         # the last lines of earlier deaths have been told: many of them would be much
-        entry.lost = {host: replace(one, tail="") for host, one in entry.lost.items()}
-        entry.lost[death.host] = death
-        entry.jail.kill_host(death.host)  # it may live, and have broken the rules
-        entry.pids.pop(death.host, None)
-        close_fds(self._deposits.take(entry.number, death.host))
+        entry.lost = {runner: replace(one, tail="") for runner, one in entry.lost.items()}
+        entry.lost[death.runner] = death
+        entry.jail.kill_runner(death.runner)  # it may live, and have broken the rules
+        entry.pids.pop(death.runner, None)
+        close_fds(self._deposits.take(entry.number, death.runner))
         if entry.idle is not None:
-            entry.idle.forget(death.host)
-        link = entry.links.pop(death.host)
+            entry.idle.forget(death.runner)
+        link = entry.links.pop(death.runner)
         self._loop.unwatch(link.fileno())
         for pending, index in link.pending.values():
             pending.lost(index, death)
             self._gather(pending)
         link.close()
-        for opening in [one for one in entry.opening if death.host in one.waiting]:
+        for opening in [one for one in entry.opening if death.runner in one.waiting]:
             entry.opening.remove(opening)
             self._answers.reply(opening.asker, for_operation(death, "start"))
 
@@ -494,7 +498,7 @@ class Jails:
         if entry.closing:
             del self._jails[entry.number]
         else:
-            self._jail_events(entry)  # its hosts' exits say more than its own
+            self._jail_events(entry)  # its runners' exits say more than its own
             how = signal_name(event.signal)
             self._end(entry, m.Died(-1, "exit", event.code, how, "", "", ""))
         self._release(entry)

@@ -13,7 +13,7 @@ from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.spawn.jail_handle import Jail
 from envhub_worker.supervisor.idle_timer import Idleness
 from envhub_worker.supervisor.output_tail import OutputTail
-from envhub_worker.supervisor.runner_stream import HostLink
+from envhub_worker.supervisor.runner_stream import RunnerLink
 
 
 class Asker(NamedTuple):
@@ -30,16 +30,16 @@ class Asker(NamedTuple):
 
 @dataclass
 class Opening:
-    """An ``OpenJail`` or ``StartHosts`` whose hosts have not all come up."""
+    """An ``OpenJail`` or ``StartRunners`` whose runners have not all come up."""
 
     asker: Asker
     waiting: set[int]
-    hosts: tuple[int, ...]
+    runners: tuple[int, ...]
 
 
 @dataclass(slots=True)
 class Pending:
-    """A ``Relay`` that hosts still owe answers to."""
+    """A ``Relay`` that runners still owe answers to."""
 
     asker: Asker
     operation: str
@@ -48,7 +48,7 @@ class Pending:
     since: float = field(default_factory=monotonic)
 
     def lost(self, index: int, death: m.Died) -> None:
-        """In the place of a host's answer: how it died."""
+        """In the place of a runner's answer: how it died."""
         self.dead.add(index)
         self.replies[index] = m.pack(for_operation(death, self.operation), 0)
 
@@ -63,7 +63,7 @@ class JailEntry:
     jail: Jail
     spawner: tuple[object, ...]
     output: OutputTail
-    links: dict[int, HostLink] = field(default_factory=dict)
+    links: dict[int, RunnerLink] = field(default_factory=dict)
     pids: dict[int, int] = field(default_factory=dict)
     report: tuple[object, ...] = ()
     opening: list[Opening] = field(default_factory=list)
@@ -92,7 +92,7 @@ class Answers(Protocol):
 
 
 def waiting(entry: JailEntry) -> list[Pending]:
-    """Everything that hosts owe an answer to; they owe it no more."""
+    """Everything that runners owe an answer to; they owe it no more."""
     found = {}
     for link in entry.links.values():
         for pending, _ in link.pending.values():
@@ -101,9 +101,9 @@ def waiting(entry: JailEntry) -> list[Pending]:
     return list(found.values())
 
 
-def owes(entry: JailEntry, host: int) -> int:
-    """How many answers a host owes; one that has died owes none any more."""
-    link = entry.links.get(host)
+def owes(entry: JailEntry, runner: int) -> int:
+    """How many answers a runner owes; one that has died owes none any more."""
+    link = entry.links.get(runner)
     return 0 if link is None else len(link.pending)
 
 
@@ -126,7 +126,7 @@ _STATES = {"R": "running", "S": "waiting", "D": "waiting", "T": "stopped", "t": 
 
 
 def _state_of(pid: int) -> str:
-    """What the kernel says that a host is doing: of a busy environment nobody else can tell."""
+    """What the kernel says that a runner is doing: of a busy environment nobody else can tell."""
     try:
         with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as file:
             # the command may hold anything, parentheses and blanks included
@@ -139,8 +139,8 @@ def status_of(entry: JailEntry) -> dict[str, object]:
     """What a jail is doing, for ``Status``."""
     owed = [pending for link in entry.links.values() for pending, _ in link.pending.values()]
     oldest = min(owed, key=lambda pending: pending.since, default=None)
-    # in the order of the hosts: they come up side by side, and say so in any order
-    pids = tuple(entry.pids[host] for host in sorted(entry.pids))
+    # in the order of the runners: they come up side by side, and say so in any order
+    pids = tuple(entry.pids[runner] for runner in sorted(entry.pids))
     return {
         "jail": entry.number,
         "name": entry.name,

@@ -1,4 +1,4 @@
-"""The server's end of the stream to one host: bounded both ways, never blocking."""
+"""The server's end of the stream to one runner: bounded both ways, never blocking."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from envhub_worker.protocol.limits import LARGE_BYTES, WireLimits
 from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
 
 MAX_PENDING = 16
-"""Requests that one host may owe: a client waits for its answer before it asks again, but a
+"""Requests that one runner may owe: a client waits for its answer before it asks again, but a
 late one after a timeout may still be under way."""
 _MAX_IOVECS = 512
 
 
 @dataclass
-class HostLink:
-    """One host's stream.
+class RunnerLink:
+    """One runner's stream.
 
     Attributes:
         pending: By the ids of the requests that it owes an answer to, oldest first.
@@ -65,17 +65,17 @@ class HostLink:
     def _send_fds(self, request_id: int, frames: Sequence[Buffer], fds: Sequence[int]) -> None:
         """Descriptors belong to a place in the stream, so their small packet goes in one piece."""
         if self._unsent:
-            raise RuntimeError("the host is still being sent another request")
+            raise RuntimeError("the runner is still being sent another request")
         data = b"".join(map(bytes, pack_packet(request_id, frames)))
         try:
             sent = socket.send_fds(self.sock, [data], fds)
         except OSError:
             return  # it is gone: its exit answers
         if sent != len(data):
-            raise RuntimeError("the host does not read its stream")
+            raise RuntimeError("the runner does not read its stream")
 
     def flush(self) -> None:
-        """Send what the socket takes. A host that is gone is noticed by its exit."""
+        """Send what the socket takes. A runner that is gone is noticed by its exit."""
         while self._unsent:
             batch = [self._unsent[i] for i in range(min(len(self._unsent), _MAX_IOVECS))]
             try:
@@ -95,7 +95,7 @@ class HostLink:
         """The replies that have arrived with their owners, or None at the end of the stream.
 
         Raises:
-            RemoteProtocolError: The host sent what nobody asked for. Trust: it is hostile.
+            RemoteProtocolError: The runner sent what nobody asked for. Trust: it is hostile.
         """
         try:
             data = self.sock.recv(self._reader.chunk)
@@ -119,7 +119,9 @@ class HostLink:
         """Before there is memory for what nobody asked for."""
         expected = next(iter(self.pending), None)
         if request_id != expected:
-            raise RemoteProtocolError(f"the host answered request {request_id}, it owes {expected}")
+            raise RemoteProtocolError(
+                f"the runner answered request {request_id}, it owes {expected}"
+            )
 
     def _owner(self, packet: Packet) -> Any:
         return self.pending.pop(packet.request_id)

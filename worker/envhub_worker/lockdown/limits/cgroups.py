@@ -1,7 +1,7 @@
 """Memory and process counts by the kernel, where this process may make control groups.
 
 As root under cgroup v1 or v2, or as a user who was delegated a v2 group. The server makes a
-group for each jail; a host joins it before anything else, through descriptors that the server
+group for each jail; a runner joins it before anything else, through descriptors that the server
 opened. Where there is none, ``watchdog`` measures instead.
 """
 

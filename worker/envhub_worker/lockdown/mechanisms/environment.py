@@ -27,7 +27,7 @@ def zygote_environment(host: Mapping[str, str], python: str) -> dict[str, str]:
         "HOME": "/nonexistent",
         # A thread in the zygote would make unshare(CLONE_NEWUSER) fail, and die in the fork.
         "OPENBLAS_NUM_THREADS": "1",
-        # In cycles, a power of two; read once as well. By default a host's threads would spin for
+        # In cycles, a power of two; read once as well. By default a runner's threads would spin for
         # a tenth of a second after their start and after each use, on the cores of its siblings
         # and of the client, and its page faults would wait for them.
         "OPENBLAS_THREAD_TIMEOUT": "20",
@@ -37,7 +37,7 @@ def zygote_environment(host: Mapping[str, str], python: str) -> dict[str, str]:
 def jail_environment(
     base: Mapping[str, str], granted: Mapping[str, str], home: str, temporary: str
 ) -> dict[str, str]:
-    """What a host of a jail sees.
+    """What a runner of a jail sees.
 
     Args:
         base: The zygote's own environment.

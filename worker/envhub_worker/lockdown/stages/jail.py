@@ -1,4 +1,4 @@
-"""A jail's own confinement, by its init: what all hosts of the jail have in common."""
+"""A jail's own confinement, by its init: what all runners of the jail have in common."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from envhub_worker.protocol.confinement import Limits
 
 
 def enter(spec: JailSpec, common: Common, folder: str) -> tuple[Scratch, str]:
-    """Confine this init as far as all of its hosts are.
+    """Confine this init as far as all of its runners are.
 
     Args:
         spec: The jail.
@@ -87,7 +87,7 @@ def _check_readable(spec: JailSpec) -> None:
 
 
 def process_limit(limits: Limits, namespaced: bool) -> int:
-    """``RLIMIT_NPROC`` of a host: it counts all of the user's threads in the user namespace."""
+    """``RLIMIT_NPROC`` of a runner: it counts all of the user's threads in the user namespace."""
     if namespaced:
         return limits.processes + 1  # init
     return limits.processes + _threads_of(os.getuid())

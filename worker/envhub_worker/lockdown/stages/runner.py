@@ -1,4 +1,4 @@
-"""A host's own confinement: what the kernel binds to one process and its descendants."""
+"""A runner's own confinement: what the kernel binds to one process and its descendants."""
 
 from __future__ import annotations
 
@@ -77,11 +77,11 @@ def _be_killed_first() -> None:
 
 
 def rules(jail: JailContext, pid: int) -> list[Rule]:
-    """What Landlock permits a host; everything else it denies.
+    """What Landlock permits a runner; everything else it denies.
 
     Args:
         jail: The jail.
-        pid: The host's own: without a pid namespace it may read only its own ``/proc`` folder.
+        pid: The runner's own: without a pid namespace it may read only its own ``/proc`` folder.
     """
     common, scratch = jail.common, jail.scratch
     readable = [*common.trees, jail.spec.snapshot]

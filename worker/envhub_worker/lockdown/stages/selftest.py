@@ -1,4 +1,4 @@
-"""A host tries what it must not be able to do. The last thing before a stranger's code."""
+"""A runner tries what it must not be able to do. The last thing before a stranger's code."""
 
 from __future__ import annotations
 
