@@ -27,6 +27,7 @@ from envhub_sandbox.transport.shared_memory.sharding import bounds_for
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.manifest import EnvManifest, Manifest
+from envhub_worker.protocol.runtime import Runtime
 
 
 def make_env(
@@ -125,9 +126,9 @@ def make_env(
     chosen_policy = policy_from(policy, limits_from(limits))
     chosen_timeouts = timeouts_from(timeouts)
     place = None if sandbox is None else _sandbox(sandbox, server_key)
-    runs_on = arguments.interpreter(python)
+    runs_on = Runtime(arguments.interpreter(python))
     if sandbox == "process":
-        arguments.check_executable(runs_on)
+        arguments.check_executable(runs_on.python)
     snapshot = named(reference, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
     if place is None:
         envs = inprocess.make(snapshot, n_envs, use_async_envs, config, further)
@@ -203,7 +204,7 @@ class _Maker:
         self._num_workers = num_workers
         self._prewarm = prewarm
         load = repository.arguments.message()
-        key = manifest_key(repository.snapshot, load, repository.policy, repository.interpreter)
+        key = manifest_key(repository.snapshot, load, repository.policy, repository.runs_on)
         self._cache = ManifestCache(store.cache_root() / "manifests", key)
 
     def make(self) -> EnvSuites:

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from envhub_sandbox.transport.connection import WorkerClient
     from envhub_sandbox.transport.deadline import Deadline
     from envhub_sandbox.transport.tcp import Far
+    from envhub_worker.protocol.runtime import Runtime
 
 
 class WorkerServer(Protocol):
@@ -107,13 +108,13 @@ class RepositorySandbox(Sandbox, Protocol):
 class PerRepository(Protocol):
     """A place where each repository gets a server of its own, which sees no other's files."""
 
-    def for_repository(self, snapshot: Path, policy: Policy, python: str) -> RepositorySandbox:
+    def for_repository(self, snapshot: Path, policy: Policy, runtime: Runtime) -> RepositorySandbox:
         """The sandbox for the files in ``snapshot``. Starts nothing.
 
         Args:
             snapshot: The verified files.
             policy: What the jails may do.
-            python: The interpreter that the caller named, or empty.
+            runtime: The interpreter that the caller named, or none, and the repository's packages.
 
         Raises:
             PolicyError: The place cannot permit what the policy does.

@@ -29,6 +29,7 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.tcp import Far
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import parse_key
+from envhub_worker.protocol.runtime import Runtime
 
 SERVER_KEY_VARIABLE = "ENVHUB_SERVER_KEY"
 CLIENT_KEY_VARIABLE = "ENVHUB_CLIENT_KEY"
@@ -81,14 +82,14 @@ class RemoteSandbox:
     def __deepcopy__(self, memo: dict[int, Any]) -> RemoteSandbox:
         return replace(self)
 
-    def for_repository(self, snapshot: Path, policy: Policy, python: str) -> RemoteRepository:
+    def for_repository(self, snapshot: Path, policy: Policy, runtime: Runtime) -> RemoteRepository:
         """The sandbox for one repository. Connects to nothing.
 
         Raises:
             PolicyError: The policy names what a client on another host cannot have.
             SandboxUnavailableError: A key is missing.
         """
-        check_policy(policy, python)
+        check_policy(policy, runtime)
         return RemoteRepository(self.endpoint, self._far(), snapshot, policy)
 
     def _far(self) -> Far:
@@ -105,16 +106,21 @@ class RemoteSandbox:
         """Nothing was acquired here."""
 
 
-def check_policy(policy: Policy, python: str) -> None:
+def check_policy(policy: Policy, runtime: Runtime) -> None:
     """Refuse what names this machine's things; the server would refuse it, too.
 
     Raises:
         PolicyError: With what to do instead.
     """
-    if python:
+    if runtime.packages:
         raise PolicyError(
-            f"python={python!r} is an interpreter of this machine, and a remote server has its "
-            "own: start it in the environment or image that the repository needs"
+            "dependencies: an environment of the repository's own is of this machine, and a remote "
+            "server uses its own: start it in the environment or image that the repository needs"
+        )
+    if runtime.python:
+        raise PolicyError(
+            f"python={runtime.python!r} is an interpreter of this machine, and a remote server has "
+            "its own: start it in the environment or image that the repository needs"
         )
     if policy.readable:
         raise PolicyError(

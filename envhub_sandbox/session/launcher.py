@@ -15,6 +15,7 @@ from envhub_sandbox.crash.writer import Crash, keep
 from envhub_sandbox.errors import (
     EnvHubError,
     LoadError,
+    VersionMismatchError,
     WorkerDiedError,
     WorkerTimeoutError,
     name_bundle,
@@ -41,12 +42,14 @@ from envhub_sandbox.transport.output import OutputFollower, Wanted
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import WireLimits
 from envhub_worker.protocol.manifest import EnvManifest, Manifest, decode_manifest
+from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _CLOSE_S = 5.0
 _STATUS_S = 1.0
 _FIRST_WITH_LOAD_TASK = 3
 """The version of the protocol."""
+_FIRST_WITH_PACKAGES = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,12 +115,13 @@ class Repository:
         policy: What a jail may do.
         timeouts: How long operations may take.
         sandbox: Where workers run.
-        python: The interpreter of the jails; empty for ours.
+        runtime: The interpreter of the jails, and their packages.
         store: The folder that snapshots lie in.
         lane: ``"auto"`` or ``"frames"``.
         copy: Whether observations are copied for the caller, or lent.
 
     Attributes:
+        runs_on: What runs it where it runs; a remembered manifest holds for this only.
         latest_report: The layers of the jail that was opened last, for the provenance of what was
             made. Which of them hold for an environment, only its own jail says.
     """
@@ -129,7 +133,7 @@ class Repository:
         policy: Policy,
         timeouts: Timeouts,
         sandbox: Sandbox,
-        python: str,
+        runtime: Runtime,
         store: Path,
         lane: str,
         copy: bool,
@@ -138,16 +142,16 @@ class Repository:
         self.arguments = arguments
         self.policy = policy
         self.timeouts = timeouts
-        self.python = python
+        self.runtime = runtime
         self.lane = lane
         self.copy = copy
         self.latest_report: list[dict[str, Any]] = []
         self.recipe: Recipe | None = None
         self._sandbox = sandbox
-        self.interpreter = python
+        self.runs_on = runtime
         if isinstance(sandbox, PerRepository):
-            own = sandbox.for_repository(snapshot.root, policy, python)
-            self._sandbox, self.interpreter = own, own.interpreter
+            own = sandbox.for_repository(snapshot.root, policy, runtime)
+            self._sandbox, self.runs_on = own, Runtime(own.interpreter)
         self._store = store
         self._hold = ServerHold(self._acquire, self._release)
         self._jail_numbers = count(1)
@@ -285,7 +289,12 @@ class Repository:
                 server.bring(client, deadline)
             # all at once, where they will load what is known: else it is asked for, and then again
             known = known if client.version >= _FIRST_WITH_LOAD_TASK else None
-            order = replace(self._order(server), runners=known.shards if known else 1)
+            order = self._order(server, known.shards if known else 1)
+            if isinstance(order, m.OpenJailWith) and client.version < _FIRST_WITH_PACKAGES:
+                raise VersionMismatchError(
+                    f"the worker speaks protocol {client.version}, and a repository with packages "
+                    f"of its own needs {_FIRST_WITH_PACKAGES}: upgrade the worker"
+                )
             jail = open_jail(client, order, self.wire_limits, deadline)
         except BaseException:
             client.close()
@@ -311,20 +320,17 @@ class Repository:
         far = server.far if isinstance(server, FarServer) else None
         return WorkerClient(server.endpoint, server.process_fd, self.wire_limits, far)
 
-    def _order(self, server: WorkerServer) -> m.OpenJail:
+    def _order(self, server: WorkerServer, runners: int) -> m.OpenJail:
         confinement = self.policy.confinement()
-        snapshot, python = str(self.snapshot.root), self.python
+        snapshot, runtime = str(self.snapshot.root), self.runtime
         if isinstance(server, EnclosedServer):
-            snapshot, python = server.snapshot, server.python
+            snapshot, runtime = server.snapshot, Runtime(server.python)
             confinement = replace(confinement, profile=server.profile)
-        return m.OpenJail(
-            name=self.label,
-            python=python,
-            snapshot=snapshot,
-            entry=self.snapshot.path,
-            confinement=asdict(confinement),
-            runners=1,
-        )
+        entry, permitted = self.snapshot.path, asdict(confinement)
+        order = (self.label, runtime.python, snapshot, entry, permitted, runners)
+        if not runtime.packages:
+            return m.OpenJail(*order)
+        return m.OpenJailWith(*order, runtime.packages)
 
     def _load(self, jail: RemoteJail, server: WorkerServer, deadline: Deadline) -> LoadedJail:
         runner = jail.runners[0]

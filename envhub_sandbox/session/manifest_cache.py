@@ -22,6 +22,7 @@ from envhub_worker import protocol
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import encode
 from envhub_worker.protocol.manifest import Manifest, decode_manifest
+from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.protocol.stream import PacketReader, pack_packet
 
 _FORMAT = 1
@@ -79,7 +80,7 @@ class ManifestCache:
                 self._path.unlink(missing_ok=True)
 
 
-def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, python: str) -> str | None:
+def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, runtime: Runtime) -> str | None:
     """The entry's name; None if an argument has no form that can be compared."""
     try:
         arguments = b"".join(map(bytes, m.pack(load, 0, pickler=_refuse)))
@@ -89,7 +90,7 @@ def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, python: str) 
         *(_FORMAT, m.VERSION, _stamp(Path(protocol.__file__).parent.parent)),
         *(snapshot.repo_type, snapshot.repo_id, snapshot.commit, snapshot.path),
         *(policy.profile, policy.network, policy.readable, policy.gpu, policy.environment),
-        *_interpreter_facts(python or sys.executable),
+        *_facts_of(runtime.python or sys.executable, runtime.packages),
     )
     digest = hashlib.sha256(arguments)
     digest.update(repr(facts).encode())
@@ -101,10 +102,11 @@ def _refuse(value: object) -> bytes:
     raise TypeError(f"{type(value).__name__} has no stable form")
 
 
-def _interpreter_facts(python: str) -> tuple[object, ...]:
+def _facts_of(python: str, packages: str) -> tuple[object, ...]:
     """The interpreter, and when packages were last installed into it."""
     prefix = Path(python).parent.parent
-    folders = sorted(prefix.glob("lib/python3*/site-packages"))
+    own = sorted(prefix.glob("lib/python3*/site-packages"))
+    folders = [Path(packages)] if packages else own
     return (python, _stamp(Path(python)), *((str(path), _stamp(path)) for path in folders))
 
 

@@ -33,9 +33,14 @@ _NEEDED = {
 """What this package imports, and what that is called where it is installed from."""
 
 
-def command(python: str, program: str, *args: str) -> list[str]:
-    """The argv that runs ``program`` (a key of ``_PROGRAMS``) with ``args`` in ``python``."""
-    return [python, "-I", os.path.abspath(__file__), program, *args]
+def command(python: str, program: str, *args: str, site: bool = True) -> list[str]:
+    """The argv that runs ``program`` (a key of ``_PROGRAMS``) with ``args`` in ``python``.
+
+    Without ``site`` there are no packages but the standard library, and so no start-up files of
+    theirs: no ``.pth``, no ``sitecustomize``.
+    """
+    flags = ["-I"] if site else ["-I", "-S"]
+    return [python, *flags, os.path.abspath(__file__), program, *args]
 
 
 def load_package() -> None:

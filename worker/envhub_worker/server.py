@@ -211,6 +211,7 @@ class Server:
 
 _HANDLERS: dict[type[m.Message], Callable[[Jails, Asker, Any], None]] = {
     m.OpenJail: Jails.open,
+    m.OpenJailWith: Jails.open,
     m.StartRunners: Jails.start_more,
     m.KeepJail: Jails.keep,
     m.ExpireIdle: Jails.expire,

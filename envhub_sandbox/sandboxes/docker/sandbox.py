@@ -39,6 +39,7 @@ from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.lingering import Lingering
 from envhub_sandbox.sandboxes.owner import identity_of
 from envhub_sandbox.sandboxes.refcount import Sharing
+from envhub_worker.protocol.runtime import Runtime
 
 _MONITOR = Path(__file__).with_name("monitor.py")
 _STARTUP_S = 120.0
@@ -83,17 +84,25 @@ class DockerSandbox:
             if value is not None and not value > 0:
                 raise PolicyError(f"DockerSandbox: {option} is {value!r}; it takes more than 0")
 
-    def for_repository(self, snapshot: Path, policy: Policy, python: str) -> RepositoryContainer:
+    def for_repository(
+        self, snapshot: Path, policy: Policy, runtime: Runtime
+    ) -> RepositoryContainer:
         """The container for one repository. Starts nothing, but asks for engine and image.
 
         Raises:
             PolicyError: A container cannot give what the policy permits.
             SandboxUnavailableError: There is no engine, no image, or no permission.
         """
-        if python:
+        if runtime.packages:
             raise PolicyError(
-                f"python={python!r} is an interpreter of this machine, and a container has its "
-                "own: choose an image instead, with DockerSandbox(image=...)"
+                "dependencies: an environment of the repository's own is of this machine, and a "
+                "container has its own: make an image with `envhub image build` and choose it, "
+                "with DockerSandbox(image=...)"
+            )
+        if runtime.python:
+            raise PolicyError(
+                f"python={runtime.python!r} is an interpreter of this machine, and a container has "
+                "its own: choose an image instead, with DockerSandbox(image=...)"
             )
         if self.gpus is not None and not policy.gpu:
             raise PolicyError("DockerSandbox(gpus=...) takes a policy with gpu=True")

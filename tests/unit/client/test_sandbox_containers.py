@@ -21,6 +21,7 @@ from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from envhub_worker.lockdown.seccomp import policy as seccomp_policy
+from envhub_worker.protocol.runtime import Runtime
 from tests.unit.docs.test_imports import folder, modules
 
 DOCKER = Engine("docker", "/usr/bin/docker", "28", rootless=False)
@@ -393,7 +394,7 @@ def test_an_engine_says_whose_users_it_has(
     assert (engine.rootless, engine.remapped) == (rootless, remapped)
     if rootless:
         with pytest.raises(SandboxUnavailableError, match="podman"):
-            DockerSandbox(engine="docker").for_repository(tmp_path, Policy(), "")
+            DockerSandbox(engine="docker").for_repository(tmp_path, Policy(), Runtime(""))
 
 
 def test_podman_under_dockers_name_is_podman(

@@ -50,6 +50,7 @@ SAMPLES: list[m.Message] = [
     m.Sessions(({"client": "a", "session": "b", "heard_s": 0.5, "connections": 1, "jails": ()},)),
     m.ExpireIdle(3, 60_000),
     m.KeepJail(3),
+    m.OpenJailWith("a/b@c:env.py", "/usr/bin/python3", "/s", "env.py", {"gpu": False}, 1, "/p"),
     m.RelayedPartly((2, 1), (1,)),
     m.Load(4, True, {"task": "pick"}, {"seed": 1}),
     m.LoadTask(4, True, {"task": "pick"}, {"seed": 1}, "suite", "task"),

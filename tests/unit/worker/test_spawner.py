@@ -15,6 +15,7 @@ import pytest
 
 from envhub_worker import bootstrap
 from envhub_worker.protocol.confinement import Confinement, Limits
+from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.spawn.jail_handle import Spawner, ZygoteDied
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from tests.integration.confinement_kit import (
@@ -240,7 +241,7 @@ def test_a_process_of_another_interpreter_is_not(folder: Path, confinement: Conf
     other = folder / "python"
     other.symlink_to(sys.executable)
     spawner = Spawner(
-        confinement, runtime_dir=folder, readable_roots=[], python=str(other), ahead=ahead
+        confinement, runtime_dir=folder, readable_roots=[], runtime=Runtime(str(other)), ahead=ahead
     )
     assert inside.zygote_pid(spawner) != ahead.pid
     assert not os.path.exists(f"/proc/{ahead.pid}")
@@ -271,7 +272,10 @@ def test_dead_zygote_is_told_with_its_log(folder: Path, confinement: Confinement
     bare = folder / "bare"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(bare)], check=True)
     spawner = Spawner(
-        confinement, runtime_dir=folder, readable_roots=[], python=str(bare / "bin/python")
+        confinement,
+        runtime_dir=folder,
+        readable_roots=[],
+        runtime=Runtime(str(bare / "bin/python")),
     )
     wait_until(lambda: any(isinstance(e, ZygoteDied) for e in _keep(spawner)), "it lives")
     died = next(event for event in _SEEN if isinstance(event, ZygoteDied))

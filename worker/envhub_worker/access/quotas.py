@@ -71,6 +71,12 @@ def check_policy(request: m.OpenJail, confinement: Confinement, permitted: Permi
     Raises:
         RefusedError: With what to do instead.
     """
+    if request.runtime.packages:
+        raise RefusedError(
+            "PolicyError",
+            "dependencies: this server uses no environment of a repository's own; start it in the "
+            "environment or image that the repository needs",
+        )
     if request.python:
         raise RefusedError("PolicyError", "python: the interpreter is the remote server's own")
     if confinement.readable:

@@ -22,6 +22,8 @@ class ZygoteConfig:
         network: Their network.
         gpu: Whether they get the GPU.
         readable: Further paths that they read.
+        packages: The folder of packages that their code comes with, or empty. Not trusted: only a
+            runner imports from it, once it is confined.
         roots: Folders that snapshots lie in.
         place: An empty folder of the zygote's own.
         canary: A file that exists and that no jail may read.
@@ -35,6 +37,7 @@ class ZygoteConfig:
     network: str
     gpu: bool
     readable: tuple[str, ...]
+    packages: str
     roots: tuple[str, ...]
     place: str
     canary: str

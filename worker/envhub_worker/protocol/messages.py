@@ -24,13 +24,14 @@ from envhub_worker.protocol.codec.kinds import DOCUMENT_BYTES
 from envhub_worker.protocol.confinement import Reason
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
-VERSION = 4
+VERSION = 5
 """The newest version of the protocol: ``Hello`` offers a range, ``Welcome`` agrees to one.
 
-Version 2 added kinds 17 to 31, version 3 kind 53, version 4 kind 54; nothing that there was
-changed.
+Version 2 added kinds 17 to 30, version 3 kind 53, version 4 kind 54, version 5 kind 31; nothing
+that there was changed.
 """
 OLDEST_VERSION = 1
 """The oldest version that this code still speaks."""
@@ -134,6 +135,11 @@ class OpenJail(Message):
     entry: str
     confinement: dict[str, object]
     runners: int
+
+    @property
+    def runtime(self) -> Runtime:
+        """What runs the repository."""
+        return Runtime(self.python)
 
 
 @_message(5)
@@ -393,6 +399,23 @@ class ExpireIdle(Message):
 
     jail: int
     idle_ms: int
+
+
+@_message(31)
+@dataclass(frozen=True, slots=True)
+class OpenJailWith(OpenJail):
+    """``OpenJail`` for a repository with packages of its own. The same replies.
+
+    ``packages`` is a folder of them, for ``python``; that interpreter's own are not used. Nothing
+    of it runs outside of the jail.
+    """
+
+    packages: str
+
+    @property
+    def runtime(self) -> Runtime:
+        """What runs the repository."""
+        return Runtime(self.python, self.packages)
 
 
 # --- client and jail runner ----------------------------------------------------------------------

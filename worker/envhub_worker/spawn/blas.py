@@ -9,7 +9,10 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+
+from envhub_worker.lockdown.mechanisms.environment import THREAD_TIMEOUT
 
 # numpy's wheels carry a build whose symbols have a prefix and a suffix.
 _SETTERS = (
@@ -53,6 +56,20 @@ def thread_count(environment: Mapping[str, str], cores: int, runners: int) -> in
         if value.isdigit() and int(value) > 0:
             return int(value)
     return max(1, min(cores // runners, _MOST))
+
+
+@contextmanager
+def threads_at_load(runners: int) -> Iterator[None]:
+    """What OpenBLAS shall read, where a runner itself loads it; nothing of it stays behind."""
+    count = thread_count(os.environ, len(os.sched_getaffinity(0)), runners)
+    wanted = {"OPENBLAS_NUM_THREADS": str(count), "OPENBLAS_THREAD_TIMEOUT": THREAD_TIMEOUT}
+    fresh = {name: value for name, value in wanted.items() if name not in os.environ}
+    os.environ.update(fresh)
+    try:
+        yield
+    finally:
+        for name in fresh:
+            os.environ.pop(name, None)
 
 
 def restore_threads(setter: Callable[[int], None] | None, runners: int) -> None:

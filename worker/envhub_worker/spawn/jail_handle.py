@@ -11,7 +11,6 @@ import os
 import select
 import signal
 import socket
-import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -26,6 +25,7 @@ from envhub_worker.lockdown.mechanisms.scratch import Scratch, remove_tree
 from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.confinement import Confinement
+from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.spawn.events import (
     Failed,
     JailEvent,
@@ -34,7 +34,7 @@ from envhub_worker.spawn.events import (
     RunnerStarted,
     ZygoteDied,
 )
-from envhub_worker.spawn.zygote_process import ZygoteProcess
+from envhub_worker.spawn.zygote_process import OWN, ZygoteProcess, resolved
 
 __all__ = [
     "RUNNER_TARGET",
@@ -76,7 +76,7 @@ class Spawner:
         *,
         runtime_dir: Path,
         readable_roots: Sequence[str],
-        python: str | None = None,
+        runtime: Runtime = OWN,
         target: str = RUNNER_TARGET,
         ahead: ZygoteProcess | None = None,
     ) -> None:
@@ -86,7 +86,7 @@ class Spawner:
             confinement: What the zygote's jails have in common.
             runtime_dir: An existing folder of the server's own.
             readable_roots: Where snapshots lie (the snapshot store).
-            python: The interpreter of the jails, by absolute path; default: this one.
+            runtime: The interpreter of the jails, and their packages; default: ours.
             target: What a runner runs once it is confined: ``"module:function"``, or
                 ``"/a/file.py:function"``.
             ahead: A process to use, if it is one of this interpreter; else it is ended.
@@ -95,18 +95,19 @@ class Spawner:
         self._count = 0
         self._pidfd = -1
         self._exited = False
-        self._process = _usable(ahead, python) or ZygoteProcess(
-            python or sys.executable, runtime_dir
-        )
+        self._process = _usable(ahead, runtime) or ZygoteProcess(runtime, runtime_dir)
         self._folder = self._process.folder
         self._user, self._refusal = _choose_user()
         self._scratches = self._make_scratches(confinement)
         self._cgroups = self._make_cgroups()
         self._log = self._process.log
         self._channel = self._process.channel
-        self._channel.send(asdict(self._config(confinement, readable_roots, target)))
+        config = self._config(confinement, readable_roots, target, runtime.packages)
+        self._channel.send(asdict(config))
 
-    def _config(self, confinement: Confinement, roots: Sequence[str], target: str) -> ZygoteConfig:
+    def _config(
+        self, confinement: Confinement, roots: Sequence[str], target: str, packages: str
+    ) -> ZygoteConfig:
         place = self._folder / "root"
         place.mkdir()
         return ZygoteConfig(
@@ -116,6 +117,7 @@ class Spawner:
             network=confinement.network,
             gpu=confinement.gpu,
             readable=confinement.readable,
+            packages=packages and os.path.realpath(packages),
             roots=tuple(roots),
             place=str(place),
             canary=str(self._log),
@@ -235,8 +237,8 @@ class Spawner:
             remove_tree(str(folder))
 
 
-def _usable(ahead: ZygoteProcess | None, python: str | None) -> ZygoteProcess | None:
-    if ahead is not None and ahead.python != (python or sys.executable):
+def _usable(ahead: ZygoteProcess | None, runtime: Runtime) -> ZygoteProcess | None:
+    if ahead is not None and ahead.runtime != resolved(runtime):
         ahead.discard()
         return None
     return ahead

@@ -18,8 +18,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NoReturn
 
-import numpy as np
-
 from envhub_worker.channel import Channel
 from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.limits import cgroups
@@ -28,7 +26,7 @@ from envhub_worker.lockdown.mechanisms.environment import jail_environment
 from envhub_worker.lockdown.report import Layer, LayerUnavailableError
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.lockdown.stages import runner
-from envhub_worker.spawn import blas
+from envhub_worker.spawn import blas, packages
 
 _SELF_TEST = Layer("self-test", True, "the denials above were tried and held")
 
@@ -79,9 +77,19 @@ def _run(order: Order) -> int:
     blas.restore_threads(order.jail.common.set_blas_threads, order.runners)
     init.send({"report": [_SELF_TEST.to_wire()]})
     init.close()
+    main = _main(order)  # not before init is out of reach: packages may be a stranger's
     stream = socket.socket(fileno=order.fds[0])
-    main = _resolve(order.jail.common.config.target)
     return int(main(stream, order.jail.spec, order.fds[1:]) or 0)
+
+
+def _main(order: Order) -> Callable[[socket.socket, JailSpec, list[int]], int | None]:
+    """What the runner runs, imported with the packages that it is to have."""
+    config = order.jail.common.config
+    if not config.packages:
+        return _resolve(config.target)
+    packages.bring_in(config.packages, order.jail.scratch.home)
+    with blas.threads_at_load(order.runners):
+        return _resolve(config.target)
 
 
 def _resolve(target: str) -> Callable[[socket.socket, JailSpec, list[int]], int | None]:
@@ -113,8 +121,9 @@ def _forget_the_zygote(jail: JailContext) -> None:
     os.umask(0o022)
     tempfile.tempdir = None
     random.seed()
-    # One number: an array, as numpy takes by itself, costs a tenth of the whole spawn.
-    np.random.seed(int.from_bytes(os.urandom(4), "little"))
+    numpy = sys.modules.get("numpy")
+    if numpy is not None:  # one number: an array, as it takes itself, costs a tenth of the spawn
+        numpy.random.seed(int.from_bytes(os.urandom(4), "little"))
 
 
 def _exit_code(error: SystemExit) -> int:

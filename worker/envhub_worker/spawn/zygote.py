@@ -32,7 +32,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import cast
 
@@ -41,7 +41,7 @@ from envhub_worker.lockdown.context import Common, ZygoteConfig
 from envhub_worker.lockdown.mechanisms import namespaces, process, reap
 from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.stages import zygote
-from envhub_worker.spawn import blas, jail_init
+from envhub_worker.spawn import blas, jail_init, packages
 
 # What nearly every runner imports anyway. pyzmq is left out on purpose: a jail holds no ZeroMQ
 # socket, and a context started here would not survive the fork.
@@ -83,8 +83,11 @@ def main(argv: Sequence[str]) -> int:
     process.become_subreaper()
     # what a repository prints must not lie in a buffer when its process dies
     cast(io.TextIOWrapper, sys.stdout).reconfigure(line_buffering=True)
-    preload(config.target)
-    common = replace(common, set_blas_threads=blas.find_setter())
+    if config.packages:
+        import_all(packages.STANDARD)
+    else:
+        preload(config.target)
+        common = replace(common, set_blas_threads=blas.find_setter())
     gc.freeze()  # without looking through it: there is next to nothing that could go
     gc.enable()
     Zygote(channel, common).run()
@@ -93,11 +96,16 @@ def main(argv: Sequence[str]) -> int:
 
 def preload(target: str) -> None:
     """Import what every runner needs, the code that serves it included: ours, and inert."""
-    for module in _PRELOAD:
-        importlib.import_module(module)
+    import_all(_PRELOAD)
     place, _, _ = target.partition(":")
     if not place.endswith(".py"):
         importlib.import_module(place)
+
+
+def import_all(modules: Iterable[str]) -> None:
+    """Import each of a list of our own."""
+    for module in modules:
+        importlib.import_module(module)
 
 
 def refuse(channel: Channel, error: LayerUnavailableError) -> None:

@@ -15,15 +15,24 @@ from pathlib import Path
 from envhub_worker import bootstrap
 from envhub_worker.channel import Channel
 from envhub_worker.lockdown.mechanisms.environment import zygote_environment
+from envhub_worker.protocol.runtime import Runtime
 
+OWN = Runtime("")
+"""The server's own interpreter, with its packages."""
 _END_S = 8.0
+
+
+def resolved(runtime: Runtime) -> Runtime:
+    """The same, with the name of its interpreter."""
+    return Runtime(runtime.python or sys.executable, runtime.packages)
 
 
 class ZygoteProcess:
     """Owns the process, its channel, and a private folder.
 
     Args:
-        python: Its interpreter.
+        runtime: Its interpreter, and the packages of its jails. Where it has any, it starts without
+            ``site``, and so sees none: not those, and not the interpreter's own.
         runtime_dir: An existing folder of the server's own.
         ahead: Import before the configuration comes, and so before any confinement: only in an
             interpreter from which the server has imported the same.
@@ -35,8 +44,9 @@ class ZygoteProcess:
         pid: Of what was started, which may only wait for the zygote.
     """
 
-    def __init__(self, python: str, runtime_dir: Path, *, ahead: bool = False) -> None:
-        self.python = python
+    def __init__(self, runtime: Runtime, runtime_dir: Path, *, ahead: bool = False) -> None:
+        self.runtime = resolved(runtime)
+        python, site = self.runtime.python, not runtime.packages
         self.folder = runtime_dir / f"zygote-{os.urandom(4).hex()}"
         self.folder.mkdir(mode=0o700)
         self.log = self.folder / "log"
@@ -44,7 +54,7 @@ class ZygoteProcess:
         arguments = [str(theirs.fileno()), *(["ahead"] if ahead else [])]
         with theirs, open(self.log, "ab") as log:
             self._process = subprocess.Popen(
-                bootstrap.command(python, "zygote", *arguments),
+                bootstrap.command(python, "zygote", *arguments, site=site),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -58,7 +68,7 @@ class ZygoteProcess:
     @classmethod
     def ahead(cls, runtime_dir: Path) -> ZygoteProcess:
         """One that imports at once."""
-        return cls(sys.executable, runtime_dir, ahead=True)
+        return cls(OWN, runtime_dir, ahead=True)
 
     def wait(self) -> int:
         """Its exit code; it is killed if it does not end by itself soon."""

@@ -21,6 +21,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.spawn.jail_handle import (
     Failed,
     JailExited,
@@ -120,8 +121,9 @@ class Jails:
             confinement=confinement,
             name=request.name,
         )
-        key = (request.python, *(getattr(confinement, name) for name in _ZYGOTE_FIELDS))
-        jail = self._spawner(key, confinement).spawn(spec)
+        # a zygote is one environment's: not even what it has not imported is shared with another
+        key = (request.runtime, *(getattr(confinement, name) for name in _ZYGOTE_FIELDS))
+        jail = self._spawner(key, request.runtime, confinement).spawn(spec)
         entry = JailEntry(
             number=secrets.randbits(62),
             name=request.name,
@@ -173,7 +175,9 @@ class Jails:
 
         self._loop.watch(fd, guarded)
 
-    def _spawner(self, key: tuple[object, ...], confinement: Confinement) -> Spawner:
+    def _spawner(
+        self, key: tuple[object, ...], runtime: Runtime, confinement: Confinement
+    ) -> Spawner:
         spawner = self._spawners.pop(key, None)
         if spawner is None:
             self._end_idle_zygotes()
@@ -182,7 +186,7 @@ class Jails:
                 confinement,
                 runtime_dir=self._runtime_dir,
                 readable_roots=self._readable_roots,
-                python=str(key[0]) or None,
+                runtime=runtime,
                 ahead=ahead,
             )
             self._loop.watch(spawner.fileno(), lambda: self._spawner_events(key))

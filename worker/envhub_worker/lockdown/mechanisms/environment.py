@@ -8,6 +8,11 @@ from collections.abc import Mapping
 _PATH = "/usr/local/bin:/usr/bin:/bin:/usr/local/sbin:/usr/sbin:/sbin"
 _INHERITED = ("LANG", "LC_ALL", "LC_CTYPE", "TZ")
 
+THREAD_TIMEOUT = "20"
+"""For OpenBLAS, which reads it once: in cycles, a power of two. By default a runner's threads would
+spin for a tenth of a second after their start and after each use, on the cores of its siblings and
+of the client, and its page faults would wait for them."""
+
 # A jail has no display, sound card or terminal; without these, libraries look for them.
 _HEADLESS = {
     "MPLBACKEND": "Agg",
@@ -27,10 +32,7 @@ def zygote_environment(host: Mapping[str, str], python: str) -> dict[str, str]:
         "HOME": "/nonexistent",
         # A thread in the zygote would make unshare(CLONE_NEWUSER) fail, and die in the fork.
         "OPENBLAS_NUM_THREADS": "1",
-        # In cycles, a power of two; read once as well. By default a runner's threads would spin for
-        # a tenth of a second after their start and after each use, on the cores of its siblings
-        # and of the client, and its page faults would wait for them.
-        "OPENBLAS_THREAD_TIMEOUT": "20",
+        "OPENBLAS_THREAD_TIMEOUT": THREAD_TIMEOUT,
     }
 
 

@@ -43,6 +43,11 @@ def _denials(jail: JailContext) -> dict[str, Callable[[], object]]:
             number("prlimit64"), init, _RLIMIT_CORE, 0, 0
         ),
     }
+    packages = jail.common.config.packages
+    if packages:  # a file without a name: if it can be made, it is gone at once
+        denials["the packages cannot be written"] = lambda: os.open(
+            packages, os.O_TMPFILE | os.O_WRONLY, 0o600
+        )
     if jail.plan.landlock or jail.common.namespaced:
         canary = jail.common.config.canary
         denials["files outside cannot be read"] = lambda: os.open(canary, os.O_RDONLY)

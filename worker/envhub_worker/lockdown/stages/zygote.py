@@ -45,6 +45,8 @@ def enter(config: ZygoteConfig) -> Common:
             _become(config)
             _check_interpreter()
         covered = ([], [])
+    if config.packages:
+        _check_packages(config.packages)
     abi = landlock.version()
     brokered = needs_broker(namespaced=namespaced, landlock_abi=abi)
     # A driver keeps more out of sight than a filter could deny.
@@ -76,7 +78,7 @@ def enter(config: ZygoteConfig) -> Common:
 def _plan_root(config: ZygoteConfig) -> root_plan.RootPlan:
     return root_plan.plan_root(
         interpreter_paths(),
-        config.readable,
+        (*config.readable, *([config.packages] if config.packages else [])),
         config.roots,
         private=[*_homes(), config.place],
         gpu=config.gpu,
@@ -139,6 +141,27 @@ def _check_interpreter() -> None:
                 'Use an interpreter that all users may read, the profile "strict", or start as '
                 "a plain user.",
             )
+
+
+def _check_packages(folder: str) -> None:
+    """What lies deeper is told when it is imported: that it is there, and closed."""
+    try:
+        names = os.listdir(folder)
+    except OSError as error:
+        raise _unreadable_packages(folder, f"cannot be read: {error.strerror}") from error
+    for name in names:
+        path = os.path.join(folder, name)
+        if not os.access(path, os.R_OK | os.X_OK if os.path.isdir(path) else os.R_OK):
+            raise _unreadable_packages(folder, f"holds {name}, which the jails may not read")
+
+
+def _unreadable_packages(folder: str, why: str) -> LayerUnavailableError:
+    return LayerUnavailableError(
+        "packages",
+        f"the folder of packages {folder} {why}",
+        f"The jails run as uid {os.getuid()} here. Make it anew, or readable to all users: "
+        f"chmod -R a+rX {folder}",
+    )
 
 
 def _be_the_first_process() -> None:
