@@ -37,6 +37,7 @@ CONFIG_VARIABLE = "ENVHUB_CONFIG"
 _KEEP_ALIVE_S = 10.0
 _FIRST_S = 0.5
 _STOP_S = 1.0
+_CLOSE_S = 5.0
 
 
 @dataclass
@@ -319,7 +320,7 @@ class Host:
         while not self._stop.wait(every_s):
             try:
                 if client is None:
-                    client = WorkerClient(self.endpoint, self.stopped, far=self.far)
+                    client = self._connection()
                     client.hello(Deadline(_KEEP_ALIVE_S))
                     every_s = min(_KEEP_ALIVE_S, client.patience_s / 4 or _KEEP_ALIVE_S)
                 client.request(m.KeepAlive(tuple(self.far.held)), deadline=Deadline(_KEEP_ALIVE_S))
@@ -330,6 +331,19 @@ class Host:
         if client is not None:
             client.close()
 
+    def _close_jails(self) -> None:
+        """Whatever is open there still: at the end of a process that closed nothing."""
+        if not self.far.held:
+            return
+        client, deadline = self._connection(), Deadline(_CLOSE_S)
+        with contextlib.suppress(EnvHubError), contextlib.closing(client):
+            client.hello(deadline)
+            for jail in tuple(self.far.held):
+                client.request(m.CloseJail(jail), deadline=deadline)
+
+    def _connection(self) -> WorkerClient:
+        return WorkerClient(self.endpoint, self.stopped, far=self.far)
+
     @property
     def runs(self) -> bool:
         """Nobody here knows; whoever asks it something hears."""
@@ -338,6 +352,7 @@ class Host:
     def stop(self) -> None:
         """No longer tell it. A fork of its owner does nothing."""
         if os.getpid() == self.owner:
+            self._close_jails()
             self._stop.set()
             os.close(self._stops)  # wakes the thread, should it wait for an answer
             self._thread.join(_STOP_S)

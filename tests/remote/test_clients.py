@@ -22,7 +22,6 @@ from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.keys import key_text
 from tests.remote.listening import Listening, listening
 from tests.support import inside
-from tests.support.processes import eventually
 
 ALICE, MALLORY = keys.generate(), keys.generate()
 
@@ -186,8 +185,8 @@ def test_a_key_has_so_many_sessions_and_no_more(tmp_path: Path) -> None:
     """Each Hello under a new name is one; the old ones are found again."""
     with listening(tmp_path / "server", "--max-sessions", "2") as server:
         pair = keys.load(server.state / "client.key")
-        with peer(server, pair) as found:
-            for name in (b"one", b"two", b"one"):
+        with peer(server, pair) as one, peer(server, pair) as two, peer(server, pair) as three:
+            for found, name in ((one, b"one"), (two, b"two"), (three, b"one")):
                 assert isinstance(found.ask(m.Hello(1, 2, name)), m.Welcome)
-            assert "2 sessions" in found.refused(m.Hello(1, 2, b"three")).message
-        assert eventually(lambda: len(server.sessions()) == 2)
+            assert "2 sessions" in three.refused(m.Hello(1, 2, b"three")).message
+            assert len(server.sessions()) == 2

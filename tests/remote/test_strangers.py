@@ -22,7 +22,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerError
 from envhub_worker.access import keys
 from envhub_worker.access.connection_limit import Doorman
-from envhub_worker.access.gate import Asked, RemoteGate, Rules
+from envhub_worker.access.gate import Arrived, Asked, Greeting, RemoteGate, Rules
 from envhub_worker.access.keys import AuthorizedClients
 from envhub_worker.access.quotas import Permissions, Quotas, RefusedError
 from envhub_worker.access.rate_limited_log import LINES, PERIOD_S, Log
@@ -153,7 +153,7 @@ def test_a_message_without_a_proved_key_is_refused(tmp_path: Path) -> None:
     """Where keys are needed an empty one is nobody's: neither a session nor a request."""
     gate, sessions = _gate(tmp_path), Sessions()
     with pytest.raises(RefusedError, match="not authorised"):
-        gate.greet(sessions, b"", b"name")
+        gate.greet(Greeting(Arrived(b"id", b"", []), b"name", sessions, None))  # type: ignore[arg-type]
     asker = Asker(b"id", 1, b"x" * 40, b"")
     with pytest.raises(RefusedError, match="not authorised"):
         gate.authorize(Asked(asker, m.GetSessions(), (), sessions, None))  # type: ignore[arg-type]

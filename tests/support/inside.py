@@ -296,9 +296,9 @@ def public_key(gate: RemoteGate) -> bytes:
     return keys.public
 
 
-def happen(doorman: Doorman, event: int) -> None:
+def happen(doorman: Doorman, event: int, value: int = 0) -> None:
     """Tell a doorman what libzmq's monitor would."""
-    doorman._happened(event)
+    doorman._happened(event, value)
 
 
 def door_is_shut(doorman: Doorman) -> bool:

@@ -15,7 +15,7 @@ from typing import Any
 import zmq
 
 from envhub_worker import __version__, multipart
-from envhub_worker.access.gate import Asked, Gate, LocalGate
+from envhub_worker.access.gate import Arrived, Asked, Gate, Greeting, LocalGate
 from envhub_worker.access.quotas import RefusedError
 from envhub_worker.access.sessions import Sessions
 from envhub_worker.lockdown.mechanisms.scratch import remove_tree
@@ -115,9 +115,10 @@ class Server:
         for _ in range(_ROUND):
             if not multipart.has_message(self._router):
                 return
-            self._serve(*self._gate.receive(self._router))
+            self._serve(self._gate.receive(self._router))
 
-    def _serve(self, identity: bytes, key: bytes, frames: list[Any]) -> None:
+    def _serve(self, arrived: Arrived) -> None:
+        identity, key, frames, _ = arrived
         if not frames:
             return
         session = self._sessions.find(identity, key)
@@ -130,7 +131,7 @@ class Server:
             return
         asker = Asker(identity, request_id, b"" if session is None else session.owner, key)
         try:
-            self._dispatch(asker, request, frames[1:])
+            self._dispatch(asker, request, arrived)
         except RefusedError as refused:
             self.refuse(asker, refused.error, refused.message)
         except Exception as error:
@@ -146,10 +147,11 @@ class Server:
         said = str(error) if known else type(error).__name__
         self.refuse(asker, "LocalProtocolError", f"the request cannot be read: {said}")
 
-    def _dispatch(self, asker: Asker, request: m.Message, payload: list[Any]) -> None:
+    def _dispatch(self, asker: Asker, request: m.Message, arrived: Arrived) -> None:
         if isinstance(request, m.Hello):
-            self._hello(asker, request)
+            self._hello(asker, request, arrived)
             return
+        payload = arrived.frames[1:]
         if not asker.session:
             self.refuse(asker, "HelloError", "say Hello first")
             return
@@ -186,7 +188,7 @@ class Server:
         # what the client has sent may be quoted in it, at any length
         self.reply(asker, m.Refused(error, message[:_MAX_SAID], layer, fix))
 
-    def _hello(self, asker: Asker, request: m.Hello) -> None:
+    def _hello(self, asker: Asker, request: m.Hello, arrived: Arrived) -> None:
         version = min(m.VERSION, request.newest)
         if version < max(m.OLDEST_VERSION, request.oldest):
             side = "client" if request.newest < m.OLDEST_VERSION else "worker"
@@ -197,8 +199,7 @@ class Server:
             )
         if not request.session:
             raise RefusedError("LocalProtocolError", "a session has a name")
-        self._gate.greet(self._sessions, asker.key, request.session)
-        self._sessions.connect(asker.identity, asker.key, request.session)
+        self._gate.greet(Greeting(arrived, request.session, self._sessions, self._jails))
         self.reply(asker, m.Welcome(version, __version__, os.getpid()))
 
     def _agree(self, asker: Asker, request: m.Agree) -> None:

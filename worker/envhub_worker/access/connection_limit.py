@@ -1,8 +1,8 @@
-"""Counts connections, and lets no more in while there are too many: strangers make them, too.
+"""Knows which connections are open, and lets no more in while there are too many of them.
 
-Each takes a descriptor and memory before any key is asked for. libzmq cannot pause its listener,
-and ends a listener's connections with it. So the kernel is told to drop what knocks: those that
-are in stay, and whoever knocks again later is let in.
+Strangers make them, too, and each takes a descriptor and memory before any key is asked for.
+libzmq cannot pause its listener, and ends a listener's connections with it. So the kernel is told
+to drop what knocks: those that are in stay, and whoever knocks again later is let in.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from envhub_worker.loop import Loop
 MAX_CONNECTIONS = 1024
 _FAILED = zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 _EVENTS = _FAILED | zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED
-_EVENT = struct.Struct("=H")  # a monitor's first frame begins with it (zmq_socket_monitor(3))
+_EVENT = struct.Struct("=HI")  # a monitor's first frame: what, and a number (zmq_socket_monitor(3))
 _SO_ATTACH_FILTER = 26
 _SO_DETACH_FILTER = 27
 _DROP = struct.pack("=HBBI", 0x06, 0, 0, 0)  # BPF: return 0 bytes of the packet
@@ -43,6 +43,8 @@ class Doorman:
         self._log = log
         self._limit = limit
         self._open = 0
+        self._accepted = 0
+        self._wires: dict[int, int] = {}
         self._shut_door: socket.socket | None = None
         self._monitor = router.get_monitor_socket(_EVENTS)
         loop.watch(self._monitor, self._drain)
@@ -53,17 +55,33 @@ class Doorman:
                 frames = self._monitor.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
                 return
-            self._happened(_EVENT.unpack_from(frames[0])[0])
+            self._happened(*_EVENT.unpack_from(frames[0]))
 
-    def _happened(self, event: int) -> None:
+    def _happened(self, event: int, value: int) -> None:
         if event == zmq.EVENT_ACCEPTED:
             self._open += 1
+            self._accepted += 1
+            self._wires[value] = self._accepted
             if self._open >= self._limit and self._shut_door is None:
                 self._shut()
         elif event == zmq.EVENT_DISCONNECTED:
             self._open -= 1
+            self._wires.pop(value, None)
         else:
             self._log.say("refused", "a handshake failed: no key, another server's, or noise")
+
+    def wire(self, fd: int) -> int:
+        """The number of the connection that a message has just come from; 0 if that is not known.
+
+        A descriptor's number is given out again, this one never.
+        """
+        self._drain()  # libzmq says that it has accepted before it hands anything on
+        return self._wires.get(fd, 0)
+
+    def open_wires(self) -> frozenset[int]:
+        """The numbers of all connections that are there now."""
+        self._drain()
+        return frozenset(self._wires.values())
 
     def _shut(self) -> None:
         """Without descriptors or permission it stays open, and the next one tries again."""

@@ -45,6 +45,9 @@ _BACKLOG = 64
 _SNDHWM = 32
 _FORGOTTEN_S = 3600.0
 """Where silent clients keep their jails, those without any are forgotten after so long."""
+_PLACE_NEEDED = "its client has gone, and its key needed the place"
+WATCHER = b"status"
+"""The session of whoever only looks: the same each time, and not counted."""
 ANYBODY = bytes(KEY_BYTES)
 """The key of clients that have none, behind ``--insecure-loopback``."""
 
@@ -55,6 +58,31 @@ class Asked(NamedTuple):
     asker: Asker
     request: m.Message
     payload: Sequence[bytes]
+    sessions: Sessions
+    jails: Jails
+
+
+class Arrived(NamedTuple):
+    """A message as it came.
+
+    Attributes:
+        identity: The routing id of its sender.
+        key: The key that he has proved; empty where none is needed.
+        frames: The message.
+        fd: The descriptor of the connection that it came over; -1 if that is not known.
+    """
+
+    identity: bytes
+    key: bytes
+    frames: list[Any]
+    fd: int = -1
+
+
+class Greeting(NamedTuple):
+    """A ``Hello``: whose it is, and the name of the session that it asks for."""
+
+    arrived: Arrived
+    name: bytes
     sessions: Sessions
     jails: Jails
 
@@ -79,11 +107,10 @@ class Gate(Protocol):
     def secure(self, router: zmq.Socket[bytes], loop: Loop) -> None:
         """Set what must be set before the socket is bound."""
 
-    def receive(self, router: zmq.Socket[bytes]) -> tuple[bytes, bytes, list[bytes]]:
-        """A message that is there: the routing id of its sender, the key that he has proved (empty
-        where none is needed), and its frames."""
+    def receive(self, router: zmq.Socket[bytes]) -> Arrived:
+        """A message that is there."""
 
-    def greet(self, sessions: Sessions, key: bytes, name: bytes) -> None:
+    def greet(self, greeting: Greeting) -> None:
         """A session begins, or is found again; raises ``RefusedError``."""
 
     def authorize(self, asked: Asked) -> m.Message:
@@ -109,13 +136,15 @@ class LocalGate:
     def secure(self, router: zmq.Socket[bytes], loop: Loop) -> None:
         """Nothing: the folder is of mode 0700."""
 
-    def receive(self, router: zmq.Socket[bytes]) -> tuple[bytes, bytes, list[bytes]]:
+    def receive(self, router: zmq.Socket[bytes]) -> Arrived:
         """Nobody has a key."""
         identity, *frames = receive(router)
-        return identity, b"", frames
+        return Arrived(identity, b"", frames)
 
-    def greet(self, sessions: Sessions, key: bytes, name: bytes) -> None:
+    def greet(self, greeting: Greeting) -> None:
         """Everybody is welcome."""
+        arrived = greeting.arrived
+        greeting.sessions.connect(arrived.identity, arrived.key, greeting.name)
 
     def authorize(self, asked: Asked) -> m.Message:
         """Everything is permitted."""
@@ -204,13 +233,14 @@ class RemoteGate:
         self._log.say("unknown key", f"{key_text(key)} at {address} is not authorised")
         return False
 
-    def receive(self, router: zmq.Socket[bytes]) -> tuple[bytes, bytes, list[bytes]]:
+    def receive(self, router: zmq.Socket[bytes]) -> Arrived:
         """The key is the one that was proved in the handshake, never what the peer claims."""
         identity = router.recv(zmq.NOBLOCK)
         # not of the frame before: libzmq 4.3.4 knows nothing of who sent the first one
         header = router.recv(zmq.NOBLOCK, copy=False)
         rest = receive(router) if header.more else []
-        return identity, self._key_of(header), [header.bytes, *rest]
+        frames = [header.bytes, *rest]
+        return Arrived(identity, self._key_of(header), frames, _descriptor_of(header))
 
     def _key_of(self, frame: zmq.Frame) -> bytes:
         if self._rules.keys is None:
@@ -222,26 +252,33 @@ class RemoteGate:
 
     # --- requests ------------------------------------------------------------------------------
 
-    def greet(self, sessions: Sessions, key: bytes, name: bytes) -> None:
+    def greet(self, greeting: Greeting) -> None:
         """Refuse who has proved no key, and more sessions than the quota."""
+        (identity, key, _, fd), name, sessions, jails = greeting
         self._refuse_unless_authorized(key)
-        mine = sessions.of_key(key)
         if len(name) > 64:
             raise RefusedError("LocalProtocolError", "the name of a session is too long")
+        self._end_deserted(sessions, jails)
+        others = [one for one in sessions.of_key(key) if one.name not in (name, WATCHER)]
         quota = self._rules.quotas.sessions
-        if all(one.name != name for one in mine) and len(mine) >= quota:
-            raise RefusedError(
-                "WorkerError", f"your key has {quota} sessions, which is the server's quota"
-            )
+        if name != WATCHER and len(others) >= quota:
+            gone = _longest_gone(others)
+            if gone is None:
+                raise RefusedError(
+                    "WorkerError", f"your key has {quota} sessions, which is the server's quota"
+                )
+            self._end(gone, sessions, jails, _PLACE_NEEDED)
+        wire = 0 if self._doorman is None else self._doorman.wire(fd)
+        sessions.connect(identity, key, name, wire)
 
     def authorize(self, asked: Asked) -> m.Message:
         """Hold a request against keys and quotas."""
         asker, request = asked.asker, asked.request
         self._refuse_unless_authorized(asker.key)
         if isinstance(request, m.OpenJail):
-            return self._authorize_open(asker.key, request, asked.jails)
+            return self._authorize_open(asked, request)
         if isinstance(request, m.StartRunners):
-            check_jail(_uses(asked.jails, asker.key), Use(0, request.runners), self._rules.quotas)
+            self._find_place(asked, Use(0, request.runners))
         elif isinstance(request, m.Relay):
             size = sum(map(len, asked.payload))
             self._in_flight.add(asker.key, asker, size, self._rules.quotas.inflight_bytes)
@@ -257,7 +294,25 @@ class RemoteGate:
         if not self._is_known(key):
             raise RefusedError("WorkerError", "your key is not authorised any more")
 
-    def _authorize_open(self, key: bytes, request: m.OpenJail, jails: Jails) -> m.OpenJail:
+    def _find_place(self, asked: Asked, more: Use) -> None:
+        """Hold a jail against the quotas; those of the key's processes that have gone go first."""
+        asker, sessions, jails = asked.asker, asked.sessions, asked.jails
+        check_jail((), more, self._rules.quotas)  # nobody goes for what never fits
+        while True:
+            try:
+                check_jail(_uses(jails, asker.key), more, self._rules.quotas)
+            except RefusedError:
+                self._disconnect(sessions)
+                # its own may look so, too: what it said last is read after it has gone
+                others = [one for one in sessions.of_key(asker.key) if one.owner != asker.session]
+                gone = _longest_gone(others)
+                if gone is None:
+                    raise
+                self._end(gone, sessions, jails, _PLACE_NEEDED)
+            else:
+                return
+
+    def _authorize_open(self, asked: Asked, request: m.OpenJail) -> m.OpenJail:
         try:
             confinement = confinement_from_wire(request.confinement)
         except ProtocolError as error:
@@ -266,12 +321,8 @@ class RemoteGate:
         wrong = wrong_with_path(request.entry)
         if wrong:
             raise RefusedError("PolicyError", f"the entry file {wrong}")
-        check_jail(
-            _uses(jails, key),
-            Use(confinement.limits.memory_bytes, request.runners),
-            self._rules.quotas,
-        )
-        tree = self._uploads.tree(key, request.snapshot)
+        self._find_place(asked, Use(confinement.limits.memory_bytes, request.runners))
+        tree = self._uploads.tree(asked.asker.key, request.snapshot)
         return m.OpenJail(
             request.name[:512], "", tree, request.entry, request.confinement, request.runners
         )
@@ -307,6 +358,7 @@ class RemoteGate:
 
     def _sessions_of(self, key: bytes, sessions: Sessions, jails: Jails) -> list[dict[str, Any]]:
         rules = self._rules
+        self._end_deserted(sessions, jails)
         seen = sessions.all() if key in rules.operators else sessions.of_key(key)
         used = {key: self._uploads.used_bytes(key) for key in {one.key for one in seen}}
         return [
@@ -336,6 +388,7 @@ class RemoteGate:
         for session in sessions.all():
             if not self._is_known(session.key):
                 self._end(session, sessions, jails, "its key is not authorised any more")
+        self._end_deserted(sessions, jails)
         for session in sessions.idle(self.idle_s or _FORGOTTEN_S):
             if self.idle_s:
                 why = f"nothing was heard of its client for {self.idle_s} s"
@@ -345,6 +398,22 @@ class RemoteGate:
                 sessions.drop(session)
         if self.idle_s:
             self._end_unheld(sessions, jails)
+
+    def _end_deserted(self, sessions: Sessions, jails: Jails) -> None:
+        """Forget the connections that have gone, and the sessions that have nothing else.
+
+        A client that is only cut off loses nothing: what it had was a name. One that has jails
+        keeps them, for ``idle_s``, or until others of its key need the place.
+        """
+        self._disconnect(sessions)
+        for session in sessions.all():
+            if not session.connections and not jails.open_ones(session.owner):
+                self._uploads.forget(session.owner)
+                sessions.drop(session)
+
+    def _disconnect(self, sessions: Sessions) -> None:
+        if self._doorman is not None:
+            sessions.disconnect(self._doorman.open_wires())
 
     def _end_unheld(self, sessions: Sessions, jails: Jails) -> None:
         for session in sessions.all():
@@ -366,6 +435,19 @@ class RemoteGate:
         """Close the sockets of the handshakes."""
         for close in self._closers:
             close()
+
+
+def _longest_gone(sessions: Sequence[Session]) -> Session | None:
+    """The session without a connection that was heard from the longest ago, if there is one."""
+    gone = [one for one in sessions if not one.connections]
+    return min(gone, key=lambda one: one.heard, default=None)
+
+
+def _descriptor_of(frame: zmq.Frame) -> int:
+    try:
+        return int(frame.get(zmq.SRCFD))
+    except (zmq.ZMQError, ValueError):
+        return -1
 
 
 def _uses(jails: Jails, key: bytes) -> list[Use]:

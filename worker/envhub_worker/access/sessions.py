@@ -4,14 +4,27 @@ from __future__ import annotations
 
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
 MAX_CONNECTIONS = 4096
-"""Of one session. libzmq does not tell which of them have gone: the longest unused is dropped."""
+"""Of one session; the longest unused is dropped."""
 
 MAX_HELD = 8192
 """Jails of one session whose last mention is remembered."""
+
+
+@dataclass
+class Connection:
+    """One of a session's.
+
+    Attributes:
+        wire: Its number, by which it is known whether it is still there; 0 if that is not told.
+        compression: What was agreed on; empty for none.
+    """
+
+    wire: int = 0
+    compression: str = ""
 
 
 @dataclass
@@ -29,7 +42,7 @@ class Session:
     name: bytes
     heard: float
     held: dict[int, float] | None = None
-    connections: OrderedDict[tuple[bytes, bytes], str] = field(default_factory=OrderedDict)
+    connections: OrderedDict[tuple[bytes, bytes], Connection] = field(default_factory=OrderedDict)
 
     @property
     def owner(self) -> bytes:
@@ -57,14 +70,14 @@ class Sessions:
         """Every session of a key."""
         return [session for session in self._sessions.values() if session.key == key]
 
-    def connect(self, identity: bytes, key: bytes, name: bytes) -> Session:
+    def connect(self, identity: bytes, key: bytes, name: bytes, wire: int = 0) -> Session:
         """A connection says which session it belongs to; one that is there is found again."""
         session = self._sessions.get(key + name)
         if session is None:
             session = self._sessions[key + name] = Session(key, name, self._clock())
         self._disconnect((identity, key))
         self._of[identity, key] = session
-        session.connections[identity, key] = ""
+        session.connections[identity, key] = Connection(wire)
         if len(session.connections) > MAX_CONNECTIONS:
             self._disconnect(next(iter(session.connections)))
         return session
@@ -73,6 +86,13 @@ class Sessions:
         session = self._of.pop(connection, None)
         if session is not None:
             session.connections.pop(connection, None)
+
+    def disconnect(self, wires: Collection[int]) -> None:
+        """Forget the connections that are not among these."""
+        for session in self._sessions.values():
+            for name, connection in list(session.connections.items()):
+                if connection.wire and connection.wire not in wires:
+                    self._disconnect(name)
 
     def find(self, identity: bytes, key: bytes) -> Session | None:
         """The session of a connection that has said something just now."""
@@ -84,12 +104,12 @@ class Sessions:
 
     def agree(self, identity: bytes, key: bytes, compression: str) -> None:
         """From here on a connection's frames may be compressed."""
-        self._of[identity, key].connections[identity, key] = compression
+        self._of[identity, key].connections[identity, key].compression = compression
 
     def compression(self, identity: bytes, key: bytes) -> str:
         """What a connection has agreed to; empty for none."""
         session = self._of.get((identity, key))
-        return "" if session is None else session.connections[identity, key]
+        return "" if session is None else session.connections[identity, key].compression
 
     def idle(self, idle_s: float) -> list[Session]:
         """Sessions that have not been heard from for so long."""

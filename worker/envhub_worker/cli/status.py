@@ -11,6 +11,7 @@ from typing import Any
 import zmq
 
 from envhub_worker.access import keys
+from envhub_worker.access.gate import WATCHER
 from envhub_worker.cli.listen import reachable, state_dir
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import ProtocolError
@@ -18,8 +19,6 @@ from envhub_worker.protocol.keys import parse_key
 from envhub_worker.protocol.text import printable
 
 _WAIT_MS = 5_000
-_SESSION = b"status"
-"""The same each time: whoever asks often does not use up the sessions of a key."""
 
 
 class UnreachableError(Exception):
@@ -91,7 +90,7 @@ def _ask(endpoint: str, server_key: bytes | None, pair: keys.KeyPair) -> list[di
             socket.setsockopt(zmq.CURVE_PUBLICKEY, pair.public)
             socket.setsockopt(zmq.CURVE_SECRETKEY, pair.secret)
         socket.connect(endpoint)
-        _request(socket, m.Hello(2, m.VERSION, _SESSION), 1, m.Welcome)
+        _request(socket, m.Hello(2, m.VERSION, WATCHER), 1, m.Welcome)
         reply = _request(socket, m.GetSessions(), 2, m.Sessions)
         assert isinstance(reply, m.Sessions)
         return [dict(one) for one in reply.sessions if isinstance(one, dict)]
