@@ -9,6 +9,7 @@ from typing import Any
 from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.session.recipe import Recipe
+from envhub_sandbox.vector.single_env import SingleEnv
 
 Envs = Mapping[str, Mapping[int | str, VectorEnv[Any, Any, Any]]]
 
@@ -49,11 +50,42 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
         Raises:
             ValueError: There are several; the text names them.
         """
-        found = list(self.envs())
+        return self.choose()
+
+    def choose(self, suite: str | None = None, task: int | str | None = None) -> Any:
+        """The one environment of this suite and this task; None is whichever there is.
+
+        Raises:
+            ValueError: There is not exactly one; the text names what there is.
+        """
+        found = [
+            (a_suite, a_task)
+            for a_suite, tasks in self.items()
+            for a_task in tasks
+            if suite in (None, a_suite) and task in (None, a_task)
+        ]
         if len(found) == 1:
-            return found[0]
-        names = ", ".join(f"[{suite!r}][{task!r}]" for suite in self for task in self[suite])
-        raise ValueError(f"there are {len(found)} environments; choose one: {names}")
+            return self[found[0][0]][found[0][1]]
+        if found:
+            names = ", ".join(f"[{a_suite!r}][{a_task!r}]" for a_suite, a_task in found)
+            raise ValueError(f"there are {len(found)} environments; choose one: {names}")
+        names = ", ".join(
+            f"[{a_suite!r}][{a_task!r}]" for a_suite in self for a_task in self[a_suite]
+        )
+        raise ValueError(f"there is no suite {suite!r} with a task {task!r}; there are: {names}")
+
+    def single(self, suite: str | None = None, task: int | str | None = None) -> SingleEnv:
+        """One environment as an ordinary ``gymnasium.Env``; its ``close`` closes all of these.
+
+        Args:
+            suite: Which suite; needed where there are several.
+            task: Which task; likewise.
+
+        Raises:
+            ValueError: There is not exactly one such environment, or it has several
+                sub-environments.
+        """
+        return SingleEnv(self.choose(suite, task), self)
 
     def envs(self) -> Iterator[VectorEnv[Any, Any, Any]]:
         """All environments, suite by suite."""

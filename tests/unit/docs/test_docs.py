@@ -152,9 +152,9 @@ def test_contributing_names_every_step_and_every_folder_of_tests() -> None:
 
 def test_readme_quick_start_runs() -> None:
     """The Python of the README does what it says."""
-    [source] = fenced(README, "python")
+    blocks = fenced(README, "python")
     done = subprocess.run(
-        [sys.executable, "-c", source],
+        [sys.executable, "-c", "\n".join(blocks)],
         cwd=CHECKOUT,
         capture_output=True,
         text=True,

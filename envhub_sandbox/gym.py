@@ -1,0 +1,96 @@
+"""One environment of a repository as an ordinary ``gymnasium.Env``, also by Gymnasium's registry.
+
+    >>> env = SandboxEnv("org/repo@<commit>")
+    >>> env = gymnasium.make("envhub_sandbox.gym:Hub-v0", ref="org/repo@<commit>")
+    >>> envs = gymnasium.make_vec("envhub_sandbox.gym:Hub-v0", num_envs=4, ref="org/repo@<commit>")
+
+What stands before the colon is imported by Gymnasium, which finds the id registered then.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+from gymnasium.vector import VectorEnv
+
+from envhub_sandbox.api import make_env
+from envhub_sandbox.vector.single_env import SingleEnv
+from envhub_sandbox.vector.suites import EnvSuites
+
+ID = "Hub-v0"
+
+
+class SandboxEnv(SingleEnv):
+    """One environment of a repository, in a sandbox of its own.
+
+    Args:
+        ref: What ``make_env`` takes: a hub reference, a folder, a config with ``hub_path``.
+        suite: Which suite of the repository; needed where there are several.
+        task: Which task of it; likewise.
+        render_mode: Handed to the repository's ``make_env``, if given.
+        options: ``make_env``'s.
+
+    Raises:
+        ValueError: The repository has several environments, or not the one that is named.
+        EnvHubError: As ``make_env``.
+    """
+
+    def __init__(
+        self,
+        ref: Any,
+        *,
+        suite: str | None = None,
+        task: int | str | None = None,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        suites = make_env(ref, n_envs=1, **_with_render_mode(options, render_mode))
+        try:
+            super().__init__(suites.choose(suite, task), suites)
+        except BaseException:
+            suites.close()
+            raise
+
+
+def make_vector(
+    ref: Any,
+    num_envs: int = 1,
+    *,
+    suite: str | None = None,
+    task: int | str | None = None,
+    render_mode: str | None = None,
+    **options: Any,
+) -> VectorEnv[Any, Any, Any]:
+    """What ``gymnasium.make_vec`` calls: the vector environment of a repository.
+
+    Args:
+        ref: What ``envhub_sandbox.make_env`` takes.
+        num_envs: Number of sub-environments.
+        suite: Which suite of the repository; needed where there are several.
+        task: Which task of it; likewise.
+        render_mode: Handed to the repository's ``make_env``, if given.
+        options: ``make_env``'s.
+    """
+    suites: EnvSuites = make_env(ref, n_envs=num_envs, **_with_render_mode(options, render_mode))
+    try:
+        vector: VectorEnv[Any, Any, Any] = suites.choose(suite, task)
+        return vector
+    except BaseException:
+        suites.close()
+        raise
+
+
+def _with_render_mode(options: dict[str, Any], render_mode: str | None) -> dict[str, Any]:
+    if render_mode is None:
+        return options
+    return {
+        **options,
+        "env_kwargs": {**(options.get("env_kwargs") or {}), "render_mode": render_mode},
+    }
+
+
+if ID not in gymnasium.registry:
+    gymnasium.register(
+        ID, entry_point=f"{__name__}:SandboxEnv", vector_entry_point=f"{__name__}:make_vector"
+    )

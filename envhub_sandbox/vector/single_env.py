@@ -1,0 +1,192 @@
+"""One sub-environment with the face of an ordinary ``gymnasium.Env``.
+
+For libraries that take single environments: Stable-Baselines3, tianshou, PufferLib, RLlib's default
+mode, TorchRL, and Gymnasium's wrappers. What lies below is a vector environment of one, so that a
+step takes the same way, the fast one, as every other.
+"""
+
+from __future__ import annotations
+
+import html
+from typing import Any, Protocol, SupportsFloat, cast
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import VectorEnv
+from gymnasium.vector.utils import concatenate, create_empty_array, iterate
+
+from envhub_worker.protocol.names import is_servable
+
+_PLAIN = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
+
+
+class Closing(Protocol):
+    """What ends with the environment."""
+
+    def close(self) -> None:
+        """End it; more than once does nothing."""
+
+
+class SingleEnv(gym.Env[Any, Any]):
+    """The only sub-environment of ``vector``, as a ``gymnasium.Env``.
+
+    A vector environment resets what has ended by itself; a ``gymnasium.Env`` does not. So an
+    observation that ends an episode is always the last one of that episode, and ``reset`` begins
+    the next. In the mode ``SAME_STEP`` the vector environment has begun it already, and ``reset``
+    without a seed or options returns that beginning instead of making another: as many resets
+    happen as were asked for.
+
+    Args:
+        vector: With ``num_envs`` 1.
+        owner: Closed with it, the vector environment included; else only that is closed.
+
+    Raises:
+        ValueError: ``vector`` has another number of sub-environments.
+    """
+
+    def __init__(self, vector: VectorEnv[Any, Any, Any], owner: Closing | None = None) -> None:
+        if vector.num_envs != 1:
+            raise ValueError(
+                f"a gymnasium.Env is one environment, and {vector!r} has {vector.num_envs}: make "
+                "it with n_envs=1"
+            )
+        self._vector = vector
+        self._owner = owner
+        self._begun: tuple[Any, dict[str, Any]] | None = None
+        self.observation_space = vector.single_observation_space
+        self.action_space = vector.single_action_space
+        items = vector.metadata.items()  # the mode is a vector environment's alone
+        self.metadata = {key: value for key, value in items if key != "autoreset_mode"}
+        self.render_mode = vector.render_mode
+        mode = getattr(vector.metadata.get("autoreset_mode"), "value", None)
+        self._resets_in_the_same_step = mode == "SameStep"
+
+    @property
+    def vector(self) -> VectorEnv[Any, Any, Any]:
+        """The vector environment below, with ``stats``, ``sandbox_report`` and the rest."""
+        return self._vector
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode.
+
+        Returns:
+            An observation of ``observation_space``, and its info.
+
+        Raises:
+            WorkerTimeoutError, WorkerDiedError, RemoteEnvError: As ``SandboxVectorEnv.reset``.
+        """
+        begun, self._begun = self._begun, None
+        if begun is not None and seed is None and not options:
+            return begun
+        batch, infos = self._vector.reset(seed=seed, options=options)
+        return self._first(batch), of_the_only(infos)
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """One step with ``action``, an element of ``action_space``.
+
+        Returns:
+            Observation, reward as a float, terminated, truncated, info. The observation of a step
+            that ends the episode is that episode's last.
+
+        Raises:
+            ActionError, WorkerTimeoutError, WorkerDiedError, RemoteEnvError: As
+                ``SandboxVectorEnv.step``.
+        """
+        self._begun = None
+        result = self._vector.step(self._batch(action))
+        batch, rewards, terminations, truncations, infos = result
+        observation, info = self._first(batch), of_the_only(infos)
+        terminated, truncated = bool(terminations[0]), bool(truncations[0])
+        if (terminated or truncated) and self._resets_in_the_same_step:
+            last, last_info = info.pop("final_obs"), info.pop("final_info", {})
+            self._begun = observation, info
+            observation, info = last, last_info
+        return observation, float(rewards[0]), terminated, truncated, info
+
+    def render(self) -> Any:
+        """What the environment renders in its ``render_mode``."""
+        frames = self._vector.render()
+        return None if frames is None else frames[0]
+
+    def close(self) -> None:
+        """End its processes. Idempotent."""
+        (self._owner or self._vector).close()
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """A copy of the environment's generator."""
+        found = self._vector.np_random
+        return found[0] if isinstance(found, tuple) else found
+
+    @np_random.setter
+    def np_random(self, value: np.random.Generator) -> None:
+        raise AttributeError("the generator is in the sandbox: seed it with reset(seed=...)")
+
+    # Gymnasium's checks look at this one
+    _np_random = np_random
+
+    @property
+    def np_random_seed(self) -> int:
+        """The seed of its generator, as Gymnasium has it: -1 if it is not known."""
+        found = self._vector.np_random_seed
+        return int(found[0] if isinstance(found, tuple) else found)  # type: ignore[arg-type]
+
+    def __getattr__(self, name: str) -> Any:
+        """An attribute or a method of the environment itself, as ``envs[0]`` has it."""
+        vector = self.__dict__.get("_vector")
+        if vector is None or not is_servable(name):
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        return getattr(vector.envs[0], name)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # copy and deepcopy, too: another one like it, with processes of its own
+        return type(self)._like, (self._vector,)
+
+    @classmethod
+    def _like(cls, vector: VectorEnv[Any, Any, Any]) -> SingleEnv:
+        return SingleEnv(vector)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {self._vector!r}>"
+
+    __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        return f"<code>{html.escape(repr(self))}</code>"
+
+    def _batch(self, action: Any) -> Any:
+        space = self.action_space
+        if isinstance(space, _PLAIN):
+            return np.asarray(action)[None]
+        return concatenate(space, [action], cast("Any", create_empty_array(space, 1)))
+
+    def _first(self, batch: Any) -> Any:
+        return next(iter(iterate(self._vector.observation_space, batch)))
+
+
+def of_the_only(infos: dict[str, Any]) -> dict[str, Any]:
+    """The info of the only sub-environment, from a vector environment's infos.
+
+    The other way round from ``VectorEnv._add_info``: a key counts where its mask, ``"_" + key``,
+    is set, and mappings are nested.
+    """
+    info = {}
+    for key, value in infos.items():
+        mask = infos.get(f"_{key}")
+        if key.startswith("_") and key[1:] in infos:
+            continue
+        if mask is not None and not bool(np.asarray(mask).flat[0]):
+            continue
+        info[key] = _only(value)
+    return info
+
+
+def _only(value: Any) -> Any:
+    if isinstance(value, dict):
+        return of_the_only(value)
+    if isinstance(value, (np.ndarray, list, tuple)) and len(value) == 1:
+        return value[0]
+    return value

@@ -1,0 +1,133 @@
+"""A vector environment of one as a ``gymnasium.Env``: the same episodes as without it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from envhub_sandbox.vector.single_env import SingleEnv
+
+_SPACES = (
+    spaces.Box(-1, 1, (2, 3)),
+    spaces.Box(-1, 1, ()),
+    spaces.Discrete(5),
+    spaces.MultiDiscrete([3, 4]),
+    spaces.MultiBinary(3),
+    spaces.Text(6),
+    spaces.Sequence(spaces.Discrete(3)),
+    spaces.Graph(spaces.Box(0, 1, (2,)), spaces.Discrete(3)),
+    spaces.OneOf([spaces.Discrete(3), spaces.Box(0, 1, (2,))]),
+    spaces.Dict(a=spaces.Box(0, 1, (2,)), b=spaces.Tuple([spaces.Discrete(3), spaces.Text(4)])),
+)
+
+
+class _Story(gym.Env[Any, Any]):
+    """Counts its steps and its resets, ends every third step, and tells it in its infos."""
+
+    observation_space = spaces.Box(0, 1e6, (2,), np.float32)
+    action_space = spaces.Discrete(4)
+
+    def __init__(self) -> None:
+        self.resets = self.steps = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        self.resets, self.steps = self.resets + 1, 0
+        return self._seen(), {"reset": self.resets, "drawn": self.np_random.random()}
+
+    def step(self, action: Any) -> Any:
+        self.steps += 1
+        info: dict[str, Any] = {"step": self.steps, "deep": {"action": int(action), "word": "up"}}
+        if self.steps == 2:
+            info["rare"] = np.arange(3)
+        return self._seen(), self.steps / 2, self.steps == 3, False, info
+
+    def _seen(self) -> Any:
+        return np.array([self.resets, self.steps], np.float32)
+
+
+class _Echo(gym.Env[Any, Any]):
+    """Observes the action."""
+
+    def __init__(self, space: spaces.Space[Any]) -> None:
+        self.observation_space = self.action_space = space
+        self._last = space.sample()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        return self._last, {}
+
+    def step(self, action: Any) -> Any:
+        assert action in self.action_space
+        return action, 0.0, False, False, {}
+
+
+def play(env: gym.Env[Any, Any]) -> list[Any]:
+    """Four episodes, each begun by whoever plays."""
+    seen: list[Any] = []
+    for episode in range(4):
+        observation, info = env.reset(seed=5 if episode == 0 else None)
+        seen.append((observation.tolist(), info))
+        ended = False
+        while not ended:
+            observation, reward, terminated, truncated, info = env.step(len(seen) % 4)
+            ended = terminated or truncated
+            info = {key: np.asarray(value).tolist() for key, value in info.items() if key != "deep"}
+            seen.append((observation.tolist(), reward, terminated, truncated, info))
+    return seen
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_episodes_are_those_of_the_environment_itself(mode: AutoresetMode) -> None:
+    """Observations, rewards, ends, infos, draws, and no reset that nobody asked for."""
+    vector = SyncVectorEnv([_Story], autoreset_mode=mode)
+    assert play(SingleEnv(vector)) == play(_Story())
+
+
+def test_a_last_observation_is_the_last_one() -> None:
+    """Also where the vector environment has begun the next episode in the same step."""
+    env = SingleEnv(SyncVectorEnv([_Story], autoreset_mode=AutoresetMode.SAME_STEP))
+    env.reset(seed=1)
+    env.step(0)
+    env.step(1)
+    observation, _, terminated, _, info = env.step(2)
+    assert terminated
+    assert observation.tolist() == [1, 3]
+    assert (info["step"], info["deep"]["action"]) == (3, 2)
+    observation, info = env.reset()
+    assert observation.tolist() == [2, 0]
+    assert info["reset"] == 2
+
+
+@pytest.mark.parametrize("space", _SPACES, ids=str)
+def test_actions_and_observations_are_of_the_single_spaces(space: spaces.Space[Any]) -> None:
+    """One action becomes a batch of one, and a batch of one an observation."""
+    env = SingleEnv(SyncVectorEnv([lambda: _Echo(space)]))
+    env.reset()
+    env.action_space.seed(3)
+    for _ in range(5):
+        action = env.action_space.sample()
+        observation = env.step(action)[0]
+        assert observation in env.observation_space
+        assert repr(observation) == repr(action) or np.array_equal(observation, action)
+
+
+def test_infos_lose_their_masks() -> None:
+    """Only what this step told, mappings within mappings included."""
+    env = SingleEnv(SyncVectorEnv([_Story]))
+    env.reset()
+    assert set(env.step(0)[4]) == {"step", "deep"}
+    info = env.step(1)[4]
+    assert set(info) == {"step", "deep", "rare"}
+    assert info["deep"] == {"action": 1, "word": "up"}
+    assert info["rare"].tolist() == [0, 1, 2]
+
+
+def test_several_are_refused() -> None:
+    """It says how to make one."""
+    with pytest.raises(ValueError, match="n_envs=1"):
+        SingleEnv(SyncVectorEnv([_Story, _Story]))
