@@ -1,11 +1,8 @@
 """Evaluations of suites, and first steps: ``python -m benchmarks.suites --help``.
 
-What LeRobot's ``eval_policy_all`` does to a suite of tasks, one after the other, each closed
-before the next opens (``tests/support/lerobot.py`` follows it call by call): over in-process
-vector environments that are built when they are first used, as LeRobot builds its own, and over
-this project's, for a pin whose manifest is known. Every run is an interpreter of its own, and the
-variants take turns, so that ratios are of one time on one machine. Needs torch, and root for the
-number of processes.
+What is evaluated, and by what, is said in ``evaluations.py``. Every run is an interpreter of its
+own, and the variants take turns, so that ratios are of one time on one machine. Needs torch, or
+with ``--lerobot`` an interpreter with LeRobot, and root for the number of processes.
 """
 
 from __future__ import annotations
@@ -17,137 +14,79 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from shutil import which
 from time import perf_counter
 from typing import Any
 
 from benchmarks.driver import ROOT
+from benchmarks.evaluations import LAZY, LEROBOT, LOOP, VARIANTS
+from benchmarks.interpreters import PEER_VENVS
 from benchmarks.watching import Watched, watch
 from benchmarks.workloads import REPOSITORIES
 
-VARIANTS = ("lerobot-sync", "lerobot-async", "envhub-sync", "envhub-async")
-N_ENVS = 4
 _MODULE_BYTES = 2_000_000
 _FIRST_ROUNDS = 7
 
 
-def play(variant: str, folder: str, tasks: int, heavy: bool) -> None:
-    """One evaluation in this process; prints a line before it and a JSON object after it."""
-    import torch
+@dataclass(frozen=True)
+class Suite:
+    """What is evaluated in every run.
 
-    from tests.support import lerobot
+    Attributes:
+        folder: The repository.
+        tasks: How many it has.
+        heavy: Whether each is a simulator.
+        python: The interpreter.
+        evaluator: Its module that evaluates.
+    """
 
-    torch.manual_seed(0)
-    policy = torch.nn.Linear(4, 2)
-    make = _ours if variant.startswith("envhub") else _theirs
-    make(variant.endswith("async"), folder, 1, heavy=False, only_import=True)
-    print("imported", flush=True)
-    start = perf_counter()
-    envs, end = make(variant.endswith("async"), folder, tasks, heavy=heavy)
-    found = lerobot.evaluate_all(
-        envs, lambda seen: policy(seen["observation.state"]), N_ENVS, 1, render=False
-    )
-    end()
-    seconds = perf_counter() - start
-    print(json.dumps({"seconds": seconds, "returns": [one["returns"] for one in found.values()]}))
+    folder: str
+    python: str
+    evaluator: str
+    tasks: int = 10
+    heavy: bool = False
 
-
-def _ours(
-    use_async: bool, folder: str, tasks: int, *, heavy: bool, only_import: bool = False
-) -> Any:
-    from envhub_sandbox import make_env
-
-    if only_import:
-        return None
-    given = {"tasks": tasks, "heavy": heavy}
-    suites = make_env(folder, N_ENVS, use_async, env_kwargs=given, timeouts={"startup_s": 300})
-    return suites, suites.close
+    def evaluate(self, variant: str, *, memory: bool = False) -> Watched:
+        """Once, in an interpreter of its own."""
+        command = [self.python, "-m", "benchmarks.evaluations", variant, self.folder]
+        command += ["--tasks", str(self.tasks), "--evaluator", self.evaluator]
+        command += ["--heavy"] if self.heavy else []
+        path = os.pathsep.join([str(ROOT), str(ROOT / "worker")])
+        return watch(command, memory=memory, variables={"PYTHONPATH": path})
 
 
-def _theirs(
-    use_async: bool, folder: str, tasks: int, *, heavy: bool, only_import: bool = False
-) -> Any:
-    import gymnasium as gym
-
-    if only_import:
-        return None
-    sys.path.insert(0, folder)
-    import env as repository
-
-    def build(task: int) -> Callable[[], Any]:
-        kind = gym.vector.AsyncVectorEnv if use_async else gym.vector.SyncVectorEnv
-        makers = [
-            lambda index=index: repository.Reach(task, heavy and index == 0)
-            for index in range(N_ENVS)
-        ]
-        return lambda: kind(makers)
-
-    return {"reach": {task: _Lazy(build(task)) for task in range(tasks)}}, lambda: None
-
-
-class _Lazy:
-    """A vector environment that is built when it is first looked into, as LeRobot's are."""
-
-    def __init__(self, build: Callable[[], Any]) -> None:
-        self._build = build
-        self._env: Any = None
-
-    def _ensure(self) -> None:
-        if self._env is None:
-            self._env = self._build()
-
-    def __getattr__(self, name: str) -> Any:
-        self._ensure()
-        return getattr(self._env, name)
-
-    @property
-    def unwrapped(self) -> Any:
-        """The vector environment itself."""
-        self._ensure()
-        return self._env
-
-    def close(self) -> None:
-        """Close what was built, and forget it."""
-        if self._env is not None:
-            self._env.close()
-        self._env = None
-
-
-def evaluate(variant: str, folder: str, tasks: int, heavy: bool, *, memory: bool) -> Watched:
-    """The same in an interpreter of its own."""
-    command = [sys.executable, "-m", "benchmarks.suites", "--play", variant, "--folder", folder]
-    command += ["--tasks", str(tasks), *(["--heavy"] if heavy else [])]
-    return watch(command, memory=memory)
-
-
-def compare(folder: str, tasks: int, heavy: bool, rounds: int, variants: list[str]) -> list[Any]:
+def compare(suite: Suite, rounds: int, variants: Sequence[str]) -> list[dict[str, Any]]:
     """One row for each variant: medians of rounds in turns, and a run of its own for memory."""
     for variant in variants:
-        evaluate(variant, folder, tasks, heavy, memory=False)  # from here on the pin is known
+        suite.evaluate(variant)  # from here on the pin is known
     runs: dict[str, list[Watched]] = {variant: [] for variant in variants}
     for _ in range(rounds):
         for variant in variants:
-            runs[variant].append(evaluate(variant, folder, tasks, heavy, memory=False))
-    rows = []
-    for variant in variants:
-        watched = evaluate(variant, folder, tasks, heavy, memory=True)
-        found = [json.loads(run.output) for run in runs[variant]]
-        rows.append(
-            {
-                "variant": variant,
-                "seconds": round(statistics.median(one["seconds"] for one in found), 2),
-                "all": [round(one["seconds"], 2) for one in found],
-                "peak_mb": watched.peak_mb,
-                "ever": runs[variant][-1].ever,
-                "peak_processes": runs[variant][-1].peak_processes,
-                "stolen": max(run.stolen for run in runs[variant]),
-                "load": round(max(run.load for run in runs[variant]), 1),
-                "returns": found[0]["returns"],
-            }
-        )
+            runs[variant].append(suite.evaluate(variant))
+    rows = [_row(v, runs[v], suite.evaluate(v, memory=True).peak_mb) for v in variants]
+    if any(row["returns"] != rows[0]["returns"] for row in rows):
+        raise RuntimeError("the variants' returns differ")
     return rows
+
+
+def _row(variant: str, runs: list[Watched], peak_mb: float) -> dict[str, Any]:
+    found = [json.loads(run.output) for run in runs]
+    cpu = [run.cpu_s - one["imports_cpu_s"] for run, one in zip(runs, found, strict=True)]
+    return {
+        "variant": variant,
+        "seconds": statistics.median(one["seconds"] for one in found),
+        "cpu": statistics.median(cpu),
+        "all": [round(one["seconds"], 2) for one in found],
+        "peak_mb": peak_mb,
+        "ever": runs[-1].ever,
+        "peak_processes": runs[-1].peak_processes,
+        "stolen": max(run.stolen for run in runs),
+        "load": round(max(run.load for run in runs), 1),
+        "returns": found[0]["returns"],
+    }
 
 
 FIRST = """
@@ -204,20 +143,21 @@ def _first(prepare: str, measured: str, cache: str) -> float:
     return float(subprocess.run(command, env=variables, check=True, stdout=-1, text=True).stdout)
 
 
-def _tables(options: argparse.Namespace, folder: str) -> Iterator[str]:
+def _tables(options: argparse.Namespace, suite: Suite) -> Iterator[str]:
     before = os.environ.get("ENVHUB_CACHE")
     with tempfile.TemporaryDirectory() as cache:
         os.environ["ENVHUB_CACHE"] = cache
-        if "light" in options.parts:
-            yield from _rows(compare(folder, 10, False, options.rounds, options.variants))
-        if "heavy" in options.parts:
-            yield from _rows(
-                compare(folder, 10, True, max(options.rounds // 2, 1), options.variants)
-            )
+        for part in ("light", "heavy"):
+            if part in options.parts:
+                rounds = options.rounds if part == "light" else max(options.rounds // 2, 1)
+                chosen = replace(suite, heavy=part == "heavy")
+                yield f"{part}: {chosen.tasks} tasks"
+                yield from _rows(compare(chosen, rounds, options.variants))
         if "growth" in options.parts:
             for variant in options.variants:
-                sizes = [evaluate(variant, folder, n, False, memory=True) for n in (10, 10, 40)]
-                yield f"{variant}: 10 tasks {sizes[1].peak_mb} MB, 40 tasks {sizes[2].peak_mb} MB"
+                many = [replace(suite, tasks=n) for n in (10, 10, 40)]
+                sizes = [one.evaluate(variant, memory=True).peak_mb for one in many]
+                yield f"{variant}: 10 tasks {sizes[1]} MB, 40 tasks {sizes[2]} MB"
     os.environ.pop("ENVHUB_CACHE")
     if before is not None:
         os.environ["ENVHUB_CACHE"] = before
@@ -230,30 +170,32 @@ def _tables(options: argparse.Namespace, folder: str) -> Iterator[str]:
 
 
 def _rows(rows: list[dict[str, Any]]) -> Iterator[str]:
-    if any(row["returns"] != rows[0]["returns"] for row in rows):
-        yield "the variants' returns differ"
+    yield "| variant | seconds | processor | memory | ever | at once | stolen | load | all |"
     for row in rows:
         yield (
-            f"| {row['variant']} | {row['seconds']} s | {row['peak_mb']} MB | {row['ever']} | "
-            f"{row['peak_processes']} | {100 * row['stolen']:.1f} % | {row['load']} | "
-            f"{row['all']} |"
+            f"| {row['variant']} | {row['seconds']:.2f} s | {row['cpu']:.2f} s | "
+            f"{row['peak_mb']} MB | {row['ever']} | {row['peak_processes']} | "
+            f"{100 * row['stolen']:.1f} % | {row['load']} | {row['all']} |"
         )
 
 
 def main() -> None:
-    """Play, or compare."""
+    """Compare."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.suites", description=__doc__)
     parser.add_argument("parts", nargs="*", default=["light", "heavy", "growth", "first"])
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
-    parser.add_argument("--play", choices=VARIANTS, help="one evaluation, in this process")
-    parser.add_argument("--folder")
     parser.add_argument("--tasks", type=int, default=10)
-    parser.add_argument("--heavy", action="store_true")
+    parser.add_argument("--variants", nargs="+", choices=(*VARIANTS, LAZY))
+    parser.add_argument(
+        "--lerobot",
+        nargs="?",
+        const=str(PEER_VENVS / "lerobot" / "bin" / "python"),
+        metavar="PYTHON",
+        help="evaluate with LeRobot's own code, in an interpreter that has it",
+    )
     options = parser.parse_args()
-    if options.play:
-        play(options.play, options.folder, options.tasks, options.heavy)
-        return
+    evaluator = LEROBOT if options.lerobot else LOOP
+    options.variants = options.variants or VARIANTS
     os.chdir(ROOT)
     with tempfile.TemporaryDirectory() as parent:
         folder = Path(parent) / "suite"
@@ -261,7 +203,9 @@ def main() -> None:
         (folder / "env.py").write_text((REPOSITORIES / "suite" / "env.py").read_text())
         (folder / "simulator.py").write_text(_simulator())
         os.chmod(parent, 0o755)
-        for line in _tables(options, str(folder)):
+        python = options.lerobot or sys.executable
+        suite = Suite(str(folder), python, evaluator, options.tasks)
+        for line in _tables(options, suite):
             print(line, flush=True)
 
 

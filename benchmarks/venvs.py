@@ -12,6 +12,7 @@ import sys
 import venv
 from pathlib import Path
 
+from benchmarks import lerobot_venv
 from benchmarks.interpreters import PEER_VENVS
 
 # pip's arguments, one call each. PufferLib 1.0.1 asks for old pins that its vectorization does
@@ -24,6 +25,14 @@ REQUIREMENTS: dict[str, list[list[str]]] = {
     ],
     "openenv": [["openenv-core", "gymnasium"]],
     "envpool": [["envpool", "gymnasium[mujoco]"]],
+    # its pins of torch and torchvision are looser than they need be, and it wants Python 3.12
+    "lerobot": [
+        ["torch", "gymnasium", "einops", "draccus<0.12", "huggingface-hub>=1.6,<2", "requests"],
+        ["safetensors", "packaging<26", "termcolor", "tqdm", "opencv-python-headless", "Pillow"],
+        ["datasets>=4.8,<5", "av>=15,<16", "jsonlines"],
+        ["--no-deps", "--ignore-requires-python", "torchvision", "lerobot==0.6.1"],
+        ["msgpack", "pyzmq", "cloudpickle", "platformdirs"],  # what this project needs beside it
+    ],
 }
 
 
@@ -38,6 +47,8 @@ def make(peer: str, folder: Path) -> None:
     for arguments in REQUIREMENTS[peer]:
         pip = [str(place / "bin" / "python"), "-m", "pip", "install", "--quiet", *arguments]
         subprocess.run(pip, check=True)
+    if peer == "lerobot":
+        lerobot_venv.adapt(next((place / "lib").glob("python3*")) / "site-packages")
 
 
 def main() -> None:

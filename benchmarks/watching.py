@@ -7,12 +7,13 @@ miss none however short it lives; memory by looking again and again, in a run of
 from __future__ import annotations
 
 import os
+import resource
 import socket
 import struct
 import subprocess
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,6 +39,7 @@ class Watched:
         peak_mb: The most by which it grew, its processes included; 0.0 where nobody looked.
         stolen: Share of the cores' time that the host took.
         load: The load average at its end.
+        cpu_s: What it and its processes took of the processor, as far as they were waited for.
     """
 
     output: str
@@ -46,9 +48,16 @@ class Watched:
     peak_mb: float
     stolen: float
     load: float
+    cpu_s: float
 
 
-def watch(command: Sequence[str], *, memory: bool, timeout_s: float = 600.0) -> Watched:
+def watch(
+    command: Sequence[str],
+    *,
+    memory: bool,
+    variables: Mapping[str, str] | None = None,
+    timeout_s: float = 600.0,
+) -> Watched:
     """Run a command to its end; with ``memory`` its memory is looked at, which disturbs.
 
     It prints one line once it has imported what it needs, from where on its growth counts.
@@ -56,9 +65,10 @@ def watch(command: Sequence[str], *, memory: bool, timeout_s: float = 600.0) -> 
     Raises:
         RuntimeError: It failed.
     """
-    before = _jiffies()
+    before, used = _jiffies(), _cpu_s()
+    environment = os.environ | dict(variables or {})
     with _Forks() as forks:
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
         forks.follow(process.pid)
         assert process.stdout is not None
         process.stdout.readline()
@@ -69,7 +79,14 @@ def watch(command: Sequence[str], *, memory: bool, timeout_s: float = 600.0) -> 
         raise RuntimeError(f"{command} ended with {process.returncode}")
     total, stolen = (now - then for now, then in zip(_jiffies(), before, strict=True))
     share = round(stolen / max(total, 1), 4)
-    return Watched(output, forks.ever, forks.peak, peak_mb, share, os.getloadavg()[0])
+    load, cpu_s = os.getloadavg()[0], _cpu_s() - used
+    return Watched(output, forks.ever, forks.peak, peak_mb, share, load, cpu_s)
+
+
+def _cpu_s() -> float:
+    """Of all that this process has waited for."""
+    found = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return found.ru_utime + found.ru_stime
 
 
 class _Forks:
