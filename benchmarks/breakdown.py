@@ -57,8 +57,8 @@ def _client(env: Any, batches: list[Any], spin_ns: int | None) -> dict[str, floa
     marks: list[int] = []
     lane = inside.lane(env)
     assert lane is not None
-    lane.ask, lane.wait = (
-        _marking(type(lane).ask, lane, marks),
+    lane.send_step, lane.wait = (
+        _marking(type(lane).send_step, lane, marks),
         _marking(type(lane).wait, lane, marks),
     )
     inside.force_spin(lane, _Forced(spin_ns) if spin_ns is not None else SpinChooser(True))

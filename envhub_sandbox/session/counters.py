@@ -15,45 +15,35 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from envhub_worker.protocol.manifest import EnvManifest
-from envhub_worker.protocol.shared_memory import slabs
-
 KEPT = 1024
 """Step latencies that are kept: the last ones. A power of two."""
 
 
 class Connection(Protocol):
-    """A connection to a server, which counts by itself."""
+    """The way to an environment's processes, which counts by itself."""
 
-    stale_replies: int
-    sent_bytes: int
-    received_bytes: int
+    def traffic(self) -> tuple[int, int, int]:
+        """Stale replies, and bytes sent and received."""
 
 
 class Counters:
     """What has happened to one environment.
 
-    Args:
-        lane_bytes: What a step by the fast lane sends and receives.
-
     Attributes:
-        requests: Requests sent, steps by the fast lane not among them.
-        lane_steps: Steps by the fast lane.
+        requests: Requests sent.
         timeouts: Replies that were late.
         deaths: Processes that ended under a request.
     """
 
-    def __init__(self, lane_bytes: tuple[int, int] = (0, 0)) -> None:
+    def __init__(self) -> None:
         self.requests = 0
-        self.lane_steps = 0
         self.timeouts = 0
         self.deaths = 0
-        self._lane_bytes = lane_bytes
         self._steps = 0
         self._total_ns = 0
         self._latencies = array("q", bytes(8 * KEPT))
         self._connection: Connection | None = None
-        self._stale = self._sent = self._received = 0
+        self._before = (0, 0, 0)
 
     def stepped(self, elapsed_ns: int) -> None:
         """A step has been answered."""
@@ -61,15 +51,16 @@ class Counters:
         self._steps += 1
         self._total_ns += elapsed_ns
 
-    def connected(self, connection: Connection) -> None:
-        """From now on this connection serves the environment."""
-        if connection is self._connection:
-            return
-        before, self._connection = self._connection, connection
-        if before is not None:
-            self._stale += before.stale_replies
-            self._sent += before.sent_bytes
-            self._received += before.received_bytes
+    def connected(self, connection: Connection | None) -> None:
+        """From now on this serves the environment, or nothing does."""
+        if connection is not self._connection:
+            self._before, self._connection = self._traffic(), connection
+
+    def _traffic(self) -> tuple[int, int, int]:
+        stale, sent, received = self._before
+        now = self._connection
+        more = (0, 0, 0) if now is None else now.traffic()
+        return stale + more[0], sent + more[1], received + more[2]
 
     def snapshot(self) -> dict[str, Any]:
         """Plain numbers: counts, and percentiles of the last step latencies in seconds."""
@@ -79,18 +70,15 @@ class Counters:
 
     def numbers(self) -> dict[str, float]:
         """Everything that only grows; ``step_seconds`` is the sum of all step latencies."""
-        now = self._connection
-        sent, received = self._lane_bytes
+        stale, sent, received = self._traffic()
         return {
-            "requests": self.requests + self.lane_steps,
+            "requests": self.requests,
             "steps": self._steps,
             "timeouts": self.timeouts,
             "deaths": self.deaths,
-            "stale_replies": self._stale + (now.stale_replies if now else 0),
-            "sent_bytes": self._sent + (now.sent_bytes if now else 0) + sent * self.lane_steps,
-            "received_bytes": self._received
-            + (now.received_bytes if now else 0)
-            + received * self.lane_steps,
+            "stale_replies": stale,
+            "sent_bytes": sent,
+            "received_bytes": received,
             "step_seconds": self._total_ns / 1e9,
         }
 
@@ -104,21 +92,6 @@ class Counters:
             return {}
         p50, p90, p99 = np.percentile(kept, (50, 90, 99)).tolist()
         return {"p50": p50, "p90": p90, "p99": p99, "max": float(kept.max())}
-
-
-def lane_step_bytes(manifest: EnvManifest) -> tuple[int, int]:
-    """What one step by shared memory sends and receives; infos, which vary, are left out."""
-    count = manifest.num_envs
-    sent = slabs.layout_of(manifest.single_action_space, count)
-    received = slabs.observation_layout(manifest.single_observation_space, count, 1)
-    if sent is None or received is None:
-        return 0, 0
-    flags = count * (8 + 1 + 1)
-    return _leaf_bytes(sent.actions), _leaf_bytes(received.leaves) + flags
-
-
-def _leaf_bytes(leaves: tuple[slabs.Leaf, ...]) -> int:
-    return sum(int(np.prod(leaf.shape, dtype=np.int64)) * leaf.dtype.itemsize for leaf in leaves)
 
 
 # --- all environments of this process ----------------------------------------------------------

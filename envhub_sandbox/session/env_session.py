@@ -8,10 +8,9 @@ life in jails is in ``lease``, what becomes of it when one dies in ``recovery``.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from time import perf_counter_ns
 from typing import Any, TypeVar
 
 from envhub_sandbox.errors import (
@@ -21,14 +20,13 @@ from envhub_sandbox.errors import (
     WorkerError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.session import lane_requests, survivors
+from envhub_sandbox.session import survivors
 from envhub_sandbox.session.recovery import MessageFor, Mortal
-from envhub_sandbox.session.results import StepResult
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RunnersDiedError, check, typed
-from envhub_sandbox.transport.shared_memory.lane import JailGoneError, Outcome
+from envhub_sandbox.transport.lane import Lane
+from envhub_sandbox.transport.results import StepResult
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.lifecycle import Event, State
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.untrusted import blamed, is_fault
@@ -37,9 +35,6 @@ _GRACE_S = 2.0
 """How long ``reset`` waits for a late reply before it gives the jail up and starts another."""
 
 T = TypeVar("T")
-_LANE = 0
-"""In place of a request's id, for what went by the fast lane; requests count from 1."""
-_BY_LANE = (_LANE, "step")
 
 
 class RemoteEnv(Mortal):
@@ -61,12 +56,12 @@ class RemoteEnv(Mortal):
             self._refuse_unless_usable(operation)
             if self.lifecycle.state is State.IDLE:
                 self._start()
-            requests = [
-                (runner, message_for(self._number, bounds))
-                for runner, bounds in zip(self._runners, self.bounds, strict=True)
-            ]
-            sent = self._send(operation, requests)
-            self._remember(message_for, requests[0][1], sent)
+            lane = self._lane
+            assert lane is not None
+            messages = [message_for(lane.number, bounds) for bounds in self.bounds]
+            packed = lane.pack(messages)
+            self._send(operation, partial(lane.send, operation, packed))
+            self._remember(message_for, messages[0], packed)
             self.history.requested(message_for)
             self._note_first_use()
 
@@ -79,11 +74,10 @@ class RemoteEnv(Mortal):
             RemoteEnvError: The repository's code raised; the environment is still usable.
         """
         with self._turn("a request"), self._judging():
-            deadline = Deadline(timeout_s)
             try:
-                replies = self._collect(deadline)
+                replies = self._finish(self._asked_lane().replies, Deadline(timeout_s))
             except RunnersDiedError as deaths:
-                replies = self._survive_request(deaths, deadline)
+                replies = self._survive_request(deaths)
             for reply in replies:
                 check(reply)
             self._has_set()
@@ -126,75 +120,44 @@ class RemoteEnv(Mortal):
     # --- steps ---------------------------------------------------------------------------------
 
     def submit_step(self, actions: Any) -> None:
-        """Send a validated batch of actions, by the fast lane where there is one."""
+        """Send a validated batch of actions."""
         with self._lock:
             if self.lifecycle.state is not State.READY:
                 with self._turn("step"):
                     self._refuse_unless_usable("step")
                     self._start()
             try:
-                if self._lane is None:
-                    self._send("step", self._step_requests(actions))
-                else:
-                    # first: an interrupt from here on leaves a reply that may come
-                    self._pending = _BY_LANE
-                    self.lifecycle.on(Event.SUBMIT)
-                    self._lane.ask(actions)
-                    self.counters.lane_steps += 1
-            except BaseException:
+                lane = self._lane
+                assert lane is not None
+                self.lifecycle.request = "step"
+                # first: an interrupt from here on leaves a reply that may come
+                self.lifecycle.on(Event.SUBMIT)
+                lane.send_step(actions)
+            except BaseException as error:
                 with self._turn("step"):
+                    self._nothing_was_sent(error)
                     raise
+            self.counters.requests += 1
             self.history.step(actions)  # while the jail is at it
-
-    def _step_requests(self, actions: Any) -> list[tuple[int, m.Message]]:
-        if len(self.bounds) == 1:
-            return [(self._runners[0], m.Step(self._number, actions))]
-        parts = batches.split(self.manifest.single_action_space, actions, self.bounds)
-        return [
-            (runner, m.Step(self._number, part))
-            for runner, part in zip(self._runners, parts, strict=True)
-        ]
 
     def collect_step(self, timeout_s: float | None) -> StepResult:
         """What ``VectorEnv.step`` returns; raises as ``collect`` does."""
         with self._lock:
             deadline = Deadline(timeout_s)
             try:
-                if self._pending is _BY_LANE:
-                    return self._collect_by_lane(deadline)
-                replies = self._collect(deadline)
-                self.counters.stepped(perf_counter_ns() - self._asked_ns)
-                for reply in replies:
-                    check(reply)
-                return self._stepped([typed(reply, m.StepDone) for reply in replies], deadline)
+                lane = self._asked_lane()
+                self._finish(lane.wait, deadline)
+                self.counters.stepped(lane.elapsed_ns)
+                try:
+                    return lane.result()
+                except batches.Misfit:
+                    return lane.result(self._infos_apart(deadline))
             except RunnersDiedError as deaths:
                 with self._turn("step"), self._judging():
-                    return self._survive_step(deaths, deadline)
+                    return self._survive_step(deaths)
             except BaseException:
                 with self._turn("step"), self._judging():
                     raise
-
-    def _collect_by_lane(self, deadline: Deadline) -> StepResult:
-        lane = self._lane
-        assert lane is not None
-        outcomes = self._finish(self._wait_on_lane, deadline)
-        self.counters.stepped(lane.elapsed_ns)
-        infos: dict[Any, Any] = {}
-        if outcomes:
-            assert self._place is not None
-            fetch = partial(self._fetch_infos, deadline=deadline)
-            parts = lane_requests.infos(self._place, outcomes, self.results, fetch)
-            try:
-                infos = self.results.infos(parts)
-            except batches.Misfit:
-                infos = self._infos_apart(deadline)
-        return (lane.observation(), *lane.flags(), infos)
-
-    def _stepped(self, replies: list[m.StepDone], deadline: Deadline) -> StepResult:
-        try:
-            return self.results.step(replies)
-        except batches.Misfit:
-            return self.results.step(replies, self._infos_apart(deadline))
 
     def finish_reset(
         self, replies: list[m.ResetDone], timeout_s: float | None
@@ -208,35 +171,18 @@ class RemoteEnv(Mortal):
 
     def _infos_apart(self, deadline: Deadline) -> dict[Any, Any]:
         """The last infos, of shards that do not agree about them."""
-        self._send("step", [(runner, m.FetchInfosApart(self._number)) for runner in self._runners])
+        lane = self._lane
+        assert lane is not None
+        self._send("step", lane.send_for_infos)
         try:
-            replies = self._collect(deadline)
+            replies = self._finish(lane.replies, deadline)
         except RunnersDiedError as deaths:
-            self._pending = None  # the next request meets the deaths
+            self.lifecycle.request = None  # the next request meets the deaths
             self._moved(Event.REPLY)
             raise deaths.first from None
         for reply in replies:
             check(reply)
         return self.results.apart([typed(reply, m.Value) for reply in replies])
-
-    def _wait_on_lane(self, deadline: Deadline) -> list[Outcome]:
-        assert self._lane is not None
-        try:
-            return self._lane.wait(deadline)
-        except JailGoneError:
-            if self._loaded is not None and self._loaded.jail.kept:
-                assert self._place is not None
-                return survivors.wait(self._place, deadline)
-            raise self._cause_of_death() from None
-
-    def _fetch_infos(self, runner: int, deadline: Deadline) -> m.Message:
-        self._send("step", [(runner, m.FetchInfos(self._number))])
-        try:
-            [reply] = self._collect(deadline)
-        except RunnersDiedError as deaths:
-            asked = [self._runners.index(runner)]
-            raise survivors.among_all(deaths, asked, len(self.bounds)) from None
-        return reply
 
     def recover(self) -> None:
         """Before a reset: catch up with a late reply, or give up the jail that owes it.
@@ -261,32 +207,22 @@ class RemoteEnv(Mortal):
                 self._forget()
 
     def _catch_up(self) -> None:
-        loaded, pending = self._loaded, self._pending
-        if loaded is None:  # an earlier attempt was interrupted when it had given the jail up
-            self._forget()
-            return
-        deadline = Deadline(_GRACE_S)
+        lane, request = self._lane, self.lifecycle.request
         try:
-            if pending is None:  # interrupted on the way out: nobody knows what was sent
-                raise WorkerTimeoutError("the request was interrupted")
-            if pending is _BY_LANE and self._lane is not None:
-                self._wait_on_lane(deadline)
-            elif pending[0] == _LANE:
-                self._receive_by_lane(deadline)
-            else:
-                loaded.jail.receive(pending[0], deadline)
+            if lane is None or request is None:
+                raise WorkerError("an earlier attempt gave the jail up, or nobody knows how far")
+            lane.catch_up(Deadline(_GRACE_S))
         except RunnersDiedError:
             pass  # the reset that follows meets them
         except (WorkerDiedError, WorkerTimeoutError) as error:
-            if pending is not None:
-                error.request = pending[1]
-                self._keep_crash(error)
+            error.request = request
+            self._keep_crash(error)
             self._forget()
             return
         except EnvHubError:
             self._forget()
             return
-        self._pending = None
+        self.lifecycle.request = None
         self.lifecycle.on(Event.REPLY)
 
     def _refuse_unless_usable(self, operation: str) -> None:
@@ -318,74 +254,44 @@ class RemoteEnv(Mortal):
         if state not in (State.IDLE, State.READY):
             raise WorkerError(f"cannot {operation}: the environment is {state.value}")
 
-    def _send(
-        self, operation: str, requests: Sequence[tuple[int, m.Message]]
-    ) -> list[list[Buffer]]:
-        """Send each runner its message; returns the frames of each."""
-        assert self._loaded is not None
-        self._asked_ns = perf_counter_ns()
-        jail = self._loaded.jail
-        packed = [(runner, jail.pack(message)) for runner, message in requests]
-        messages = [frames for _, frames in packed]
-        # what may have to be repeated in a fresh runner goes by the server, who knows the dead
-        if self._lane and not self._revives and lane_requests.takes(operation, messages):
-            self._tell(operation, messages)
-            return messages
-        self.lifecycle.on(Event.SUBMIT)  # first, as for a step by the lane
+    def _send(self, operation: str, send: Callable[[], None]) -> None:
+        self.lifecycle.request = operation
+        self.lifecycle.on(Event.SUBMIT)  # first, as for a step
         try:
-            request_id = jail.relay(operation, packed)
-        except EnvHubError:  # nothing was sent
-            self._moved(Event.REPLY)
+            send()
+        except EnvHubError as error:
+            self._nothing_was_sent(error)
             raise
-        self._pending = (request_id, operation)
-        if self._lane and operation == "reset":
-            self._lane.observations.leave()
-        self.counters.requests += 1
-        return messages
-
-    def _tell(self, operation: str, messages: list[list[Buffer]]) -> None:
-        assert self._place is not None
-        self._pending = (_LANE, operation)  # first, as for a step
-        self.lifecycle.on(Event.SUBMIT)
-        lane_requests.tell(self._place, operation, messages)
         self.counters.requests += 1
 
-    def _receive_by_lane(self, deadline: Deadline) -> list[m.Message]:
-        place, pending = self._place, self._pending
-        assert place is not None
-        assert pending is not None
-        try:
-            replies = lane_requests.answers(place, pending[1], deadline)
-        except JailGoneError:
-            raise self._cause_of_death() from None
-        if pending[1] != "reset":
-            return replies
-        found = (self.manifest, self.bounds, self.results)
-        return lane_requests.with_observations(place, replies, *found)
+    def _nothing_was_sent(self, error: BaseException) -> None:
+        """Go back to where we were, if the lane says so: by an error of this project."""
+        if isinstance(error, EnvHubError) and self.lifecycle.state is State.PENDING:
+            self.lifecycle.request = None
+            self.lifecycle.on(Event.REPLY)
 
-    def _collect(self, deadline: Deadline) -> list[m.Message]:
-        loaded, pending = self._loaded, self._pending
-        if loaded is None or pending is None:
+    def _asked_lane(self) -> Lane:
+        lane = self._lane
+        if lane is None or self.lifecycle.state is not State.PENDING:
             state = self.lifecycle.state.value
             raise WorkerError(f"there is no request to wait for: the environment is {state}")
-        if pending[0] == _LANE:
-            return self._finish(self._receive_by_lane, deadline)
-        return self._finish(lambda at: loaded.jail.receive(pending[0], at), deadline)
+        return lane
 
     def _finish(self, receive: Callable[[Deadline], T], deadline: Deadline) -> T:
         """Wait for the pending reply, and move on to the state that it leads to."""
-        assert self._pending is not None
+        request = self.lifecycle.request
+        assert request is not None
         try:
             received = receive(deadline)
         except WorkerTimeoutError as error:
             self.counters.timeouts += 1
             self._moved(Event.TIMEOUT)
-            raise self._late(self._pending[1], deadline) from error
+            raise self._late(request, deadline) from error
         except RunnersDiedError:
             raise
         except EnvHubError as error:
             if isinstance(error, WorkerDiedError) and error.reason == "idle":
-                raise self._expired(self._pending[1], error.detail) from None
+                raise self._expired(request, error.detail) from None
             open_still = self.lifecycle.state is not State.CLOSED
             if self._revives and open_still and isinstance(error, WorkerError):
                 raise survivors.all_died(error, len(self.bounds)) from error.__cause__
@@ -395,6 +301,6 @@ class RemoteEnv(Mortal):
                 raise self._dead(WorkerDiedError("")) from error
             self._moved(Event.INTERRUPT)
             raise
-        self._pending = None
+        self.lifecycle.request = None
         self._moved(Event.REPLY)
         return received

@@ -15,13 +15,14 @@ from typing import Any
 from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError
 from envhub_sandbox.log import WORKER
-from envhub_sandbox.session.counters import LEDGER, Counters, Labels, lane_step_bytes
+from envhub_sandbox.session.counters import LEDGER, Counters, Labels
 from envhub_sandbox.session.jail_sources import JailSource
 from envhub_sandbox.session.launcher import LoadedJail, Repository
 from envhub_sandbox.session.placement import Builder, Place
 from envhub_sandbox.session.restart_policy import Restarts
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
-from envhub_sandbox.transport.shared_memory.lane import FastLane
+from envhub_sandbox.transport.lane import Lane
+from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.shared_memory.sharding import PaceBook
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
@@ -56,22 +57,19 @@ class Tenant:
     ) -> None:
         self.manifest = manifest
         self.bounds = list(bounds)
+        self.results = Results(manifest, self.bounds)
         self.lifecycle = Lifecycle()
-        self.counters = Counters(lane_step_bytes(manifest))
+        self.counters = Counters()
         self.history = History(manifest, jails.repository.policy.crash_history)
         self._paces = paces
         self._jails = jails
         self._lock = threading.RLock()  # a signal handler may close what its own thread waits for
         self._ending = threading.RLock()  # nothing is given back that another thread is ending
         self._owner = os.getpid()
-        self._builder = Builder(jails, manifest, self.bounds)
+        self._builder = Builder(jails, self.results)
         self._restarts = Restarts(jails.repository.policy)
-        self._place: Place | None = None
         self._loaded: LoadedJail | None = None
-        self._runners: list[int] = []
-        self._number = 0
-        self._lane: FastLane | None = None
-        self._pending: tuple[int, str] | None = None  # a request's id, and what was asked
+        self._lane: Lane | None = None
         self._release_server: Callable[[], None] = _nothing
         self._startup: StartupDeadline | None = None
         self._warm = False  # started ahead, and not used yet
@@ -172,7 +170,7 @@ class Tenant:
         if not self._lock.acquire(timeout=0 if warming is None else _INTERRUPT_S):
             return False  # somebody uses it
         try:
-            loaded, used = self._loaded, self.counters.requests or self.counters.lane_steps
+            loaded, used = self._loaded, self.counters.requests
             if not self._warm or used or loaded is None or self.lifecycle.state is not State.READY:
                 return warming is not None
             with self._turn("make_env"):
@@ -244,9 +242,8 @@ class Tenant:
             raise self._closed("make_env")
 
     def _settle(self, place: Place) -> None:
-        self._place, self._loaded, self._lane = place, place.loaded, place.lane
-        self.counters.connected(place.loaded.jail.client)
-        self._runners, self._number = place.runners, place.number
+        self._loaded, self._lane = place.loaded, place.lane
+        self.counters.connected(place.lane)
 
     # --- moving out ----------------------------------------------------------------------------
 
@@ -254,7 +251,7 @@ class Tenant:
         """Give up the jail; the next request opens another, in the same server."""
         WORKER.info("%s: the jail is given up for a fresh one", self.repository.label)
         self._leave()
-        self._pending = None
+        self.lifecycle.request = None
         self._moved(Event.FORGET)
 
     def _leave(self) -> None:
@@ -276,8 +273,9 @@ class Tenant:
                 self._close_lane()
 
     def _close_lane(self) -> None:
-        lane, self._lane, self._place = self._lane, None, None
+        lane, self._lane = self._lane, None
         if lane is not None:
+            self.counters.connected(None)
             lane.close()
 
     def _let_server_go(self) -> None:
@@ -322,7 +320,10 @@ class Tenant:
     def _close_politely(self, loaded: LoadedJail) -> None:
         """Let the repository's ``close`` run; whatever it does, the processes end after it."""
         deadline = Deadline(self.repository.timeouts.close_s)
-        requests = [(runner, m.Close(self._number)) for runner in self._runners]
+        lane = self._lane
+        if lane is None:
+            return
+        requests = [(runner, m.Close(lane.number)) for runner in lane.runners]
         with contextlib.suppress(EnvHubError):
             loaded.jail.receive(loaded.jail.send("close", requests), deadline)
 
@@ -361,7 +362,7 @@ class Tenant:
         self._ending = threading.RLock()
         if self.lifecycle.state is not State.CLOSED:
             self.lifecycle.on(Event.FORK)
-        self._pending, self._release_server = None, _nothing
+        self.lifecycle.request, self._release_server = None, _nothing
         self._close_lane()
 
 

@@ -1,23 +1,24 @@
-"""Building an environment in a jail: a slice of it in each runner, and the fast lane to them."""
+"""Building an environment in a jail: a slice of it in each runner, and the lane to them."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NoReturn
 
-from envhub_sandbox.errors import LoadError, RemoteProtocolError, WorkerDiedError
+from envhub_sandbox.errors import LoadError
 from envhub_sandbox.session.jail_sources import JailSource, SharedJail
 from envhub_sandbox.session.launcher import LoadedJail
-from envhub_sandbox.transport.connection import SESSION
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import typed
-from envhub_sandbox.transport.shared_memory.lane import FastLane, deposit
+from envhub_sandbox.transport.lane import Lane, RelayLane
+from envhub_sandbox.transport.results import Results
+from envhub_sandbox.transport.shared_memory.attachment import Attachment
+from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest import EnvManifest, decode_env
 
-Bounds = list[tuple[int, int]]
 _numbers = itertools.count(1)
 
 
@@ -27,15 +28,11 @@ class Place:
 
     Attributes:
         loaded: Its jail.
-        runners: One for each shard.
-        number: What it is called there.
-        lane: The way of its steps, where there is a fast one.
+        lane: The way to its runners there.
     """
 
     loaded: LoadedJail
-    runners: list[int]
-    number: int
-    lane: FastLane | None
+    lane: Lane
 
 
 class Builder:
@@ -43,15 +40,15 @@ class Builder:
 
     Args:
         jails: Where its jails come from.
-        manifest: What the environment is expected to be.
-        bounds: The slices of the sub-environments, one for each shard.
+        results: What the environment is expected to be, and its slices, one for each shard.
     """
 
-    def __init__(self, jails: JailSource, manifest: EnvManifest, bounds: Bounds) -> None:
+    def __init__(self, jails: JailSource, results: Results) -> None:
         self._jails = jails
         self._repository = jails.repository
-        self._manifest = manifest
-        self._bounds = bounds
+        self._results = results
+        self._manifest = results.manifest
+        self._bounds = results.bounds
         # runners of a jail that several environments share die with it, for all of them
         own = not isinstance(jails, SharedJail)
         self._own = own
@@ -73,45 +70,38 @@ class Builder:
             loaded.jail.expire(idle_s, deadline)
         runners = self._repository.spread(loaded, len(self._bounds), deadline, self._manifest)
         self._check_manifest(loaded)
-        place = Place(loaded, runners, self._number, None)
-        shards = range(len(runners))
-        self._build(place, shards, deadline)
-        return replace(place, lane=self._open_lane(place, deadline))
+        relay = RelayLane(loaded.jail, runners, self._number, self._results)
+        self._build(relay, range(len(runners)), deadline)
+        return Place(loaded, self._fast_lane(relay, loaded, deadline) or relay)
 
-    def rebuild(self, place: Place, dead: Sequence[int], deadline: Deadline) -> Place:
+    def rebuild(self, place: Place, dead: Sequence[int], deadline: Deadline) -> None:
         """Build some shards again, each in a fresh runner in the same jail.
 
         Raises:
             LoadError, RemoteEnvError: The repository failed this time.
             WorkerError: They died again, or took too long.
         """
-        jail, runners = place.loaded.jail, list(place.runners)
-        gone = [runners[index] for index in dead]
-        fresh = jail.replace_runners(gone, deadline)
-        place.loaded.loaded.difference_update(gone)
-        for index, runner in zip(dead, fresh, strict=True):
-            runners[index] = runner
-        self._repository.load(place.loaded, fresh, deadline, self._manifest)
-        self._check_manifest(place.loaded)
-        place = replace(place, runners=runners)
-        self._build(place, dead, deadline)
-        if place.lane is not None:
-            for index in dead:
-                place.lane.renew(index)
-            if not self._attach(place.lane, place, dead, deadline):
-                raise RemoteProtocolError("a fresh runner refuses the fast lane that others take")
-        return place
+        loaded, lane = place.loaded, place.lane
+        gone = [lane.runners[index] for index in dead]
+        fresh = loaded.jail.replace_runners(gone, deadline)
+        loaded.loaded.difference_update(gone)
+        self._repository.load(loaded, fresh, deadline, self._manifest)
+        self._check_manifest(loaded)
+        relay = RelayLane(loaded.jail, lane.runners, self._number, self._results)
+        relay.renew(dead, fresh, deadline)
+        self._build(relay, dead, deadline)
+        lane.renew(dead, fresh, deadline)
 
-    def _build(self, place: Place, shards: Sequence[int], deadline: Deadline) -> None:
+    def _build(self, relay: RelayLane, shards: Sequence[int], deadline: Deadline) -> None:
         wanted = self._manifest
-        builds = [
+        builds: list[tuple[int, m.Message]] = [
             (
-                place.runners[index],
-                m.Build(place.number, wanted.suite, wanted.task, *self._bounds[index]),
+                relay.runners[index],
+                m.Build(relay.number, wanted.suite, wanted.task, *self._bounds[index]),
             )
             for index in shards
         ]
-        replies = place.loaded.jail.exchange("make_env", builds, deadline)
+        replies = relay.jail.exchange("make_env", builds, deadline)
         for index, reply in zip(shards, replies, strict=True):
             self._check_built(typed(reply, m.Built), *self._bounds[index])
 
@@ -123,45 +113,21 @@ class Builder:
         if built.num_envs != count or _kind(built) != _kind(wanted):
             self._refuse()
 
-    def _open_lane(self, place: Place, deadline: Deadline) -> FastLane | None:
-        """Agree with the runners on slabs and doorbells; None where frames have to serve."""
-        server, manifest = place.loaded.server, self._manifest
-        if server.fd_path is None or not manifest.shardable or self._repository.lane == "frames":
-            return None
-        if not self._own:
-            return None  # a runner has one lane, and these environments share theirs
-        copy = self._repository.copy
-        lane = FastLane.for_spaces(manifest, self._bounds, server.process_fd, copy=copy)
-        if lane is None:
-            return None
-        try:
-            agreed = self._attach(lane, place, range(len(place.runners)), deadline)
-        except BaseException:
-            lane.close()
-            raise
-        if not agreed:
-            lane.close()
-        return lane if agreed else None
+    def _fast_lane(
+        self, relay: RelayLane, loaded: LoadedJail, deadline: Deadline
+    ) -> SharedMemoryLane | None:
+        """Agree with the runners on slabs and doorbells; None where the relay has to serve.
 
-    def _attach(
-        self, lane: FastLane, place: Place, shards: Sequence[int], deadline: Deadline
-    ) -> bool:
-        jail, path = place.loaded.jail, place.loaded.server.fd_path
-        assert path is not None
-        for index in shards:
-            shard, runner = lane.shards[index], place.runners[index]
-            try:
-                pidfd = deposit(path, SESSION, jail.number, runner, shard.fds)
-            except OSError as error:  # the runner has gone, or the server
-                text = "the worker process died before its first request"
-                raise WorkerDiedError(text, request="make_env") from error
-            lane.watch_runner(index, pidfd)
-            shard.handed_over()
-        messages = [
-            (place.runners[index], lane.attach_message(place.number, index)) for index in shards
-        ]
-        replies = jail.exchange("attach", messages, deadline)
-        return all(typed(reply, m.Value).value is True for reply in replies)
+        This is the one place that decides which lane an environment has.
+        """
+        server = loaded.server
+        if server.fd_path is None or self._repository.lane == "frames":
+            return None
+        if not self._manifest.shardable or not self._own:
+            return None  # a runner has one lane, and environments of one jail share theirs
+        attachment = Attachment(server.fd_path, loaded.jail.number, server.process_fd)
+        copy = self._repository.copy
+        return SharedMemoryLane.open(relay, self._results, attachment, deadline, copy=copy)
 
     def _check_manifest(self, loaded: LoadedJail) -> None:
         key = (self._manifest.suite, self._manifest.task)

@@ -5,7 +5,6 @@ Who of the others has answered is in ``survivors``, what the fresh are asked in 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from time import perf_counter_ns
@@ -22,11 +21,12 @@ from envhub_sandbox.session import survivors
 from envhub_sandbox.session.jail_sources import JailSource, SharedJail
 from envhub_sandbox.session.launcher import LoadedJail
 from envhub_sandbox.session.lease import Tenant
+from envhub_sandbox.session.placement import Place
 from envhub_sandbox.session.reseed import Frames, SeedBook, Settings, marked, resets, truncated
-from envhub_sandbox.session.results import Results, StepResult
 from envhub_sandbox.session.survivors import Requests
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.jail import RunnersDiedError, check, typed
+from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.transport.shared_memory.sharding import PaceBook
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Event, State
@@ -36,7 +36,6 @@ MessageFor = Callable[[int, tuple[int, int]], m.Message]
 """Makes the message for a shard out of the environment's number and the shard's bounds."""
 
 _CAUSE_S = 10.0
-_CAUSE_POLL_S = 0.01
 
 
 class Mortal(Tenant):
@@ -54,32 +53,17 @@ class Mortal(Tenant):
         paces: PaceBook,
     ) -> None:
         super().__init__(jails, manifest, bounds, paces)
-        self.results = Results(manifest, self.bounds)
         self._revives = jails.repository.policy.restart == "transparent"
         self._seeds = SeedBook(manifest.num_envs, manifest.shardable)
         self._settings = Settings()
         self._setting: tuple[str, list[Frames]] | None = None  # what is being set
-        self._asked: MessageFor | None = None  # what was asked last, and when
-        self._asked_ns = 0
+        self._asked: MessageFor | None = None  # what was asked last
 
     def _build_in(self, loaded: LoadedJail, deadline: Deadline) -> None:
         super()._build_in(loaded, deadline)
         self._settings.clear()
 
     # --- how it is learnt, and told ------------------------------------------------------------
-
-    def _cause_of_death(self) -> Exception:
-        """Why the jail has ended: the server knows, at the latest when it has reaped it."""
-        assert self._loaded is not None
-        operation = "step" if self._pending is None else self._pending[1]
-        deadline = Deadline(_CAUSE_S)
-        while not deadline.passed:
-            try:
-                self._loaded.jail.output(operation, deadline)
-            except EnvHubError as error:
-                return error
-            time.sleep(_CAUSE_POLL_S)
-        return WorkerDiedError(f"the worker process died during {operation}", request=operation)
 
     def _see_whether_it_expired(self) -> None:
         assert self._loaded is not None
@@ -107,15 +91,15 @@ class Mortal(Tenant):
 
     def _expired(self, operation: str, why: str) -> WorkerDiedError:
         self._moved(Event.EXPIRY)
-        self._pending = None
+        self.lifecycle.request = None
         text = f"cannot {operation}: {why}, so its processes were ended; call reset() first"
         return WorkerDiedError(text, reason="idle", request=operation, detail=why)
 
     def _dead(self, error: EnvHubError) -> EnvHubError:
         """Write a death down; what closed an environment under its user is told as such."""
-        assert self._pending is not None
+        assert self.lifecycle.request is not None
         if self.lifecycle.state is State.CLOSED:
-            return self._closed(self._pending[1])
+            return self._closed(self.lifecycle.request)
         self.counters.deaths += 1
         self._moved(Event.DEATH)
         WORKER.info("%s: %s", self.repository.label, str(error).partition("\n")[0])
@@ -129,7 +113,7 @@ class Mortal(Tenant):
     def _distrust(self, error: RemoteProtocolError) -> None:
         """Its reply came, and broke a rule: it is ended, whatever else it may have to say."""
         self.counters.deaths += 1
-        self._pending = None
+        self.lifecycle.request = None
         self._moved(Event.DEATH)
         WORKER.info("%s: %s", self.repository.label, str(error).partition("\n")[0])
         if self._loaded is not None:
@@ -141,23 +125,22 @@ class Mortal(Tenant):
             "task": self.manifest.task,
             "num_envs": self.manifest.num_envs,
             "shards": len(self.bounds),
-            "lane": "frames" if self._lane is None else "shared memory",
+            "lane": None if self._lane is None else self._lane.name,
         }
         recording, shared = self.history.recording(), isinstance(self._jails, SharedJail)
         self.repository.keep_crash(error, recording, task, self._loaded, shared=shared)
 
     # --- a request that is survived ------------------------------------------------------------
 
-    def _survive_request(self, deaths: RunnersDiedError, deadline: Deadline) -> list[m.Message]:
+    def _survive_request(self, deaths: RunnersDiedError) -> list[m.Message]:
         """A reset is done in fresh runners; anything else is not repeated.
 
         Raises:
             WorkerDiedError: It was something else; the next step or reset brings them back.
         """
-        replies = self._of_survivors(deaths, deadline)
-        assert self._pending is not None
-        if self._pending[1] != "reset":
-            self._pending = None
+        replies = self._of_survivors(deaths)
+        if self.lifecycle.request != "reset":
+            self.lifecycle.request = None
             self._moved(Event.REPLY)
             raise deaths.first
         for index, reply in self._revive(deaths, self._resets).items():
@@ -165,41 +148,30 @@ class Mortal(Tenant):
             replies[index] = replace(done, info=marked(done.info, self._size(index)))
         return [reply for reply in replies if reply is not None]
 
-    def _survive_step(self, deaths: RunnersDiedError, deadline: Deadline) -> StepResult:
+    def _survive_step(self, deaths: RunnersDiedError) -> StepResult:
         """The step's results, with fresh observations in the rows of the dead."""
         started = perf_counter_ns()
-        parts = self._of_survivors(deaths, deadline)
+        parts = self._of_survivors(deaths)
         for index, reply in self._revive(deaths, self._revivals).items():
             parts[index] = truncated(typed(reply, m.StepDone), self._size(index))
         self.counters.stepped(perf_counter_ns() - started)
         return self.results.step([typed(part, m.StepDone) for part in parts if part is not None])
 
-    def _of_survivors(self, deaths: RunnersDiedError, deadline: Deadline) -> list[m.Message | None]:
+    def _of_survivors(self, deaths: RunnersDiedError) -> list[m.Message | None]:
         """What the others answered; None where nobody did.
 
         Raises:
             RemoteEnvError: One of them raised. The next request meets the deaths.
-            WorkerTimeoutError: One of them kept something back for too long.
         """
-        assert self._pending is not None
         try:
-            replies = deaths.replies
-            if self._lane is not None and self._pending[1] == "step":
-                assert self._place is not None
-                found = (self.manifest, self.bounds, self.results)
-                replies = survivors.answers_by_lane(self._place, deaths, *found, deadline)
-            for reply in replies:
+            for reply in deaths.replies:
                 if reply is not None:
                     check(reply)
-        except WorkerTimeoutError as error:
-            late, self._pending = self._late(self._pending[1], deadline), None
-            self._moved(Event.TIMEOUT)
-            raise late from error
         except EnvHubError:
-            self._pending = None
+            self.lifecycle.request = None
             self._moved(Event.REPLY)
             raise
-        return replies
+        return deaths.replies
 
     # --- the fresh in place of the dead --------------------------------------------------------
 
@@ -212,7 +184,7 @@ class Mortal(Tenant):
         except WorkerTimeoutError as error:
             if self.lifecycle.state is State.CLOSED:
                 raise self._dead(error) from error
-            self._pending = None  # nobody knows how far it came: a reset starts afresh
+            self.lifecycle.request = None  # nobody knows how far it came: a reset starts afresh
             self._moved(Event.TIMEOUT)
             raise
         except EnvHubError as error:
@@ -220,21 +192,21 @@ class Mortal(Tenant):
         except BaseException as error:
             if self.lifecycle.state is State.CLOSED and isinstance(error, Exception):
                 raise self._dead(WorkerDiedError("")) from error
-            self._pending = None
+            self.lifecycle.request = None
             self._moved(Event.INTERRUPT)
             raise
-        self._pending = None
+        self.lifecycle.request = None
         self.counters.deaths += len(replies)
         self.history.revived()
         self._moved(Event.REVIVAL)
         return replies
 
     def _bring_back(self, deaths: RunnersDiedError, requests: Requests) -> dict[int, m.Message]:
-        assert self._pending is not None
+        assert self.lifecycle.request is not None
         if any(death.reason == "protocol" for death in deaths.deaths.values()):
             raise deaths.first  # whoever breaks the rules is given no second chance
         try:
-            self._restarts.spend(self._pending[1])
+            self._restarts.spend(self.lifecycle.request)
         except WorkerDiedError as spent:
             raise deaths.first from spent
         dead = sorted(deaths.deaths)
@@ -253,16 +225,17 @@ class Mortal(Tenant):
             self._leave()
             self._move_into(self._jails.take(deadline), deadline)
         else:
-            assert self._place is not None
-            self._settle(self._builder.rebuild(self._place, dead, deadline))
+            assert self._loaded is not None
+            assert self._lane is not None
+            self._builder.rebuild(Place(self._loaded, self._lane), dead, deadline)
 
     def _ask_anew(self, dead: list[int], requests: Requests) -> dict[int, m.Message]:
-        assert self._place is not None
+        assert self._lane is not None
         deadline = Deadline(self.repository.timeouts.reset_s)
         try:
-            for name in survivors.set_again(self._place, dead, self._settings.messages(), deadline):
+            for name in survivors.set_again(self._lane, dead, self._settings.messages(), deadline):
                 WORKER.warning("%s: %r could not be set again", self.repository.label, name)
-            return survivors.ask_anew(self._place, dead, requests, deadline)
+            return survivors.ask_anew(self._lane, dead, requests, deadline)
         except WorkerTimeoutError as error:
             raise self._late("reset", deadline) from error
 
@@ -289,7 +262,7 @@ class Mortal(Tenant):
             self._setting = None
 
     def _revivals(self, index: int) -> list[m.Message]:
-        return [m.Revive(self._number, self._derived(index))]
+        return [m.Revive(self._env_number, self._derived(index))]
 
     def _resets(self, index: int) -> list[m.Message]:
         return resets(self._reset_of(self.bounds[index]), self._derived(index))
@@ -299,9 +272,14 @@ class Mortal(Tenant):
 
     def _reset_of(self, bounds: tuple[int, int]) -> m.Reset:
         assert self._asked is not None
-        reset = self._asked(self._number, bounds)
+        reset = self._asked(self._env_number, bounds)
         assert isinstance(reset, m.Reset)
         return reset
+
+    @property
+    def _env_number(self) -> int:
+        assert self._lane is not None
+        return self._lane.number
 
     def _size(self, index: int) -> int:
         start, stop = self.bounds[index]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from itertools import islice
 from typing import Any
@@ -27,6 +28,9 @@ from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.limits import WireLimits
 from envhub_worker.protocol.text import printable
 from envhub_worker.protocol.untrusted import UNTRUSTED
+
+_CAUSE_S = 10.0
+_CAUSE_POLL_S = 0.01
 
 
 class RunnersDiedError(WorkerDiedError):
@@ -188,6 +192,17 @@ class RemoteJail:
         """
         reply, _ = self.client.request(m.ReadOutput(self.number, operation), deadline=deadline)
         return expect(reply, m.Output).text
+
+    def cause_of_death(self, operation: str) -> Exception:
+        """Why it has ended: the server knows, at the latest when it has reaped it."""
+        deadline = Deadline(_CAUSE_S)
+        while not deadline.passed:
+            try:
+                self.output(operation, deadline)
+            except EnvHubError as error:
+                return error
+            time.sleep(_CAUSE_POLL_S)
+        return WorkerDiedError(f"the worker process died during {operation}", request=operation)
 
     def close(self, deadline: Deadline) -> None:
         """End the jail and everything in it. A server that has gone has ended it already."""

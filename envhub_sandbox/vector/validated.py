@@ -17,7 +17,7 @@ from gymnasium.vector.utils import iterate
 
 from envhub_sandbox.errors import ActionError, ObservationError
 from envhub_sandbox.session.env_session import RemoteEnv
-from envhub_sandbox.session.results import StepResult
+from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES, OpaqueSpace

@@ -23,8 +23,8 @@ from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.session.env_session import RemoteEnv
-from envhub_sandbox.session.results import StepResult
 from envhub_sandbox.transport.jail import typed
+from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.vector import from_manifest, generators
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.names import is_servable

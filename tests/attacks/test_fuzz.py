@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from envhub_sandbox.session import results
+from envhub_sandbox.transport import results
 from envhub_worker.protocol import messages as m
 from tests.fuzz import child, traffic
 from tests.fuzz.oracle import WrongError, fits

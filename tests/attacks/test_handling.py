@@ -25,7 +25,7 @@ from envhub_sandbox.errors import (
     RemoteProtocolError,
     WorkerDiedError,
 )
-from envhub_sandbox.session import results
+from envhub_sandbox.transport import results
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol import untrusted

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from envhub_sandbox.session.results import Results
-from envhub_sandbox.transport.shared_memory.lane import LaneShard
+from envhub_sandbox.transport.results import Results
+from envhub_sandbox.transport.shared_memory.lane import infos_of
 from envhub_sandbox.transport.shared_memory.observations import ObservationSlab
+from envhub_sandbox.transport.shared_memory.shard import LaneShard
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.stream import pack_packet
@@ -84,7 +85,9 @@ def lane(dice: Dice) -> None:
         usable([] if found is None else parts(found))
         return
     with UNTRUSTED:
-        infos = ours.results.infos([ours.results.lane_info(found, shard, lambda: m.Value({}))])
+        if found[0] == slabs.FETCH:
+            found = slabs.DONE, m.Value({})
+        infos = ours.results.infos([infos_of(shard, found, ours.results)])
         usable(infos)
         observation = ours.observations.take()
     fits(SPACE, observation, COUNT)

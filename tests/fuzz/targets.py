@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.session.results import Results
 from envhub_sandbox.transport.connection import death, expect
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RemoteJail, RunnersDiedError, check, open_jail
+from envhub_sandbox.transport.results import Results
 from envhub_sandbox.vector import from_manifest
 from envhub_sandbox.vector.generators import generator
 from envhub_worker.protocol import messages as m

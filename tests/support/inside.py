@@ -27,7 +27,7 @@ from envhub_sandbox.session.recipe import Recipe
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RemoteJail
-from envhub_sandbox.transport.shared_memory.lane import FastLane
+from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
 from envhub_worker.access.connection_limit import Doorman
 from envhub_worker.access.gate import RemoteGate
 from envhub_worker.cli import listen
@@ -122,12 +122,13 @@ def pids(env: Any) -> list[int]:
     return next(list(one["pids"]) for one in jails if one["jail"] == jail(env).number)
 
 
-def lane(env: Any) -> FastLane | None:
+def lane(env: Any) -> SharedMemoryLane | None:
     """Its fast lane, where it has one."""
-    return session(env)._lane
+    found = session(env)._lane
+    return found if isinstance(found, SharedMemoryLane) else None
 
 
-def force_spin(used: FastLane, chooser: Any) -> None:
+def force_spin(used: SharedMemoryLane, chooser: Any) -> None:
     """Have another one decide for how long a step spins."""
     used._step_spin = chooser
 

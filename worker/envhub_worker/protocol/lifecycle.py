@@ -75,7 +75,14 @@ TABLE: dict[tuple[State, Event], State] = {
 
 
 class Lifecycle:
-    """A state and its legal moves."""
+    """A state and its legal moves.
+
+    Attributes:
+        request: What was asked and is not answered yet. None in ``LATE``: nobody knows how far it
+            came.
+    """
+
+    request: str | None = None
 
     def __init__(self) -> None:
         self.state = State.IDLE

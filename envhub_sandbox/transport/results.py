@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
 
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, remote_error
 from envhub_sandbox.transport.jail import check, typed
-from envhub_sandbox.transport.shared_memory.lane import LaneShard, Outcome
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.manifest import EnvManifest
-from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.untrusted import FAULTS
 
@@ -28,9 +26,14 @@ class Results:
     Args:
         manifest: What the worker declared.
         bounds: The slices of the sub-environments, in the order of the replies.
+
+    Attributes:
+        manifest, bounds: As given.
     """
 
     def __init__(self, manifest: EnvManifest, bounds: Sequence[tuple[int, int]]) -> None:
+        self.manifest = manifest
+        self.bounds = list(bounds)
         self._space = manifest.single_observation_space
         self._declared = manifest.shardable
         self._sizes = [stop - start for start, stop in bounds]
@@ -79,9 +82,8 @@ class Results:
         return self._restored(infos)
 
     def reset_done(self, observation: Any, reply: m.Message) -> m.ResetDone:
-        """A shard's reply to a reset by the fast lane."""
-        check(reply)
-        return m.ResetDone(observation, self._info(typed(reply, m.Value).value))
+        """A shard's reply to a reset, of which the observation has come another way."""
+        return m.ResetDone(observation, self.info(reply))
 
     def infos(self, parts: list[dict[Any, Any]]) -> dict[Any, Any]:
         """One mapping of the shards' infos."""
@@ -96,23 +98,16 @@ class Results:
                 final[index] = batches.restore(self._space, member)
         return infos
 
-    def lane_info(
-        self, outcome: Outcome, shard: LaneShard, fetch: Callable[[], m.Message]
-    ) -> dict[Any, Any]:
-        """A shard's infos of a step by the fast lane; ``fetch`` asks for what did not fit.
+    def info(self, reply: m.Message | None) -> dict[Any, Any]:
+        """A shard's infos, out of what it said of them; nothing at all is none.
 
         Raises:
             RemoteEnvError: The environment raised.
         """
-        kind, message = outcome
-        if kind == slabs.COLUMNS:
-            return shard.columns()
-        if kind == slabs.FETCH:
-            message = fetch()
-        if message is None:
+        if reply is None:
             return {}
-        check(message)
-        return self._info(typed(message, m.Value).value)
+        check(reply)
+        return self._info(typed(reply, m.Value).value)
 
     def one_each(self, what: str, replies: list[m.Value]) -> tuple[Any, ...]:
         """One value for each sub-environment."""

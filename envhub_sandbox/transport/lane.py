@@ -1,0 +1,225 @@
+"""The way of an environment's requests to its runners: one interface, and the way over the server.
+
+There are two: ``RelayLane``, below, and ``SharedMemoryLane``. Which of them an environment has is
+decided once, when it is built (``session/placement``); whoever asks for something does not know.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from time import perf_counter_ns
+from typing import Any, Protocol
+
+from envhub_sandbox.errors import EnvHubError, WorkerError
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.jail import RemoteJail, RunnersDiedError, check, typed
+from envhub_sandbox.transport.results import Results, StepResult
+from envhub_sandbox.transport.shared_memory.sharding import Pace
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.spaces import batches
+
+Frames = list[Buffer]
+
+
+class Lane(Protocol):
+    """The way to the runners of one environment: one request at a time, and its answers.
+
+    The order is the point. ``send_step`` or ``send`` comes first, then ``wait`` or ``replies``, for
+    which a deadline is given that also bounds whatever else has to be fetched. Where that wait ends
+    in any other way than with answers, the lane still knows what it is owed, and ``catch_up`` must
+    take it before anything else is sent: a step's answer would otherwise be taken for the next's.
+    ``result`` waits for nothing, so that what it raises is never a signal handler's.
+
+    Attributes:
+        name: What a crash bundle calls it.
+        jail: Where its runners are.
+        runners: One for each shard.
+        number: What the environment is called there.
+        elapsed_ns: What the last step took, from its sending to the last answer.
+    """
+
+    name: str
+    jail: RemoteJail
+    runners: list[int]
+    number: int
+    elapsed_ns: int
+
+    def send_step(self, actions: Any) -> None:
+        """Send a validated batch of actions: to each shard its slice.
+
+        Raises:
+            EnvHubError: Nothing was sent.
+        """
+
+    def wait(self, deadline: Deadline) -> None:
+        """Until every shard has answered the step, with all that belongs to it.
+
+        Raises:
+            WorkerTimeoutError: The deadline came first.
+            WorkerDiedError: The jail has ended.
+            RunnersDiedError: Runners of a kept jail did; it has what the others answered.
+            RemoteProtocolError: A runner broke the rules.
+        """
+
+    def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
+        """What ``VectorEnv.step`` returns; with these infos, if there are other ones.
+
+        Raises:
+            Misfit: The shards' infos do not go together; ``send_for_infos`` asks for others.
+            RemoteEnvError: The repository's code raised.
+            RemoteProtocolError: A runner broke the rules.
+        """
+
+    def pack(self, messages: Sequence[m.Message]) -> list[Frames]:
+        """The frames of a message for each shard.
+
+        Raises:
+            LocalProtocolError: One cannot be sent.
+        """
+
+    def send(self, operation: str, packed: Sequence[Frames]) -> None:
+        """Send each shard its message.
+
+        Raises:
+            EnvHubError: Nothing was sent.
+        """
+
+    def send_for_infos(self) -> None:
+        """Ask for the last infos as each sub-environment gave them; ``replies`` has them.
+
+        Raises:
+            EnvHubError: Nothing was sent.
+        """
+
+    def replies(self, deadline: Deadline) -> list[m.Message]:
+        """Every shard's reply to what was sent; raises as ``wait`` does."""
+
+    def catch_up(self, deadline: Deadline) -> None:
+        """Take what is owed and drop it; raises as ``wait`` does.
+
+        Raises:
+            WorkerError: The sending was interrupted: nobody knows what was sent.
+        """
+
+    def renew(self, dead: Sequence[int], fresh: Sequence[int], deadline: Deadline) -> None:
+        """Go to other runners in the place of those that have died.
+
+        Args:
+            dead: Their shards.
+            fresh: The runner of each, in which the environment is built already.
+            deadline: For all of it.
+        """
+
+    def pace(self) -> Pace | None:
+        """What steps took, if that says how to spread them the next time."""
+
+    def traffic(self) -> tuple[int, int, int]:
+        """Stale replies, and bytes sent and received, so far."""
+
+    def close(self) -> None:
+        """Give back what is its own; the jail is not."""
+
+
+class RelayLane:
+    """Over ZeroMQ and the server, which passes frames on to the runners: see ``Lane``.
+
+    Args:
+        jail: Where the runners are.
+        runners: One for each shard.
+        number: What the environment is called there.
+        results: What is declared of its answers.
+    """
+
+    name = "frames"
+
+    def __init__(
+        self, jail: RemoteJail, runners: Sequence[int], number: int, results: Results
+    ) -> None:
+        self.jail = jail
+        self.runners = list(runners)
+        self.number = number
+        self.elapsed_ns = 0
+        self._results = results
+        self._asked_ns = 0
+        self._answers: list[m.Message] = []
+        self._owed: int | None = None
+        self._sending = False
+
+    def send_step(self, actions: Any) -> None:
+        """See ``Lane``."""
+        self._asked_ns = perf_counter_ns()
+        bounds = self._results.bounds
+        parts = [actions]
+        if len(bounds) > 1:
+            parts = batches.split(self._results.manifest.single_action_space, actions, bounds)
+        self.send("step", self.pack([m.Step(self.number, part) for part in parts]))
+
+    def wait(self, deadline: Deadline) -> None:
+        """See ``Lane``."""
+        self._answers = self.replies(deadline)
+        self.elapsed_ns = perf_counter_ns() - self._asked_ns
+
+    def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
+        """See ``Lane``. Trust: input from the worker."""
+        for reply in self._answers:
+            check(reply)
+        return self._results.step([typed(reply, m.StepDone) for reply in self._answers], infos)
+
+    def pack(self, messages: Sequence[m.Message]) -> list[Frames]:
+        """See ``Lane``."""
+        return [self.jail.pack(message) for message in messages]
+
+    def send(self, operation: str, packed: Sequence[Frames]) -> None:
+        """See ``Lane``."""
+        self.send_some(operation, self.runners, packed)
+
+    def send_some(self, operation: str, runners: Sequence[int], packed: Sequence[Frames]) -> None:
+        """Send some runners a message each; ``replies`` has what they answer."""
+        self._owed = None
+        self._sending = True  # an interrupt from here on leaves half a message, or a whole one
+        try:
+            self._owed = self.jail.relay(operation, list(zip(runners, packed, strict=True)))
+        except EnvHubError:  # nothing was sent
+            self._sending = False
+            raise
+        self._sending = False
+
+    def send_for_infos(self) -> None:
+        """See ``Lane``."""
+        self.send("step", self.pack([m.FetchInfosApart(self.number)]) * len(self.runners))
+
+    def replies(self, deadline: Deadline) -> list[m.Message]:
+        """See ``Lane``."""
+        assert self._owed is not None
+        try:
+            received = self.jail.receive(self._owed, deadline)
+        except RunnersDiedError:  # that was the answer
+            self._owed = None
+            raise
+        self._owed = None
+        return received
+
+    def catch_up(self, deadline: Deadline) -> None:
+        """See ``Lane``."""
+        if self._sending:
+            raise WorkerError("the request was interrupted while it was being sent")
+        if self._owed is not None:
+            self.replies(deadline)
+
+    def renew(self, dead: Sequence[int], fresh: Sequence[int], deadline: Deadline) -> None:
+        """See ``Lane``."""
+        for index, runner in zip(dead, fresh, strict=True):
+            self.runners[index] = runner
+
+    def pace(self) -> Pace | None:
+        """Nothing: it is the server that spreads."""
+        return None
+
+    def traffic(self) -> tuple[int, int, int]:
+        """See ``Lane``."""
+        client = self.jail.client
+        return client.stale_replies, client.sent_bytes, client.received_bytes
+
+    def close(self) -> None:
+        """There is nothing but the jail."""

@@ -1,0 +1,114 @@
+"""Who holds the other ends of the slabs and doorbells: handed over, watched, and waited for."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Sequence
+
+from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
+from envhub_sandbox.transport.connection import SESSION
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.shared_memory.doorbell import Watch
+from envhub_sandbox.transport.shared_memory.shard import LaneShard
+from envhub_worker.protocol import messages as m
+
+_RECHECK_MS = 2
+_CONNECT_S = 5.0
+
+
+class Attachment:
+    """The runners of one environment's shards, as far as they share memory with us.
+
+    Args:
+        path: The socket at which the server takes descriptors.
+        jail: The number of their jail.
+        process_fd: Readable once the worker server has ended.
+
+    Attributes:
+        watch: Wakes up at their rings, and at the death of any of them, or of the server.
+    """
+
+    def __init__(self, path: str, jail: int, process_fd: int) -> None:
+        self._path = path
+        self._jail = jail
+        self._pidfds: dict[int, int] = {}
+        self.watch = Watch()
+        self.watch.death(process_fd)
+
+    def hand_over(self, index: int, runner: int, shard: LaneShard) -> None:
+        """Give a shard's runner its ends.
+
+        Raises:
+            WorkerDiedError: There is no such runner any more, or no server.
+        """
+        self.watch.bell(shard.bell)
+        try:
+            pidfd = deposit(self._path, SESSION, self._jail, runner, shard.fds)
+        except OSError as error:
+            text = "the worker process died before its first request"
+            raise WorkerDiedError(text, request="make_env") from error
+        self._pidfds[index] = pidfd
+        self.watch.death(pidfd)
+        shard.handed_over()
+
+    def forget(self, index: int, shard: LaneShard) -> None:
+        """A shard's runner has died: what it still may ring is heard no more."""
+        pidfd = self._pidfds.pop(index)
+        self.watch.forget(pidfd)
+        os.close(pidfd)
+        self.watch.forget(shard.bell)
+
+    def answers(self, index: int, shard: LaneShard, deadline: Deadline) -> bool:
+        """Whether a shard's answer comes before its runner's death; raises as ``sleep_for``."""
+        watch = Watch()
+        watch.bell(shard.bell)
+        watch.death(self._pidfds[index])
+        try:
+            return sleep_for(watch, shard, deadline)
+        finally:
+            watch.close()
+
+    def close(self) -> None:
+        """Let go of them."""
+        self.watch.close()
+        while self._pidfds:
+            os.close(self._pidfds.popitem()[1])
+
+
+def sleep_for(watch: Watch, shard: LaneShard, deadline: Deadline) -> bool:
+    """Sleep until a shard answers, or somebody dies; whether it has answered.
+
+    Raises:
+        WorkerTimeoutError: The deadline came first.
+    """
+    shard.park(1)
+    try:
+        # a ring may cross with our going to sleep: look again soon, once
+        timeout: int | None = _RECHECK_MS
+        while not shard.answered():
+            if watch.wait(timeout):
+                return shard.answered()
+            if deadline.passed and not shard.answered():
+                raise WorkerTimeoutError("the worker did not answer in time")
+            timeout = deadline.left_ms()
+        return True
+    finally:
+        shard.park(0)
+
+
+def deposit(path: str, session: bytes, jail: int, runner: int, fds: Sequence[int]) -> int:
+    """Hand descriptors to the server for a runner; returns a pidfd of the jail, or of the runner.
+
+    Raises:
+        OSError: The server did not take them.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+        connection.settimeout(_CONNECT_S)
+        connection.connect(path)
+        [frame] = m.pack(m.Deposit(session, jail, runner), 0)
+        socket.send_fds(connection, [frame], list(fds))
+        data, received, _, _ = socket.recv_fds(connection, 16, 1)
+    if data != b"k" or len(received) != 1:
+        raise ConnectionError("the worker server did not take the descriptors")
+    return received[0]

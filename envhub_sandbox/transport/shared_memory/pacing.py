@@ -1,0 +1,44 @@
+"""What the steps of one environment take, measured now and then: for ``sharding`` the next time."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+from envhub_sandbox.transport.shared_memory.shard import LaneShard
+from envhub_sandbox.transport.shared_memory.sharding import ASK_NS, Cost, Pace, Sample, pace_of
+
+_PACE_STEPS = 256
+"""Steps after which what they took is worth remembering."""
+_SAMPLES = 64
+
+
+class Pacing:
+    """Samples of steps over several shards.
+
+    Args:
+        sizes: Sub-environments of each shard.
+        awake: How many shards, the first ones, may wait awake.
+    """
+
+    def __init__(self, sizes: Sequence[int], awake: int) -> None:
+        self._sizes = list(sizes)
+        self._awake = awake
+        self._samples: deque[Sample] = deque(maxlen=_SAMPLES)
+
+    def sample(self, shards: Sequence[LaneShard], slept_ns: int, elapsed_ns: int) -> None:
+        """Take note of the last step, which every shard has measured."""
+        busy = [shard.busy_ns for shard in shards]
+        asleep, awake = busy[self._awake :], busy[: self._awake]
+        if asleep and awake and all(busy):
+            self._samples.append(Sample(slept_ns, elapsed_ns, max(asleep), max(awake)))
+
+    def pace(self, shards: Sequence[LaneShard]) -> Pace | None:
+        """What the steps took; None after too few of them."""
+        if shards[0].sequence < _PACE_STEPS:
+            return None
+        if self._samples:
+            asleep, awake = self._sizes[self._awake :], self._sizes[: self._awake]
+            return pace_of(self._samples, max(asleep), max(awake))
+        busy = sum(shard.busy_ns for shard in shards)
+        return Pace(Cost(ASK_NS, busy / sum(self._sizes)), None) if busy else None

@@ -1,0 +1,192 @@
+"""One shard's end of the fast lane: its slabs, its doorbells, and what its runner wrote.
+
+Each shard has two sealed memfds and a doorbell each way (``doorbell``). Trust: the jail writes the
+reply slab whenever it likes, so every word is read once and bounded, and bytes are copied before
+they are looked at. ``F_SEAL_SHRINK`` keeps it from cutting the memory away under us (which would be
+a SIGBUS).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from time import perf_counter_ns
+from typing import Any
+
+from envhub_sandbox.errors import RemoteProtocolError
+from envhub_sandbox.transport.shared_memory.doorbell import OwnBell, RunnerBell
+from envhub_sandbox.transport.shared_memory.memfd import SEAL_FUTURE_WRITE, slab
+from envhub_sandbox.transport.tensors import to_tensor
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.shared_memory import slabs
+from envhub_worker.protocol.shared_memory.columns import Column, columns_of
+from envhub_worker.protocol.stream import read_packet
+from envhub_worker.protocol.untrusted import UNTRUSTED
+
+Outcome = tuple[int, m.Message | None]
+"""``slabs.DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``, and what came encoded."""
+_OUTCOMES = frozenset({slabs.DONE, slabs.RAISED, slabs.FETCH, slabs.COLUMNS})
+
+
+class LaneShard:
+    """The slabs and doorbells of one shard.
+
+    Args:
+        layout: Where everything lies.
+        observations: The descriptor of the slab that all shards share.
+
+    Attributes:
+        fds: What the runner gets: three slabs, its doorbell, ours.
+        bell: Our doorbell, to be watched.
+    """
+
+    def __init__(self, layout: slabs.Layout, observations: int) -> None:
+        self.layout = layout
+        self._request, request_fd = slab("request", layout.request_bytes, SEAL_FUTURE_WRITE)
+        self._reply, reply_fd = slab("reply", layout.reply_bytes)
+        self._runner_bell, self.bell = RunnerBell(), OwnBell()
+        self._ring = self._runner_bell.ring
+        self._slab_fds = [request_fd, reply_fd]
+        bells = [self._runner_bell.theirs, self.bell.fileno()]
+        self.fds = [request_fd, reply_fd, observations, *bells]
+        self._asks = slabs.words(self._request)
+        self._tells = slabs.words(self._reply)
+        self._columns: list[tuple[Column, Any]] = []
+        self._views: dict[tuple[int, Any], Any] = {}
+        self._codes = [-1] * len(layout.actions)
+        self._wishes = (0, 0, 0)
+        self._told = False
+        self.sequence = 0
+
+    def handed_over(self) -> None:
+        """The runner has its copies of the descriptors; the maps keep ours alive."""
+        while self._slab_fds:
+            os.close(self._slab_fds.pop())
+        self._runner_bell.handed_over()
+
+    def ask(self, leaves: Sequence[Any], slot: int, spin_ns: int, cpu: int = 0) -> None:
+        """Write a shard's actions and announce them; its observations are to go to ``slot``."""
+        asks = self._asks
+        if self._told:
+            asks[slabs.MESSAGE] = 0
+            self._told = False
+        for index, leaf in enumerate(leaves):
+            found = self._views.get((index, leaf.dtype))
+            if found is None:
+                found = self._view(index, leaf.dtype)
+            if self._codes[index] != found[0]:
+                asks[slabs.DTYPES + index] = self._codes[index] = found[0]
+                asks[slabs.CHANGES] += 1
+            found[1][...] = leaf
+        wishes = (spin_ns, slot, cpu)
+        if wishes != self._wishes:
+            self._wish(*wishes)
+        self._announce()
+
+    def tell(self, packet: bytes, slot: int, spin_ns: int = 0, cpu: int = 0) -> None:
+        """Write a message and announce it."""
+        start = self.layout.message
+        self._request[start : start + len(packet)] = packet
+        self._asks[slabs.MESSAGE] = len(packet)
+        self._told = True
+        wishes = (spin_ns, slot, cpu)
+        if wishes != self._wishes:
+            self._wish(*wishes)
+        self._announce()
+
+    def _announce(self) -> None:
+        self.sequence += 1
+        self._asks[slabs.SEQUENCE] = self.sequence
+        if self._tells[slabs.PARKED]:
+            self._ring()
+
+    def _wish(self, spin_ns: int, slot: int, cpu: int) -> None:
+        asks = self._asks
+        self._wishes = (spin_ns, slot, cpu)
+        asks[slabs.SPIN] = spin_ns
+        asks[slabs.SLOT] = slot
+        asks[slabs.CPU] = cpu
+        asks[slabs.CHANGES] += 1
+
+    def _view(self, index: int, dtype: Any) -> tuple[int, Any]:
+        code = slabs.DTYPE_CODES[dtype]
+        leaf = self.layout.actions[index]
+        made = self._views[index, dtype] = (code, slabs.view(self._request, leaf, dtype))
+        return made
+
+    def answered(self) -> bool:
+        """Whether the reply to the last request is there."""
+        return self._tells[slabs.SEQUENCE] == self.sequence
+
+    def answered_until(self, until_ns: int) -> bool:
+        """Whether it comes before that time; waits awake."""
+        tells, sequence = self._tells, self.sequence
+        while tells[slabs.SEQUENCE] != sequence:
+            if perf_counter_ns() > until_ns:
+                return False
+        return True
+
+    def has_nothing_to_say(self) -> bool:
+        """Whether the reply is results and nothing else."""
+        tells = self._tells
+        return tells[slabs.OUTCOME] == slabs.DONE and not tells[slabs.LENGTH]
+
+    @property
+    def busy_ns(self) -> int:
+        """What the last measured step took the runner. Trust: it says so itself."""
+        return self._tells[slabs.BUSY]
+
+    def park(self, parked: int) -> None:
+        """Say whether we sleep and want our doorbell rung."""
+        self._asks[slabs.PARKED] = parked
+
+    def outcome(self) -> Outcome:
+        """How the request went. Trust: input from the worker; the length is bounded here.
+
+        What came encoded is decoded at once, wanted or not: the columns that follow are its.
+        """
+        kind, length = self._tells[slabs.OUTCOME], self._tells[slabs.LENGTH]
+        if kind not in _OUTCOMES or length > slabs.INFO_BYTES:
+            raise RemoteProtocolError("the worker wrote an impossible reply into its slab")
+        if not length:
+            return kind, None
+        start = self.layout.infos
+        message = m.unpack([self._reply[start : start + length]], tensors=to_tensor)[1]
+        if isinstance(message, m.Value) and type(message.value) is dict:
+            with UNTRUSTED:
+                self._learn(message.value)
+        return kind, message
+
+    def answer(self) -> m.Message | None:
+        """The answer to a message; None if it did not fit. Trust: as ``outcome``."""
+        kind, length = self._tells[slabs.OUTCOME], self._tells[slabs.LENGTH]
+        if kind == slabs.FETCH:
+            return None
+        if kind not in (slabs.DONE, slabs.RAISED) or length > slabs.INFO_BYTES:
+            raise RemoteProtocolError("the worker wrote an impossible answer into its slab")
+        if kind == slabs.RAISED:
+            return self.outcome()[1]
+        start = self.layout.answer
+        with UNTRUSTED:
+            packet = read_packet(self._reply[start : start + length])
+        return m.unpack(packet.frames, tensors=to_tensor)[1]
+
+    def _learn(self, infos: dict[Any, Any]) -> None:
+        start = self.layout.infos
+        columns = columns_of(infos) or ()
+        self._columns = [(column, column.view(self._reply, start)) for column in columns]
+
+    def columns(self) -> dict[Any, Any]:
+        """Infos that came as columns: fresh arrays."""
+        if not self._columns:
+            raise RemoteProtocolError("the worker sent columns before their schema")
+        return {column.key: view.astype(column.dtype) for column, view in self._columns}
+
+    def close(self) -> None:
+        """Give everything back."""
+        self.handed_over()
+        self._runner_bell.close()
+        self.bell.close()
+        self._asks.release()
+        self._tells.release()
+        # the maps go with the last array over them
