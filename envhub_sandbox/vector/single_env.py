@@ -16,6 +16,7 @@ from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
+from envhub_sandbox.vector.infos import of_one
 from envhub_worker.protocol.names import is_servable
 
 _PLAIN = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
@@ -82,7 +83,7 @@ class SingleEnv(gym.Env[Any, Any]):
         if begun is not None and seed is None and not options:
             return begun
         batch, infos = self._vector.reset(seed=seed, options=options)
-        return self._first(batch), of_the_only(infos)
+        return self._first(batch), of_one(infos, 0, 1)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """One step with ``action``, an element of ``action_space``.
@@ -98,7 +99,7 @@ class SingleEnv(gym.Env[Any, Any]):
         self._begun = None
         result = self._vector.step(self._batch(action))
         batch, rewards, terminations, truncations, infos = result
-        observation, info = self._first(batch), of_the_only(infos)
+        observation, info = self._first(batch), of_one(infos, 0, 1)
         terminated, truncated = bool(terminations[0]), bool(truncations[0])
         if (terminated or truncated) and self._resets_in_the_same_step:
             last, last_info = info.pop("final_obs"), info.pop("final_info", {})
@@ -165,28 +166,3 @@ class SingleEnv(gym.Env[Any, Any]):
 
     def _first(self, batch: Any) -> Any:
         return next(iter(iterate(self._vector.observation_space, batch)))
-
-
-def of_the_only(infos: dict[str, Any]) -> dict[str, Any]:
-    """The info of the only sub-environment, from a vector environment's infos.
-
-    The other way round from ``VectorEnv._add_info``: a key counts where its mask, ``"_" + key``,
-    is set, and mappings are nested.
-    """
-    info = {}
-    for key, value in infos.items():
-        mask = infos.get(f"_{key}")
-        if key.startswith("_") and key[1:] in infos:
-            continue
-        if mask is not None and not bool(np.asarray(mask).flat[0]):
-            continue
-        info[key] = _only(value)
-    return info
-
-
-def _only(value: Any) -> Any:
-    if isinstance(value, dict):
-        return of_the_only(value)
-    if isinstance(value, (np.ndarray, list, tuple)) and len(value) == 1:
-        return value[0]
-    return value

@@ -150,9 +150,12 @@ def test_contributing_names_every_step_and_every_folder_of_tests() -> None:
     assert listed == {name for name in folders if "__pycache__" not in name}
 
 
-def test_readme_quick_start_runs() -> None:
-    """The Python of the README does what it says."""
-    blocks = fenced(README, "python")
+@pytest.mark.parametrize(
+    ("document", "printed"), [("README.md", "local-"), ("docs/integrations.md", "")]
+)
+def test_the_python_of_a_document_runs(document: str, printed: str) -> None:
+    """All of its blocks, one after the other, do what they say."""
+    blocks = fenced((CHECKOUT / document).read_text(), "python")
     done = subprocess.run(
         [sys.executable, "-c", "\n".join(blocks)],
         cwd=CHECKOUT,
@@ -162,7 +165,7 @@ def test_readme_quick_start_runs() -> None:
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("local-")
+    assert done.stdout.startswith(printed)
 
 
 def error_texts() -> list[str]:

@@ -24,6 +24,7 @@ CLIENTS_OWN = {
 # used where they are installed, and only there
 OPTIONAL = {
     "envhub_worker.protocol.compression": {"lz4"},
+    "envhub_sandbox.integrations.sb3": {"stable_baselines3"},
     "envhub_sandbox.metrics": {"prometheus_client"},
     "envhub_sandbox.transport.tensors": {"torch"},
     "envhub_sandbox.cli.rollout.video": {"imageio_ffmpeg"},
@@ -41,6 +42,7 @@ MAY_IMPORT = {
         *("arguments", "config", "hub", "policy", "sandboxes", "session", "transport", "vector"),
     },
     "envhub_sandbox.gym": {"api", "vector"},
+    "envhub_sandbox.integrations": {"api", "vector"},
     "envhub_sandbox.vector": {"session", "transport"},
     "envhub_sandbox.metrics": {"session"},
     "envhub_sandbox.session": {"crash", "folders", "hub", "policy", "sandboxes", "transport"},
@@ -276,6 +278,7 @@ def test_only_faces_and_the_command_line_import_make_env() -> None:
     assert {name for name in importers if not below(name, "envhub_sandbox.cli")} <= {
         "envhub_sandbox",
         "envhub_sandbox.gym",
+        "envhub_sandbox.integrations.sb3",
     }
 
 
