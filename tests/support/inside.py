@@ -54,6 +54,11 @@ def state(env: Any) -> State:
     return session(env).lifecycle.state
 
 
+def choice_of_runtime() -> Spot:
+    """Makes of an interpreter what a repository's jails run on."""
+    return api, "Runtime"
+
+
 def turn_lock(env: Any) -> Spot:
     """What a thread holds while it asks the environment something."""
     return session(env), "_lock"

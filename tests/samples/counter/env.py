@@ -40,7 +40,9 @@ class Counter(gym.Env):
         over = self.count >= self.length
         terminated = np.bool_(over and self.episode % 2 == 0)
         info = self._info(over)
-        return self._observe(), reward * self.gain, terminated, over and not terminated, info
+        if self.gain != 1:  # in float64, whatever numpy makes of a float32 and a number
+            reward = float(reward) * self.gain
+        return self._observe(), reward, terminated, over and not terminated, info
 
     def render(self):
         return np.full((4, 6, 3), self.count, np.uint8)
@@ -91,8 +93,14 @@ class Counter(gym.Env):
 
 
 def make_env(
-    n_envs: int = 1, use_async_envs: bool = False, autoreset_mode: str = "NextStep"
+    n_envs: int = 1,
+    use_async_envs: bool = False,
+    autoreset_mode: str | None = "NextStep",
+    subclass: bool = False,
 ) -> gym.vector.VectorEnv:
     vector = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv
+    if subclass:
+        vector = type("Own", (vector,), {})
     envs = [lambda index=index: Counter(index) for index in range(n_envs)]
-    return vector(envs, autoreset_mode=autoreset_mode)
+    # releases before 1.1 have no mode to choose
+    return vector(envs, **({} if autoreset_mode is None else {"autoreset_mode": autoreset_mode}))

@@ -8,8 +8,7 @@ wrapper, the repository itself) makes it build itself after all, and it is drive
 Its end is no look: what was never built has nothing to close. Gymnasium's ``__del__`` asks for
 attributes, and would build all processes of every task that nobody used, only to end them.
 
-Followed: ``gymnasium.vector.SyncVectorEnv.__init__`` and ``AsyncVectorEnv.__init__`` (1.1 to 1.4).
-Older releases have other autoreset semantics; there the classes are left alone.
+Followed: ``gymnasium.vector.SyncVectorEnv.__init__`` and ``AsyncVectorEnv.__init__`` (0.29 to 1.4).
 """
 
 from __future__ import annotations
@@ -23,6 +22,8 @@ from typing import Any
 
 import gymnasium as gym
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
+
+from envhub_worker.runner import gymnasium_compat as compat
 
 _KEY = "_envhub_recording"
 _ANSWERED = frozenset({"unwrapped", "spec", "closed", "close", "num_envs"})
@@ -57,9 +58,6 @@ def recording(env: object) -> Recording | None:
 @contextmanager
 def standing_in() -> Iterator[None]:
     """While it lasts, the two classes record instead of building."""
-    if not hasattr(gym.vector, "AutoresetMode"):
-        yield
-        return
     for cls, lazy in _LAZY.items():
         cls.__init__ = _recorder(cls, lazy)
     try:
@@ -105,11 +103,10 @@ def _record(
             None  # the sub-environments' spaces differ, and only all of them make the batched one
         )
     env_fns = arguments["env_fns"] = list(arguments["env_fns"])
-    mode = arguments.get("autoreset_mode", "NextStep")
     return Recording(
         env_fns=env_fns,
         sync=cls is SyncVectorEnv,
-        autoreset_mode=gym.vector.AutoresetMode(mode).value,
+        autoreset_mode=compat.mode_named(arguments.get("autoreset_mode", compat.DEFAULT_MODE)),
         arguments=arguments,
     )
 

@@ -12,9 +12,10 @@ from gymnasium.vector.utils import batch_space
 
 from envhub_worker.protocol.manifest import EnvManifest, Manifest
 from envhub_worker.protocol.names import MAX_NAMES
+from envhub_worker.runner import gymnasium_compat as compat
 from envhub_worker.runner.tasks import Task
 
-_GYMNASIUMS = frozenset(dir(VectorEnv)) | {"num_envs", "env", "envs"}
+_GYMNASIUMS = frozenset(dir(VectorEnv)) | compat.OWN_NAMES | {"num_envs", "env", "envs"}
 _HEAD_BYTES = 2048
 """The name and the version come first."""
 _LINES = 16
@@ -60,7 +61,7 @@ def describe_task(task: Task) -> EnvManifest:
 def describe_vector(task: Task, env: Any) -> EnvManifest:
     """The manifest of a vector environment with a ``step`` of its own."""
     metadata = dict(getattr(env, "metadata", None) or {})
-    mode = metadata.pop("autoreset_mode", None)
+    mode = compat.mode_of(env, metadata.pop("autoreset_mode", None))
     num_envs = int(env.num_envs)
     single_observation, observation = _spaces(env, "observation_space", num_envs)
     single_action, action = _spaces(env, "action_space", num_envs)

@@ -25,6 +25,7 @@ from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
 from envhub_worker.runner import loader, manifest
 from envhub_worker.runner.deferred import standing_in
 from envhub_worker.runner.exceptions import raised
+from envhub_worker.runner.gymnasium_compat import joined_infos
 from envhub_worker.runner.infos import join
 from envhub_worker.runner.lane import Lane
 from envhub_worker.runner.sync_envs import SubEnvs
@@ -165,7 +166,8 @@ class Runner:
             actions, space = request.actions, getattr(env, "single_action_space", None)
             if space is not None and batches.restores(space):
                 actions = batches.restore_batch(space, actions)
-            return m.StepDone(*env.step(actions))
+            observation, rewards, terminated, truncated, info = env.step(actions)
+            return m.StepDone(observation, rewards, terminated, truncated, joined_infos(info))
         infos = join(env.run_step(request.actions), env.num_envs, sliced=env.sliced)
         batch = env.batch
         flags = (batch.rewards, batch.terminations, batch.truncations)

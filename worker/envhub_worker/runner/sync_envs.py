@@ -14,12 +14,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import SyncVectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
+from envhub_worker.runner.gymnasium_compat import SyncBase
 from envhub_worker.runner.infos import Pairs
 
 Store = Callable[[int, Any], None]
@@ -93,7 +93,7 @@ class Batch:
         return concatenate(self._space, self._members, empty)
 
 
-class SubEnvs(SyncVectorEnv):
+class SubEnvs(SyncBase):  # type: ignore[misc]
     """Plain sub-environments, driven with ``SyncVectorEnv``'s semantics.
 
     Attributes:

@@ -17,6 +17,7 @@ from gymnasium import spaces
 from gymnasium.spaces.graph import GraphInstance
 
 from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
+from envhub_worker.protocol.spaces.opaque import OneOf
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
 from envhub_worker.protocol.untrusted import FAULTS
 
@@ -283,7 +284,6 @@ def _restore_tuple(space: spaces.Tuple[Any], member: Any) -> Any:
     return tuple(restore(sub, item) for sub, item in zip(space.spaces, member, strict=True))
 
 
-@restore.register(spaces.OneOf)
 def _restore_one_of(space: Any, member: Any) -> Any:
     if not isinstance(member, tuple):
         return member
@@ -292,6 +292,10 @@ def _restore_one_of(space: Any, member: Any) -> Any:
         return (index, restore(space.spaces[index], chosen))
     except FAULTS:
         return member
+
+
+if OneOf is not None:  # since 1.0
+    restore.register(OneOf, _restore_one_of)
 
 
 @restore.register(spaces.Sequence)

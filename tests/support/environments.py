@@ -1,0 +1,40 @@
+"""Folders of packages, installed as for a repository of its own, and what makes jails use them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import uv
+
+from envhub_worker.protocol.runtime import Runtime
+from tests.support import inside
+
+NEEDED = ("cloudpickle", "msgpack")
+"""What the worker imports in a jail, beside gymnasium and numpy."""
+
+
+def base_interpreter() -> str:
+    """The interpreter below the virtual environment that runs the tests."""
+    return str(Path(getattr(sys, "_base_executable", sys.executable)).resolve())
+
+
+def install(folder: Path, *requirements: str) -> Runtime:
+    """``requirements``, and what the worker needs, as wheels for this interpreter."""
+    python = base_interpreter()
+    command = [uv.find_uv_bin(), "pip", "install", "--quiet", "--no-config", "--no-build"]
+    command += ["--compile-bytecode", "--python", python, "--target", str(folder)]
+    subprocess.run([*command, *NEEDED, *requirements], check=True, timeout=300)
+    return Runtime(python, str(folder))
+
+
+@contextmanager
+def running_on(runtime: Runtime) -> Iterator[None]:
+    """While it lasts, ``make_env`` gives its jails this interpreter and these packages."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(*inside.choice_of_runtime(), lambda python: runtime)
+        yield

@@ -1,0 +1,158 @@
+"""Older releases of Gymnasium in a jail, as the client's own would have it: 0.29 and 1.0.
+
+What they lack is added here, so that nobody else asks for a version:
+
+- **Autoreset.** Before 1.1 there is no mode to choose. 1.0 resets in the step after the end, as
+  ``NextStep`` does; 0.29 in the same step, as ``SameStep`` does, but with the last observation as
+  ``final_observation``. Vector environments of 0.29 are described as ``SameStep``, and their last
+  observations and infos are called ``final_obs`` and ``final_info``, with a dict of arrays for the
+  latter.
+- **Vector environments.** Those of 0.29 have no ``render``, one random generator for all, and look
+  attributes up in the outermost wrapper only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import SyncVectorEnv, VectorEnv
+
+from envhub_worker.protocol.spaces import batches
+
+_MODES: Any = getattr(gym.vector, "AutoresetMode", None)
+_BEFORE_1_0 = issubclass(VectorEnv, gym.Env)
+DEFAULT_MODE = "SameStep" if _BEFORE_1_0 else "NextStep"
+"""What a vector environment does that was asked for nothing else."""
+OWN_NAMES = frozenset(
+    {
+        *("action_space", "closed", "is_vector_env", "metadata", "observation_space"),
+        *("single_action_space", "single_observation_space", "spec", "viewer"),
+    }
+)
+"""Names of any vector environment; older classes set some of them only when they are made."""
+_EXPERIMENTAL = "gymnasium.experimental.vector"
+
+
+def mode_named(mode: Any) -> str:
+    """The name of an autoreset mode, given as Gymnasium takes it."""
+    return str(mode if _MODES is None else _MODES(mode).value)
+
+
+def mode_of(env: Any, stated: Any) -> Any:
+    """The autoreset mode of a vector environment with a ``step`` of its own.
+
+    Args:
+        env: The environment.
+        stated: What its metadata says, or None.
+    """
+    if stated is not None or _MODES is not None or not _is_gymnasiums(env):
+        return stated
+    return DEFAULT_MODE
+
+
+def _is_gymnasiums(env: Any) -> bool:
+    if isinstance(env, VectorEnv):
+        return True
+    return any(cls.__module__.startswith(_EXPERIMENTAL) for cls in type(env).__mro__)
+
+
+def _as_they_are(info: Any) -> Any:
+    return info
+
+
+def _renamed(info: Any) -> Any:
+    if not isinstance(info, dict):
+        return info
+    found: dict[Any, Any] = {}
+    for key, value in info.items():
+        if not _is_mask(key, info):
+            mask = info.get(f"_{key}")
+            found.update(_entry(_RENAMED.get(key, key), value, mask))
+    return found
+
+
+_RENAMED = {"final_observation": "final_obs"}
+
+
+def _is_mask(key: Any, info: dict[Any, Any]) -> bool:
+    return isinstance(key, str) and key.startswith("_") and key[1:] in info
+
+
+def _entry(key: Any, values: Any, mask: Any) -> dict[Any, Any]:
+    if mask is None:
+        return {key: values}
+    dicts = isinstance(values, np.ndarray) and values.dtype == object and key != "final_obs"
+    if dicts and mask.any() and all(isinstance(value, dict) for value in values[mask]):
+        pairs = [(int(index), {key: values[index]}) for index in np.flatnonzero(mask)]
+        return batches.join_pairs(pairs, len(values))
+    return {key: values, f"_{key}": mask}
+
+
+joined_infos: Callable[[Any], Any] = _renamed if _BEFORE_1_0 else _as_they_are
+"""The infos of a vector environment with a ``step`` of its own, under the names of today."""
+
+
+class _WithMode(SyncVectorEnv):
+    """``SyncVectorEnv`` of 1.0, told its autoreset mode; what it does in ``step`` is not used."""
+
+    def __init__(self, env_fns: Any, *, copy: bool, autoreset_mode: str) -> None:
+        super().__init__(env_fns, copy=copy)
+        self.metadata = {**(self.metadata or {}), "autoreset_mode": autoreset_mode}
+        self.render_mode = getattr(self.envs[0], "render_mode", None)
+
+
+class _OldSyncVectorEnv(_WithMode):
+    """``SyncVectorEnv`` of 0.29 with what it has since."""
+
+    def render(self) -> Any:
+        return tuple(env.render() for env in self.envs)
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        found = [env.get_wrapper_attr(name) for env in self.envs]
+        return tuple(one(*args, **kwargs) if callable(one) else one for one in found)
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        if not isinstance(values, (list, tuple)):
+            values = [values] * self.num_envs
+        if len(values) != self.num_envs:
+            raise ValueError(
+                "Values must be a list or tuple with length equal to the number of environments. "
+                f"Got `{len(values)}` values for {self.num_envs} environments."
+            )
+        for env, value in zip(self.envs, values, strict=True):
+            setattr(_owner(env, name), name, value)
+
+    @property
+    def np_random(self) -> Any:
+        return tuple(env.np_random for env in self.envs)
+
+    @np_random.setter
+    def np_random(self, value: Any) -> None:
+        """Gymnasium's own ``seed`` sets it; each sub-environment keeps its own."""
+
+    @property
+    def np_random_seed(self) -> Any:
+        return tuple(one.bit_generator.seed_seq.entropy for one in self.np_random)
+
+
+def _owner(env: Any, name: str) -> Any:
+    """The wrapper, or what is wrapped, that has this attribute itself; else the outermost."""
+    layer = env
+    while True:
+        if name in vars(layer) or hasattr(type(layer), name):
+            return layer
+        if not isinstance(layer, gym.Wrapper):
+            return env
+        layer = layer.env
+
+
+SyncBase: Any = SyncVectorEnv
+if _MODES is None:
+    SyncBase = _OldSyncVectorEnv if _BEFORE_1_0 else _WithMode
+"""What the worker's own loop is built on."""
