@@ -6,7 +6,6 @@ Who of the others has answered is in ``survivors``, what the fresh are asked in 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from time import perf_counter_ns
 from typing import Any
 
@@ -145,7 +144,7 @@ class Mortal(Tenant):
             raise deaths.first
         for index, reply in self._revive(deaths, self._resets).items():
             done = typed(reply, m.ResetDone)
-            replies[index] = replace(done, info=marked(done.info, self._size(index)))
+            replies[index] = m.replace(done, info=marked(done.info, self._size(index)))
         return [reply for reply in replies if reply is not None]
 
     def _survive_step(self, deaths: RunnersDiedError) -> StepResult:

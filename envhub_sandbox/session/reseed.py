@@ -6,7 +6,6 @@ Nothing here asks anybody: it makes the requests for a fresh runner and reads it
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -107,7 +106,7 @@ def resets(message: m.Reset, derived: Any) -> list[m.Message]:
     """
     if message.mask is not None:
         return [m.Reset(message.env, derived, None, None), message]
-    return [replace(message, seeds=_filled(message.seeds, derived))]
+    return [m.replace(message, seeds=_filled(message.seeds, derived))]
 
 
 def _filled(seeds: Any, derived: Any) -> Any:

@@ -92,7 +92,7 @@ class NotSentError(Exception):
 
 def parts(message: m.Message) -> list[Any]:
     """The fields of a message."""
-    return [getattr(message, name) for name in type(message).__dataclass_fields__]  # type: ignore[attr-defined]
+    return m.values_of(message)
 
 
 # --- messages, with the memory of what recurs ----------------------------------------------------

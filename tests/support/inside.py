@@ -36,6 +36,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.lifecycle import Lifecycle, State
 from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.messages import packing
 from envhub_worker.spawn.jail_handle import Spawner
 
 Spot = tuple[Any, str]
@@ -201,7 +202,7 @@ CGROUP_WRITE: Spot = (cgroups, "_write")
 """What writes a file of a control group."""
 DECODING: Spot = (m, "_decode")
 """What makes a message of a document that has no form yet."""
-FORMS: tuple[Spot, Spot] = ((m, "_OUTGOING"), (m, "_INCOMING"))
+FORMS: tuple[Spot, Spot] = ((packing, "_OUTGOING"), (packing, "_INCOMING"))
 """What is remembered of the shape of messages, each way."""
 IDLE_CONTAINERS: Spot = (sandbox, "_IDLE")
 """Where a container is that nobody uses."""

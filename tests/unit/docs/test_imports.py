@@ -25,6 +25,7 @@ CLIENTS_OWN = {
 OPTIONAL = {
     "envhub_worker.protocol.compression": {"lz4"},
     "envhub_sandbox.integrations.sb3": {"stable_baselines3"},
+    "envhub_worker.protocol.messages.base": {"typing_extensions"},  # for type checkers alone
     "envhub_sandbox.metrics": {"prometheus_client"},
     "envhub_sandbox.transport.tensors": {"torch"},
     "envhub_sandbox.cli.rollout.video": {"imageio_ffmpeg"},

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from pathlib import Path
 from typing import Any
@@ -89,8 +88,7 @@ BY_NAME = {type(message).__name__: message for message in SAMPLES}
 
 def values_of(message: m.Message) -> dict[str, Any]:
     """The fields of a message, since arrays have no ``==`` that compares."""
-    names = [field.name for field in dataclasses.fields(message)]  # type: ignore[arg-type]
-    return {name: getattr(message, name) for name in names}
+    return {name: getattr(message, name) for name in message.FIELDS}
 
 
 def test_every_message_has_a_sample_and_a_golden_file() -> None:
@@ -187,5 +185,19 @@ def test_unsendable_fields_are_our_own_fault() -> None:
 
 def test_messages_cannot_be_changed() -> None:
     """A decoded message stays what was checked."""
-    with pytest.raises(dataclasses.FrozenInstanceError):
+    with pytest.raises(AttributeError, match=r"CloseJail\.jail"):
         m.CloseJail(3).jail = 4  # type: ignore[misc]
+    with pytest.raises(AttributeError, match=r"CloseJail\.jail"):
+        del m.CloseJail(3).jail
+
+
+def test_messages_are_made_like_dataclasses() -> None:
+    """By order, by name, with defaults; nothing missing, unknown or twice."""
+    expected = m.KeepJail(3)
+    assert m.KeepJail(jail=3) == m.replace(m.KeepJail(4), jail=3) == expected
+    assert expected != m.CloseJail(3)
+    assert hash(m.KeepJail(3)) == hash(expected)
+    assert repr(expected) == "KeepJail(jail=3)"
+    for values, named in (((), {}), ((3, 4), {}), ((3,), {"jail": 3}), ((3,), {"other": 1})):
+        with pytest.raises(TypeError, match="KeepJail"):
+            m.KeepJail(*values, **named)

@@ -12,7 +12,6 @@ import contextlib
 import mmap
 import os
 from collections.abc import Callable
-from dataclasses import replace
 from time import perf_counter_ns
 from typing import Any
 
@@ -212,5 +211,5 @@ def _raised_frame(error: BaseException) -> Any:
     message = raised(error, "step")
     [frame] = m.pack(message, 0)
     if len(frame) > slabs.INFO_BYTES:
-        [frame] = m.pack(replace(message, traceback=""), 0)
+        [frame] = m.pack(m.replace(message, traceback=""), 0)
     return frame

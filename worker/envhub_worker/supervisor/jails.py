@@ -11,7 +11,6 @@ import os
 import secrets
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from envhub_worker.channel import close_fds
@@ -446,9 +445,9 @@ class Jails:
     def _lose(self, entry: JailEntry, death: m.Died) -> None:
         """Go on without a runner: whoever waits for it hears how it died, and nobody else."""
         entry.output.read()
-        death = replace(death, tail=entry.output.text())
+        death = m.replace(death, tail=entry.output.text())
         # the last lines of earlier deaths have been told: many of them would be much
-        entry.lost = {runner: replace(one, tail="") for runner, one in entry.lost.items()}
+        entry.lost = {runner: m.replace(one, tail="") for runner, one in entry.lost.items()}
         entry.lost[death.runner] = death
         entry.jail.kill_runner(death.runner)  # it may live, and have broken the rules
         entry.pids.pop(death.runner, None)
@@ -470,7 +469,7 @@ class Jails:
         if entry.death is not None:
             return
         entry.output.read()
-        entry.death = death = replace(death, tail=entry.output.text())
+        entry.death = death = m.replace(death, tail=entry.output.text())
         for pending in waiting(entry):
             self._answers.reply(pending.asker, for_operation(death, pending.operation))
         for opening in entry.opening:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from time import monotonic
 from typing import NamedTuple, Protocol
 
@@ -109,7 +109,7 @@ def owes(entry: JailEntry, runner: int) -> int:
 
 def for_operation(death: m.Died, operation: str) -> m.Died:
     """A death, told to who waited for this."""
-    return replace(death, operation=operation)
+    return m.replace(death, operation=operation)
 
 
 def signal_name(number: int | None) -> str | None:

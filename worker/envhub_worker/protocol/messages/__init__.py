@@ -1,0 +1,11 @@
+"""Every message, one class each; ``docs/protocol.md`` is their document.
+
+Two conversations share this package: ``server.py`` is between client and worker server, to open
+and close jails and to relay; ``runner.py`` is between client and runner, about environments.
+"""
+
+# ruff: noqa: F403 - the names are sixty, and stand in these modules
+from envhub_worker.protocol.messages.base import *
+from envhub_worker.protocol.messages.packing import *
+from envhub_worker.protocol.messages.runner import *
+from envhub_worker.protocol.messages.server import *

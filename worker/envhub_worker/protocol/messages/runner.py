@@ -1,0 +1,202 @@
+"""Between client and runner, about environments. The server relays these and never decodes them."""
+
+from __future__ import annotations
+
+from envhub_worker.protocol.messages.base import Message
+
+
+class Load(Message, kind=32):
+    """Import the entry file and call its ``make_env``. Reply: ``Loaded`` or ``Raised``.
+
+    ``cfg`` holds the ``vars()`` of the caller's config object, or None.
+    """
+
+    n_envs: int
+    use_async_envs: bool
+    cfg: dict[str, object] | None
+    env_kwargs: dict[str, object]
+
+
+class Loaded(Message, kind=33):
+    """What the repository's ``make_env`` returned: see ``manifest.decode_manifest``."""
+
+    manifest: dict[str, object]
+
+
+class Build(Message, kind=34):
+    """Build sub-environments ``start`` to ``stop`` of a task as ``env``. Reply: ``Built``.
+
+    The reply's manifest is that of the built slice.
+    """
+
+    env: int
+    suite: str
+    task: object
+    start: int
+    stop: int
+
+
+class Built(Message, kind=35):
+    """The slice is ready: see ``manifest.decode_env``."""
+
+    manifest: dict[str, object]
+
+
+class Reset(Message, kind=36):
+    """``seeds`` is None or one seed or None per sub-environment of the slice; so is ``mask``."""
+
+    env: int
+    seeds: object
+    options: dict[str, object] | None
+    mask: object
+
+
+class ResetDone(Message, kind=37):
+    """Batched observation and infos of the slice."""
+
+    observation: object
+    info: dict[object, object]
+
+
+class Step(Message, kind=38):
+    """The slice's batch of actions."""
+
+    env: int
+    actions: object
+
+
+class StepDone(Message, kind=39):
+    """Batched results of the slice."""
+
+    observation: object
+    rewards: object
+    terminations: object
+    truncations: object
+    info: dict[object, object]
+
+
+class Call(Message, kind=40):
+    """``VectorEnv.call``: a method or attribute of every sub-environment. Reply: ``Value``."""
+
+    env: int
+    name: str
+    args: tuple[object, ...]
+    kwargs: dict[str, object]
+
+
+class SetAttr(Message, kind=41):
+    """One value per sub-environment of the slice. Reply: ``Value``."""
+
+    env: int
+    name: str
+    values: tuple[object, ...]
+
+
+class Render(Message, kind=42):
+    """``VectorEnv.render``. Reply: ``Value`` with a tuple of frames or None."""
+
+    env: int
+
+
+class GetOwn(Message, kind=43):
+    """An attribute of the vector environment itself. Reply: ``Value``, or ``Method``."""
+
+    env: int
+    name: str
+
+
+class Method(Message, kind=44):
+    """The attribute is callable; ``CallOwn`` calls it."""
+
+
+class CallOwn(Message, kind=45):
+    """Call a method of the vector environment itself. Reply: ``Value``."""
+
+    env: int
+    name: str
+    args: tuple[object, ...]
+    kwargs: dict[str, object]
+
+
+class GetRandom(Message, kind=46):
+    """Ask for the generators. Reply: ``Value``, one state each, or the one state there is."""
+
+    env: int
+
+
+class Close(Message, kind=47):
+    """Close an environment. Reply: ``Value`` with None."""
+
+    env: int
+
+
+class Attach(Message, kind=50):
+    """Serve an environment's steps over the slabs and doorbells that come along.
+
+    The descriptors: request slab, reply slab, observation slab, the runner's doorbell, the
+    client's. The shard's rows of a batch of ``count`` begin at ``start``. Reply: ``Value``; False
+    where the environment has no fixed layout.
+    """
+
+    env: int
+    start: int
+    count: int
+    slots: int
+
+
+class FetchInfos(Message, kind=51):
+    """Ask for the last step's infos, which did not fit the slab. Reply: ``Value``."""
+
+    env: int
+
+
+class Revive(Message, kind=52):
+    """Reset all sub-environments in the place of others, which died in the middle of an episode.
+
+    Reply: ``StepDone``: the fresh observations, rewards of zero, every episode truncated. What
+    the next step does with those is as the autoreset mode says.
+    """
+
+    env: int
+    seeds: object
+
+
+class FetchInfosApart(Message, kind=54):
+    """Ask for the last reset's or step's infos as each sub-environment gave them.
+
+    For shards that do not agree about a key: the first sub-environment of all decides.
+    Reply: ``Value`` of ``((index in the slice, info), ...)``.
+    """
+
+    env: int
+
+
+class LoadTask(Message, kind=53):
+    """As ``Load``, where the client knows what comes back: nothing is described, nor built for it.
+
+    Reply: ``Value`` of the task's ``(num_envs, shardable)``, None if there is none, or ``Raised``.
+    """
+
+    n_envs: int
+    use_async_envs: bool
+    cfg: dict[str, object] | None
+    env_kwargs: dict[str, object]
+    suite: str
+    task: object
+
+
+class Value(Message, kind=48):
+    """A result."""
+
+    value: object
+
+
+class Raised(Message, kind=49):
+    """The repository's code raised. ``builtin`` is its nearest builtin ancestor."""
+
+    builtin: str
+    type_name: str
+    message: str
+    traceback: str
+    stage: str
+    """``"import"``, ``"make_env"``, ``"return"`` or the operation."""

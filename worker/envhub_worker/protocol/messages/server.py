@@ -1,0 +1,278 @@
+"""Between client and worker server: jails are opened, asked, watched and closed."""
+
+from __future__ import annotations
+
+from envhub_worker.protocol.confinement import Reason
+from envhub_worker.protocol.messages.base import Message
+from envhub_worker.protocol.runtime import Runtime
+
+
+class Hello(Message, kind=1):
+    """The first request on every connection. Reply: ``Welcome`` or ``Refused``."""
+
+    oldest: int
+    newest: int
+    session: bytes
+    """Random bytes that join the connections of one client; jails belong to a session."""
+
+
+class Welcome(Message, kind=2):
+    """The agreed version, and what the worker server runs on."""
+
+    version: int
+    worker: str
+    pid: int
+
+
+class Refused(Message, kind=3):
+    """The server did not do it. ``error`` is a name out of a table in the client.
+
+    ``layer`` and ``fix`` are filled where a layer of the confinement is missing.
+    """
+
+    error: str
+    message: str
+    layer: str
+    fix: str
+
+
+class OpenJail(Message, kind=4):
+    """Fork a jail for a snapshot. Reply: ``JailOpened``, ``Refused`` or ``Died``.
+
+    ``confinement`` holds the fields of ``Confinement``, with ``limits`` as a nested mapping.
+    ``python`` is the interpreter that runs the repository; empty for the server's own.
+    """
+
+    name: str
+    python: str
+    snapshot: str
+    entry: str
+    confinement: dict[str, object]
+    runners: int
+
+    @property
+    def runtime(self) -> Runtime:
+        """What runs the repository."""
+        return Runtime(self.python)
+
+
+class JailOpened(Message, kind=5):
+    """The jail's number and its runners' numbers."""
+
+    jail: int
+    runners: tuple[int, ...]
+    report: tuple[object, ...]
+    """One mapping per layer: ``layer``, ``enforced``, ``detail``."""
+
+
+class StartRunners(Message, kind=6):
+    """Fork further runners in an open jail. Reply: ``JailOpened`` with just the new ones."""
+
+    jail: int
+    runners: int
+
+
+class Relay(Message, kind=7):
+    """Hand the frames that follow to runners: ``parts`` is ``((runner, frames), ...)``.
+
+    Reply: ``Relayed`` once every runner has answered, or ``Died``.
+    """
+
+    jail: int
+    operation: str
+    parts: tuple[object, ...]
+
+
+class Relayed(Message, kind=8):
+    """The runners' replies: ``parts`` is the number of frames of each, in the request's order."""
+
+    parts: tuple[int, ...]
+
+
+class Died(Message, kind=9):
+    """A process of the jail ended. Trust: ``tail`` is the jail's own output, escaped."""
+
+    runner: int
+    reason: Reason
+    exit_code: int | None
+    signal: str | None
+    detail: str
+    tail: str
+    operation: str
+
+
+class CloseJail(Message, kind=10):
+    """End a jail and everything in it. Reply: ``Done``, once it is gone."""
+
+    jail: int
+
+
+class Done(Message, kind=11):
+    """It is done, and there is nothing to say about it."""
+
+
+class ReadOutput(Message, kind=12):
+    """Ask for the last lines that a jail printed. Reply: ``Output``, or ``Died``.
+
+    ``operation`` is what ``Died`` then says the client was waiting for.
+    """
+
+    jail: int
+    operation: str
+
+
+class Output(Message, kind=13):
+    """The last lines of a jail's output, control characters escaped."""
+
+    text: str
+
+
+class GetStatus(Message, kind=14):
+    """Ask for the server's jails. Reply: ``Status``."""
+
+
+class Status(Message, kind=15):
+    """One mapping per jail: ``jail``, ``name``, ``pids``, ``states``, ``busy_s``, ``operation``."""
+
+    jails: tuple[object, ...]
+
+
+class Deposit(Message, kind=16):
+    """Over the descriptor socket: descriptors for a runner, which the next request brings to it.
+
+    That has to be an ``Attach``; the server, which decodes no such message, does not look.
+    Reply, over the same socket: one byte, with a pidfd of the jail.
+    """
+
+    session: bytes
+    jail: int
+    runner: int
+
+
+class KeepJail(Message, kind=17):
+    """From now on a runner's death does not end the jail. Reply: ``Done``, or ``Died``.
+
+    A ``Relay`` to a runner that has died, or dies before it answers, is then answered with
+    ``RelayedPartly``; further runners can be started in its place.
+    """
+
+    jail: int
+
+
+class RelayedPartly(Message, kind=18):
+    """As ``Relayed``, of a jail that is kept, where some runners have died.
+
+    ``dead`` holds their places in the request; what stands there is the server's own ``Died``,
+    in one frame. What runners send never counts as such, whatever it says.
+    """
+
+    parts: tuple[int, ...]
+    dead: tuple[int, ...]
+
+
+class OfferSnapshot(Message, kind=19):
+    """A snapshot's files, each ``(path, size, sha256)``. Reply: ``Wanted``, or ``Refused``."""
+
+    files: tuple[object, ...]
+
+
+class Wanted(Message, kind=20):
+    """The hashes that the server does not have. None: ``OpenJail`` may name ``snapshot``."""
+
+    snapshot: str
+    hashes: tuple[object, ...]
+
+
+class PutBlob(Message, kind=21):
+    """One piece of a wanted file, in order; the frame that follows holds it. Reply: ``Done``.
+
+    With the last piece the whole is compared with its hash.
+    """
+
+    sha256: bytes
+    offset: int
+
+
+class KeepAlive(Message, kind=22):
+    """The client lives, and still holds these jails. Reply: ``Done``."""
+
+    jails: tuple[int, ...]
+
+
+class Agree(Message, kind=23):
+    """The compressions that the client can read, best first. Reply: ``Agreed``."""
+
+    compressions: tuple[object, ...]
+
+
+class Agreed(Message, kind=24):
+    """The compression of both directions from here on, or ``""``; and the server's patience.
+
+    Jails of a client that is not heard from for ``idle_s`` seconds are ended; 0 means never.
+    """
+
+    compression: str
+    idle_s: int
+
+
+class Packed(Message, kind=25):
+    """In front of a message's frames: some of them are compressed.
+
+    ``sizes`` has one number for each frame that follows: its size when unpacked, or -1 for a
+    frame that is as it was.
+    """
+
+    compression: str
+    sizes: tuple[int, ...]
+
+
+class GetSessions(Message, kind=26):
+    """Ask who uses the server: the asker's own sessions, or all for the operator."""
+
+
+class Sessions(Message, kind=27):
+    """One mapping a session: ``client``, ``session``, ``heard_s``, ``connections``, ``jails``."""
+
+    sessions: tuple[object, ...]
+
+
+class FollowOutput(Message, kind=28):
+    """Ask for what a jail has printed from its ``offset``-th byte on. Reply: ``OutputBytes``.
+
+    Also after the jail's death, until it is closed.
+    """
+
+    jail: int
+    offset: int
+
+
+class OutputBytes(Message, kind=29):
+    """Bytes that a jail printed. Trust: raw; what lay before ``start`` is not kept any more."""
+
+    start: int
+    data: bytes
+
+
+class ExpireIdle(Message, kind=30):
+    """End a jail whose runners do nothing for so many milliseconds. Reply: ``Done``, or ``Died``.
+
+    Whoever asks anything of it afterwards is told ``Died`` with the reason ``"idle"``.
+    """
+
+    jail: int
+    idle_ms: int
+
+
+class OpenJailWith(OpenJail, kind=31):
+    """``OpenJail`` for a repository with packages of its own. The same replies.
+
+    ``packages`` is a folder of them, for ``python``; that interpreter's own are not used. Nothing
+    of it runs outside of the jail.
+    """
+
+    packages: str
+
+    @property
+    def runtime(self) -> Runtime:
+        """What runs the repository."""
+        return Runtime(self.python, self.packages)
