@@ -13,13 +13,14 @@ import select
 import shutil
 import subprocess
 import sys
-import tempfile
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
 import envhub_worker.protocol
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
+from envhub_sandbox.log import WORKER
+from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.base import WorkerServer
 from envhub_sandbox.sandboxes.lingering import Lingering
 from envhub_sandbox.sandboxes.refcount import Sharing
@@ -90,8 +91,7 @@ class ProcessSandbox:
 
 
 def _start(store: Path) -> ProcessServer:
-    # mkdtemp gives mode 0700: the endpoint is ours alone
-    folder = Path(tempfile.mkdtemp(prefix="envhub-"))
+    folder = runtime_folder.make(runtime_folder.SERVER)  # of mode 0700: the endpoint is ours alone
     endpoint = f"ipc://{folder}/server"
     ready, ready_end = os.pipe()
     try:
@@ -104,6 +104,8 @@ def _start(store: Path) -> ProcessServer:
         os.close(ready_end)
     server = ProcessServer(endpoint, os.pidfd_open(process.pid), process, folder)
     try:
+        for path in runtime_folder.remove_stale():  # while it starts, this costs nothing
+            WORKER.info("removed %s, which a client that was killed had left", path)
         _wait_until_ready(ready, server)
     except BaseException:
         server.stop()

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import WorkerDiedError
-from tests.remote.listening import Listening
+from envhub_sandbox.sandboxes import runtime_folder
+from tests.faults.traces import temporary_root
+from tests.remote.listening import Listening, listening
 from tests.support.processes import eventually
 from tests.support.samples import sample
 
@@ -46,3 +50,24 @@ def test_idle_jails_end_over_there(server: Listening) -> None:
             env.step([LIVE])
         env.reset(seed=1)
         assert env.step([LIVE])[0][:, 1].tolist() == [1]
+
+
+def test_a_killed_server_leaves_nothing_that_nobody_finds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its folder is told from a living one's by a lock; ``gc``, or the next server, removes it."""
+    left = set[Path]()
+    with temporary_root() as place:
+        monkeypatch.setenv("TMPDIR", str(place))
+        for _ in range(2):
+            with listening(tmp_path / "server") as server:
+                mine = set(place.iterdir())
+                assert len(mine) == 1
+                assert not mine & left
+                assert list(runtime_folder.stale_folders(place)) == []
+                server.process.kill()
+                server.process.wait()
+                assert eventually(lambda: set(runtime_folder.stale_folders(place)) == mine)  # noqa: B023
+                left = mine
+        assert set(runtime_folder.remove_stale()) >= left
+        assert list(place.iterdir()) == []

@@ -30,7 +30,9 @@ answers, else 1.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
+import select
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -54,6 +56,22 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _serve(arguments: argparse.Namespace) -> int:
     """Run a worker server until it is told to stop or its client ends."""
     arguments.runtime_dir.mkdir(mode=0o700, exist_ok=True)
+    try:
+        return _serve_in(arguments)
+    except BaseException:
+        if _client_has_gone(arguments):  # one that is there reads our log, and then removes it
+            from envhub_worker.lockdown.mechanisms.scratch import remove_tree
+
+            remove_tree(str(arguments.runtime_dir))
+        raise
+
+
+def _client_has_gone(arguments: argparse.Namespace) -> bool:
+    fd = 0 if arguments.until_eof else arguments.client_pidfd
+    return fd is not None and bool(select.select([fd], [], [], 0)[0])
+
+
+def _serve_in(arguments: argparse.Namespace) -> int:
     ahead = _ahead(arguments)  # before anything heavy is imported: both are at it at once
     from envhub_worker.server import Server
 
@@ -68,7 +86,8 @@ def _serve(arguments: argparse.Namespace) -> int:
     )
     server.stop_on(signal.SIGTERM, signal.SIGINT)
     if arguments.ready_fd is not None:
-        os.write(arguments.ready_fd, b"ready\n")
+        with contextlib.suppress(BrokenPipeError):  # a client that has gone: the loop sees it
+            os.write(arguments.ready_fd, b"ready\n")
         os.close(arguments.ready_fd)
     if announced is not None:
         print(announced, flush=True)

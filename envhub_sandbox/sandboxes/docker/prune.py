@@ -1,8 +1,8 @@
 """What clients that were killed left behind: containers, folders, control groups.
 
 Only what can be told to be ours, and to be nobody's any more. A container names its client in a
-label, a folder in a file or by a socket that nobody serves, a control group by a pid; what does not
-is left alone. So is what belongs to another user, whose processes we may not even see; root sees
+label, a folder in a file or by a lock that nobody holds, a control group by a pid; what does not is
+left alone. So is what belongs to another user, whose processes we may not even see; root sees
 all, and removes every user's containers and control groups.
 """
 
@@ -13,24 +13,20 @@ import json
 import os
 import re
 import shutil
-import socket
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.errors import SandboxUnavailableError
+from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.docker.engines import ENGINES, Engine, EngineError, find_engine
 from envhub_sandbox.sandboxes.docker.run_arguments import CLIENT_LABEL, USER_LABEL
 from envhub_sandbox.sandboxes.owner import has_ended, is_of_this_boot
 
 _CGROUPS = Path("/sys/fs/cgroup")
-_CONNECT_S = 2.0
 _ENDED = frozenset({"exited", "stopped", "dead"})
 _GROUP = re.compile(r"envhub-(\d+)-\w[\w-]*")
-_SERVER_FOLDER = re.compile(r"envhub-[a-z0-9_]{8}")
-_CONTAINER_FOLDER = re.compile(r"envhub-docker-[a-z0-9_]{8}")
 
 
 @dataclass(frozen=True)
@@ -64,7 +60,11 @@ def find() -> list[Leftover]:
     """Everything that can be removed. Removes nothing."""
     engines = list(_engines())
     containers = [found for engine in engines for found in stale_containers(engine)]
-    folders = list(stale_folders(Path(tempfile.gettempdir())))
+    folders = [
+        Leftover("folder", str(path))
+        for place in runtime_folder.places()
+        for path in runtime_folder.stale_folders(place)
+    ]
     return [*containers, *folders, *stale_groups(_CGROUPS)]
 
 
@@ -104,38 +104,6 @@ def _is_deserted_container(said: dict[str, Any]) -> bool:
 
 def _is_mine(user: str | None) -> bool:
     return os.geteuid() == 0 or user == str(os.geteuid())
-
-
-def stale_folders(temporary: Path) -> Iterator[Leftover]:
-    """Runtime folders of servers and of containers, below the folder for temporary files."""
-    for path in sorted(temporary.glob("envhub-*")):
-        with contextlib.suppress(OSError):
-            if not path.is_dir() or path.is_symlink() or not _belongs_to_us(path):
-                continue
-            if _CONTAINER_FOLDER.fullmatch(path.name):
-                stale = has_ended((path / "client").read_text()) is True
-            else:
-                stale = bool(_SERVER_FOLDER.fullmatch(path.name)) and _is_deserted(path)
-            if stale:
-                yield Leftover("folder", str(path))
-
-
-def _belongs_to_us(path: Path) -> bool:
-    status = path.stat()
-    return status.st_uid == os.geteuid() and status.st_mode & 0o077 == 0
-
-
-def _is_deserted(path: Path) -> bool:
-    """Whether a server's folder is there, and its socket, and nobody listens at it."""
-    if not (path / "server.log").is_file():
-        return False
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
-        connection.settimeout(_CONNECT_S)  # one that is merely busy is not deserted
-        try:
-            connection.connect(str(path / "fds"))
-        except ConnectionRefusedError:
-            return True
-    return False
 
 
 def stale_groups(root: Path) -> Iterator[Leftover]:

@@ -17,7 +17,6 @@ import select
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +24,7 @@ from typing import Any
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.policy import Policy
+from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.base import WorkerServer
 from envhub_sandbox.sandboxes.docker import attestation, run_arguments, seccomp_profile
 from envhub_sandbox.sandboxes.docker.engines import (
@@ -45,7 +45,6 @@ _MONITOR = Path(__file__).with_name("monitor.py")
 _STARTUP_S = 120.0
 _STOP_S = 45.0
 _ANNOUNCEMENT_BYTES = 65536
-_PREFIX = "envhub-docker-"
 # of the engine's own: it failed, it could not run the program, there is no such program
 _ENGINES_CODES = (125, 126, 127)
 # Far above the users of distributions, systemd and rootless containers.
@@ -176,6 +175,7 @@ class ContainerServer:
         _end(self.process)
         with contextlib.suppress(OSError):
             os.close(self.process_fd)
+        shutil.rmtree(self.folder, ignore_errors=True)  # where the monitor was killed itself
 
 
 _IDLE: Lingering[ContainerServer] = Lingering()
@@ -206,7 +206,7 @@ class RepositoryContainer:
         self._servers.release(server, idle_s)
 
     def _start(self) -> ContainerServer:
-        folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
+        folder = runtime_folder.make(runtime_folder.CONTAINER)
         ready, ready_end = os.pipe()
         try:
             wanted = self._wanted(folder)
@@ -221,6 +221,7 @@ class RepositoryContainer:
             return self._enclosed(wanted, folder, process, _answer(ready, process))
         except BaseException:
             _end(process)
+            shutil.rmtree(folder, ignore_errors=True)
             raise
         finally:
             os.close(ready)
@@ -252,7 +253,6 @@ class RepositoryContainer:
         if user != os.geteuid():
             os.chown(sockets, user, group)
         identity = identity_of(os.getpid())
-        (folder / "client").write_text(identity)
         (folder / "seccomp.json").write_text(json.dumps(seccomp_profile.profile()))
         own = len(os.sched_getaffinity(0))
         limits = (

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import json
 import os
-import socket
+import shutil
 import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from envhub_sandbox.errors import SandboxUnavailableError
+from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.docker import prune
 from envhub_sandbox.sandboxes.docker.run_arguments import CLIENT_LABEL, USER_LABEL
 from envhub_sandbox.sandboxes.owner import identity_of
+from envhub_worker.lockdown.mechanisms.locked_folder import LockedFolder, remove_deserted
 
 
 @pytest.fixture(scope="module")
@@ -40,15 +41,7 @@ def folder(root: Path, name: str, files: dict[str, str], mode: int = 0o700) -> P
 
 def found(root: Path) -> set[str]:
     """Names of the folders that would be removed."""
-    return {Path(one.name).name for one in prune.stale_folders(root)}
-
-
-def bound(path: Path) -> socket.socket:
-    """A socket of a server's kind."""
-    made = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    made.bind(str(path))
-    made.listen()
-    return made
+    return {path.name for path in runtime_folder.stale_folders(root)}
 
 
 def test_a_containers_folder_is_left_behind_when_its_client_is(tmp_path: Path, dead: str) -> None:
@@ -63,22 +56,65 @@ def test_a_containers_folder_is_left_behind_when_its_client_is(tmp_path: Path, d
     assert found(tmp_path) == {"envhub-docker-dead0000"}
 
 
-@pytest.fixture
-def short() -> Iterator[Path]:
-    """A folder with a name that a socket's may begin with, wherever temporary files go."""
-    with tempfile.TemporaryDirectory(prefix="envhub-test-", dir="/tmp") as folder:
-        yield Path(folder)
+def test_a_servers_folder_is_left_behind_when_nobody_holds_its_lock(tmp_path: Path) -> None:
+    """One without a client of its own; a lock is given back by the kernel, whoever ended it."""
+    held = LockedFolder("envhub-", tmp_path)
+    apart = LockedFolder("envhub-scratch-", tmp_path)
+    apart.path.chmod(0o711)
+    folder(tmp_path, "envhub-deserted", {"lock": ""})
+    folder(tmp_path, "envhub-strangers-too", {"lock": ""})
+    folder(tmp_path, "envhub-scratch-deserted", {"lock": ""}, mode=0o711)
+    both = {"envhub-deserted", "envhub-scratch-deserted"}
+    assert found(tmp_path) == both
+    remove_deserted(tmp_path)
+    assert held.path.is_dir()
+    assert not (tmp_path / "envhub-deserted").exists()
+    for one in (held, apart):
+        one.remove()
+    assert [path.name for path in tmp_path.iterdir()] == ["envhub-strangers-too"]
 
 
-def test_a_servers_folder_is_left_behind_when_nobody_listens(short: Path) -> None:
-    """At the socket in it; one that is only being made has none yet."""
-    for name in ("listens0", "deserted", "starting", "no_log00"):
-        log = {} if name == "no_log00" else {"server.log": ""}
-        folder(short, f"envhub-{name}", log)
-    with bound(short / "envhub-listens0" / "fds"):
-        for name in ("deserted", "no_log00"):
-            bound(short / f"envhub-{name}" / "fds").close()
-        assert found(short) == {"envhub-deserted"}
+def test_a_folder_without_a_word_is_left_behind_once_it_is_old(tmp_path: Path) -> None:
+    """Its client was killed before it wrote who it is; one that is new may be about to."""
+    for name, files in (("empty000", {}), ("nobody00", {"client": ""}), ("full0000", {"x": ""})):
+        folder(tmp_path, f"envhub-{name}", files)
+    assert found(tmp_path) == set()
+    for path in tmp_path.iterdir():
+        os.utime(path, (0, 0))
+    assert found(tmp_path) == {"envhub-empty000", "envhub-nobody00"}
+
+
+def test_what_may_be_another_machines_is_removed_by_hand_only(
+    tmp_path: Path, dead: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A start removes what this machine has left since it runs; ``gc`` finds the other, too."""
+    pid, start, _, namespace = dead.split(":")
+    folder(tmp_path, "envhub-dead0000", {"client": dead})
+    folder(tmp_path, "envhub-another0", {"client": f"{pid}:{start}:another:{namespace}"})
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr(runtime_folder, "places", lambda: [tmp_path])
+    assert found(tmp_path) == {"envhub-dead0000", "envhub-another0"}
+    assert [path.name for path in runtime_folder.remove_stale()] == ["envhub-dead0000"]
+    assert [path.name for path in tmp_path.iterdir()] == ["envhub-another0"]
+
+
+def test_a_folder_for_sockets_has_a_short_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where that of temporary files is too long another one stands in, if there is one."""
+    long = tmp_path / ("x" * 100)
+    long.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(long))
+    made = runtime_folder.make(runtime_folder.CONTAINER)
+    try:
+        assert len(os.fsencode(made / "sockets" / "server")) <= 107
+        assert made.stat().st_mode & 0o777 == 0o700
+        assert made.parent in runtime_folder.places()
+    finally:
+        shutil.rmtree(made)
+    monkeypatch.setattr(runtime_folder, "places", lambda: [long])
+    with pytest.raises(SandboxUnavailableError, match="set TMPDIR to a shorter one"):
+        runtime_folder.make(runtime_folder.SERVER)
 
 
 def test_a_link_is_not_followed(tmp_path: Path, dead: str) -> None:
@@ -94,8 +130,8 @@ def test_removing_removes_the_folder_and_nothing_beside(tmp_path: Path, dead: st
     """And says that it did."""
     folder(tmp_path, "envhub-docker-dead0000", {"client": dead, "seccomp.json": "{}"})
     beside = folder(tmp_path, "envhub-docker-alive000", {"client": identity_of(os.getpid())})
-    [one] = prune.stale_folders(tmp_path)
-    assert one.remove()
+    [path] = runtime_folder.stale_folders(tmp_path)
+    assert prune.Leftover("folder", str(path)).remove()
     assert list(tmp_path.iterdir()) == [beside]
 
 

@@ -19,7 +19,7 @@ from envhub_sandbox.sandboxes import owner
 from envhub_sandbox.sandboxes.docker import attestation, engines, run_arguments, seccomp_profile
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
-from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
+from envhub_sandbox.sandboxes.docker.sandbox import ContainerServer, DockerSandbox
 from envhub_worker.lockdown.seccomp import policy as seccomp_policy
 from envhub_worker.protocol.runtime import Runtime
 from tests.unit.docs.test_imports import folder, modules
@@ -428,3 +428,16 @@ def test_impossible_limits_are_refused(options: dict[str, Any]) -> None:
     """At once, without an engine."""
     with pytest.raises(PolicyError, match="more than 0"):
         DockerSandbox(**options)
+
+
+def test_a_container_whose_monitor_was_killed_leaves_no_folder(tmp_path: Path) -> None:
+    """The monitor cannot remove it then; whoever gives the container up does."""
+    folder = tmp_path / "folder"
+    (folder / "sockets").mkdir(parents=True)
+    monitor = subprocess.Popen([sys.executable, "-S", "-c", "input()"], stdin=subprocess.PIPE)
+    server = ContainerServer(folder, monitor, os.pidfd_open(monitor.pid), [], "strict", "")
+    monitor.kill()
+    monitor.communicate()
+    assert not server.runs
+    server.stop()
+    assert not folder.exists()

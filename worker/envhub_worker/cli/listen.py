@@ -30,8 +30,8 @@ from envhub_worker.access.quotas import Permissions, Quotas
 from envhub_worker.access.rate_limited_log import Log
 from envhub_worker.access.uploads import Uploads
 from envhub_worker.lockdown import probe, surroundings
-from envhub_worker.lockdown.mechanisms import landlock
-from envhub_worker.lockdown.mechanisms.scratch import remove_tree
+from envhub_worker.lockdown.mechanisms import landlock, locked_folder
+from envhub_worker.lockdown.mechanisms.locked_folder import LockedFolder
 from envhub_worker.protocol.confinement import GIB, MIB, PROFILES
 from envhub_worker.protocol.keys import key_text
 from envhub_worker.server import Server
@@ -108,13 +108,15 @@ def _listen(arguments: argparse.Namespace, state: Path) -> int:
     identity = replace(_identity(arguments, state), profile=(*strongest, "strict")[0])
     sys.stderr.write(unusable(identity.profile, arguments.weakest_profile))
     _raise_file_limit()
-    runtime_dir = Path(tempfile.mkdtemp(prefix="envhub-"))
+    place = locked_folder.place_for_sockets()
+    locked_folder.remove_deserted(place)
+    runtime = LockedFolder("envhub-", place)
     try:
         gate = _gate(arguments, state, identity)
         store = state / "store"
-        server = Server(arguments.bind, runtime_dir, [str(store)], gate=gate)
+        server = Server(arguments.bind, runtime.path, [str(store)], gate=gate)
     except BaseException:
-        remove_tree(str(runtime_dir))
+        runtime.remove()
         raise
     server.stop_on(signal.SIGTERM, signal.SIGINT)
     note = state / "endpoint"
@@ -125,6 +127,7 @@ def _listen(arguments: argparse.Namespace, state: Path) -> int:
         server.run()
     finally:
         note.unlink(missing_ok=True)
+        runtime.remove()
     return 0
 
 
@@ -317,11 +320,11 @@ def _state(chosen: Path | None) -> Iterator[Path]:
     if folder is not None:
         yield folder
         return
-    made = tempfile.mkdtemp(prefix="envhub-state-")
+    made = LockedFolder("envhub-state-")
     try:
-        yield Path(made)
+        yield made.path
     finally:
-        remove_tree(made)
+        made.remove()
 
 
 def state_dir(chosen: Path | None, *, create: bool) -> Path | None:

@@ -11,7 +11,6 @@ import os
 import select
 import signal
 import socket
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from envhub_worker.channel import Channel, close_fds
 from envhub_worker.lockdown.context import ZygoteConfig
 from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.lockdown.mechanisms import process, user
+from envhub_worker.lockdown.mechanisms.locked_folder import LockedFolder
 from envhub_worker.lockdown.mechanisms.scratch import Scratch, remove_tree
 from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.spec import JailSpec
@@ -98,6 +98,7 @@ class Spawner:
         self._process = _usable(ahead, runtime) or ZygoteProcess(runtime, runtime_dir)
         self._folder = self._process.folder
         self._user, self._refusal = _choose_user()
+        self._apart: LockedFolder | None = None
         self._scratches = self._make_scratches(confinement)
         self._cgroups = self._make_cgroups()
         self._log = self._process.log
@@ -132,9 +133,9 @@ class Spawner:
         if self._user is None:
             return self._folder
         # The jails' user may not cross root's runtime folder.
-        folder = Path(tempfile.mkdtemp(prefix="envhub-scratch-"))
-        folder.chmod(0o711)
-        return folder
+        self._apart = LockedFolder("envhub-scratch-")
+        self._apart.path.chmod(0o711)
+        return self._apart.path
 
     def _make_cgroups(self) -> cgroups.Tree | None:
         hierarchy = cgroups.discover()
@@ -233,8 +234,9 @@ class Spawner:
         if self._cgroups is not None:
             self._cgroups.remove()
             self._cgroups = None
-        for folder in {self._folder, self._scratches or self._folder}:
-            remove_tree(str(folder))
+        remove_tree(str(self._folder))
+        if self._apart is not None:
+            self._apart.remove()
 
 
 def _usable(ahead: ZygoteProcess | None, runtime: Runtime) -> ZygoteProcess | None:

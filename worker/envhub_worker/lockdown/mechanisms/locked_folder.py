@@ -1,0 +1,73 @@
+"""A folder of a server's own among the temporary files, locked for as long as the server lives.
+
+Whoever ends the server by a signal that nobody can catch leaves its folders behind. The kernel
+gives the lock back, so the next server, or ``envhub gc``, can tell and remove them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import re
+import tempfile
+from pathlib import Path
+
+from envhub_worker.lockdown.mechanisms.scratch import remove_tree
+
+_LOCK = "lock"
+_NAME = re.compile(r"envhub-([a-z]+-)?[a-z0-9_]{8}")
+_SOCKET_BYTES = 107
+_LONGEST = "/envhub-12345678/fds"
+
+
+class LockedFolder:
+    """A new one. It is private; its owner may let others pass.
+
+    Args:
+        prefix: What its name begins with.
+        place: Where it lies; by default below the folder for temporary files.
+
+    Attributes:
+        path: Its path.
+    """
+
+    def __init__(self, prefix: str, place: Path | None = None) -> None:
+        self.path = Path(tempfile.mkdtemp(prefix=prefix, dir=place))
+        new = self.path / f".{_LOCK}"
+        self._lock = os.open(new, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        fcntl.flock(self._lock, fcntl.LOCK_EX)
+        os.rename(new, self.path / _LOCK)  # under that name nobody sees it without its lock
+
+    def remove(self) -> None:
+        """Remove it, with all that is in it. Idempotent."""
+        with contextlib.suppress(FileNotFoundError):
+            remove_tree(str(self.path))
+        if self._lock >= 0:
+            os.close(self._lock)
+            self._lock = -1
+
+
+def place_for_sockets() -> Path:
+    """The folder for temporary files; where its path is too long for a socket's, ``/tmp``."""
+    place = Path(tempfile.gettempdir())
+    return place if len(os.fsencode(place)) + len(_LONGEST) <= _SOCKET_BYTES else Path("/tmp")
+
+
+def remove_deserted(place: Path) -> None:
+    """Remove folders of ours whose server has gone."""
+    for path in filter(lambda path: _NAME.fullmatch(path.name), place.iterdir()):
+        with contextlib.suppress(OSError):
+            if path.lstat().st_uid == os.geteuid() and _is_deserted(path / _LOCK):
+                remove_tree(str(path))
+
+
+def _is_deserted(lock: Path) -> bool:
+    fd = os.open(lock, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    finally:
+        os.close(fd)
+    return True
