@@ -121,7 +121,10 @@ def _doubts(
     elif history.get("mixed"):
         yield "what was set or called before a transparent restart need not hold everywhere"
     elif not _member(history, "exact", bool):
-        yield "some requests held objects that only pickle could carry, and are not repeated"
+        yield (
+            "some requests held objects that only pickle could carry; plain values or descriptions "
+            "stand for them"
+        )
     if not _member(arguments, "exact", bool):
         yield "make_env was given objects that only pickle could carry"
     if document.get("task") is not None and not _member(history, "seeded", bool):

@@ -115,7 +115,7 @@ def _ended(
 
 
 def _reset(env: Any, message: m.Reset) -> None:
-    options = None if message.options is None else dict(message.options)
+    options = message.options if isinstance(message.options, dict) else None
     if message.mask is not None:
         options = {**(options or {}), "reset_mask": message.mask}
     env.reset(seed=message.seeds, options=options)

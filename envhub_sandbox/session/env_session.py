@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 from envhub_sandbox.errors import (
     EnvHubError,
+    LocalProtocolError,
     RemoteProtocolError,
     WorkerDiedError,
     WorkerError,
@@ -59,11 +60,20 @@ class RemoteEnv(Mortal):
             lane = self._lane
             assert lane is not None
             messages = [message_for(lane.number, bounds) for bounds in self.bounds]
-            packed = lane.pack(messages)
+            try:
+                packed = lane.pack(messages)
+            except LocalProtocolError:
+                self._refuse_whole(lane, message_for)
+                raise
             self._send(operation, partial(lane.send, operation, packed))
             self._remember(message_for, messages[0], packed)
             self.history.requested(message_for)
             self._note_first_use()
+
+    def _refuse_whole(self, lane: Lane, message_for: MessageFor) -> None:
+        """Raise what cannot be sent as it is called in the caller's arguments, not in a shard's."""
+        if len(self.bounds) > 1:
+            lane.pack([message_for(lane.number, (0, self.manifest.num_envs))])
 
     def collect(self, timeout_s: float | None) -> list[m.Message]:
         """The shards' replies to the last ``submit``; the environment is usable afterwards.

@@ -17,6 +17,7 @@ from envhub_sandbox import folders
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.policy import Policy
+from envhub_sandbox.transport import pickles
 from envhub_sandbox.transport.shared_memory.sharding import PaceBook
 from envhub_worker import protocol
 from envhub_worker.protocol import messages as m
@@ -81,9 +82,13 @@ class ManifestCache:
 
 
 def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, runtime: Runtime) -> str | None:
-    """The entry's name; None if an argument has no form that can be compared."""
+    """The entry's name; None if an argument has no form that can be compared.
+
+    Pickles of equal values may differ (the order of a set of texts does in each process): that is
+    a miss, and no harm.
+    """
     try:
-        arguments = b"".join(map(bytes, m.pack(load, 0, pickler=_refuse)))
+        arguments = b"".join(map(bytes, m.pack(load, 0, pickler=pickles.lasting)))
     except (EnvHubError, TypeError):
         return None
     facts = (
@@ -96,10 +101,6 @@ def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, runtime: Runt
     digest.update(repr(facts).encode())
     digest.update(b"".join(map(bytes, encode([os.environ.get(n) for n in policy.environment]))))
     return digest.hexdigest()
-
-
-def _refuse(value: object) -> bytes:
-    raise TypeError(f"{type(value).__name__} has no stable form")
 
 
 def _facts_of(python: str, packages: str) -> tuple[object, ...]:

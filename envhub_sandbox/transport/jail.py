@@ -7,8 +7,6 @@ from collections.abc import Callable, Sequence
 from itertools import islice
 from typing import Any
 
-import cloudpickle  # type: ignore[import-untyped]
-
 from envhub_sandbox.errors import (
     DependencyError,
     EnvHubError,
@@ -19,6 +17,7 @@ from envhub_sandbox.errors import (
     load_error,
     remote_error,
 )
+from envhub_sandbox.transport import pickles
 from envhub_sandbox.transport.connection import WorkerClient, death, expect
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.tensors import to_tensor
@@ -31,6 +30,8 @@ from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _CAUSE_S = 10.0
 _CAUSE_POLL_S = 0.01
+_FIRST_WITH_FRAMED_PICKLES = 6
+"""The version of the protocol."""
 
 
 class RunnersDiedError(WorkerDiedError):
@@ -119,7 +120,9 @@ class RemoteJail:
     def pack(self, message: m.Message) -> list[Buffer]:
         """The frames of a message to a runner."""
         # the only way in for the caller's own objects; nothing is ever unpickled here
-        return m.pack(message, 0, pickler=cloudpickle.dumps, limits=self._limits)
+        new = self.client.version >= _FIRST_WITH_FRAMED_PICKLES
+        pickler = pickles.framed if new else pickles.pickled
+        return m.pack(message, 0, pickler=pickler, limits=self._limits)
 
     def send(self, operation: str, requests: Sequence[tuple[int, m.Message]]) -> int:
         """Send one message to each of some runners, in one request; returns its id."""

@@ -10,6 +10,7 @@ import html
 import warnings
 import weakref
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any, cast
 
 import numpy as np
@@ -115,9 +116,10 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     ) -> None:
         """Send the reset; ``reset_wait`` returns its results."""
         self._refuse_if_busy("reset_async")
-        options = None if options is None else dict(options)
-        mask = None if options is None else options.pop("reset_mask", None)
-        if mask is not None:
+        mask = None
+        if options is not None and "reset_mask" in options:
+            options = copy(options)  # the caller's own keep theirs
+            mask = options.pop("reset_mask")
             from_manifest.check_mask(mask, self.num_envs)
         seeds = self._seeds(seed)
         self._recover()

@@ -22,6 +22,48 @@ def assert_same(expected: object, actual: object, what: str = "value") -> None:
     assert found is None, found
 
 
+def assert_identical(expected: Any, actual: Any, what: str = "value") -> None:
+    """Assert that a value arrived as it is: classes of the tests' own by name, order in memory."""
+    # a class that travelled by value is another class of the same name
+    assert type(actual).__qualname__ == type(expected).__qualname__, what
+    if isinstance(expected, np.ndarray):
+        assert actual.flags.fnc == expected.flags.fnc, f"{what}: another order in memory"
+        assert (actual.dtype, actual.shape) == (expected.dtype, expected.shape), what
+        if not expected.dtype.hasobject:
+            assert actual.tobytes() == expected.tobytes(), what
+    # the pickle says everything, sets and the memory of views apart
+    if isinstance(expected, (set, frozenset)) or expected is ...:
+        assert actual == expected, what
+    elif isinstance(expected, memoryview):
+        assert (actual.format, actual.tolist()) == (expected.format, expected.tolist()), what
+        assert actual.readonly == expected.readonly, what
+    else:
+        assert _unfolded(actual) == _unfolded(expected), what
+
+
+def _unfolded(value: Any) -> Any:
+    """All that a value is made of, as something that can be compared and does not share."""
+    name = type(value).__qualname__
+    if isinstance(value, dict):
+        found: Any = [(_unfolded(key), _unfolded(item)) for key, item in value.items()]
+    elif isinstance(value, (list, tuple)):
+        found = [_unfolded(item) for item in value]
+    elif isinstance(value, np.ndarray):
+        found = value.shape, value.dtype.str, [_unfolded(item) for item in value.ravel().tolist()]
+    elif isinstance(value, np.random.Generator):
+        found = _unfolded(value.bit_generator.state)
+    elif isinstance(value, np.random.RandomState):
+        found = _unfolded(value.get_state())
+    elif not isinstance(value, (type, np.generic)) and getattr(value, "__dict__", None):
+        found = _unfolded(vars(value))
+    elif isinstance(value, int):
+        found = hex(value)
+    else:
+        found = repr(value)
+    extra = getattr(value, "default_factory", None) or getattr(value, "maxlen", None)
+    return name, found, repr(extra)
+
+
 def differences(expected: Any, actual: Any, path: str = "value") -> Iterator[str]:
     """Where two values differ, in words; nothing if they are the same."""
     if type(actual).__name__ in ("RemoteEnum", "RemoteObject") and actual != expected:

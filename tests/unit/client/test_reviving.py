@@ -26,6 +26,7 @@ class Told:
 
     def __init__(self, reply: m.Message, *parts: m.Message) -> None:
         self.reply = reply
+        self.version = m.VERSION
         self.payload: list[Buffer] = [frame for part in parts for frame in m.pack(part, 0)]
 
     def send(self, message: m.Message, payload: Any = ()) -> int:

@@ -360,7 +360,7 @@ def test_no_deserialiser_is_imported() -> None:
     ]
     assert found == []
     users = {name for name in modules() if "cloudpickle" in imported(name)}
-    assert users == {"envhub_sandbox.transport.jail", "envhub_worker.runner.runner"}
+    assert users == {"envhub_sandbox.transport.pickles", "envhub_worker.runner.runner"}
 
 
 def test_only_the_loader_imports_by_computed_names() -> None:

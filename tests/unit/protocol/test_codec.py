@@ -254,7 +254,7 @@ def test_known_values_are_never_pickled() -> None:
 
 def test_failures_of_pickler_and_unpickler_are_protocol_errors() -> None:
     """What cannot be pickled is refused with its path; what cannot be loaded, with the reason."""
-    with pytest.raises(LocalProtocolError, match=r'kwargs\["f"\]\[1\] cannot be sent'):
+    with pytest.raises(LocalProtocolError, match=r"kwargs\[.f.\]\[1\] cannot be sent"):
         encode({"kwargs": {"f": [0, lambda: 0]}}, pickler=pickle.dumps)
     with pytest.raises(RemoteProtocolError, match="cannot be loaded"):
         decode(packed(ext(5, b"junk")), unpickler=pickle.loads)
@@ -279,7 +279,7 @@ class Broken(Foreign):
 def test_arrays_of_other_libraries_arrive_as_numpy_arrays() -> None:
     """What speaks __array__ and __dlpack__ (jax, cupy) is an array; its failure names the path."""
     assert_same({"x": np.arange(3.0)}, through({"x": Foreign()}))
-    with pytest.raises(LocalProtocolError, match=r'obs\["x"\] cannot be sent: Array has been'):
+    with pytest.raises(LocalProtocolError, match=r"obs\[.x.\] cannot be sent: Array has been"):
         encode({"obs": {"x": Broken()}})
 
 
@@ -322,11 +322,11 @@ def cyclic() -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("value", "text"),
     [
-        (cyclic(), r'info\["a"\]\[3\] cannot be sent: it contains itself'),
+        (cyclic(), r"info\[.a.\]\[3\] cannot be sent: it contains itself"),
         ({"info": deep(32)}, r"info\[0\].* cannot be sent: it is nested deeper than 32"),
         (deep(1000), "nested deeper than 32"),
         ([1, np.zeros(2, "f4,f4")], r"value\[1\] cannot be sent: dtype"),
-        ({"info": {"a": np.longdouble(1)}}, r'info\["a"\] cannot be sent: dtype'),
+        ({"info": {"a": np.longdouble(1)}}, r"info\[.a.\] cannot be sent: dtype"),
         ({"a": as_objects([1, 2, (np.void(b"x"),), 3])}, r"a\[2\]\[0\] cannot be sent: dtype"),
         ({1: 2**10_000}, r"value\[1\] cannot be sent: an integer"),
         (np.zeros(2, "V8"), "The value cannot be sent: dtype"),

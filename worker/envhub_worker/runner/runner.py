@@ -153,9 +153,10 @@ class Runner:
             return m.ResetDone(
                 env.batch.observation(), join(pairs, env.num_envs, sliced=env.sliced)
             )
-        options = request.options
+        options: Any = request.options
         if request.mask is not None:
-            options = {**(options or {}), "reset_mask": request.mask}
+            options = {} if options is None else options  # our own copy
+            options["reset_mask"] = request.mask
         observation, info = env.reset(seed=request.seeds, options=options)
         return m.ResetDone(observation, info)
 

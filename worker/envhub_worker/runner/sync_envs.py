@@ -123,7 +123,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         self._restores = batches.restores(self.single_action_space)
         self._plain_actions = isinstance(self.single_action_space, ARRAY_SPACES)
 
-    def run_reset(self, seeds: Any, options: dict[str, Any] | None, mask: Any) -> Pairs:
+    def run_reset(self, seeds: Any, options: Any, mask: Any) -> Pairs:
         """Reset the sub-environments that the mask names, or all; returns the infos.
 
         Args:

@@ -13,7 +13,8 @@ from collections.abc import Sequence
 from envhub_worker.protocol.codec import structure
 from envhub_worker.protocol.codec.arrays import ArrayReader, Buffer
 from envhub_worker.protocol.codec.decoder import Decoder, TensorMaker, Unpickler
-from envhub_worker.protocol.codec.encoder import Encoder, Pickler
+from envhub_worker.protocol.codec.encoder import Encoder
+from envhub_worker.protocol.codec.exact import Pickler
 from envhub_worker.protocol.codec.explain import explain
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
 from envhub_worker.protocol.codec.kinds import DOCUMENT_BYTES
@@ -32,6 +33,7 @@ def encode(
     *,
     pickler: Pickler | None = None,
     limits: WireLimits = DEFAULT_LIMITS,
+    names: Sequence[str] = (),
 ) -> list[Buffer]:
     """Encodes a value as frames: the header, then one per large array.
 
@@ -40,6 +42,7 @@ def encode(
             Anything else crosses as ``RemoteObject``.
         pickler: Encodes objects that have no form of their own instead. Client to worker only.
         limits: What the receiver accepts.
+        names: What to call the elements of the value in an error.
 
     Returns:
         Frames to be sent in this order. Large contiguous arrays are not copied: nobody may
@@ -54,7 +57,7 @@ def encode(
         frames = encoder.frames(value)
     except Exception as error:
         # Objects' own code runs here (__array__, iteration): anything can come out of it.
-        raise LocalProtocolError(explain(value, error, limits, pickler)) from error
+        raise LocalProtocolError(explain(value, error, limits, pickler, names)) from error
     check_outgoing(frames, limits)
     return frames
 

@@ -10,7 +10,13 @@ from typing import Any
 import msgpack  # type: ignore[import-untyped]
 import numpy as np
 
-from envhub_worker.protocol.codec.arrays import Array, ArrayReader, read_scalar, unpack_shape
+from envhub_worker.protocol.codec.arrays import (
+    Array,
+    ArrayReader,
+    Buffer,
+    read_scalar,
+    unpack_shape,
+)
 from envhub_worker.protocol.codec.inert import (
     MAX_NAME_CHARS,
     MAX_REPR_CHARS,
@@ -27,6 +33,7 @@ from envhub_worker.protocol.codec.kinds import (
     INTEGER,
     OBJECTS,
     PICKLE,
+    PICKLE_FRAME,
     RANGE,
     REMOTE,
     SCALAR,
@@ -40,7 +47,7 @@ from envhub_worker.protocol.codec.kinds import (
 from envhub_worker.protocol.errors import MessageTooLargeError, ProtocolError, RemoteProtocolError
 from envhub_worker.protocol.limits import WireLimits
 
-Unpickler = Callable[[bytes], object]
+Unpickler = Callable[[Buffer], object]
 TensorMaker = Callable[[Array, str], object]
 
 # Maps and sets up to this size are too small for colliding keys to cost anything.
@@ -161,11 +168,26 @@ def _read_complex(decoder: Decoder, payload: bytes) -> object:
     return complex(*COMPLEX_BYTES.unpack(payload))
 
 
-def _read_pickle(decoder: Decoder, payload: bytes) -> object:
+def _read_pickle_frame(decoder: Decoder, payload: bytes) -> object:
+    if decoder.unpickler is None:
+        return _read_pickle(decoder, b"")
+    data = decoder.reader.take(payload)
+    if data.dtype != np.uint8 or data.ndim != 1:
+        raise RemoteProtocolError("A pickled object is not an array of bytes.")
+    return _read_pickle(decoder, data.data)
+
+
+def _read_pickle(decoder: Decoder, payload: Buffer) -> object:
     if decoder.unpickler is None:
         raise RemoteProtocolError("The message holds a pickled object, which is never loaded.")
     try:
         return decoder.unpickler(payload)
+    except ModuleNotFoundError as error:
+        raise RemoteProtocolError(
+            f"An object of the client cannot be loaded: {error}. There is no such module "
+            "where the environment runs. Hand over plain data, or have the module's code travel "
+            f"along: cloudpickle.register_pickle_by_value({error.name})"
+        ) from error
     except Exception as error:
         raise RemoteProtocolError(f"An object of the client cannot be loaded: {error}") from error
 
@@ -254,6 +276,7 @@ _READERS: dict[int, Callable[[Decoder, bytes], object]] = {
     INTEGER: _read_integer,
     COMPLEX: _read_complex,
     PICKLE: _read_pickle,
+    PICKLE_FRAME: _read_pickle_frame,
 }
 _BUILDERS: dict[int, Callable[[Decoder, list[Any], bytes], object]] = {
     TUPLE: _build_tuple,

@@ -12,6 +12,7 @@ import numpy as np
 
 from envhub_worker.protocol.codec import structure
 from envhub_worker.protocol.codec.arrays import Array, ArrayWriter, Buffer, pack_shape, write_scalar
+from envhub_worker.protocol.codec.exact import Pickled, Pickler
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject, describe, describe_enum
 from envhub_worker.protocol.codec.kinds import (
     ARRAY,
@@ -23,6 +24,7 @@ from envhub_worker.protocol.codec.kinds import (
     INTEGER,
     OBJECTS,
     PICKLE,
+    PICKLE_FRAME,
     RANGE,
     REMOTE,
     SCALAR,
@@ -35,8 +37,6 @@ from envhub_worker.protocol.codec.kinds import (
 )
 from envhub_worker.protocol.errors import LocalProtocolError
 from envhub_worker.protocol.limits import WireLimits
-
-Pickler = Callable[[object], bytes]
 
 
 class Encoder:
@@ -175,9 +175,17 @@ def _write_unknown(encoder: Encoder, value: object) -> object:
     if encoder.pickler is None:
         return _write_remote(encoder, describe(value))
     try:
-        return msgpack.ExtType(PICKLE, encoder.pickler(value))
+        data = encoder.pickler(value)
     except Exception as error:
         raise LocalProtocolError(f"{type(value).__name__} cannot be pickled: {error}") from error
+    return _write_pickled(encoder, Pickled(data))
+
+
+def _write_pickled(encoder: Encoder, pickled: Pickled) -> object:
+    data = pickled.data
+    if type(data) is bytes:
+        return msgpack.ExtType(PICKLE, data)
+    return msgpack.ExtType(PICKLE_FRAME, encoder.writer.add(np.frombuffer(data, np.uint8)))
 
 
 _HEADS = {code: msgpack.ExtType(code, b"") for code in range(TUPLE, REMOTE + 1)}
@@ -193,6 +201,7 @@ _WRITERS: dict[type, Callable[[Encoder, Any], object]] = {
     slice: _write_slice,
     np.str_: _write_text_scalar,
     np.bytes_: _write_text_scalar,
+    Pickled: _write_pickled,
     RemoteObject: _write_remote,
     RemoteEnum: _write_remote_enum,
     **{np.dtype(char).type: _write_scalar for char in "?bBhHiIlLqQefdFDmM"},

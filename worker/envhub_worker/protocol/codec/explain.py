@@ -2,24 +2,71 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from enum import Enum
 
 import numpy as np
 
-from envhub_worker.protocol.codec.encoder import Encoder, Pickler
-from envhub_worker.protocol.codec.inert import describe, one_line
+from envhub_worker.protocol.codec.encoder import Encoder
+from envhub_worker.protocol.codec.exact import Pickler
+from envhub_worker.protocol.codec.inert import describe, one_line, type_name
 from envhub_worker.protocol.limits import WireLimits
 
 Path = tuple[object, ...]
+_ATTEMPTS = 2000
+"""Values that are pickled to find the one that cannot be."""
 
 
-def explain(value: object, error: Exception, limits: WireLimits, pickler: Pickler | None) -> str:
+def explain(
+    value: object,
+    error: Exception,
+    limits: WireLimits,
+    pickler: Pickler | None,
+    names: Sequence[str] = (),
+) -> str:
     """Says what cannot be sent, and where in the value it is."""
     found = _Search(limits, pickler).first(value, (), ())
     if found is None:
         return f"The value cannot be sent: {error}"
     path, reason = found
+    if path and names:
+        path = (names[path[0]], *path[1:])  # type: ignore[call-overload]
     return f"{_path_text(path)} cannot be sent: {reason}."
+
+
+def unpicklable(name: str, value: object, error: Exception, pickler: Pickler) -> str:
+    """Says which part of an argument cannot be pickled, and what to do."""
+    text, culprit, error = _culprit(name, value, error, pickler, {id(value)})
+    reason = one_line(f"{type(error).__name__}: {error}", 500)
+    return (
+        f"{one_line(text)} cannot be sent: a {type_name(type(culprit))} cannot be pickled "
+        f"({reason}). Hand over plain data, or a function that makes it there."
+    )
+
+
+def _culprit(
+    text: str, value: object, error: Exception, pickler: Pickler, seen: set[int]
+) -> tuple[str, object, Exception]:
+    """The innermost value that fails, how to call it, and how it does."""
+    for step, child in _members(value):
+        if id(child) in seen or len(seen) > _ATTEMPTS:
+            continue
+        seen.add(id(child))
+        try:
+            pickler(child)
+        except Exception as inner:
+            return _culprit(text + step, child, inner, pickler, seen)
+    return text, value, error
+
+
+def _members(value: object) -> Iterator[tuple[str, object]]:
+    """What a value consists of, and how one gets at it."""
+    for step, child in _children(value) or ():
+        yield f"[{_step_text(step)}]", child
+    attributes = getattr(value, "__dict__", None)
+    if type(attributes) is dict:
+        for name, child in attributes.items():
+            yield f".{name}", child
 
 
 class _Search:
@@ -79,4 +126,4 @@ def _path_text(path: tuple[object, ...]) -> str:
 
 
 def _step_text(step: object) -> str:
-    return '"' + step + '"' if isinstance(step, str) else describe(step).text
+    return describe(step).text

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 # Extensions that are a value by themselves.
-ARRAY, SCALAR, INTEGER, COMPLEX, PICKLE = 1, 2, 3, 4, 5
+ARRAY, SCALAR, INTEGER, COMPLEX, PICKLE, PICKLE_FRAME = 1, 2, 3, 4, 5, 6
 # Extensions that head a msgpack array and say what its other elements make.
 TUPLE, SET, FROZENSET, RANGE, SLICE, OBJECTS, TEXT_SCALAR, TENSOR, ENUM, REMOTE = range(16, 26)
 

@@ -20,11 +20,11 @@ else:
         return lambda cls: cls
 
 
-VERSION = 5
+VERSION = 6
 """The newest version of the protocol: ``Hello`` offers a range, ``Welcome`` agrees to one.
 
-Version 2 added kinds 17 to 30, version 3 kind 53, version 4 kind 54, version 5 kind 31; nothing
-that there was changed.
+Version 2 added kinds 17 to 30, version 3 kind 53, version 4 kind 54, version 5 kind 31, version 6
+pickles in frames of their own; nothing that there was changed.
 """
 OLDEST_VERSION = 1
 """The oldest version that this code still speaks."""
@@ -54,15 +54,20 @@ KINDS: dict[int, type[Message]] = {}
 class Message:
     """Base of all messages; ``kind`` is its number on the wire and never changes.
 
-    ``FIELDS`` are what a class annotates, in the order in which they travel.
+    ``FIELDS`` are what a class annotates, in the order in which they travel. ``HANDED`` are those
+    that are the caller's own: they arrive exactly as they are, pickled if need be. ``ASKS`` is what
+    the caller calls it, for errors; with the name of what is called, if the message has one.
     """
 
     kind: ClassVar[int]
+    HANDED: ClassVar[tuple[str, ...]] = ()
+    ASKS: ClassVar[str] = ""
     FIELDS: ClassVar[tuple[str, ...]] = ()
     _checks: ClassVar[tuple[tuple[str, frozenset[type] | None], ...]] = ()
 
-    def __init_subclass__(cls, *, kind: int) -> None:
+    def __init_subclass__(cls, *, kind: int, asks: str = "", handed: tuple[str, ...] = ()) -> None:
         cls.kind = kind
+        cls.ASKS, cls.HANDED = asks, handed
         KINDS[kind] = cls
         own = cls.__annotations__
         cls.FIELDS += tuple(own)

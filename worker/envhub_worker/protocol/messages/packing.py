@@ -15,8 +15,11 @@ import msgpack  # type: ignore[import-untyped]
 
 from envhub_worker.protocol.codec import templates
 from envhub_worker.protocol.codec.codec import Buffer, decode_parts, encode, split
+from envhub_worker.protocol.codec.decoder import Unpickler
+from envhub_worker.protocol.codec.exact import Pickler, handed_over
+from envhub_worker.protocol.codec.explain import unpicklable
 from envhub_worker.protocol.codec.kinds import DOCUMENT_BYTES
-from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.messages.base import KINDS, Message, check_fields, values_of
 from envhub_worker.protocol.untrusted import UNTRUSTED
@@ -31,33 +34,75 @@ def pack(
     message: Message,
     request_id: int,
     *,
-    pickler: Callable[[object], bytes] | None = None,
+    pickler: Pickler | None = None,
     limits: WireLimits = DEFAULT_LIMITS,
 ) -> list[Buffer]:
     """The frames of a message.
+
+    With a pickler, what the caller hands over (``Message.HANDED``) arrives exactly as it is.
 
     Raises:
         LocalProtocolError: A field holds what the wire cannot carry; nothing was sent.
     """
     cls = type(message)
     values = values_of(message)
+    if pickler is not None and cls.HANDED:
+        values = _handed(message, values, pickler, limits)
     found = templates.outline(values)
     if found is None:
-        return encode([cls.kind, request_id, *values], pickler=pickler, limits=limits)
+        return _encoded(message, request_id, values, pickler, limits)
     outline, arrays = found
     form = _OUTGOING.get((cls, outline))
     if form is not None and form.limits is limits:
         return form.frames(request_id, arrays)
-    frames = encode([cls.kind, request_id, *values], pickler=pickler, limits=limits)
+    frames = _encoded(message, request_id, values, pickler, limits)
     _OUTGOING.met((cls, outline), lambda: templates.Outgoing(frames, arrays, limits))
     return frames
+
+
+def _handed(
+    message: Message, values: list[Any], pickler: Pickler, limits: WireLimits
+) -> list[object]:
+    """The fields as they are sent."""
+    sent = list(values)
+    for index, name in enumerate(message.FIELDS):
+        if name not in message.HANDED:
+            continue
+        try:
+            sent[index] = handed_over(values[index], pickler, limits)
+        except Exception as error:  # whatever the caller's own classes raise
+            text = unpicklable(name, values[index], error, pickler)
+            raise LocalProtocolError(f"{_asked(message)}{text}") from error
+    return sent
+
+
+def _encoded(
+    message: Message,
+    request_id: int,
+    values: list[Any],
+    pickler: Pickler | None,
+    limits: WireLimits,
+) -> list[Buffer]:
+    value, names = [message.kind, request_id, *values], ("kind", "id", *message.FIELDS)
+    try:
+        return encode(value, pickler=pickler, limits=limits, names=names)
+    except LocalProtocolError as error:
+        raise LocalProtocolError(f"{_asked(message)}{error}") from error.__cause__
+
+
+def _asked(message: Message) -> str:
+    """What the caller asked for, to stand before an error about it."""
+    name = getattr(message, "name", None) if message.ASKS else None
+    if not message.ASKS:
+        return ""
+    return f"{message.ASKS}: " if name is None else f"{message.ASKS}({name!r}): "
 
 
 def unpack(
     frames: Sequence[Buffer],
     *,
     limits: WireLimits = DEFAULT_LIMITS,
-    unpickler: Callable[[bytes], object] | None = None,
+    unpickler: Unpickler | None = None,
     tensors: Callable[[Any, str], object] | None = None,
 ) -> tuple[int, Message]:
     """The request id and the message of some frames.
@@ -100,7 +145,7 @@ def _decode(
     tail: Buffer,
     buffers: list[Buffer],
     limits: WireLimits,
-    unpickler: Callable[[bytes], object] | None,
+    unpickler: Unpickler | None,
     tensors: Callable[[Any, str], object] | None,
 ) -> tuple[int, Message]:
     value = decode_parts(document, tail, buffers, limits, unpickler, tensors)

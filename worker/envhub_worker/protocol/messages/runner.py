@@ -5,7 +5,7 @@ from __future__ import annotations
 from envhub_worker.protocol.messages.base import Message
 
 
-class Load(Message, kind=32):
+class Load(Message, kind=32, asks="make_env", handed=("cfg", "env_kwargs")):
     """Import the entry file and call its ``make_env``. Reply: ``Loaded`` or ``Raised``.
 
     ``cfg`` holds the ``vars()`` of the caller's config object, or None.
@@ -42,12 +42,12 @@ class Built(Message, kind=35):
     manifest: dict[str, object]
 
 
-class Reset(Message, kind=36):
+class Reset(Message, kind=36, asks="reset", handed=("options",)):
     """``seeds`` is None or one seed or None per sub-environment of the slice; so is ``mask``."""
 
     env: int
     seeds: object
-    options: dict[str, object] | None
+    options: object
     mask: object
 
 
@@ -58,7 +58,7 @@ class ResetDone(Message, kind=37):
     info: dict[object, object]
 
 
-class Step(Message, kind=38):
+class Step(Message, kind=38, asks="step"):
     """The slice's batch of actions."""
 
     env: int
@@ -75,7 +75,7 @@ class StepDone(Message, kind=39):
     info: dict[object, object]
 
 
-class Call(Message, kind=40):
+class Call(Message, kind=40, asks="call", handed=("args", "kwargs")):
     """``VectorEnv.call``: a method or attribute of every sub-environment. Reply: ``Value``."""
 
     env: int
@@ -84,7 +84,7 @@ class Call(Message, kind=40):
     kwargs: dict[str, object]
 
 
-class SetAttr(Message, kind=41):
+class SetAttr(Message, kind=41, asks="set_attr", handed=("values",)):
     """One value per sub-environment of the slice. Reply: ``Value``."""
 
     env: int
@@ -109,7 +109,7 @@ class Method(Message, kind=44):
     """The attribute is callable; ``CallOwn`` calls it."""
 
 
-class CallOwn(Message, kind=45):
+class CallOwn(Message, kind=45, asks="method", handed=("args", "kwargs")):
     """Call a method of the vector environment itself. Reply: ``Value``."""
 
     env: int
@@ -171,7 +171,7 @@ class FetchInfosApart(Message, kind=54):
     env: int
 
 
-class LoadTask(Message, kind=53):
+class LoadTask(Message, kind=53, asks="make_env", handed=("cfg", "env_kwargs")):
     """As ``Load``, where the client knows what comes back: nothing is described, nor built for it.
 
     Reply: ``Value`` of the task's ``(num_envs, shardable)``, None if there is none, or ``Raised``.

@@ -1,0 +1,195 @@
+"""What the caller hands in reaches the environment as it would in this process."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from envhub_sandbox import SandboxVectorEnv, make_env
+from envhub_sandbox.errors import EnvHubError, LocalProtocolError
+from tests.support import handed
+from tests.support.compare import assert_identical
+
+REPOSITORY = """
+import cloudpickle
+import gymnasium as gym
+import numpy as np
+
+
+class Told(gym.Env):
+    observation_space = gym.spaces.Box(-1, 1, (2,))
+    action_space = gym.spaces.Discrete(3)
+
+    def __init__(self, given):
+        self.given = given
+        self.note = None
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.options = options
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(2, np.float32), 0.0, False, False, {}
+
+    def again(self, *args, **kwargs):
+        # bytes come back as they are; only the tests make something of them
+        return cloudpickle.dumps((args, kwargs))
+
+    def kept(self, name):
+        return cloudpickle.dumps(getattr(self, name))
+
+
+class Own(gym.vector.SyncVectorEnv):
+    def again(self, *args, **kwargs):
+        return cloudpickle.dumps((args, kwargs))
+
+
+def make_env(n_envs=1, use_async_envs=False, own=False, autoreset_mode="NextStep", **given):
+    kind = Own if own else gym.vector.SyncVectorEnv
+    return kind([lambda: Told(given)] * n_envs, autoreset_mode=autoreset_mode)
+"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _by_value() -> Iterator[None]:
+    """The tests' own classes travel along, as those of a ``__main__`` do."""
+    cloudpickle.register_pickle_by_value(handed)
+    yield
+    cloudpickle.unregister_pickle_by_value(handed)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A repository whose environments keep what they are given."""
+    found = tmp_path_factory.mktemp("told")
+    (found / "env.py").write_text(REPOSITORY)
+    return found
+
+
+@pytest.fixture(scope="module", params=["auto", "frames"])
+def env(folder: Path, request: pytest.FixtureRequest) -> Iterator[SandboxVectorEnv]:
+    """Three sub-environments in two processes."""
+    made = made_of(folder, n_envs=3, num_workers=2, lane=request.param)
+    made.reset()
+    yield made
+    made.close()
+
+
+def made_of(folder: Path, **kwargs: Any) -> SandboxVectorEnv:
+    """The repository's only environment."""
+    env = make_env(folder, **kwargs).env
+    assert isinstance(env, SandboxVectorEnv)
+    return env
+
+
+LARGE = ("long list", "long text", "many bytes")
+UNSAID = ("memoryview", "memoryview of numbers", "partial")
+VALUES = {
+    name: value
+    for name, value in (handed.PLAIN | handed.PICKLED).items()
+    if name not in (*LARGE, *UNSAID)  # they go the same way, and do not come back so easily
+}
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_a_value_reaches_the_environment_as_it_is(env: SandboxVectorEnv, name: str) -> None:
+    """As an argument, by position and by name, in every sub-environment."""
+    value = VALUES[name]
+    for data in env.call("again", value, named=value):
+        args, kwargs = cloudpickle.loads(data)
+        assert_identical(value, args[0], name)
+        assert_identical(value, kwargs["named"], name)
+
+
+@pytest.mark.parametrize("name", ["namedtuple", "OrderedDict", "Fortran order", "StrEnum", "list"])
+def test_so_do_attributes_and_options(env: SandboxVectorEnv, name: str) -> None:
+    """``set_attr``, one for all and one each; ``reset``'s options, whatever they are."""
+    value = VALUES[name]
+    env.set_attr("note", [value, 1, None])
+    for expected, data in zip([value, 1, None], env.call("kept", "note"), strict=True):
+        assert_identical(expected, cloudpickle.loads(data), name)
+    options = handed.OwnDict(a=value, reset_mask=np.array([True, False, True]))
+    env.reset(options=options)
+    assert "reset_mask" in options
+    for data in env.call("kept", "options")[::2]:
+        assert_identical(handed.OwnDict(a=value), cloudpickle.loads(data), name)
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_so_do_arguments_of_make_env(folder: Path, own: bool) -> None:
+    """In each process that calls it; and a mode of Gymnasium's is one."""
+    given = {
+        name.replace(" ", "_"): VALUES[name] for name in ("NamedTuple", "Counter", "dataclass")
+    }
+    env = made_of(
+        folder,
+        n_envs=2,
+        num_workers=1 if own else 2,
+        env_kwargs={**given, "own": own, "autoreset_mode": gym.vector.AutoresetMode.DISABLED},
+    )
+    assert env.metadata["autoreset_mode"] is gym.vector.AutoresetMode.DISABLED
+    env.reset()
+    for data in env.call("kept", "given"):
+        assert_identical(given, cloudpickle.loads(data), "given")
+    if own:
+        args, _ = cloudpickle.loads(env.again(handed.Pose(1.0)))
+        assert_identical(handed.Pose(1.0), args[0])
+    env.close()
+
+
+def test_what_comes_back_is_inert(env: SandboxVectorEnv) -> None:
+    """A class that went there by value makes nothing here when it returns."""
+    env.set_attr("note", handed.Level.LOW)
+    for found in env.get_attr("note"):
+        assert type(found).__name__ == "RemoteEnum"
+
+
+def test_what_cannot_be_sent_says_which_it_is(env: SandboxVectorEnv, folder: Path) -> None:
+    """By its place in the caller's arguments, whatever the shards are; and nothing has happened."""
+    lock = threading.Lock()
+    with pytest.raises(LocalProtocolError, match=r"set_attr\('note'\): values\[2\] cannot be sent"):
+        env.set_attr("note", [1, 2, lock])
+    with pytest.raises(LocalProtocolError, match=r"call\('again'\): kwargs\['a'\]\['b'\] cannot"):
+        env.call("again", a={"b": lock})
+    with pytest.raises(LocalProtocolError, match=r"reset: options\['a'\] cannot be sent"):
+        env.reset(options={"a": lock})
+    assert len(env.call("again")) == 3
+    with pytest.raises(EnvHubError, match=r"env_kwargs\['camera'\]\['pose'\] cannot be sent"):
+        make_env(folder, env_kwargs={"camera": {"pose": lock}})
+
+
+def test_a_class_that_is_not_to_be_had_there_says_what_to_do(
+    env: SandboxVectorEnv, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A module of the caller's own is not in the sandbox; its classes can travel along."""
+    (tmp_path / "my_own_config.py").write_text("class Config:\n    size = 3\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    import my_own_config  # type: ignore[import-not-found]
+
+    with pytest.raises(EnvHubError, match="register_pickle_by_value\\(my_own_config\\)"):
+        env.call("again", my_own_config.Config())
+    cloudpickle.register_pickle_by_value(my_own_config)
+    try:
+        assert len(env.call("again", my_own_config.Config())) == 3
+    finally:
+        cloudpickle.unregister_pickle_by_value(my_own_config)
+        del sys.modules["my_own_config"]
+
+
+def test_a_known_manifest_serves_again(folder: Path) -> None:
+    """For arguments that only pickle carries, if no code of the caller's own is named in them."""
+    lasting = {"a": VALUES["OrderedDict"], "b": VALUES["AutoresetMode"], "c": VALUES["big-endian"]}
+    for given, known in ((lasting, True), ({"a": VALUES["NamedTuple"]}, False)):
+        make_env(folder, env_kwargs=given).close()
+        again = made_of(folder, env_kwargs=given)
+        assert bool(again.sandbox_report) is not known  # it runs, where it has to be asked
+        again.close()

@@ -1,0 +1,143 @@
+"""What the caller hands over arrives as it is, of exactly its type."""
+
+from __future__ import annotations
+
+import functools
+import threading
+import types
+from typing import Any
+
+import cloudpickle
+import numpy as np
+import pytest
+
+from envhub_sandbox.transport.pickles import framed
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.arrays import INLINE_BYTES
+from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
+from tests.support import handed
+from tests.support.compare import assert_identical
+
+
+def frames_of(value: object) -> list[Any]:
+    """A call with this for an argument."""
+    return [bytes(one) for one in m.pack(m.Call(1, "told", (value,), {}), 2, pickler=framed)]
+
+
+def through(value: object) -> Any:
+    """What the other side gets of it."""
+    _, call = m.unpack(frames_of(value), unpickler=cloudpickle.loads)
+    assert isinstance(call, m.Call)
+    return call.args[0]
+
+
+@pytest.mark.parametrize("name", handed.PLAIN | handed.PICKLED)
+def test_a_value_arrives_as_it_is(name: str) -> None:
+    """Of the same type and content, and the same order in memory."""
+    value = (handed.PLAIN | handed.PICKLED)[name]
+    assert_identical(value, through(value), name)
+
+
+@pytest.mark.parametrize("name", handed.CALLABLE)
+def test_what_is_called_arrives_as_it_is(name: str) -> None:
+    """And gives the same."""
+    function = handed.CALLABLE[name]
+    arrived = through(function)
+    assert arrived(3) == function(3)
+    assert type(arrived(3)).__name__ == type(function(3)).__name__
+
+
+def test_a_tensor_arrives_as_it_is() -> None:
+    """With its dtype."""
+    torch = pytest.importorskip("torch")
+    tensor = torch.arange(6, dtype=torch.bfloat16).reshape(2, 3)
+    arrived = through(tensor)
+    assert arrived.dtype is torch.bfloat16
+    assert torch.equal(arrived, tensor)
+
+
+def test_what_holds_itself_arrives_so() -> None:
+    """One piece is pickled, not each leaf: what is the same object stays the same."""
+    arrived = through(handed.CYCLIC)
+    assert arrived[1]["self"] is arrived
+    shared = bytearray(b"x")
+    one, other = through([shared, shared])
+    assert one is other
+
+
+@pytest.mark.parametrize("name", handed.PLAIN)
+def test_what_the_wire_carries_is_not_pickled(name: str) -> None:
+    """Crash bundles repeat it, and who has no unpickler reads it."""
+    assert isinstance(m.unpack(frames_of(handed.PLAIN[name]))[1], m.Call)
+
+
+@pytest.mark.parametrize("name", handed.PICKLED)
+def test_what_the_wire_would_change_is_pickled(name: str) -> None:
+    """Nobody who has no unpickler reads it."""
+    with pytest.raises(RemoteProtocolError, match="never loaded"):
+        m.unpack(frames_of(handed.PICKLED[name]))
+
+
+def test_every_field_of_the_callers_own_arrives_as_it_is() -> None:
+    """Whatever the message is called."""
+    value = handed.Pose(1.0, bytearray(b"x"))
+    for message in (
+        m.Load(1, False, {"a": value}, {"b": value}),
+        m.LoadTask(1, False, {"a": value}, {"b": value}, "s", 0),
+        m.Reset(1, [1], handed.OwnDict(a=value), None),
+        m.Call(1, "told", (value,), {"b": value}),
+        m.CallOwn(1, "told", (value,), {"b": value}),
+        m.SetAttr(1, "note", (value, value)),
+    ):
+        frames = m.pack(message, 2, pickler=framed)
+        assert_identical(message, m.unpack(frames, unpickler=cloudpickle.loads)[1], "message")
+
+
+def test_what_comes_back_is_never_pickled() -> None:
+    """An answer has no field that would be; a pickle in it is refused, framed or not."""
+    for size in (1, 2 * INLINE_BYTES):
+        frames = m.pack(m.Value(bytearray(size)), 1, pickler=framed)
+        assert isinstance(m.unpack(frames)[1], m.Value)
+        forged = m.pack(m.Value(functools.partial(print, bytes(size))), 1, pickler=framed)
+        with pytest.raises(RemoteProtocolError, match="never loaded"):
+            m.unpack(forged)
+    frames = frames_of(np.zeros(INLINE_BYTES, handed.STRUCTURED))
+    assert len(frames) > 1
+    with pytest.raises(RemoteProtocolError, match="never loaded"):
+        m.unpack(frames)
+
+
+def test_a_framed_pickle_is_an_array_of_bytes() -> None:
+    """Anything else in its place is refused before it is loaded."""
+    frames = frames_of(np.zeros(INLINE_BYTES, handed.STRUCTURED))
+    loaded: list[Any] = []
+    header = frames[0].replace(b"\x06\x05\x81", b"\x06\x01\x81")  # int8 for uint8
+    assert header != frames[0]
+    with pytest.raises(RemoteProtocolError, match="not an array of bytes"):
+        m.unpack([header, *frames[1:]], unpickler=loaded.append)
+    assert not loaded
+
+
+@pytest.mark.parametrize(
+    ("message", "words"),
+    [
+        (
+            m.Load(1, False, None, {"camera": {"pose": [1, threading.Lock()]}}),
+            r"make_env: env_kwargs\['camera'\]\['pose'\]\[1\] cannot be sent: a _thread.lock",
+        ),
+        (
+            m.Load(1, False, None, {"camera": types.SimpleNamespace(lock=threading.Lock())}),
+            r"make_env: env_kwargs\['camera'\]\.lock cannot be sent: a _thread.lock cannot",
+        ),
+        (m.Reset(1, None, {"level": (x for x in ())}, None), r"reset: options\['level'\] cannot"),
+        (m.Call(1, "f", (1,), {"a": (x for x in ())}), r"call\('f'\): kwargs\['a'\] cannot"),
+        (m.SetAttr(1, "f", (1, (x for x in ()))), r"set_attr\('f'\): values\[1\] cannot"),
+        (m.Step(1, {"a": np.zeros(2, "f4,f4")}), r"step: actions\['a'\] cannot be sent: dtype"),
+    ],
+)
+def test_what_cannot_be_sent_is_named(message: m.Message, words: str) -> None:
+    """Which call, which argument, which key in it, and what to do."""
+    with pytest.raises(LocalProtocolError, match=words) as caught:
+        m.pack(message, 1, pickler=framed)
+    if message.HANDED:
+        assert "Hand over plain data" in str(caught.value)
