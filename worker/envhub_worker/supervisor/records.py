@@ -6,10 +6,11 @@ import signal
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from time import monotonic
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.confinement import Reason
 from envhub_worker.spawn.jail_handle import Jail
 from envhub_worker.supervisor.idle_timer import Idleness
 from envhub_worker.supervisor.output_tail import OutputTail
@@ -61,7 +62,7 @@ class JailEntry:
     name: str
     session: bytes
     jail: Jail
-    spawner: tuple[object, ...]
+    zygote: tuple[object, ...]
     output: OutputTail
     links: dict[int, RunnerLink] = field(default_factory=dict)
     pids: dict[int, int] = field(default_factory=dict)
@@ -110,6 +111,11 @@ def owes(entry: JailEntry, runner: int) -> int:
 def for_operation(death: m.Died, operation: str) -> m.Died:
     """A death, told to who waited for this."""
     return m.replace(death, operation=operation)
+
+
+def whole_jail(reason: Reason, **how: Any) -> m.Died:
+    """A death that was not one runner's; ``how`` are further fields of ``Died``."""
+    return m.Died(-1, reason, **how)
 
 
 def signal_name(number: int | None) -> str | None:

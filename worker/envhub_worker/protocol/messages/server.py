@@ -90,15 +90,18 @@ class Relayed(Message, kind=8):
 
 
 class Died(Message, kind=9):
-    """A process of the jail ended. Trust: ``tail`` is the jail's own output, escaped."""
+    """A process of the jail ended. Trust: ``tail`` is the jail's own output, escaped.
+
+    ``runner`` is -1 where it was all of the jail.
+    """
 
     runner: int
     reason: Reason
-    exit_code: int | None
-    signal: str | None
-    detail: str
-    tail: str
-    operation: str
+    exit_code: int | None = None
+    signal: str | None = None
+    detail: str = ""
+    tail: str = ""
+    operation: str = ""
 
 
 class CloseJail(Message, kind=10):

@@ -1,0 +1,254 @@
+"""What happens to jails: they come up, answer, print, break rules and die.
+
+Nobody asks for any of it. Requests are in ``jails.py``; what both do to a jail is here, such as its
+end. Trust: a runner is hostile. What it says is not decoded, only its sizes and order are checked,
+and one that breaks the rules loses its jail.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+
+from envhub_worker.channel import close_fds
+from envhub_worker.loop import Loop
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.errors import ProtocolError
+from envhub_worker.spawn.jail_handle import (
+    Failed,
+    JailExited,
+    RunnerExited,
+    RunnerStarted,
+    ZygoteDied,
+)
+from envhub_worker.supervisor.fd_store import Deposits
+from envhub_worker.supervisor.records import (
+    Answers,
+    JailEntry,
+    Pending,
+    for_operation,
+    signal_name,
+    waiting,
+    whole_jail,
+)
+from envhub_worker.supervisor.runner_stream import RunnerLink
+
+MAX_DEAD = 256
+"""Jails that have ended and are not closed, whose deaths are remembered."""
+
+
+class JailEvents:
+    """Writes down what happens, and tells everybody who waits for it.
+
+    Args:
+        loop: Calls back when a descriptor is ready.
+        answers: Takes the replies.
+        jails: All jails of the server; what has ended long ago is taken out.
+        deposits: Descriptors that wait for runners.
+    """
+
+    def __init__(
+        self, loop: Loop, answers: Answers, jails: dict[int, JailEntry], deposits: Deposits
+    ) -> None:
+        self._loop = loop
+        self._answers = answers
+        self._jails = jails
+        self._deposits = deposits
+
+    def follow(self, entry: JailEntry) -> None:
+        """Hear of a new jail from now on."""
+        self._watch(entry, entry.control, lambda: self._jail_events(entry))
+        self._watch(entry, entry.output.fileno(), lambda: self._read_output(entry))
+
+    def follow_runner(self, entry: JailEntry, runner: int) -> None:
+        """Hear of a new runner from now on."""
+        self._watch(entry, entry.links[runner].fileno(), lambda: self._runner_ready(entry, runner))
+
+    def _watch(self, entry: JailEntry, fd: int, callback: Callable[[], None]) -> None:
+        """Whatever goes wrong with a jail is its own end, and not the server's."""
+
+        def guarded() -> None:
+            try:
+                callback()
+            except Exception as error:
+                traceback.print_exc()
+                what = f"an error of the worker server: {type(error).__name__}: {error}"
+                self.end(entry, whole_jail("killed", detail=what))
+
+        self._loop.watch(fd, guarded)
+
+    def follow_writes(self, link: RunnerLink) -> None:
+        """Send the rest when its socket takes it, if there is a rest."""
+        if link.wants_write != link.watched:
+            link.watched = link.wants_write
+            self._loop.watch_writes(link.fileno(), link.watched)
+
+    def _runner_ready(self, entry: JailEntry, runner: int) -> None:
+        link = entry.links[runner]
+        link.flush()
+        try:
+            answers = link.receive()
+        except ProtocolError as error:
+            self._runner_died(entry, m.Died(runner, "protocol", detail=str(error)))
+            return
+        if answers is None:
+            self._loop.unwatch(link.fileno())
+            return  # its exit says more
+        self.follow_writes(link)
+        if entry.idle is not None:
+            entry.idle.begin()
+        for packet, (pending, index) in answers:
+            pending.replies[index] = packet.frames
+            self.gather(pending)
+
+    def gather(self, pending: Pending) -> None:
+        """Answer a ``Relay``, once all that were asked have answered or died."""
+        replies = [frames for frames in pending.replies if frames is not None]
+        if len(replies) == len(pending.replies):
+            payload = [frame for frames in replies for frame in frames]
+            counts = tuple(map(len, replies))
+            dead = tuple(sorted(pending.dead))
+            answer = m.RelayedPartly(counts, dead) if dead else m.Relayed(counts)
+            self._answers.reply(pending.asker, answer, payload)
+
+    def _read_output(self, entry: JailEntry) -> None:
+        entry.output.read()
+        if entry.output.ended:
+            self._loop.unwatch(entry.output.fileno())
+            entry.output.close()
+
+    def _jail_events(self, entry: JailEntry) -> None:
+        events = entry.jail.poll()
+        if entry.jail.fileno() < 0:
+            self._unwatch_control(entry)
+        for event in events:
+            if isinstance(event, RunnerStarted):
+                self._runner_started(entry, event)
+            elif isinstance(event, Failed):
+                self._failed(entry, event)
+            elif isinstance(event, RunnerExited):
+                self._runner_exited(entry, event)
+
+    def _runner_started(self, entry: JailEntry, event: RunnerStarted) -> None:
+        entry.pids[event.runner_id] = event.pid
+        entry.report = tuple(event.report)
+        for opening in list(entry.opening):
+            opening.waiting.discard(event.runner_id)
+            if not opening.waiting:
+                entry.opening.remove(opening)
+                opened = m.JailOpened(entry.number, opening.runners, entry.report)
+                self._answers.reply(opening.asker, opened)
+
+    def _failed(self, entry: JailEntry, event: Failed) -> None:
+        for opening in entry.opening:
+            self._answers.refuse(
+                opening.asker, "SandboxUnavailableError", event.reason, event.layer, event.fix
+            )
+        entry.opening.clear()
+        self.end(entry, whole_jail("unavailable", detail=event.reason))
+
+    def _runner_exited(self, entry: JailEntry, event: RunnerExited) -> None:
+        death = m.Died(
+            event.runner_id,
+            event.reason,
+            exit_code=event.code,
+            signal=signal_name(event.signal),
+            detail=event.detail,
+        )
+        self._runner_died(entry, death)
+
+    def _runner_died(self, entry: JailEntry, death: m.Died) -> None:
+        """The end of its jail too, unless that is kept."""
+        if not entry.kept:
+            self.end(entry, death)
+        elif entry.death is None and death.runner in entry.links:
+            self._lose(entry, death)
+
+    def _lose(self, entry: JailEntry, death: m.Died) -> None:
+        """Go on without a runner: whoever waits for it hears how it died, and nobody else."""
+        entry.output.read()
+        death = m.replace(death, tail=entry.output.text())
+        # the last lines of earlier deaths have been told: many of them would be much
+        entry.lost = {runner: m.replace(one, tail="") for runner, one in entry.lost.items()}
+        entry.lost[death.runner] = death
+        entry.jail.kill_runner(death.runner)  # it may live, and have broken the rules
+        entry.pids.pop(death.runner, None)
+        close_fds(self._deposits.take(entry.number, death.runner))
+        if entry.idle is not None:
+            entry.idle.forget(death.runner)
+        link = entry.links.pop(death.runner)
+        self._loop.unwatch(link.fileno())
+        for pending, index in link.pending.values():
+            pending.lost(index, death)
+            self.gather(pending)
+        link.close()
+        for opening in [one for one in entry.opening if death.runner in one.waiting]:
+            entry.opening.remove(opening)
+            self._answers.reply(opening.asker, for_operation(death, "start"))
+
+    def end(self, entry: JailEntry, death: m.Died) -> None:
+        """Write the jail's death down, tell everybody who waits, and make it true."""
+        if entry.death is not None:
+            return
+        entry.output.read()
+        entry.death = death = m.replace(death, tail=entry.output.text())
+        for pending in waiting(entry):
+            self._answers.reply(pending.asker, for_operation(death, pending.operation))
+        for opening in entry.opening:
+            self._answers.reply(opening.asker, for_operation(death, "start"))
+        entry.opening.clear()
+        self.kill(entry)
+
+    def kill(self, entry: JailEntry) -> None:
+        """End its processes; ``jail_gone`` is when they are gone."""
+        self._deposits.drop(entry.number)
+        self._unwatch_control(entry)
+        entry.jail.kill()
+
+    def _unwatch_control(self, entry: JailEntry) -> None:
+        """Once: after that the number may be another's."""
+        self._loop.unwatch(entry.control)
+        entry.control = -1
+
+    def jail_gone(self, event: JailExited) -> None:
+        """Nothing of a jail is left: whoever waits for that hears it."""
+        entry = next((one for one in self._jails.values() if one.jail is event.jail), None)
+        if entry is None:
+            return
+        if entry.closing:
+            del self._jails[entry.number]
+        else:
+            self._jail_events(entry)  # its runners' exits say more than its own
+            how = signal_name(event.signal)
+            self.end(entry, whole_jail("exit", exit_code=event.code, signal=how))
+        self._release(entry)
+        for asker in entry.closing:
+            self._answers.reply(asker, m.Done())
+
+    def _release(self, entry: JailEntry) -> None:
+        entry.released = True
+        for link in entry.links.values():
+            self._loop.unwatch(link.fileno())
+            link.close()
+        self._loop.unwatch(entry.output.fileno())
+        entry.output.close()
+        self._unwatch_control(entry)
+        if entry.idle is not None:
+            entry.idle.close()
+        for pending in waiting(entry):
+            death = whole_jail("killed", detail="the jail was closed")
+            self._answers.reply(pending.asker, for_operation(death, pending.operation))
+        self._forget_some()
+
+    def _forget_some(self) -> None:
+        """The oldest dead, where there are many: their clients do not come back for them."""
+        dead = [number for number, one in self._jails.items() if one.released]
+        for number in dead[:-MAX_DEAD]:
+            del self._jails[number]
+
+    def zygote_died(self, key: tuple[object, ...], event: ZygoteDied) -> None:
+        """A zygote has gone, and every jail with it."""
+        for entry in list(self._jails.values()):
+            if entry.zygote == key and not entry.released:
+                self.end(entry, whole_jail("zygote", exit_code=event.code, detail=event.log))
+                self._release(entry)
