@@ -15,7 +15,7 @@ from envhub_sandbox.hub.snapshot import named
 from envhub_sandbox.policy import Limits, Policy, Timeouts, limits_from, policy_from, timeouts_from
 from envhub_sandbox.sandboxes import inprocess
 from envhub_sandbox.sandboxes.base import Sandbox
-from envhub_sandbox.session.env_session import RemoteEnv
+from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.jail_sources import JailSource, OwnJails, SharedJail
 from envhub_sandbox.session.launcher import Known, LoadArguments, LoadedJail, Repository
 from envhub_sandbox.session.manifest_cache import ManifestCache, manifest_key
@@ -228,7 +228,7 @@ class _Maker:
         if loaded is not None and shared is None:
             self._use(loaded, remotes)
         envs: dict[str, dict[Any, Any]] = {}
-        suites: dict[str, list[RemoteEnv]] = {}
+        suites: dict[str, list[EnvSession]] = {}
         for remote in remotes:
             env = remote.manifest
             envs.setdefault(env.suite, {})[env.task] = self._face(remote)
@@ -248,15 +248,17 @@ class _Maker:
             shared.provide(loaded)
         return shared
 
-    def _remote(self, manifest: Manifest, env: EnvManifest, shared: SharedJail | None) -> RemoteEnv:
+    def _remote(
+        self, manifest: Manifest, env: EnvManifest, shared: SharedJail | None
+    ) -> EnvSession:
         paces = self._cache.paces
         bounds = bounds_for(env, self._num_workers, paces.of(env))
         known = Known(manifest, env, len(bounds))
         own = OwnJails(self._repository, self._cache.forget, known)
         source: JailSource = own if shared is None else shared
-        return RemoteEnv(source, env, bounds, paces)
+        return EnvSession(source, env, bounds, paces)
 
-    def _use(self, loaded: LoadedJail, remotes: list[RemoteEnv]) -> None:
+    def _use(self, loaded: LoadedJail, remotes: list[EnvSession]) -> None:
         """The jail that told the manifest becomes the only task's; a suite holds none in stock."""
         if len(remotes) == 1:
             with self._repository.named():

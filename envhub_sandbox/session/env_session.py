@@ -1,18 +1,21 @@
-"""One task's environment: what is asked of it, on which way, and what comes back.
+"""One task's environment: what is asked of it, in which state it is, and what comes back.
 
-``vector_env`` asks it for replies and knows nothing of jails; ``Lifecycle`` says what is legal.
-Sub-environments are spread over shards; every request goes to all of them in one message. Its
-life in jails is in ``lease``, what becomes of it when one dies in ``recovery``.
+``vector_env`` asks it for replies and knows nothing of jails; ``Lifecycle`` says what is legal. It
+*has* a ``Lease``, whose lane takes each request to the shards, and a ``Recovery``, which stands in
+for those that die. None of these knows it.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable, Iterator
+import threading
+import weakref
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
+from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import (
     EnvHubError,
     LocalProtocolError,
@@ -21,28 +24,96 @@ from envhub_sandbox.errors import (
     WorkerError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.session import survivors
-from envhub_sandbox.session.recovery import MessageFor, Mortal
-from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.log import WORKER
+from envhub_sandbox.session.counters import LEDGER, Counters, Labels
+from envhub_sandbox.session.failures import Failures, refusal
+from envhub_sandbox.session.jail_sources import JailSource
+from envhub_sandbox.session.launcher import LoadedJail, Repository
+from envhub_sandbox.session.lease import Lease, closed_during
+from envhub_sandbox.session.recovery import Fail, Recovery, Revive
+from envhub_sandbox.session.restart_policy import Restarts
+from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.jail import RunnersDiedError, check, typed
 from envhub_sandbox.transport.lane import Lane
-from envhub_sandbox.transport.results import StepResult
+from envhub_sandbox.transport.results import Results, StepResult
+from envhub_sandbox.transport.shared_memory.sharding import PaceBook
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.lifecycle import Event, State
+from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
+from envhub_worker.protocol.manifest import EnvManifest
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.untrusted import blamed, is_fault
 
 _GRACE_S = 2.0
 """How long ``reset`` waits for a late reply before it gives the jail up and starts another."""
+_LOOK_S = 10.0
+_INTERRUPT_S = 10.0
+"""How long ``close`` waits at most for another thread to notice that the jail has gone: no longer
+than it waits for the environment's own ``close``."""
 
+MessageFor = Callable[[int, tuple[int, int]], m.Message]
+"""Makes the message for a shard out of the environment's number and the shard's bounds."""
 T = TypeVar("T")
 
 
-class RemoteEnv(Mortal):
-    """One vector environment in a jail. It is made of what a ``Tenant`` is made of.
+class EnvSession:
+    """The life of one vector environment, in one jail at a time, or none.
 
-    Safe to use from one thread at a time; ``close`` may come from any thread at any time.
+    Safe to use from one thread at a time; ``close`` may come from any thread at any time, and from
+    a signal handler.
+
+    Args:
+        jails: Gives and takes back the jail.
+        manifest: What the environment is expected to be.
+        bounds: The slices of its sub-environments, one for each shard.
+        paces: Takes note of what its steps took.
     """
+
+    def __init__(
+        self,
+        jails: JailSource,
+        manifest: EnvManifest,
+        bounds: Sequence[tuple[int, int]],
+        paces: PaceBook,
+    ) -> None:
+        policy = jails.repository.policy
+        self.manifest = manifest
+        self.bounds = list(bounds)
+        self.lifecycle = Lifecycle()
+        self.counters = Counters()
+        self.history = History(manifest, policy.crash_history)
+        self.results = Results(manifest, self.bounds)
+        self.lease = Lease(jails, self.results, self.lifecycle, self.counters, paces)
+        self._restarts = Restarts(policy)
+        self._failures = Failures(self.lease, self.results, self.counters, self.history)
+        self._recovery: Recovery = Fail()
+        if policy.restart == "transparent":
+            self._recovery = Revive(self.lease, self.results, self._restarts, self._failures)
+        self._lock = threading.RLock()  # a signal handler may close what its own thread waits for
+        self._warm = False  # started ahead, and not used yet
+        self._warming: StartupDeadline | None = None
+        self._first_use: Callable[[], None] | None = None
+        labels = Labels(self.repository.label, manifest.suite, str(manifest.task))
+        LEDGER.add(self, labels, self._restarts)
+        _living.add(self)
+
+    @property
+    def repository(self) -> Repository:
+        """The repository that it comes from."""
+        return self.lease.repository
+
+    @property
+    def closed(self) -> bool:
+        """Whether it is closed for good."""
+        return self.lifecycle.closed
+
+    def report(self) -> list[dict[str, Any]]:
+        """The layers of the jail that it lives in; none where it does not live in any."""
+        return self.lease.report()
+
+    def stats(self) -> dict[str, Any]:
+        """Counters, and where it is in its life."""
+        found = self.counters.snapshot()
+        return {**found, "restarts": self._restarts.count, "state": self.lifecycle.state.name}
 
     # --- requests ------------------------------------------------------------------------------
 
@@ -54,19 +125,16 @@ class RemoteEnv(Mortal):
             WorkerError: The environment is not in a state to take it.
         """
         with self._turn(operation):
-            self._refuse_unless_usable(operation)
-            if self.lifecycle.state is State.IDLE:
-                self._start()
-            lane = self._lane
-            assert lane is not None
+            self._make_ready(operation)
+            lane = self._lane()
             messages = [message_for(lane.number, bounds) for bounds in self.bounds]
             try:
                 packed = lane.pack(messages)
             except LocalProtocolError:
                 self._refuse_whole(lane, message_for)
                 raise
-            self._send(operation, partial(lane.send, operation, packed))
-            self._remember(message_for, messages[0], packed)
+            self._send(operation, lambda: lane.send(operation, packed))
+            self._recovery.sent(messages, packed)
             self.history.requested(message_for)
             self._note_first_use()
 
@@ -90,7 +158,7 @@ class RemoteEnv(Mortal):
                 replies = self._survive_request(deaths)
             for reply in replies:
                 check(reply)
-            self._has_set()
+            self._recovery.answered()
             return replies
 
     def request(
@@ -110,38 +178,31 @@ class RemoteEnv(Mortal):
         with self._turn("a request"), self._judging():
             yield
 
-    @contextmanager
-    def _judging(self) -> Iterator[None]:
-        """``handling`` for who has the turn."""
-        try:
-            yield
-        except Exception as error:
-            # in any other state somebody has dealt with it already, or interrupted a wait
-            if self.lifecycle.state is not State.READY:
-                raise
-            if is_fault(error):
-                broken = blamed(error)
-                self._distrust(broken)
-                raise broken from error
-            if isinstance(error, RemoteProtocolError):
-                self._distrust(error)
-            raise
+    def finish_reset(
+        self, replies: list[m.ResetDone], timeout_s: float | None
+    ) -> tuple[Any, dict[Any, Any]]:
+        """What ``VectorEnv.reset`` returns, of the replies to one; raises as ``collect`` does."""
+        with self.handling():
+            try:
+                return self.results.reset(replies)
+            except batches.Misfit:
+                return self.results.reset(replies, self._infos_apart(Deadline(timeout_s)))
 
     # --- steps ---------------------------------------------------------------------------------
 
     def submit_step(self, actions: Any) -> None:
         """Send a validated batch of actions."""
         with self._lock:
-            if self.lifecycle.state is not State.READY:
+            lifecycle = self.lifecycle
+            if lifecycle.state is not State.READY:
                 with self._turn("step"):
-                    self._refuse_unless_usable("step")
-                    self._start()
+                    self._make_ready("step")
             try:
-                lane = self._lane
+                lane = self.lease.lane
                 assert lane is not None
-                self.lifecycle.request = "step"
+                lifecycle.request = "step"
                 # first: an interrupt from here on leaves a reply that may come
-                self.lifecycle.on(Event.SUBMIT)
+                lifecycle.on(Event.SUBMIT)
                 lane.send_step(actions)
             except BaseException as error:
                 with self._turn("step"):
@@ -169,30 +230,208 @@ class RemoteEnv(Mortal):
                 with self._turn("step"), self._judging():
                     raise
 
-    def finish_reset(
-        self, replies: list[m.ResetDone], timeout_s: float | None
-    ) -> tuple[Any, dict[Any, Any]]:
-        """What ``VectorEnv.reset`` returns, of the replies to one; raises as ``collect`` does."""
-        with self.handling():
-            try:
-                return self.results.reset(replies)
-            except batches.Misfit:
-                return self.results.reset(replies, self._infos_apart(Deadline(timeout_s)))
+    # --- out and back --------------------------------------------------------------------------
+
+    def _make_ready(self, operation: str) -> None:
+        refused = refusal(self.lifecycle.state, operation, self.repository.policy.restart)
+        if refused is not None:
+            raise refused
+        if self.lifecycle.state is State.IDLE:
+            self._start(StartupDeadline(self.repository.timeouts.startup_s))
+
+    def _send(self, operation: str, send: Callable[[], None]) -> None:
+        self.lifecycle.request = operation
+        self.lifecycle.on(Event.SUBMIT)  # first, as for a step
+        try:
+            send()
+        except EnvHubError as error:
+            self._nothing_was_sent(error)
+            raise
+        self.counters.requests += 1
+
+    def _nothing_was_sent(self, error: BaseException) -> None:
+        """Go back to where we were, if the lane says so: by an error of this project."""
+        if isinstance(error, EnvHubError) and self.lifecycle.state is State.PENDING:
+            self._answered()
+
+    def _answered(self) -> None:
+        """Nothing is owed any more."""
+        self.lifecycle.request = None
+        self.lifecycle.moved(Event.REPLY)
+
+    def _lane(self) -> Lane:
+        lane = self.lease.lane
+        assert lane is not None
+        return lane
+
+    def _asked_lane(self) -> Lane:
+        lane = self.lease.lane
+        if lane is None or self.lifecycle.state is not State.PENDING:
+            state = self.lifecycle.state.value
+            raise WorkerError(f"there is no request to wait for: the environment is {state}")
+        return lane
+
+    def _finish(self, receive: Callable[[Deadline], T], deadline: Deadline) -> T:
+        """Wait for the pending reply, and move on to the state that it leads to."""
+        lifecycle = self.lifecycle
+        try:
+            received = receive(deadline)
+        except RunnersDiedError:
+            raise
+        except EnvHubError as error:
+            self._failed(error, deadline)
+        except BaseException as error:  # Ctrl-C, or whatever else a signal handler raises or does
+            self._interrupted(error)
+            raise
+        lifecycle.request = None
+        lifecycle.moved(Event.REPLY)
+        return received
+
+    def _failed(self, error: EnvHubError, deadline: Deadline) -> NoReturn:
+        """Tell of a wait that ended in an error, and move on to the state that it leads to."""
+        failures, operation = self._failures, self.lifecycle.request or "a request"
+        if isinstance(error, WorkerTimeoutError):
+            self.counters.timeouts += 1
+            self.lifecycle.moved(Event.TIMEOUT)
+            raise failures.late(operation, deadline) from error
+        if isinstance(error, WorkerDiedError) and error.reason == "idle":
+            raise failures.expired(operation, error.detail) from None
+        if isinstance(error, WorkerError) and not self.closed:
+            deaths = self._recovery.survivable(error)
+            if deaths is not None:
+                raise deaths from error.__cause__
+        raise failures.dead(error) from error.__cause__
+
+    def _interrupted(self, error: BaseException) -> None:
+        """Nobody waits any more, but something may come.
+
+        Raises:
+            WorkerDiedError: It was a ``close`` in the midst, which took away what was waited on.
+        """
+        if self.closed and isinstance(error, Exception):
+            raise self._failures.dead(WorkerDiedError("")) from error
+        self.lifecycle.moved(Event.INTERRUPT)
 
     def _infos_apart(self, deadline: Deadline) -> dict[Any, Any]:
         """The last infos, of shards that do not agree about them."""
-        lane = self._lane
-        assert lane is not None
+        lane = self._lane()
         self._send("step", lane.send_for_infos)
         try:
             replies = self._finish(lane.replies, deadline)
         except RunnersDiedError as deaths:
-            self.lifecycle.request = None  # the next request meets the deaths
-            self._moved(Event.REPLY)
+            self._answered()  # the next request meets the deaths
             raise deaths.first from None
         for reply in replies:
             check(reply)
         return self.results.apart([typed(reply, m.Value) for reply in replies])
+
+    @contextmanager
+    def _judging(self) -> Iterator[None]:
+        """``handling`` for who has the turn."""
+        try:
+            yield
+        except Exception as error:
+            # in any other state somebody has dealt with it already, or interrupted a wait
+            if self.lifecycle.state is not State.READY:
+                raise
+            if is_fault(error):
+                broken = blamed(error)
+                self._failures.dead(broken)
+                raise broken from error
+            if isinstance(error, RemoteProtocolError):
+                self._failures.dead(error)
+            raise
+
+    @contextmanager
+    def _turn(self, operation: str) -> Iterator[None]:
+        """Hold the lock. A ``close`` that has come when it is left, did not wait for it."""
+        with self._lock, self.repository.named():
+            try:
+                yield
+            except BaseException as error:
+                self._after_close(operation, error)
+                raise
+            if self.closed:
+                self.lease.let_go()
+
+    def _after_close(self, operation: str, error: BaseException) -> None:
+        """What failed because of a ``close`` in its midst says so, and gives back what is left.
+
+        Raises:
+            WorkerDiedError: It was closed, and the error does not say so.
+        """
+        if not self.closed:
+            return
+        self.lease.let_go()
+        if isinstance(error, Exception) and not isinstance(error, WorkerDiedError):
+            raise closed_during(operation) from error
+
+    # --- survived ------------------------------------------------------------------------------
+
+    def _survive_request(self, deaths: RunnersDiedError) -> list[m.Message]:
+        """A reset is done in fresh runners; anything else is not repeated.
+
+        Raises:
+            WorkerDiedError: It was something else; the next step or reset brings them back.
+        """
+        replies = self._of_survivors(deaths)
+        if self.lifecycle.request != "reset":
+            self._answered()
+            raise deaths.first
+        fresh = self._revive(deaths, self._recovery.resets)
+        merged = [fresh.get(index, reply) for index, reply in enumerate(replies)]
+        return [reply for reply in merged if reply is not None]
+
+    def _survive_step(self, deaths: RunnersDiedError) -> StepResult:
+        """The step's results, with fresh observations in the rows of the dead."""
+        replies = self._of_survivors(deaths)
+        fresh = self._revive(deaths, self._recovery.steps)
+        merged = [fresh.get(index, reply) for index, reply in enumerate(replies)]
+        return self.results.step([typed(one, m.StepDone) for one in merged if one is not None])
+
+    def _of_survivors(self, deaths: RunnersDiedError) -> list[m.Message | None]:
+        """What the others answered; None where nobody did.
+
+        Raises:
+            RemoteEnvError: One of them raised. The next request meets the deaths.
+        """
+        try:
+            for reply in deaths.replies:
+                if reply is not None:
+                    check(reply)
+        except EnvHubError:
+            self._answered()
+            raise
+        return deaths.replies
+
+    def _revive(
+        self, deaths: RunnersDiedError, bring_back: Callable[[RunnersDiedError], dict[int, m.M]]
+    ) -> dict[int, m.M]:
+        """Have the dead shards brought back, and move on to the state that it leads to."""
+        self.lifecycle.moved(Event.LOSS)
+        self._failures.keep_crash(deaths.first)
+        try:
+            fresh = bring_back(deaths)
+        except WorkerTimeoutError as error:
+            if self.closed:
+                raise self._failures.dead(error) from error
+            self.lifecycle.request = None  # nobody knows how far it came: a reset starts afresh
+            self.lifecycle.moved(Event.TIMEOUT)
+            raise
+        except EnvHubError as error:
+            cause = error.__cause__ or deaths.first
+            raise self._failures.dead(error) from (None if cause is error else cause)
+        except BaseException as error:
+            self._interrupted(error)
+            self.lifecycle.request = None
+            raise
+        self.lifecycle.request = None
+        self.counters.deaths += len(fresh)
+        self.history.revived()
+        self.lifecycle.moved(Event.REVIVAL)
+        return fresh
+
+    # --- brought back --------------------------------------------------------------------------
 
     def recover(self) -> None:
         """Before a reset: catch up with a late reply, or give up the jail that owes it.
@@ -211,13 +450,12 @@ class RemoteEnv(Mortal):
                 self._forget()
             if self.lifecycle.state is State.LATE:
                 self._catch_up()
-            may_restart = self.repository.policy.restart != "never"
-            if self.lifecycle.state is State.DEAD and may_restart:
+            if self.lifecycle.state is State.DEAD and self._restarts.permitted:
                 self._restarts.spend("reset")
                 self._forget()
 
     def _catch_up(self) -> None:
-        lane, request = self._lane, self.lifecycle.request
+        lane, request = self.lease.lane, self.lifecycle.request
         try:
             if lane is None or request is None:
                 raise WorkerError("an earlier attempt gave the jail up, or nobody knows how far")
@@ -226,7 +464,7 @@ class RemoteEnv(Mortal):
             pass  # the reset that follows meets them
         except (WorkerDiedError, WorkerTimeoutError) as error:
             error.request = request
-            self._keep_crash(error)
+            self._failures.keep_crash(error)
             self._forget()
             return
         except EnvHubError:
@@ -235,82 +473,159 @@ class RemoteEnv(Mortal):
         self.lifecycle.request = None
         self.lifecycle.on(Event.REPLY)
 
-    def _refuse_unless_usable(self, operation: str) -> None:
-        state = self.lifecycle.state
-        if state in (State.LATE, State.PENDING):
-            raise WorkerTimeoutError(
-                f"cannot {operation}: the reply to the last request is late; call reset() first",
-                request=operation,
-            )
-        if state is State.DEAD:
-            advice = "call reset() first"
-            if self.repository.policy.restart == "never":
-                advice = (
-                    "make the environment again, or use policy={'restart': 'on_reset'} and call "
-                    "reset()"
-                )
-            raise WorkerDiedError(
-                f"cannot {operation}: the worker process has died; {advice}", request=operation
-            )
-        if state is State.EXPIRED:
-            raise self._expired(operation, "it was idle for too long")
-        if state is State.FOREIGN:
-            raise WorkerError(
-                f"cannot {operation}: this environment belongs to another process, and this is a "
-                f"fork of it ({os.getpid()}); call make_env here to get one of its own"
-            )
-        if state is State.CLOSED:
-            raise self._closed(operation)
-        if state not in (State.IDLE, State.READY):
-            raise WorkerError(f"cannot {operation}: the environment is {state.value}")
-
-    def _send(self, operation: str, send: Callable[[], None]) -> None:
-        self.lifecycle.request = operation
-        self.lifecycle.on(Event.SUBMIT)  # first, as for a step
+    def _see_whether_it_expired(self) -> None:
         try:
-            send()
-        except EnvHubError as error:
-            self._nothing_was_sent(error)
-            raise
-        self.counters.requests += 1
+            self.lease.look("reset", Deadline(_LOOK_S))
+        except WorkerDiedError as error:
+            if error.reason == "idle":
+                self.lifecycle.moved(Event.EXPIRY)
+        # of any other death the reset that follows hears as of its own
 
-    def _nothing_was_sent(self, error: BaseException) -> None:
-        """Go back to where we were, if the lane says so: by an error of this project."""
-        if isinstance(error, EnvHubError) and self.lifecycle.state is State.PENDING:
-            self.lifecycle.request = None
-            self.lifecycle.on(Event.REPLY)
-
-    def _asked_lane(self) -> Lane:
-        lane = self._lane
-        if lane is None or self.lifecycle.state is not State.PENDING:
-            state = self.lifecycle.state.value
-            raise WorkerError(f"there is no request to wait for: the environment is {state}")
-        return lane
-
-    def _finish(self, receive: Callable[[Deadline], T], deadline: Deadline) -> T:
-        """Wait for the pending reply, and move on to the state that it leads to."""
-        request = self.lifecycle.request
-        assert request is not None
-        try:
-            received = receive(deadline)
-        except WorkerTimeoutError as error:
-            self.counters.timeouts += 1
-            self._moved(Event.TIMEOUT)
-            raise self._late(request, deadline) from error
-        except RunnersDiedError:
-            raise
-        except EnvHubError as error:
-            if isinstance(error, WorkerDiedError) and error.reason == "idle":
-                raise self._expired(request, error.detail) from None
-            open_still = self.lifecycle.state is not State.CLOSED
-            if self._revives and open_still and isinstance(error, WorkerError):
-                raise survivors.all_died(error, len(self.bounds)) from error.__cause__
-            raise self._dead(error) from error.__cause__
-        except BaseException as error:  # Ctrl-C, or whatever else a signal handler raises or does
-            if self.lifecycle.state is State.CLOSED and isinstance(error, Exception):
-                raise self._dead(WorkerDiedError("")) from error
-            self._moved(Event.INTERRUPT)
-            raise
+    def _forget(self) -> None:
+        """Give up the jail; the next request opens another, in the same server."""
+        WORKER.info("%s: the jail is given up for a fresh one", self.repository.label)
+        self.lease.leave()
         self.lifecycle.request = None
-        self._moved(Event.REPLY)
-        return received
+        self.lifecycle.moved(Event.FORGET)
+
+    # --- started -------------------------------------------------------------------------------
+
+    def adopt(self, loaded: LoadedJail) -> None:
+        """Use a jail that is already loaded, instead of opening one later."""
+        with self._turn("make_env"):
+            self.lease.adopt(loaded, Deadline(self.repository.timeouts.startup_s))
+            self._started()
+
+    def prewarm(self) -> None:
+        """Start its processes in a thread of their own, unless they are there."""
+        if self.lifecycle.state is State.IDLE:
+            threading.Thread(target=self.warm_up, name="envhub-prewarm", daemon=True).start()
+
+    def warm_up(self) -> None:
+        """Start its processes, unless they are there, although nobody has asked for them yet."""
+        deadline = StartupDeadline(self.repository.timeouts.startup_s, unasked=True)
+        # whatever goes wrong: the first request meets it again, and somebody hears of it there
+        with contextlib.suppress(Exception), self._turn("make_env"):
+            if self.lifecycle.state is State.IDLE:
+                self._warming = deadline
+                try:
+                    self._start(deadline)
+                    self._warm = True
+                finally:
+                    self._warming = None
+
+    def cool_down(self) -> bool:
+        """Give up what was started ahead, if nobody has used it yet; whether it was so."""
+        warming = self._warming
+        if warming is not None:
+            warming.give_up()
+        if not self._lock.acquire(timeout=0 if warming is None else _INTERRUPT_S):
+            return False  # somebody uses it
+        try:
+            unused = self._warm and not self.counters.requests
+            if not unused or self.lifecycle.state is not State.READY:
+                return warming is not None
+            with self._turn("make_env"):
+                self._warm = False
+                self.lease.close_politely()
+                self.lease.give_back()
+                self.lifecycle.moved(Event.FORGET)
+            return True
+        finally:
+            self._lock.release()
+
+    def on_first_use(self, used: Callable[[], None], make_room: Callable[[], bool]) -> None:
+        """Whom to tell that it is used, and whom to ask where a server has no place left."""
+        self._first_use, self.lease.make_room = used, make_room
+
+    def _note_first_use(self) -> None:
+        if self._first_use is not None:
+            tell, self._first_use = self._first_use, None
+            tell()
+
+    def _look_whether_warm_lives(self) -> None:
+        """What was started ahead and has died unused is started again, as if it never had been."""
+        self._warm = False
+        if self.lifecycle.state is not State.READY:
+            return
+        try:
+            self.lease.look("make_env", Deadline(_LOOK_S))
+        except EnvHubError:
+            self._forget()
+
+    def _start(self, deadline: StartupDeadline) -> None:
+        try:
+            self.lease.acquire(deadline)
+        except EnvHubError:
+            if self.closed:
+                raise closed_during("make_env") from None
+            raise
+        self._started()
+
+    def _started(self) -> None:
+        self.history.started()
+        self._recovery.started()
+        self.lifecycle.on(Event.START)
+
+    # --- the end -------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Close the environment and end its processes, in bounded time, from any thread."""
+        if self.closed:
+            return
+        if self.lifecycle.state is State.FOREIGN:
+            self.lifecycle.on(Event.CLOSE)
+            return
+        if not self._lock.acquire(blocking=False):
+            self._interrupt()
+            return
+        try:
+            state = self.lifecycle.state
+            self._end_life()
+            self.lease.note_pace()
+            if state is State.READY:
+                self.lease.close_politely()
+        finally:
+            try:
+                self.lease.let_go()
+            finally:
+                self._lock.release()
+
+    def _end_life(self) -> None:
+        self.lifecycle.moved(Event.CLOSE)
+        self._restarts.give_up()
+
+    def _interrupt(self) -> None:
+        """Another thread waits for a reply: end the jail under it, then clean up after it.
+
+        If it does not let go in time it cleans up itself, once it sees that this was closed: no
+        process is left for it to end.
+        """
+        if not self.lease.interrupt(self._end_life):
+            return  # whoever brings a jail sees that it is closed
+        close_s = self.repository.timeouts.close_s
+        patience_s = _INTERRUPT_S if close_s is None else min(close_s, _INTERRUPT_S)
+        if self._lock.acquire(timeout=patience_s):
+            try:
+                self.lifecycle.moved(Event.CLOSE)  # the other may have moved at the same moment
+                self.lease.let_go()  # of what is there now: it may have moved elsewhere, too
+            finally:
+                self._lock.release()
+
+    def abandon(self) -> None:
+        """In a fork of the process that made it: touch nothing, and refuse from now on."""
+        self._lock = threading.RLock()  # whichever thread held it is not here
+        self.lifecycle.moved(Event.FORK)
+        self.lifecycle.request = None
+        self.lease.abandon()
+
+
+_living: weakref.WeakSet[EnvSession] = weakref.WeakSet()
+
+
+def _abandon_all() -> None:
+    for env in list(_living):
+        env.abandon()
+
+
+os.register_at_fork(after_in_child=_abandon_all)

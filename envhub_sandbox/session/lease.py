@@ -1,6 +1,6 @@
-"""An environment as the tenant of a jail: how it moves in, moves on, and closes for good.
+"""An environment's hold on a jail: taken, built in, given up for another, and given back.
 
-Nothing here knows what is asked of it, nor why a jail has to be left.
+Nothing here knows what is asked of the environment, nor why a jail has to be left.
 """
 
 from __future__ import annotations
@@ -9,372 +9,247 @@ import contextlib
 import os
 import threading
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from typing import Any
 
-from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError
-from envhub_sandbox.log import WORKER
-from envhub_sandbox.session.counters import LEDGER, Counters, Labels
-from envhub_sandbox.session.jail_sources import JailSource
+from envhub_sandbox.session.counters import Counters
+from envhub_sandbox.session.jail_sources import JailSource, SharedJail
 from envhub_sandbox.session.launcher import LoadedJail, Repository
 from envhub_sandbox.session.placement import Builder, Place
-from envhub_sandbox.session.restart_policy import Restarts
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.shared_memory.sharding import PaceBook
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
-from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.lifecycle import Lifecycle, State
 
-_INTERRUPT_S = 10.0
-"""How long ``close`` waits at most for another thread to notice that the jail has gone: no longer
-than it waits for the environment's own ``close``."""
 _WITHOUT_A_JAIL = frozenset({State.EXPIRED, State.DEAD, State.FOREIGN, State.CLOSED})
 """It may not have been given back yet."""
 
 
-class Tenant:
-    """The life of one environment in its jails, of which it has one at a time, or none.
+class Lease:
+    """The jail of one environment, of which it has one at a time, or none, and the lane there.
 
-    ``close`` may come from any thread at any time, and from a signal handler; everything else is
-    for one thread at a time. It is a base, not a part, so that a step needs no detour to its lane.
+    Whoever has the environment's turn uses it. Only ``interrupt`` and ``abandon`` come from
+    elsewhere: another thread that closes, and a fork.
 
     Args:
         jails: Gives and takes back the jail.
-        manifest: What the environment is expected to be.
-        bounds: The slices of its sub-environments, one for each shard.
+        results: What the environment is expected to be, and its slices.
+        lifecycle: Where the environment is in its life; who closes it, closes it there first.
+        counters: Told which lane serves it.
         paces: Takes note of what its steps took.
+
+    Attributes:
+        loaded: The jail; None while there is none.
+        lane: The way to its runners there.
+        make_room: Asked to end what was started ahead, where a server has no place left.
     """
 
     def __init__(
         self,
         jails: JailSource,
-        manifest: EnvManifest,
-        bounds: Sequence[tuple[int, int]],
+        results: Results,
+        lifecycle: Lifecycle,
+        counters: Counters,
         paces: PaceBook,
     ) -> None:
-        self.manifest = manifest
-        self.bounds = list(bounds)
-        self.results = Results(manifest, self.bounds)
-        self.lifecycle = Lifecycle()
-        self.counters = Counters()
-        self.history = History(manifest, jails.repository.policy.crash_history)
-        self._paces = paces
+        self.lifecycle = lifecycle
+        self.loaded: LoadedJail | None = None
+        self.lane: Lane | None = None
+        self.make_room: Callable[[], bool] = _no_room
         self._jails = jails
-        self._lock = threading.RLock()  # a signal handler may close what its own thread waits for
+        self._results = results
+        self._counters = counters
+        self._paces = paces
+        self._builder = Builder(jails, results)
         self._ending = threading.RLock()  # nothing is given back that another thread is ending
         self._owner = os.getpid()
-        self._builder = Builder(jails, self.results)
-        self._restarts = Restarts(jails.repository.policy)
-        self._loaded: LoadedJail | None = None
-        self._lane: Lane | None = None
-        self._release_server: Callable[[], None] = _nothing
         self._startup: StartupDeadline | None = None
-        self._warm = False  # started ahead, and not used yet
-        self._warming: StartupDeadline | None = None
-        self._first_use: Callable[[], None] | None = None
-        self._make_room: Callable[[], bool] = _no_room
+        self._release_server: Callable[[], None] = _nothing
         self._departs = weakref.finalize(self, jails.repository.stay())
         self._departs.atexit = False
-        labels = Labels(self.repository.label, manifest.suite, str(manifest.task))
-        LEDGER.add(self, labels, self._restarts)
-        _living.add(self)
 
     @property
     def repository(self) -> Repository:
-        """The repository that it comes from."""
+        """The repository that its jails are of."""
         return self._jails.repository
 
     @property
-    def closed(self) -> bool:
-        """Whether it is closed for good."""
-        return self.lifecycle.state is State.CLOSED
+    def shared(self) -> bool:
+        """Whether other environments live in the same jail."""
+        return isinstance(self._jails, SharedJail)
 
     def report(self) -> list[dict[str, Any]]:
-        """The layers of the jail that it lives in; none where it does not live in any."""
-        loaded = self._loaded  # another thread may give it back
+        """The layers of the jail; none where there is none."""
+        loaded = self.loaded  # another thread may give it back
         if loaded is None or self.lifecycle.state in _WITHOUT_A_JAIL:
             return []
         return loaded.jail.report
 
-    def stats(self) -> dict[str, Any]:
-        """Counters, and where it is in its life."""
-        found = self.counters.snapshot()
-        return {**found, "restarts": self._restarts.count, "state": self.lifecycle.state.name}
+    def states(self) -> tuple[str, ...]:
+        """What its runners are doing, one word each."""
+        return () if self.loaded is None else self.repository.states(self.loaded)
 
-    @contextlib.contextmanager
-    def _turn(self, operation: str) -> Iterator[None]:
-        """Hold the lock. A ``close`` that has come when it is left, did not wait for it."""
-        with self._lock, self.repository.named():
-            try:
-                yield
-            except BaseException as error:
-                self._after_close(operation, error)
-                raise
-            if self.lifecycle.state is State.CLOSED:
-                self._let_go()
-
-    def _after_close(self, operation: str, error: BaseException) -> None:
-        """What failed because of a ``close`` in its midst says so, and gives back what is left.
+    def look(self, operation: str, deadline: Deadline) -> None:
+        """Ask the server whether the jail lives.
 
         Raises:
-            WorkerDiedError: It was closed, and the error does not say so.
+            WorkerDiedError: It does not.
         """
-        if self.lifecycle.state is not State.CLOSED:
-            return
-        self._let_go()
-        if isinstance(error, Exception) and not isinstance(error, WorkerDiedError):
-            raise self._closed(operation) from error
-
-    def _closed(self, operation: str) -> WorkerDiedError:
-        text = f"the environment was closed during {operation}"
-        return WorkerDiedError(text, reason="killed", request=operation)
-
-    def _moved(self, event: Event) -> None:
-        # close() may have come meanwhile, from another thread
-        if self.lifecycle.state is not State.CLOSED:
-            self.lifecycle.on(event)
+        if self.loaded is not None:
+            self.loaded.jail.output(operation, deadline)
 
     # --- moving in -----------------------------------------------------------------------------
 
-    def adopt(self, loaded: LoadedJail) -> None:
-        """Use a jail that is already loaded, instead of opening one later."""
-        with self._turn("make_env"):
-            self._build(loaded, Deadline(self.repository.timeouts.startup_s))
+    def acquire(self, deadline: StartupDeadline) -> None:
+        """Take a jail, and build the environment in it; ``interrupt`` brings the deadline forward.
 
-    def prewarm(self) -> None:
-        """Start its processes in a thread of their own, unless they are there."""
-        if self.lifecycle.state is State.IDLE:
-            threading.Thread(target=self.warm_up, name="envhub-prewarm", daemon=True).start()
+        Raises:
+            LoadError: The repository failed to load, or returned something else than before.
+            WorkerError: The jail did not come up, died, took too long, or nobody wants it any more.
+        """
+        self.give_back()  # of an attempt that was interrupted when all was built
+        self._start(deadline, lambda: self._build(self._take(deadline), deadline))
 
-    def warm_up(self) -> None:
-        """Start its processes, unless they are there, although nobody has asked for them yet."""
-        deadline = StartupDeadline(self.repository.timeouts.startup_s, unasked=True)
-        # whatever goes wrong: the first request meets it again, and somebody hears of it there
-        with contextlib.suppress(Exception), self._turn("make_env"):
-            if self.lifecycle.state is State.IDLE:
-                self._warming = deadline
-                try:
-                    self._start(deadline)
-                    self._warm = True
-                finally:
-                    self._warming = None
+    def adopt(self, loaded: LoadedJail, deadline: Deadline) -> None:
+        """Use a jail that is already loaded, instead of taking one."""
+        with self.repository.starting(deadline):
+            self._build(loaded, deadline)
 
-    def cool_down(self) -> bool:
-        """Give up what was started ahead, if nobody has used it yet; whether it was so."""
-        warming = self._warming
-        if warming is not None:
-            warming.give_up()
-        if not self._lock.acquire(timeout=0 if warming is None else _INTERRUPT_S):
-            return False  # somebody uses it
+    def replace(self, deadline: StartupDeadline) -> None:
+        """Give the jail up, and take another in the same server; raises as ``acquire`` does."""
+        self._start(deadline, lambda: self._move(deadline))
+
+    def rebuild(self, dead: list[int], deadline: StartupDeadline) -> None:
+        """Build some shards again, in fresh runners of this jail; raises as ``acquire`` does."""
+        assert self.loaded is not None
+        assert self.lane is not None
+        place = Place(self.loaded, self.lane)
+        self._start(deadline, lambda: self._builder.rebuild(place, dead, deadline))
+
+    def _start(self, deadline: StartupDeadline, start: Callable[[], None]) -> None:
+        self._startup = deadline
         try:
-            loaded, used = self._loaded, self.counters.requests
-            if not self._warm or used or loaded is None or self.lifecycle.state is not State.READY:
-                return warming is not None
-            with self._turn("make_env"):
-                self._warm = False
-                self._close_politely(loaded)
-                self._give_back()
-                self._moved(Event.FORGET)
-            return True
-        finally:
-            self._lock.release()
-
-    def on_first_use(self, used: Callable[[], None], make_room: Callable[[], bool]) -> None:
-        """Whom to tell that it is used, and whom to ask where a server has no place left."""
-        self._first_use, self._make_room = used, make_room
-
-    def _note_first_use(self) -> None:
-        if self._first_use is not None:
-            tell, self._first_use = self._first_use, None
-            tell()
-
-    def _look_whether_warm_lives(self) -> None:
-        """What was started ahead and has died unused is started again, as if it never had been."""
-        self._warm = False
-        if self._loaded is None or self.lifecycle.state is not State.READY:
-            return
-        try:
-            self._loaded.jail.output("make_env", Deadline(_INTERRUPT_S))
-        except EnvHubError:
-            self._forget()
-
-    def _start(self, deadline: StartupDeadline | None = None) -> None:
-        deadline = self._startup = deadline or StartupDeadline(self.repository.timeouts.startup_s)
-        try:
-            self._build(self._take_jail(deadline), deadline)
-        except EnvHubError:
-            if self.lifecycle.state is State.CLOSED:
-                raise self._closed("make_env") from None
-            raise
+            with self.repository.starting(deadline):
+                start()
         finally:
             self._startup = None
             self._let_server_go()
 
-    def _take_jail(self, deadline: Deadline) -> LoadedJail:
+    def _take(self, deadline: Deadline) -> LoadedJail:
         try:
             return self._jails.take(deadline)
         except WorkerError as error:
             # of this very type: the server's refusal, which may be for want of room
-            if type(error) is not WorkerError or deadline.unasked or not self._make_room():
+            if type(error) is not WorkerError or deadline.unasked or not self.make_room():
                 raise
         return self._jails.take(deadline)
 
+    def _move(self, deadline: Deadline) -> None:
+        self.leave()
+        self._build(self._jails.take(deadline), deadline)
+
     def _build(self, loaded: LoadedJail, deadline: Deadline) -> None:
-        with self.repository.starting(deadline):
-            self._build_in(loaded, deadline)
-
-    def _build_in(self, loaded: LoadedJail, deadline: Deadline) -> None:
-        self._move_into(loaded, deadline)
-        self.history.started()
-        self.lifecycle.on(Event.START)
-
-    def _move_into(self, loaded: LoadedJail, deadline: Deadline) -> None:
         try:
             place = self._builder.build(loaded, deadline)
         except BaseException:
             self._jails.give_back(loaded)
             raise
         self._settle(place)
-        if self.lifecycle.state is State.CLOSED:  # only now: who closes from here on sees the jail
-            raise self._closed("make_env")
+        if self.lifecycle.closed:  # only now: who closes from here on sees the jail
+            raise closed_during("make_env")
 
     def _settle(self, place: Place) -> None:
-        self._loaded, self._lane = place.loaded, place.lane
-        self.counters.connected(place.lane)
+        self.loaded, self.lane = place.loaded, place.lane
+        self._counters.connected(place.lane)
 
     # --- moving out ----------------------------------------------------------------------------
 
-    def _forget(self) -> None:
-        """Give up the jail; the next request opens another, in the same server."""
-        WORKER.info("%s: the jail is given up for a fresh one", self.repository.label)
-        self._leave()
-        self.lifecycle.request = None
-        self._moved(Event.FORGET)
+    def end(self) -> None:
+        """End the jail, whatever it is doing. It is still to be given back."""
+        if self.loaded is not None:
+            self._jails.end(self.loaded)
 
-    def _leave(self) -> None:
+    def leave(self) -> None:
+        """End the jail and give it back, but keep its server for another."""
         self._let_server_go()
         self._release_server = self.repository.hold()
         try:
-            if self._loaded is not None:
-                self._jails.end(self._loaded)
+            self.end()
         finally:
-            self._give_back()
+            self.give_back()
 
-    def _give_back(self) -> None:
+    def give_back(self) -> None:
+        """Give the jail back, if there is one."""
         with self._ending:
-            loaded, self._loaded = self._loaded, None
+            loaded, self.loaded = self.loaded, None
             try:
                 if loaded is not None:
                     self._jails.give_back(loaded)
             finally:
                 self._close_lane()
 
+    def close_politely(self) -> None:
+        """Let the repository's ``close`` run; whatever it does, the processes end after it."""
+        lane, deadline = self.lane, Deadline(self.repository.timeouts.close_s)
+        if lane is None:
+            return
+        requests = [(runner, m.Close(lane.number)) for runner in lane.runners]
+        with contextlib.suppress(EnvHubError):
+            lane.jail.receive(lane.jail.send("close", requests), deadline)
+
+    def note_pace(self) -> None:
+        """Remember what steps took, for the next time."""
+        pace = None if self.lane is None else self.lane.pace()
+        if pace:
+            self._paces.note(self._results.manifest, pace)
+
+    def let_go(self) -> None:
+        """Give back whatever is left, for good. A fork of its owner gives back nothing."""
+        if os.getpid() != self._owner:
+            return
+        try:
+            self.give_back()
+        finally:
+            self._let_server_go()
+            self._departs()
+
+    def interrupt(self, close: Callable[[], None]) -> bool:
+        """In another thread: ``close`` the environment, and end the jail under who waits for it.
+
+        Returns:
+            Whether there was one; otherwise whoever brings one sees that it is closed.
+        """
+        with self._ending:
+            close()
+            if self._startup is not None:
+                self._startup.give_up()
+            self.end()
+            return self.loaded is not None
+
+    def abandon(self) -> None:
+        """In a fork of its owner: close what is this process's own, and touch nothing else."""
+        self._ending = threading.RLock()
+        self._release_server = _nothing
+        self._close_lane()
+
     def _close_lane(self) -> None:
-        lane, self._lane = self._lane, None
+        lane, self.lane = self.lane, None
         if lane is not None:
-            self.counters.connected(None)
+            self._counters.connected(None)
             lane.close()
 
     def _let_server_go(self) -> None:
         release, self._release_server = self._release_server, _nothing
         release()
 
-    def _let_go(self) -> None:
-        """Give back whatever is left of it. A fork of its owner gives back nothing."""
-        if os.getpid() != self._owner:
-            return
-        try:
-            self._give_back()
-        finally:
-            self._let_server_go()
-            self._departs()
 
-    # --- the end -------------------------------------------------------------------------------
-
-    def close(self) -> None:
-        """Close the environment and end its processes, in bounded time, from any thread."""
-        if self.lifecycle.state is State.CLOSED:
-            return
-        if self.lifecycle.state is State.FOREIGN:
-            self.lifecycle.on(Event.CLOSE)
-            return
-        if not self._lock.acquire(blocking=False):
-            self._interrupt()
-            return
-        try:
-            state, loaded = self.lifecycle.state, self._loaded
-            self._moved(Event.CLOSE)
-            self._restarts.give_up()
-            self._note_pace()
-            if loaded is not None and state is State.READY:
-                self._close_politely(loaded)
-        finally:
-            try:
-                self._let_go()
-            finally:
-                self._lock.release()
-
-    def _close_politely(self, loaded: LoadedJail) -> None:
-        """Let the repository's ``close`` run; whatever it does, the processes end after it."""
-        deadline = Deadline(self.repository.timeouts.close_s)
-        lane = self._lane
-        if lane is None:
-            return
-        requests = [(runner, m.Close(lane.number)) for runner in lane.runners]
-        with contextlib.suppress(EnvHubError):
-            loaded.jail.receive(loaded.jail.send("close", requests), deadline)
-
-    def _note_pace(self) -> None:
-        pace = self._lane and self._lane.pace()
-        if pace:
-            self._paces.note(self.manifest, pace)
-
-    def _interrupt(self) -> None:
-        """Another thread waits for a reply: end the jail under it, then clean up after it.
-
-        If it does not let go in time it cleans up itself, once it sees that this was closed: no
-        process is left for it to end.
-        """
-        with self._ending:
-            self._moved(Event.CLOSE)
-            self._restarts.give_up()
-            loaded, startup = self._loaded, self._startup
-            if startup is not None:
-                startup.give_up()
-            if loaded is None:
-                return  # whoever brings one sees that it is closed
-            self._jails.end(loaded)
-        close_s = self.repository.timeouts.close_s
-        patience_s = _INTERRUPT_S if close_s is None else min(close_s, _INTERRUPT_S)
-        if self._lock.acquire(timeout=patience_s):
-            try:
-                self._moved(Event.CLOSE)  # the other may have moved at the same moment
-                self._let_go()  # of what is there now: it may have moved elsewhere, too
-            finally:
-                self._lock.release()
-
-    def abandon(self) -> None:
-        """In a fork of the process that made it: touch nothing, and refuse from now on."""
-        self._lock = threading.RLock()  # whichever thread held it is not here
-        self._ending = threading.RLock()
-        if self.lifecycle.state is not State.CLOSED:
-            self.lifecycle.on(Event.FORK)
-        self.lifecycle.request, self._release_server = None, _nothing
-        self._close_lane()
-
-
-_living: weakref.WeakSet[Tenant] = weakref.WeakSet()
-
-
-def _abandon_all() -> None:
-    for env in list(_living):
-        env.abandon()
-
-
-os.register_at_fork(after_in_child=_abandon_all)
+def closed_during(operation: str) -> WorkerDiedError:
+    """What is told to whoever waits for an environment that somebody closes."""
+    text = f"the environment was closed during {operation}"
+    return WorkerDiedError(text, reason="killed", request=operation)
 
 
 def _nothing() -> None:

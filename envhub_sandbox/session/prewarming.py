@@ -13,7 +13,7 @@ import weakref
 from collections.abc import Iterator, Sequence
 from functools import partial
 
-from envhub_sandbox.session.env_session import RemoteEnv
+from envhub_sandbox.session.env_session import EnvSession
 
 
 class Prewarming:
@@ -28,14 +28,14 @@ class Prewarming:
             before the next is used; whoever uses just one task, or all at once, pays nothing.
     """
 
-    def __init__(self, suites: Sequence[Sequence[RemoteEnv]], count: int | None) -> None:
+    def __init__(self, suites: Sequence[Sequence[EnvSession]], count: int | None) -> None:
         self._count = count
         # weak: an environment that nobody holds is closed
         self._suites = [[weakref.ref(env) for env in suite] for suite in suites]
         self._lock = threading.Lock()
-        self._wanted: list[weakref.ref[RemoteEnv]] = []
-        self._tried: set[weakref.ref[RemoteEnv]] = set()
-        self._ahead: list[weakref.ref[RemoteEnv]] = []  # started here and not used yet
+        self._wanted: list[weakref.ref[EnvSession]] = []
+        self._tried: set[weakref.ref[EnvSession]] = set()
+        self._ahead: list[weakref.ref[EnvSession]] = []  # started here and not used yet
         self._thread: threading.Thread | None = None
         for suite in suites:
             for env in suite:
@@ -49,7 +49,7 @@ class Prewarming:
         given_up = [_cool(env) for env in ahead]
         return any(given_up)
 
-    def _used(self, used: weakref.ref[RemoteEnv]) -> None:
+    def _used(self, used: weakref.ref[EnvSession]) -> None:
         """A task has been asked something for the first time."""
         with self._lock:
             self._tried.add(used)
@@ -61,13 +61,13 @@ class Prewarming:
                 )
                 self._thread.start()
 
-    def _stale(self) -> list[weakref.ref[RemoteEnv]]:
+    def _stale(self) -> list[weakref.ref[EnvSession]]:
         return [one for one in self._ahead if one not in self._wanted]
 
-    def _untried(self) -> list[weakref.ref[RemoteEnv]]:
+    def _untried(self) -> list[weakref.ref[EnvSession]]:
         return [one for one in self._wanted if one not in self._tried]
 
-    def _following(self, used: weakref.ref[RemoteEnv]) -> Iterator[weakref.ref[RemoteEnv]]:
+    def _following(self, used: weakref.ref[EnvSession]) -> Iterator[weakref.ref[EnvSession]]:
         suite = next(suite for suite in self._suites if used in suite)
         index = suite.index(used)
         count = self._count
@@ -83,7 +83,7 @@ class Prewarming:
                 env.warm_up() if start else env.cool_down()
             del todo, env  # nobody may hold one while this waits for nothing
 
-    def _next(self) -> tuple[RemoteEnv, bool] | None:
+    def _next(self) -> tuple[EnvSession, bool] | None:
         """What to give up (False) or start (True); first the former, which bounds their number."""
         with self._lock:
             for ref in self._stale():
@@ -102,11 +102,11 @@ class Prewarming:
             return None
 
 
-def _is_closed(ref: weakref.ref[RemoteEnv]) -> bool:
+def _is_closed(ref: weakref.ref[EnvSession]) -> bool:
     env = ref()
     return env is None or env.closed
 
 
-def _cool(ref: weakref.ref[RemoteEnv]) -> bool:
+def _cool(ref: weakref.ref[EnvSession]) -> bool:
     env = ref()
     return env is not None and env.cool_down()

@@ -39,16 +39,16 @@ class SeedBook:
         self._last: Seeds = [None] * num_envs
         self._own: Any = None
 
-    def remember(self, reset: m.Reset) -> None:
-        """Take note of a reset of all sub-environments, or of those in its mask."""
+    def remember(self, reset: m.Reset, start: int = 0) -> None:
+        """Take note of a reset of sub-environments from ``start`` on, or of those in its mask."""
         seeds: Any = reset.seeds
         if seeds is None:
             return
         if not self._each:
             self._own = seeds
             return
-        chosen_of: Any = [True] * len(self._last) if reset.mask is None else reset.mask
-        for index, (chosen, seed) in enumerate(zip(chosen_of, seeds, strict=True)):
+        chosen_of: Any = [True] * len(seeds) if reset.mask is None else reset.mask
+        for index, (chosen, seed) in enumerate(zip(chosen_of, seeds, strict=True), start):
             if chosen and seed is not None:
                 self._last[index] = seed
 

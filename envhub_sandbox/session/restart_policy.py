@@ -26,6 +26,11 @@ class Restarts:
         self._given_up = False
         self.count = 0
 
+    @property
+    def permitted(self) -> bool:
+        """Whether the policy knows of any."""
+        return self._policy.restart != "never"
+
     def give_up(self) -> None:
         """Nobody needs another one: end a wait in another thread, soon."""
         # no Event: a signal handler in the midst of its wait could not set it

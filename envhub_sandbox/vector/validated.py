@@ -16,7 +16,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import iterate
 
 from envhub_sandbox.errors import ActionError, ObservationError
-from envhub_sandbox.session.env_session import RemoteEnv
+from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.codec.inert import one_line
@@ -33,7 +33,7 @@ class ValidatedVectorEnv(SandboxVectorEnv):
         ObservationError: An observation is. The environment is still usable.
     """
 
-    def __init__(self, remote: RemoteEnv) -> None:
+    def __init__(self, remote: EnvSession) -> None:
         super().__init__(remote)
         spaces_of_actions = self.single_action_space, self.action_space
         # not a method of ours: who holds himself is not closed when nobody else holds him

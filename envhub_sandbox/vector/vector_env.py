@@ -23,7 +23,7 @@ from gymnasium.error import (
 from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
-from envhub_sandbox.session.env_session import RemoteEnv
+from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.transport.jail import typed
 from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.vector import from_manifest, generators
@@ -50,7 +50,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         sandbox_report: What confines it: one mapping per layer, while it runs.
     """
 
-    def __init__(self, remote: RemoteEnv) -> None:
+    def __init__(self, remote: EnvSession) -> None:
         manifest = remote.manifest
         self._remote = remote
         self._manifest = manifest

@@ -19,9 +19,9 @@ import zmq
 from envhub_sandbox import api, folders
 from envhub_sandbox.crash import writer
 from envhub_sandbox.sandboxes.docker import sandbox
-from envhub_sandbox.session import env_session, lease
+from envhub_sandbox.session import env_session
 from envhub_sandbox.session.counters import Ledger
-from envhub_sandbox.session.env_session import RemoteEnv
+from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.launcher import LoadedJail, Repository
 from envhub_sandbox.session.recipe import Recipe
 from envhub_sandbox.transport.connection import WorkerClient
@@ -44,9 +44,9 @@ Spot = tuple[Any, str]
 # --- one environment ---------------------------------------------------------------------------
 
 
-def session(env: Any) -> RemoteEnv:
+def session(env: Any) -> EnvSession:
     """What lies behind the Gymnasium face of an environment."""
-    found: RemoteEnv = env._remote
+    found: EnvSession = env._remote
     return found
 
 
@@ -73,7 +73,7 @@ def clean_up(env: Any) -> None:
 
 def live_by(env: Any, lifecycle: Lifecycle) -> None:
     """Have another table of its states."""
-    session(env).lifecycle = lifecycle
+    session(env).lifecycle = session(env).lease.lifecycle = lifecycle
 
 
 def manifest(env: Any) -> EnvManifest:
@@ -102,7 +102,7 @@ def recipe(suites: Any) -> Recipe | None:
 
 def loaded(env: Any) -> LoadedJail | None:
     """The jail that it has, and the server of that; None while it runs nowhere."""
-    return session(env)._loaded
+    return session(env).lease.loaded
 
 
 def jail(env: Any) -> RemoteJail:
@@ -130,7 +130,7 @@ def pids(env: Any) -> list[int]:
 
 def lane(env: Any) -> SharedMemoryLane | None:
     """Its fast lane, where it has one."""
-    found = session(env)._lane
+    found = session(env).lease.lane
     return found if isinstance(found, SharedMemoryLane) else None
 
 
@@ -141,12 +141,12 @@ def force_spin(used: SharedMemoryLane, chooser: Any) -> None:
 
 def release_of_server(env: Any) -> Callable[[], None]:
     """What lets go of the server that it holds while it has no jail."""
-    return session(env)._release_server
+    return session(env).lease._release_server
 
 
 def hold_server(env: Any, release: Callable[[], None]) -> None:
     """Have it hold its server, and call this to let go of it."""
-    session(env)._release_server = release
+    session(env).lease._release_server = release
 
 
 def order(known: Repository, of: Any) -> Any:
@@ -192,7 +192,7 @@ def send_half(connection: WorkerClient, frames: Sequence[Buffer]) -> None:
 
 LATE_REPLY_GRACE: Spot = (env_session, "_GRACE_S")
 """For how long ``reset`` waits for a late reply."""
-CLOSE_PATIENCE: Spot = (lease, "_INTERRUPT_S")
+CLOSE_PATIENCE: Spot = (env_session, "_INTERRUPT_S")
 """For how long ``close`` waits for another thread."""
 MAKER: Spot = (api, "_Maker")
 """What ``make_env`` starts to work with when its arguments have been checked."""
@@ -212,12 +212,12 @@ CONTAINER_STARTS: Spot = (sandbox.RepositoryContainer, "_start")
 
 def building(env: Any) -> Spot:
     """Where it is built in a jail."""
-    return session(env)._builder, "build"
+    return session(env).lease._builder, "build"
 
 
 def settling(env: Any) -> Spot:
     """Where it takes up what was built."""
-    return session(env), "_settle"
+    return session(env).lease, "_settle"
 
 
 def started(env: Any) -> Spot:
@@ -227,7 +227,7 @@ def started(env: Any) -> Spot:
 
 def ending(env: Any) -> Spot:
     """Where its jail is ended."""
-    return session(env)._jails, "end"
+    return session(env).lease._jails, "end"
 
 
 def holding(env: Any) -> Spot:
@@ -237,7 +237,7 @@ def holding(env: Any) -> Spot:
 
 def noting_pace(env: Any) -> Spot:
     """Where the pace of its steps is noted, at its close."""
-    return session(env), "_note_pace"
+    return session(env).lease, "note_pace"
 
 
 def sending(connection: WorkerClient) -> Spot:

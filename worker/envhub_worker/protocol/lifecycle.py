@@ -87,6 +87,16 @@ class Lifecycle:
     def __init__(self) -> None:
         self.state = State.IDLE
 
+    @property
+    def closed(self) -> bool:
+        """Whether it is over."""
+        return self.state is State.CLOSED
+
+    def moved(self, event: Event) -> None:
+        """``on``, unless it was closed meanwhile: by another thread, or a signal handler."""
+        if self.state is not State.CLOSED:
+            self.on(event)
+
     def on(self, event: Event) -> State:
         """Move.
 

@@ -1,0 +1,133 @@
+"""What is told of a request that failed, and what is written down of it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+
+from envhub_sandbox.crash.history import History
+from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
+from envhub_sandbox.log import WORKER
+from envhub_sandbox.session.counters import Counters
+from envhub_sandbox.session.lease import Lease, closed_during
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.results import Results
+from envhub_worker.protocol.lifecycle import Event, State
+
+
+class Failures:
+    """Makes the errors of one environment out of what went wrong; it moves where they belong.
+
+    Args:
+        lease: Its jail.
+        results: Its manifest and slices.
+        counters: Of deaths and late replies.
+        history: What was asked, for a crash bundle.
+    """
+
+    def __init__(
+        self, lease: Lease, results: Results, counters: Counters, history: History
+    ) -> None:
+        self._lease = lease
+        self._manifest = results.manifest
+        self._shards = len(results.bounds)
+        self._counters = counters
+        self._history = history
+
+    def late(self, operation: str, deadline: Deadline) -> WorkerTimeoutError:
+        """The deadline came first."""
+        timeout_s, states = deadline.timeout_s, self._lease.states()
+        WORKER.info("%s: no answer to %s after %s s", self._label, operation, timeout_s)
+        busy = f" (its processes: {', '.join(states)})" if states else ""
+        error = WorkerTimeoutError(
+            f"{operation} has not finished after {timeout_s} s{busy}; reset() brings the "
+            "environment back, in a fresh process if it still does not answer",
+            request=operation,
+            timeout_s=timeout_s,
+        )
+        error.worker = states
+        return error
+
+    def expired(self, operation: str, why: str) -> WorkerDiedError:
+        """The server has ended it, because nobody used it."""
+        lifecycle = self._lease.lifecycle
+        lifecycle.moved(Event.EXPIRY)
+        lifecycle.request = None
+        return expiry(operation, why)
+
+    def dead(self, error: EnvHubError) -> EnvHubError:
+        """A death, or a lie; what closed an environment under its user is told as such.
+
+        Whoever has not died, or has a jail that goes on without him, lives still, and cannot be
+        trusted to do what he says: the jail is ended.
+        """
+        lifecycle, lease = self._lease.lifecycle, self._lease
+        operation = lifecycle.request or "a request"
+        if lifecycle.closed:
+            return closed_during(operation)
+        self._counters.deaths += 1
+        lifecycle.moved(Event.DEATH)
+        WORKER.info("%s: %s", self._label, str(error).partition("\n")[0])
+        died = isinstance(error, WorkerDiedError)
+        if lease.loaded is not None and (lease.loaded.jail.kept or not died):
+            lease.end()
+        if isinstance(error, WorkerDiedError):
+            self.keep_crash(error)
+        return error
+
+    def keep_crash(self, error: WorkerDiedError | WorkerTimeoutError) -> None:
+        """Write a crash bundle, and name it in the error."""
+        lease, manifest = self._lease, self._manifest
+        task = {
+            "suite": manifest.suite,
+            "task": manifest.task,
+            "num_envs": manifest.num_envs,
+            "shards": self._shards,
+            "lane": None if lease.lane is None else lease.lane.name,
+        }
+        recording, loaded = self._history.recording(), lease.loaded
+        lease.repository.keep_crash(error, recording, task, loaded, shared=lease.shared)
+
+    @property
+    def _label(self) -> str:
+        return self._lease.repository.label
+
+
+def expiry(operation: str, why: str) -> WorkerDiedError:
+    """What is told of an environment that nobody used for too long."""
+    text = f"cannot {operation}: {why}, so its processes were ended; call reset() first"
+    return WorkerDiedError(text, reason="idle", request=operation, detail=why)
+
+
+def refusal(state: State, operation: str, restart: str) -> EnvHubError | None:
+    """Why an environment takes no request now; None if it takes one.
+
+    Args:
+        state: Where it is in its life.
+        operation: What is asked.
+        restart: What the policy says of an environment that has died.
+    """
+    if state in (State.IDLE, State.READY):
+        return None
+    if state in (State.LATE, State.PENDING):
+        text = f"cannot {operation}: the reply to the last request is late; call reset() first"
+        return WorkerTimeoutError(text, request=operation)
+    if state is State.DEAD:
+        text = f"cannot {operation}: the worker process has died; {_ADVICE.get(restart, _RESET)}"
+        return WorkerDiedError(text, request=operation)
+    if state is State.EXPIRED:
+        return expiry(operation, "it was idle for too long")
+    if state is State.FOREIGN:
+        return WorkerError(
+            f"cannot {operation}: this environment belongs to another process, and this is a "
+            f"fork of it ({os.getpid()}); call make_env here to get one of its own"
+        )
+    if state is State.CLOSED:
+        return closed_during(operation)
+    return WorkerError(f"cannot {operation}: the environment is {state.value}")
+
+
+_RESET = "call reset() first"
+_ADVICE: Mapping[str, str] = {
+    "never": "make the environment again, or use policy={'restart': 'on_reset'} and call reset()"
+}
