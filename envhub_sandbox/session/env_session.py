@@ -32,7 +32,7 @@ from envhub_sandbox.session.launcher import LoadedJail, Repository
 from envhub_sandbox.session.lease import Lease, closed_during
 from envhub_sandbox.session.recovery import Fail, Recovery, Revive
 from envhub_sandbox.session.restart_policy import Restarts
-from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
+from envhub_sandbox.transport.deadline import Deadline, StartupDeadline, StepDeadline
 from envhub_sandbox.transport.jail import RunnersDiedError, check, typed
 from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.results import Results, StepResult
@@ -89,6 +89,7 @@ class EnvSession:
         if policy.restart == "transparent":
             self._recovery = Revive(self.lease, self.results, self._restarts, self._failures)
         self._lock = threading.RLock()  # a signal handler may close what its own thread waits for
+        self._step_deadline = StepDeadline(jails.repository.timeouts.step_s)
         self._warm = False  # started ahead, and not used yet
         self._warming: StartupDeadline | None = None
         self._first_use: Callable[[], None] | None = None
@@ -153,7 +154,10 @@ class EnvSession:
         """
         with self._turn("a request"), self._judging():
             try:
-                replies = self._finish(self._asked_lane().replies, Deadline(timeout_s))
+                lane = self.lease.lane
+                if lane is None or self.lifecycle.state is not State.PENDING:
+                    raise self._nothing_asked()
+                replies = self._finish(lane.replies, Deadline(timeout_s))
             except RunnersDiedError as deaths:
                 replies = self._survive_request(deaths)
             for reply in replies:
@@ -214,9 +218,15 @@ class EnvSession:
     def collect_step(self, timeout_s: float | None) -> StepResult:
         """What ``VectorEnv.step`` returns; raises as ``collect`` does."""
         with self._lock:
-            deadline = Deadline(timeout_s)
+            deadline: Deadline = self._step_deadline
+            if timeout_s is self._step_deadline.timeout_s:
+                self._step_deadline.again()
+            else:
+                deadline = Deadline(timeout_s)
             try:
-                lane = self._asked_lane()
+                lane = self.lease.lane
+                if lane is None or self.lifecycle.state is not State.PENDING:
+                    raise self._nothing_asked()
                 self._finish(lane.wait, deadline)
                 self.counters.stepped(lane.elapsed_ns)
                 try:
@@ -264,12 +274,9 @@ class EnvSession:
         assert lane is not None
         return lane
 
-    def _asked_lane(self) -> Lane:
-        lane = self.lease.lane
-        if lane is None or self.lifecycle.state is not State.PENDING:
-            state = self.lifecycle.state.value
-            raise WorkerError(f"there is no request to wait for: the environment is {state}")
-        return lane
+    def _nothing_asked(self) -> WorkerError:
+        state = self.lifecycle.state.value
+        return WorkerError(f"there is no request to wait for: the environment is {state}")
 
     def _finish(self, receive: Callable[[Deadline], T], deadline: Deadline) -> T:
         """Wait for the pending reply, and move on to the state that it leads to."""

@@ -6,7 +6,8 @@ import math
 
 import pytest
 
-from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport import deadline as deadline_module
+from envhub_sandbox.transport.deadline import Deadline, StepDeadline
 
 
 def test_no_timeout_never_comes() -> None:
@@ -29,3 +30,25 @@ def test_far_deadlines_can_be_waited_for(timeout_s: float) -> None:
     assert milliseconds is not None
     assert 0 < milliseconds < 2**31
     assert not deadline.passed
+
+
+def test_a_steps_deadline_counts_from_its_first_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each step has all of its time, and whoever never has to wait never reads the clock."""
+    now = [100.0]
+    monkeypatch.setattr(deadline_module, "monotonic", lambda: now[0])
+    deadline = StepDeadline(5.0)
+    for _ in range(2):
+        deadline.again()
+        now[0] += 60.0
+        assert not deadline.passed
+        now[0] += 2.0
+        assert deadline.left_s() == 3.0
+        now[0] += 3.0
+        assert deadline.passed
+        assert deadline.left_ms() == 1
+
+
+def test_a_step_without_a_timeout_never_ends() -> None:
+    """None waits for ever here, too."""
+    deadline = StepDeadline(None)
+    assert (deadline.left_s(), deadline.left_ms(), deadline.passed) == (None, None, False)
