@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from envhub_sandbox import arguments
 from envhub_sandbox.config import plain_config
+from envhub_sandbox.dependencies.choice import chosen
+from envhub_sandbox.dependencies.cure import cure
+from envhub_sandbox.dependencies.prepare import provided
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.hub import store
 from envhub_sandbox.hub.snapshot import named
@@ -45,6 +49,7 @@ def make_env(
     token: str | bool | None = None,
     endpoint: str | None = None,
     python: str | Path | None = None,
+    dependencies: str | os.PathLike[str] | Mapping[str, Any] = "auto",
     num_workers: int | None = None,
     prewarm: int | None = None,
     lane: str = "auto",
@@ -73,6 +78,11 @@ def make_env(
         endpoint: As in huggingface_hub.
         python: The interpreter that runs the repository; this one by default. It needs cloudpickle,
             gymnasium, msgpack, numpy and pyzmq beside the repository's own packages.
+        dependencies: Where its packages come from. ``"auto"`` makes an environment of its own from
+            what it declares, wheels only, where this interpreter lacks some of that; ``"host"``
+            takes this interpreter as it is; a path that interpreter or virtual environment. A
+            mapping always makes one: ``{"extra": ["scipy"], "python": "3.12", "exclude_newer":
+            "2026-01-31"}``. See ``docs/dependencies.md``; for ``sandbox="process"``.
         num_workers: Processes over which the sub-environments are spread; by default one, or with
             ``use_async_envs`` as many as are useful for the cores there are.
         prewarm: How many of a suite's next tasks are started in the background when a task is first
@@ -96,6 +106,7 @@ def make_env(
         SnapshotError: The files cannot be had, or are not what the commit says.
         PolicyError: An unknown or impossible policy, limit or timeout.
         SandboxUnavailableError: This host cannot enforce the policy.
+        DependencyError: Its packages cannot be had, or it imports one that it does not declare.
         LoadError: The repository failed to load, or returned something unusable.
         WorkerError: The worker did not come up, died, or took too long.
         RuntimeError: ``sandbox=None`` without ``trust_remote_code=True``.
@@ -117,11 +128,18 @@ def make_env(
                 "timeouts": timeouts,
                 "limits": limits,
                 "python": python,
+                "dependencies": None if dependencies == "auto" else dependencies,
                 "num_workers": num_workers,
                 "prewarm": prewarm,
                 "validate": validate,
                 "server_key": server_key,
             }
+        )
+    choice, python = chosen(dependencies, python)
+    if choice.where == "own" and sandbox not in ("process", None):
+        raise PolicyError(
+            "dependencies={...} is for sandbox='process'. For a container, build an image: envhub "
+            "image build REF; on another host, whoever runs the server chooses its packages"
         )
     chosen_policy = policy_from(policy, limits_from(limits))
     chosen_timeouts = timeouts_from(timeouts)
@@ -133,6 +151,9 @@ def make_env(
     if place is None:
         envs = inprocess.make(snapshot, n_envs, use_async_envs, config, further)
         return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))
+    environment = provided(snapshot, choice) if sandbox == "process" else None
+    if environment is not None:
+        runs_on = Runtime(environment.python, str(environment.packages))
     repository = Repository(
         snapshot,
         LoadArguments(
@@ -149,6 +170,8 @@ def make_env(
         lane,
         copy,
     )
+    repository.installed = None if environment is None else environment.facts
+    repository.cure = partial(cure, snapshot, place.name, choice, python, environment)
     repository.recipe = Recipe(
         make_env=make_env,
         reference=pinned(snapshot),
@@ -163,6 +186,7 @@ def make_env(
             "timeouts": chosen_timeouts,
             "endpoint": endpoint,
             "python": python,
+            "dependencies": "auto" if python is not None else dependencies,
             "num_workers": num_workers,
             "prewarm": prewarm,
             "lane": lane,
@@ -237,7 +261,9 @@ class _Maker:
             Prewarming(list(suites.values()), self._prewarm)
         return EnvSuites(
             envs,
-            lambda: provenance_of(repository.snapshot, manifest, repository.latest_report),
+            lambda: provenance_of(
+                repository.snapshot, manifest, repository.latest_report, repository.installed
+            ),
             shared.close if shared else lambda: None,
             repository.recipe,
         )

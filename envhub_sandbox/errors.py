@@ -15,6 +15,11 @@
       ObservationError (ValueError)
       SandboxUnavailableError
       DependencyError (ImportError)
+        RequirementError
+        ResolutionError
+        IndexUnavailableError
+        PackageIntegrityError
+        InterpreterUnavailableError
       LoadError
         LoadAttributeError (AttributeError), LoadValueError (ValueError), ...
       WorkerError
@@ -59,14 +64,19 @@ __all__ = [
     "DependencyError",
     "EnvHubError",
     "HubReferenceError",
+    "IndexUnavailableError",
+    "InterpreterUnavailableError",
     "LoadError",
     "LocalProtocolError",
     "MessageTooLargeError",
+    "PackageIntegrityError",
     "PolicyError",
     "ProtocolError",
     "RemoteEnvError",
     "RemoteProtocolError",
     "RepositoryUnavailableError",
+    "RequirementError",
+    "ResolutionError",
     "SandboxUnavailableError",
     "SnapshotError",
     "SnapshotIntegrityError",
@@ -137,9 +147,29 @@ class SandboxUnavailableError(EnvHubError):
 
 
 class DependencyError(EnvHubError, ImportError):
-    """The repository needs a package that the worker's interpreter does not have."""
+    """The repository needs a package that it does not get; nothing of it runs."""
 
     __str__ = Exception.__str__  # ImportError's does not look at args
+
+
+class RequirementError(DependencyError):
+    """What a repository declares cannot be taken; the text names the file and the line."""
+
+
+class ResolutionError(DependencyError):
+    """No versions satisfy all that is required; the text says which requirements are in the way."""
+
+
+class IndexUnavailableError(DependencyError):
+    """The package index did not answer."""
+
+
+class PackageIntegrityError(DependencyError):
+    """A package is not the one whose hash is known. Nothing of it was kept."""
+
+
+class InterpreterUnavailableError(DependencyError):
+    """No interpreter of this machine is one that the repository asks for."""
 
 
 class LoadError(EnvHubError):

@@ -2,7 +2,8 @@
 
 ``envhub_sandbox.worker`` tells of jails: opened, closed, died, timed out, restarted (INFO, DEBUG).
 ``envhub_sandbox.worker.output`` has every line that they print (DEBUG). ``envhub_sandbox.snapshot``
-tells of downloads, ``envhub_sandbox.crashes`` of crash bundles.
+tells of downloads, ``envhub_sandbox.dependencies`` of packages, ``envhub_sandbox.crashes`` of
+crash bundles.
 """
 
 from __future__ import annotations
@@ -14,4 +15,5 @@ ROOT.addHandler(logging.NullHandler())
 WORKER = ROOT.getChild("worker")
 OUTPUT = WORKER.getChild("output")
 SNAPSHOT = ROOT.getChild("snapshot")
+DEPENDENCIES = ROOT.getChild("dependencies")
 CRASHES = ROOT.getChild("crashes")

@@ -13,7 +13,10 @@ from hypothesis import HealthCheck, settings
 
 from envhub_sandbox import folders
 
-pytest_plugins = ["tests.hub.fixtures", "tests.support.selection", "tests.support.skips"]
+pytest_plugins = [
+    *("tests.hub.fixtures", "tests.support.selection", "tests.support.skips"),
+    "tests.support.wheels",
+]
 
 # A loaded machine is slow at random; what may be slow is bounded by pytest-timeout instead.
 settings.register_profile("local", deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -13,6 +13,8 @@ from envhub_sandbox.cli.shared.exits import reported
 from envhub_sandbox.cli.shared.progress import Bar
 
 if TYPE_CHECKING:
+    from envhub_sandbox.dependencies.declared import Declared
+    from envhub_sandbox.dependencies.resolve import Target
     from envhub_sandbox.hub.snapshot import Snapshot
 
 app = typer.Typer(
@@ -52,7 +54,7 @@ def build(
     hub_cache_dir: opt.HubCacheDir = None,
     debug: opt.Debug = False,
 ) -> None:
-    """Derive an image from envhub-worker with a repository's requirements.txt in it.
+    """Derive an image from envhub-worker with the packages that a repository declares.
 
     Its packages are pinned with hashes, wheels only: nothing of the repository runs. The image is
     tagged by the hash of all that it is made of, so the same again costs nothing.
@@ -81,24 +83,23 @@ def _build(
     exclude_newer: str | None,
     network: str | None,
 ) -> dict[str, Any]:
+    from envhub_sandbox.dependencies.declared import declared
+    from envhub_sandbox.dependencies.resolve import resolve
     from envhub_sandbox.errors import DependencyError
-    from envhub_sandbox.hub import requirements
     from envhub_sandbox.sandboxes.docker import image
     from envhub_sandbox.sandboxes.docker.engines import find_engine, find_image
 
-    wanted = snapshot.root / requirements.FILE
-    if not wanted.is_file() and not system:
+    found = declared(snapshot.root, snapshot.path)
+    if found is None and not system:
         raise DependencyError(
-            f"{snapshot.repo_id} has no {requirements.FILE}: it needs no image of its own. Use "
+            f"{snapshot.repo_id} declares no packages: it needs no image of its own. Use "
             f"--sandbox docker:{base}"
         )
-    asked = requirements.read(wanted) if wanted.is_file() else []
     engine = find_engine(engine_name)
     identity = find_image(engine, base)
     target = image.target_of(engine, base)
-    lock = requirements.resolve(
-        asked, python=target.python, machine=target.machine, exclude_newer=exclude_newer
-    )
+    _check_python(found, target)
+    lock = resolve(found.wanted if found else (), target, exclude_newer=exclude_newer)
     is_local = snapshot.repo_type == "local"
     name = Path(snapshot.repo_id).name if is_local else snapshot.repo_id
     tag = image.tag_for(name, identity, lock, system)
@@ -106,3 +107,15 @@ def _build(
     if not known:
         image.build(engine, image.dockerfile(base, lock, system), lock, tag, network)
     return {"image": tag, "built": not known, "lock": lock.digest, "packages": lock.packages}
+
+
+def _check_python(found: Declared | None, target: Target) -> None:
+    from packaging.specifiers import SpecifierSet
+
+    from envhub_sandbox.errors import InterpreterUnavailableError
+
+    if found is not None and not SpecifierSet(found.python).contains(f"{target.version}.99"):
+        raise InterpreterUnavailableError(
+            f"{found.source} asks for Python {found.python}, and the image has {target.version}: "
+            "build envhub-worker from another base (docs/deployment.md)"
+        )

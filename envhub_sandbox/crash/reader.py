@@ -262,7 +262,8 @@ def _texts(mapping: dict[str, Any]) -> dict[str, str]:
 # --- what it asks of this machine --------------------------------------------------------------
 
 _GRANTED = ("profile", "network", "readable", "gpu", "environment")
-_CARRIED = ("hub_cache_dir", "endpoint", "python")
+_CARRIED = ("hub_cache_dir", "endpoint", "python", "dependencies")
+_USUAL = (None, "auto")
 
 
 def wishes(bundle: Bundle) -> list[str]:
@@ -276,7 +277,8 @@ def wishes(bundle: Bundle) -> list[str]:
     limits = asked.get("limits")
     if isinstance(limits, dict):
         found += [f"limits.{n}={v!r}" for n, v in limits.items() if _is_more(n, v)]
-    found += [f"{name}={v!r}" for name in _CARRIED if (v := bundle.arguments.get(name)) is not None]
+    carried = {name: bundle.arguments.get(name) for name in _CARRIED}
+    found += [f"{name}={value!r}" for name, value in carried.items() if value not in _USUAL]
     return [one_line(wish, 300) for wish in found]  # a line each, whatever its name is
 
 
@@ -319,7 +321,7 @@ def replayed_arguments(bundle: Bundle, *, granted: bool) -> dict[str, Any]:
         made |= {"num_workers": bundle.task["shards"], "lane": bundle.task["lane"]}
     if granted:
         carried = {name: bundle.arguments.get(name) for name in _CARRIED}
-        made |= {name: value for name, value in carried.items() if type(value) is str}
+        made |= {name: value for name, value in carried.items() if type(value) in (str, dict)}
     return made
 
 

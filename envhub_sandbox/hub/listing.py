@@ -55,6 +55,14 @@ class Snapshot:
     root: Path
     files: tuple[FileRecord, ...]
 
+    @property
+    def label(self) -> str:
+        """Repository, commit and entry file, for errors."""
+        if self.repo_type == "local":
+            return f"{self.repo_id}:{self.path}"
+        prefix = "" if self.repo_type == "model" else f"{self.repo_type}s/"
+        return f"{prefix}{self.repo_id}@{self.commit[:12]}:{self.path}"
+
 
 @dataclass(frozen=True, kw_only=True)
 class SnapshotLimits:

@@ -13,6 +13,7 @@ from typing import Any
 from envhub_sandbox.crash.history import Recording
 from envhub_sandbox.crash.writer import Crash, keep
 from envhub_sandbox.errors import (
+    DependencyError,
     EnvHubError,
     LoadError,
     VersionMismatchError,
@@ -121,6 +122,8 @@ class Repository:
         copy: Whether observations are copied for the caller, or lent.
 
     Attributes:
+        cure: Says what to do where a module is missing.
+        installed: What was installed for it, for the provenance.
         runs_on: What runs it where it runs; a remembered manifest holds for this only.
         latest_report: The layers of the jail that was opened last, for the provenance of what was
             made. Which of them hold for an environment, only its own jail says.
@@ -147,6 +150,8 @@ class Repository:
         self.copy = copy
         self.latest_report: list[dict[str, Any]] = []
         self.recipe: Recipe | None = None
+        self.cure: Callable[[], str] = str
+        self.installed: dict[str, Any] | None = None
         self._sandbox = sandbox
         self.runs_on = runtime
         if isinstance(sandbox, PerRepository):
@@ -159,11 +164,7 @@ class Repository:
     @property
     def label(self) -> str:
         """Repository, commit and entry file, for errors."""
-        snapshot = self.snapshot
-        if snapshot.repo_type == "local":
-            return f"{snapshot.repo_id}:{snapshot.path}"
-        prefix = "" if snapshot.repo_type == "model" else f"{snapshot.repo_type}s/"
-        return f"{prefix}{snapshot.repo_id}@{snapshot.commit[:12]}:{snapshot.path}"
+        return self.snapshot.label
 
     @property
     def wire_limits(self) -> WireLimits:
@@ -176,6 +177,8 @@ class Repository:
         try:
             yield
         except EnvHubError as error:
+            if isinstance(error, DependencyError) and not str(error).startswith(self.label):
+                error.args = (f"{error}. {self.cure()}",)
             name_source(error, self.label)
             raise
 
@@ -228,7 +231,7 @@ class Repository:
         crash = Crash(
             error=error,
             label=self.label,
-            provenance=provenance_of(self.snapshot, manifest, report),
+            provenance=provenance_of(self.snapshot, manifest, report, self.installed),
             load=self.arguments.message(),
             options=self.recipe.options,
             task=task,

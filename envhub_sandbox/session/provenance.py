@@ -10,7 +10,10 @@ from envhub_worker.protocol.messages import VERSION
 
 
 def provenance_of(
-    snapshot: Snapshot, manifest: Manifest | None, report: list[dict[str, Any]]
+    snapshot: Snapshot,
+    manifest: Manifest | None,
+    report: list[dict[str, Any]],
+    installed: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The provenance of environments, as plain data.
 
@@ -18,6 +21,7 @@ def provenance_of(
         snapshot: The files; every hash has been verified.
         manifest: What the worker said. Trust: interpreter and packages are its own words.
         report: The layers that confine it, once it runs.
+        installed: What was installed for it: our own record.
     """
     return {
         "repository": snapshot.repo_id,
@@ -27,6 +31,7 @@ def provenance_of(
         "files": {record.path: record.digest for record in snapshot.files},
         "interpreter": dict(manifest.interpreter) if manifest else None,
         "packages": dict(manifest.packages) if manifest else None,
+        "installed": installed,
         "protocol": VERSION,
         "layers": [dict(layer) for layer in report],
     }

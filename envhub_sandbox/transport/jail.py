@@ -302,10 +302,7 @@ def raised(reply: m.Raised) -> EnvHubError:
         return LoadError(reply.message)
     cause: Any = remote_error(reply.builtin, reply.type_name, reply.message, reply.traceback)
     if reply.builtin == "ModuleNotFoundError":
-        error: EnvHubError = DependencyError(
-            f"{what}: {reply.message}. The worker runs in this interpreter's environment: install "
-            "the package there, or choose another interpreter with make_env(..., python=...)"
-        )
+        error: EnvHubError = DependencyError(f"{what}: {reply.message}")
     elif reply.type_name.endswith(".EntryError"):
         return LoadError(reply.message)
     else:

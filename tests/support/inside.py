@@ -18,6 +18,7 @@ import zmq
 
 from envhub_sandbox import api, folders
 from envhub_sandbox.crash import writer
+from envhub_sandbox.dependencies import environments
 from envhub_sandbox.sandboxes.docker import sandbox
 from envhub_sandbox.session import env_session
 from envhub_sandbox.session.counters import Ledger
@@ -311,3 +312,11 @@ def happen(doorman: Doorman, event: int, value: int = 0) -> None:
 def door_is_shut(doorman: Doorman) -> bool:
     """Whether nobody is let in at present."""
     return doorman._shut_door is not None
+
+
+# --- a repository's packages -------------------------------------------------------------------
+
+
+def making_an_environment(step: str) -> Spot:
+    """A step of it: ``install``, ``size``, ``compile``, ``close`` or ``publish``."""
+    return environments, f"_{step}"

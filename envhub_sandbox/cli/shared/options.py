@@ -68,6 +68,16 @@ Python = Annotated[
         rich_help_panel=_CODE,
     ),
 ]
+Dependencies = Annotated[
+    str,
+    typer.Option(
+        metavar="auto|host|PATH|JSON",
+        help="Where its packages come from: an environment of its own where this interpreter lacks "
+        "some; this interpreter; another, or a virtual environment; or one of its own, adjusted: "
+        '\'{"extra": ["scipy"], "python": "3.12", "exclude_newer": "2026-01-31"}\'.',
+        rich_help_panel=_CODE,
+    ),
+]
 NumWorkers = Annotated[
     int | None,
     typer.Option(
@@ -189,6 +199,7 @@ class MakeOptions:
     use_async: bool
     env_kwargs: Sequence[str] | None
     python: str | None
+    dependencies: str
     num_workers: int | None
     sandbox: str
     trust: bool
@@ -238,6 +249,7 @@ class MakeOptions:
             "token": self.token,
             "endpoint": self.endpoint,
             "python": self.python,
+            "dependencies": read_dependencies(self.dependencies),
             "num_workers": self.num_workers,
             "validate": self.validate,
         }
@@ -318,7 +330,7 @@ def read_env_kwargs(texts: Sequence[str]) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for text in texts:
         if text.lstrip().startswith("{"):
-            values |= _json_object(text)
+            values |= _json_object("--env-kwargs", text)
             continue
         key, equals, value = text.partition("=")
         if not equals or not key.isidentifier():
@@ -330,11 +342,20 @@ def read_env_kwargs(texts: Sequence[str]) -> dict[str, Any]:
     return values
 
 
-def _json_object(text: str) -> dict[str, Any]:
+def read_dependencies(text: str) -> str | dict[str, Any]:
+    """The argument of ``make_env``: text, or a JSON object.
+
+    Raises:
+        UsageError: It begins like an object and is none.
+    """
+    return _json_object("--dependencies", text) if text.lstrip().startswith("{") else text
+
+
+def _json_object(option: str, text: str) -> dict[str, Any]:
     try:
         value: dict[str, Any] = json.loads(text)  # it starts with a brace: an object or an error
     except ValueError as error:
-        raise UsageError(f"--env-kwargs is {text!r}, which is no JSON: {error}") from error
+        raise UsageError(f"{option} is {text!r}, which is no JSON: {error}") from error
     return value
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from types import TracebackType
 from typing import TYPE_CHECKING
 
 from envhub_sandbox.cli.shared.console import console, safe_line
+from envhub_sandbox.dependencies.progress import shown_by
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -29,6 +31,7 @@ class Bar:
         self._task: TaskID | None = None
         self._total = 0
         self._begun = self._shown = time.monotonic()
+        self._also = contextlib.ExitStack()
 
     def begin(self, title: str, total: int | None = None) -> None:
         """Show what begins; ``total`` in episodes, None where nobody knows how long."""
@@ -54,6 +57,7 @@ class Bar:
     def __enter__(self) -> Bar:
         if self._progress is not None:
             self._progress.start()
+        self._also.enter_context(shown_by(self.begin))
         return self
 
     def __exit__(
@@ -62,6 +66,7 @@ class Bar:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        self._also.close()
         if self._progress is not None:
             self._progress.stop()
 

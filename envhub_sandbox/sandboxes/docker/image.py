@@ -13,11 +13,10 @@ import re
 import subprocess
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
+from envhub_sandbox.dependencies.resolve import Lock, Target
 from envhub_sandbox.errors import DependencyError, SandboxUnavailableError
-from envhub_sandbox.hub.requirements import Lock
 from envhub_sandbox.sandboxes.docker.engines import Engine, EngineError, environment, own_limits
 
 LOCK_LABEL = "dev.envhub.lock"
@@ -43,16 +42,8 @@ USER 65532:65532
 """
 
 
-@dataclass(frozen=True)
-class Target:
-    """What runs in the base image: the interpreter's version, and the machine."""
-
-    python: str
-    machine: str
-
-
 def target_of(engine: Engine, image: str) -> Target:
-    """Ask a worker's image.
+    """What runs in a worker's image; it is asked.
 
     Raises:
         SandboxUnavailableError: It is none.
@@ -68,7 +59,7 @@ def target_of(engine: Engine, image: str) -> Target:
         python, machine = json.loads(said)
     except (EngineError, ValueError) as error:
         raise SandboxUnavailableError(f"{image!r} is no image of envhub-worker: {error}") from error
-    return Target(str(python), str(machine))
+    return Target(version=str(python), machine=str(machine))
 
 
 def tag_for(repository: str, base: str, lock: Lock, system: Sequence[str]) -> str:

@@ -23,6 +23,7 @@ NOTHING: dict[str, Any] = dict.fromkeys(
 def options(**given: Any) -> MakeOptions:
     """Options as typed; the others at their defaults."""
     defaults = {"ref": "org/repo", "n_envs": 1, "use_async": False, "gpu": False}
+    defaults["dependencies"] = "auto"
     return MakeOptions(**{**NOTHING, **defaults, "sandbox": "process", "trust": False, **given})
 
 

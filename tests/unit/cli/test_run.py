@@ -100,7 +100,8 @@ def test_options_become_arguments_of_make_env(monkeypatch: pytest.MonkeyPatch) -
         monkeypatch,
         make_env,
         *("--n-envs", "3", "--async", "--env-kwargs", "size=8", "--num-workers", "2"),
-        *("--python", "/usr/bin/python3", "--token", "hf_x", "--endpoint", "http://h"),
+        *("--python", "/usr/bin/python3", "--dependencies", '{"python": "3.12"}'),
+        *("--token", "hf_x", "--endpoint", "http://h"),
         *("--hub-cache-dir", "/cache", "--memory", "1G", "--timeout", "9", "--profile", "strict"),
         "--validate",
     )
@@ -117,6 +118,7 @@ def test_options_become_arguments_of_make_env(monkeypatch: pytest.MonkeyPatch) -
         "token": "hf_x",
         "endpoint": "http://h",
         "python": "/usr/bin/python3",
+        "dependencies": {"python": "3.12"},
         "num_workers": 2,
         "validate": True,
     }

@@ -1,0 +1,120 @@
+"""The argument ``dependencies`` of ``make_env``, checked and made plain."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from envhub_sandbox.errors import PolicyError
+
+if TYPE_CHECKING:
+    from envhub_sandbox.dependencies.declared import Wanted
+
+_DATE = re.compile(r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}:\d{2}(Z|[+-]\d{2}:\d{2}))?")
+_NAMES = ("extra", "python", "exclude_newer")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Where a repository's packages are to come from.
+
+    Attributes:
+        where: ``"auto"``: its own environment, unless this interpreter has all of it;
+            ``"host"``: this interpreter; ``"own"``: its own environment.
+        extra: Further requirements.
+        python: A version or versions, or a path; empty for what the repository runs in.
+        exclude_newer: A date: packages of later are not seen.
+    """
+
+    where: Literal["auto", "host", "own"]
+    extra: tuple[Wanted, ...] = ()
+    python: str = ""
+    exclude_newer: str | None = None
+
+
+AUTO, HOST = Choice("auto"), Choice("host")
+
+
+def chosen(
+    dependencies: str | os.PathLike[str] | Mapping[str, Any], python: str | Path | None
+) -> tuple[Choice, str | Path | None]:
+    """The choice, and the interpreter whose packages are used, if it is one of the caller's.
+
+    Args:
+        dependencies: As ``make_env`` takes it.
+        python: Likewise; it wins over ``"auto"``.
+
+    Raises:
+        PolicyError: It is none of these, or both say something else.
+        RequirementError: A further requirement is none.
+    """
+    if isinstance(dependencies, Mapping):
+        if python is not None:
+            raise _both()
+        return _adjusted(dependencies), None
+    if dependencies == "auto":
+        return (AUTO, None) if python is None else (HOST, python)
+    if dependencies == "host":
+        return HOST, python
+    if not isinstance(dependencies, (str, os.PathLike)) or os.sep not in os.fspath(dependencies):
+        raise PolicyError(
+            f"dependencies is {dependencies!r}; it is 'auto', 'host', the path of an interpreter "
+            "or a virtual environment such as './.venv', or a mapping of "
+            f"{', '.join(_NAMES)}"
+        )
+    if python is not None:
+        raise _both()
+    path = Path(dependencies).expanduser()
+    return HOST, path / "bin" / "python" if path.is_dir() else path
+
+
+def _both() -> PolicyError:
+    return PolicyError(
+        "python and dependencies both say where packages come from; give python=PATH for the "
+        "packages of an interpreter of yours, or dependencies={'python': '3.12'} for the "
+        "repository's own"
+    )
+
+
+def _adjusted(given: Mapping[str, Any]) -> Choice:
+    unknown = sorted(str(name) for name in given if name not in _NAMES)
+    if unknown:
+        raise PolicyError(f"dependencies has no {', '.join(unknown)}; it takes {', '.join(_NAMES)}")
+    extra = given.get("extra", ())
+    if isinstance(extra, str) or not all(isinstance(text, str) for text in extra):
+        raise PolicyError(f"extra in dependencies is {extra!r}; it takes a list of requirements")
+    from envhub_sandbox.dependencies.declared import one
+
+    wanted = tuple(one(text, f"{text[:80]!r} in dependencies") for text in extra)
+    return Choice("own", wanted, _python(given.get("python")), _date(given.get("exclude_newer")))
+
+
+def _python(given: object) -> str:
+    from envhub_sandbox.dependencies import interpreters
+
+    text = os.fspath(given) if isinstance(given, os.PathLike) else given or ""
+    try:
+        if not isinstance(text, str):
+            raise ValueError("no text")
+        interpreters.check_versions(text)
+    except ValueError as error:
+        raise PolicyError(
+            f"python in dependencies is {given!r}; it takes a version such as '3.12', versions "
+            "such as '>=3.11,<3.13', or the path of an interpreter"
+        ) from error
+    return text
+
+
+def _date(given: object) -> str | None:
+    if given is None:
+        return None
+    text = given if isinstance(given, str) else getattr(given, "isoformat", lambda: "")()
+    if not _DATE.fullmatch(text):
+        raise PolicyError(
+            f"exclude_newer in dependencies is {given!r}; it takes a date such as '2026-01-31'"
+        )
+    return str(text)

@@ -1,0 +1,244 @@
+"""What a repository declares that it needs, read as data from its verified files.
+
+The files are a stranger's. pip and uv obey options, URLs and paths in them, some of which build and
+run code at once, so only plain requirements get through, each parsed and printed anew. The first of
+these that there is counts, as the most particular one: the metadata of a script (PEP 723) in the
+entry file, ``requirements.txt``, and ``[project]`` of ``pyproject.toml``.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from packaging.requirements import InvalidRequirement, Requirement
+from packaging.specifiers import InvalidSpecifier, SpecifierSet
+
+from envhub_sandbox.dependencies.files import LOOKED_AT, PROJECT, REQUIREMENTS, SCRIPT
+from envhub_sandbox.errors import RequirementError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+MAX_BYTES = 256 * 1024
+MAX_REQUIREMENTS = 1000
+MAX_LINE = 2000
+MAX_DOTS = 2000
+"""In TOML: the time that its parser takes grows with the square of the parts of a key."""
+
+_HASH = re.compile(r"--hash[= ](sha256:[0-9a-f]{64}|sha384:[0-9a-f]{96}|sha512:[0-9a-f]{128})")
+_CLOSES = "# ///"
+_ADVICE = (
+    "If you trust it, install the packages into an interpreter of your own and give that with "
+    "python=..., or take this one as it is with dependencies='host'"
+)
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """One plain requirement.
+
+    Attributes:
+        requirement: Name, extras, versions and marker; never a URL.
+        where: Where it stands, as in ``"line 2 of requirements.txt"``.
+        hashes: Of its files, as in ``"sha256:..."``; empty where none are given.
+    """
+
+    requirement: Requirement
+    where: str
+    hashes: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return " ".join([str(self.requirement), *(f"--hash={one}" for one in self.hashes)])
+
+
+@dataclass(frozen=True)
+class Declared:
+    """What a repository needs.
+
+    Attributes:
+        source: The file that says so.
+        wanted: Its requirements; there may be none.
+        python: The versions of Python that it runs in, as in ``">=3.11"``; empty for any.
+    """
+
+    source: str
+    wanted: tuple[Wanted, ...]
+    python: str = ""
+
+
+def declared(root: Path, entry: str) -> Declared | None:
+    """What the files say; None where they say nothing.
+
+    Args:
+        root: The verified files.
+        entry: The entry file, as the snapshot names it.
+
+    Raises:
+        RequirementError: They say something that cannot be taken.
+    """
+    script = _script(root / entry, entry)
+    if script is not None:
+        return script
+    project = _project(root / PROJECT)
+    if (root / REQUIREMENTS).is_file():
+        python = "" if project is None else project.python
+        return Declared(REQUIREMENTS, tuple(read(root / REQUIREMENTS)), python)
+    return project if project is not None and (project.wanted or project.python) else None
+
+
+def one(text: str, where: str) -> Wanted:
+    """A requirement that somebody wrote, with the hashes behind it.
+
+    Raises:
+        RequirementError: It is none that can be taken.
+    """
+    plain, *hashes = re.split(r"\s+(?=--hash[= ])", text)
+    if len(plain) > MAX_LINE:
+        raise RequirementError(f"{where} has {len(plain)} characters; at most {MAX_LINE} are read")
+    found = [_HASH.fullmatch(one.strip()) for one in hashes]
+    try:
+        requirement = Requirement(plain)
+        if not all(found):
+            raise InvalidRequirement("a hash that is none")
+    except (InvalidRequirement, RecursionError) as error:
+        raise RequirementError(
+            f"{where} is {text[:200]!r}. Only plain requirements such as 'numpy>=2' are taken, "
+            "with hashes or without: options, links, paths and files can build and run code while "
+            f"they are installed. {_ADVICE}"
+        ) from error
+    if requirement.url is not None:
+        raise RequirementError(
+            f"{where} takes {requirement.name} from {requirement.url[:200]!r}; only packages of "
+            f"the index are installed. {_ADVICE}"
+        )
+    return Wanted(requirement, where, tuple(one[1] for one in found if one))
+
+
+def read(path: Path) -> list[Wanted]:
+    """The plain requirements in a ``requirements.txt``.
+
+    Raises:
+        RequirementError: It holds something else, or is no text.
+    """
+    text = _text(path, path.name)
+    lines = list(_joined(text.splitlines()))
+    _bounded(len(lines), path.name)
+    return [one(line, f"line {number} of {path.name}") for number, line in lines]
+
+
+def _joined(lines: Sequence[str]) -> Iterator[tuple[int, str]]:
+    """Lines without comments, each with the number of its first; a backslash continues one."""
+    parts: list[str] = []
+    first = 0
+    for number, line in enumerate(map(_without_comment, lines), start=1):
+        first = first if parts else number
+        goes_on = line.endswith("\\") and number < len(lines)
+        parts.append(line[:-1].strip() if goes_on else line)
+        if goes_on:
+            continue
+        whole = " ".join(part for part in parts if part)
+        parts = []
+        if whole:
+            yield first, whole
+
+
+def _without_comment(line: str) -> str:
+    return "" if line.lstrip().startswith("#") else line.split(" #", 1)[0].strip()
+
+
+def _script(path: Path, name: str) -> Declared | None:
+    """The metadata in an entry file, after https://peps.python.org/pep-0723/."""
+    try:
+        with path.open("rb") as file:
+            lines = file.read(LOOKED_AT).decode("utf-8", "replace").splitlines()
+    except OSError as error:
+        raise RequirementError(f"{name} cannot be read: {error}") from error
+    starts = [number for number, line in enumerate(lines) if line.rstrip() == SCRIPT]
+    blocks = [block for block in (_block(lines, start) for start in starts) if block is not None]
+    if not blocks:
+        return None
+    if len(blocks) > 1:
+        raise RequirementError(f"{name} has {len(blocks)} blocks {SCRIPT!r}; one is permitted")
+    where = f"the script metadata of {name}"
+    data = _toml(blocks[0], where)
+    python = _specifier(data.get("requires-python", ""), where)
+    return Declared(name, _list(data.get("dependencies", []), where), python)
+
+
+def _block(lines: Sequence[str], start: int) -> str | None:
+    """The text between the opening line and the last closing one of the same comment."""
+    inside: list[str] = []
+    closed = None
+    for line in lines[start + 1 :]:
+        if line.rstrip() == SCRIPT or not (line == "#" or line.startswith("# ")):
+            break
+        if line.rstrip() == _CLOSES:
+            closed = len(inside)
+        inside.append(line[2:])
+    return None if closed is None else "\n".join(inside[:closed])
+
+
+def _project(path: Path) -> Declared | None:
+    if not path.is_file():
+        return None
+    project = _toml(_text(path, PROJECT), PROJECT).get("project")
+    if not isinstance(project, dict):
+        return None
+    where = f"[project] of {PROJECT}"
+    python = _specifier(project.get("requires-python", ""), where)
+    return Declared(PROJECT, _list(project.get("dependencies", []), where), python)
+
+
+def _toml(text: str, where: str) -> dict[str, Any]:
+    if len(text) > MAX_BYTES or text.count(".") > MAX_DOTS:
+        raise RequirementError(f"{where} is too long: {len(text)} characters. {_ADVICE}")
+    try:
+        data: dict[str, Any] = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise RequirementError(f"{where} is no TOML: {str(error)[:200]}. {_ADVICE}") from error
+    return data
+
+
+def _list(found: object, where: str) -> tuple[Wanted, ...]:
+    if not isinstance(found, list) or not all(isinstance(item, str) for item in found):
+        raise RequirementError(f"dependencies in {where} is no list of texts. {_ADVICE}")
+    _bounded(len(found), where)
+    return tuple(one(item, f"{item[:80]!r} in {where}") for item in found)
+
+
+def _specifier(found: object, where: str) -> str:
+    try:
+        if not isinstance(found, str) or len(found) > MAX_LINE:
+            raise InvalidSpecifier("no text")
+        return str(SpecifierSet(found))
+    except InvalidSpecifier as error:
+        raise RequirementError(
+            f"requires-python in {where} is {str(found)[:80]!r}, which is no set of versions such "
+            f"as '>=3.11'. {_ADVICE}"
+        ) from error
+
+
+def _bounded(count: int, where: str) -> None:
+    if count > MAX_REQUIREMENTS:
+        raise RequirementError(
+            f"{where} has {count} requirements; at most {MAX_REQUIREMENTS} are read. {_ADVICE}"
+        )
+
+
+def _text(path: Path, name: str) -> str:
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+        text = data.decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise RequirementError(f"{name} cannot be read: {error}") from error
+    if len(data) > MAX_BYTES:
+        raise RequirementError(f"{name} is too long; at most {MAX_BYTES} bytes are read. {_ADVICE}")
+    return text

@@ -1,0 +1,347 @@
+"""Folders of packages, one for each lock and interpreter: made once, read-only, shared by hash.
+
+::
+
+    <cache>/environments/<key>/
+        environment.json    what it is; its time is that of the last use
+        lock.txt            the pins, as uv installed them
+        packages/           what uv installed, 0444 in folders 0555, with its bytecode
+    <cache>/environments/<key>.lock
+
+A folder is made under another name, by whoever holds the lock, and renamed into place: what bears
+a key is complete. Nothing in it is ever run here. It is no environment of any interpreter, so that
+none reads a ``.pth`` or ``sitecustomize`` of it at its start; a jail puts the folder onto its path
+once it is confined.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import hashlib
+import json
+import os
+import stat
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from envhub_sandbox import folders
+from envhub_sandbox.dependencies import uv
+from envhub_sandbox.dependencies.interpreters import Interpreter
+from envhub_sandbox.dependencies.resolve import Lock
+from envhub_sandbox.errors import DependencyError, PackageIntegrityError
+from envhub_sandbox.hub.store import CACHE_VARIABLE, cache_root, remove_tree
+
+_FORMAT = 1
+_BUILDING = ".building-"
+_INSTALL_S = 3600.0
+_WAIT_S = 2 * 3600.0
+_POLL_S = 0.1
+_COMPILE_S = 1800.0
+_NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+
+# Reads a stranger's source and runs none of it: -I -S, no package is on the path. Tests are left
+# out; nobody imports them. Bytecode is never held against its source again: both are read-only.
+_COMPILE = """\
+import compileall, py_compile, re, resource, sys
+for limit, value in ((resource.RLIMIT_AS, 8 << 30), (resource.RLIMIT_CPU, 1800),
+                     (resource.RLIMIT_CORE, 0)):
+    hard = resource.getrlimit(limit)[1]
+    value = value if hard == resource.RLIM_INFINITY else min(value, hard)
+    resource.setrlimit(limit, (value, value))
+compileall.compile_dir(sys.argv[1], quiet=2, stripdir=sys.argv[1], rx=re.compile(r"/tests?/"),
+                       maxlevels=64,
+                       invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH)
+"""
+
+
+@dataclass(frozen=True)
+class Environment:
+    """A complete environment.
+
+    Attributes:
+        key: The hash of the lock and the interpreter.
+        python: The interpreter that it is for, by absolute path.
+        version: That one's version.
+        lock: SHA-256 of the lock's text.
+        pins: ``name==version`` of each package.
+        size: Bytes of all files.
+        used: Unix time (seconds) of the last use.
+        home: Its folder.
+    """
+
+    key: str
+    python: str
+    version: str
+    lock: str
+    pins: tuple[str, ...]
+    size: int
+    used: float = field(compare=False)
+    home: Path
+
+    @property
+    def packages(self) -> Path:
+        """The folder for the path of an interpreter."""
+        return self.home / "packages"
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What is in it, as plain data."""
+        return {"lock": f"sha256:{self.lock}", "packages": list(self.pins)}
+
+
+def root() -> Path:
+    """Where they lie."""
+    return cache_root() / "environments"
+
+
+def key_of(lock: Lock, interpreter: Interpreter) -> str:
+    """The name of the environment for both."""
+    facts = json.dumps([_FORMAT, lock.text, asdict(interpreter)])
+    return hashlib.sha256(facts.encode()).hexdigest()[:40]
+
+
+def ready(key: str) -> Environment | None:
+    """The environment of this name, if it has been made.
+
+    Raises:
+        DependencyError: Others can write where it lies.
+    """
+    found = _read(root() / key)
+    if found is not None:
+        _refuse_shared(found.home)
+    return found
+
+
+def provide(
+    lock: Lock, interpreter: Interpreter, tell: Callable[[str], None] = lambda line: None
+) -> Environment:
+    """The environment for a lock and an interpreter; made if there is none, and marked as used.
+
+    Whoever asks for the same at once waits for the one that makes it.
+
+    Raises:
+        IndexUnavailableError, PackageIntegrityError: As with uv.
+        DependencyError: It cannot be made, or others can write where it lies.
+    """
+    key = key_of(lock, interpreter)
+    made = ready(key)
+    if made is None:
+        try:
+            folders.make(root())
+            _refuse_shared(root())
+            with _held(key, tell) as descriptor:
+                made = ready(key) or _made(key, lock, interpreter, descriptor, tell)
+        except OSError as error:
+            raise _not_writable(error) from error
+    with contextlib.suppress(OSError):
+        os.utime(made.home / "environment.json")
+    return made
+
+
+def every() -> list[Environment]:
+    """All of them, the latest used first."""
+    found = [_read(record.parent) for record in root().glob("*/environment.json")]
+    return sorted((one for one in found if one is not None), key=lambda one: -one.used)
+
+
+def remove(environment: Environment) -> None:
+    """Remove one. Not while somebody runs in it."""
+    lock = root() / f"{environment.key}.lock"
+    gone = root() / f"{_BUILDING}{environment.key}-gone"
+    with contextlib.suppress(OSError), _taken(lock) as descriptor:
+        if descriptor is not None:
+            # another name first: what bears the key is complete, or not there
+            os.rename(environment.home, gone)
+            remove_tree(gone)
+            lock.unlink()
+
+
+def remove_abandoned() -> None:
+    """Remove what was left half-made by somebody who was killed."""
+    for path in root().glob(f"{_BUILDING}*"):
+        key = path.name.removeprefix(_BUILDING).partition("-")[0]
+        with contextlib.suppress(OSError), _taken(root() / f"{key}.lock") as descriptor:
+            if descriptor is not None:
+                remove_tree(path)
+                (root() / f"{key}.lock").unlink()
+
+
+def _read(home: Path) -> Environment | None:
+    try:
+        record = home / "environment.json"
+        facts = json.loads(record.read_bytes())
+        if facts.pop("format") != _FORMAT or not (home / "packages").is_dir():
+            return None
+        pins = tuple(map(str, facts.pop("pins")))
+        used = record.stat().st_mtime
+        return Environment(key=home.name, home=home, pins=pins, used=used, **facts)
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
+
+
+@contextlib.contextmanager
+def _held(key: str, tell: Callable[[str], None]) -> Iterator[int]:
+    """Hold the lock of a key; gives its descriptor."""
+    until = time.monotonic() + _WAIT_S
+    told = False
+    while True:
+        with _taken(root() / f"{key}.lock") as descriptor:
+            if descriptor is not None:
+                yield descriptor
+                return
+        if time.monotonic() > until:
+            raise DependencyError(
+                f"another process makes the same environment for {_WAIT_S / 3600:.0f} hours "
+                f"already, and holds {root() / key}.lock. End it, and try again"
+            )
+        if not told:
+            tell("waiting for another process, which makes the same environment")
+            told = True
+        time.sleep(_POLL_S)
+
+
+@contextlib.contextmanager
+def _taken(path: Path) -> Iterator[int | None]:
+    """Take a lock file; None if somebody has it. It holds until every copy of it is closed."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # whoever removes an environment removes its lock file, too
+            taken = os.path.samestat(os.fstat(descriptor), os.stat(path))
+        except (BlockingIOError, FileNotFoundError):
+            taken = False
+        try:
+            yield descriptor if taken else None
+        finally:
+            # a fork of this process may have a copy, which would hold it on
+            fcntl.flock(descriptor, fcntl.LOCK_UN)
+    finally:
+        os.close(descriptor)
+
+
+def _made(
+    key: str, lock: Lock, interpreter: Interpreter, held: int, tell: Callable[[str], None]
+) -> Environment:
+    for path in root().glob(f"{_BUILDING}{key}-*"):
+        remove_tree(path)  # its maker was killed: we hold what it held
+    building = Path(tempfile.mkdtemp(prefix=f"{_BUILDING}{key}-", dir=root()))
+    try:
+        packages = building / "packages"
+        _install(lock, interpreter, building, held, tell)
+        size = _size(packages)
+        tell(f"compiling {size / 2**20:.0f} MiB")
+        _compile(interpreter, packages, held)
+        _close(packages)
+        facts = {
+            "format": _FORMAT,
+            "python": interpreter.path,
+            "version": interpreter.version,
+            "lock": lock.digest,
+            "pins": lock.packages,
+            "size": size,
+        }
+        _publish(building, key, facts)
+    finally:
+        remove_tree(building)
+    made = _read(root() / key)
+    assert made is not None
+    return made
+
+
+def _publish(building: Path, key: str, facts: dict[str, object]) -> None:
+    (building / "environment.json").write_text(json.dumps(facts, indent=1))
+    building.chmod(folders.SHARED_MODE)
+    os.rename(building, root() / key)
+
+
+def _install(
+    lock: Lock, interpreter: Interpreter, building: Path, held: int, tell: Callable[[str], None]
+) -> None:
+    pins = building / "lock.txt"
+    pins.write_text(lock.text)
+    packages = building / "packages"
+    packages.mkdir()
+    # uv keeps our lock for as long as it lives: if we are killed, nobody removes what it still
+    # writes to. Copies, since a file that is shared with uv's cache is another's to change.
+    uv.run(
+        [
+            *("pip", "install", *uv.NO_BUILDS, "--require-hashes", "--no-deps"),
+            *("--link-mode", "copy", "--python", interpreter.path, "--target", str(packages)),
+            *("-r", str(pins)),
+        ],
+        what="the packages could not be installed",
+        timeout_s=_INSTALL_S,
+        tell=tell,
+        keep=[held],
+    )
+    (packages / ".lock").unlink(missing_ok=True)  # uv's own
+
+
+def _size(packages: Path) -> int:
+    """Bytes of all files. A wheel that brought anything but files and folders is refused."""
+    size = 0
+    for path in _walk(packages):
+        status = path.lstat()
+        if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
+            raise PackageIntegrityError(
+                f"a package brought {str(path.relative_to(packages))!r}, which is no file"
+            )
+        size += status.st_size
+    return size
+
+
+def _compile(interpreter: Interpreter, packages: Path, held: int) -> None:
+    """Bytecode for all of it. What fails is only slower, so it is nobody's error."""
+    with contextlib.suppress(subprocess.SubprocessError):
+        subprocess.run(
+            [interpreter.path, "-I", "-S", "-c", _COMPILE, str(packages)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            cwd="/",
+            env={},
+            pass_fds=(held,),
+            timeout=_COMPILE_S,
+        )
+
+
+def _close(packages: Path) -> None:
+    """Let everybody read, and nobody write."""
+    for path in [*_walk(packages), packages]:
+        mode = path.lstat().st_mode
+        runs = stat.S_ISDIR(mode) or mode & stat.S_IXUSR
+        path.chmod(0o555 if runs else 0o444)
+
+
+def _walk(folder: Path) -> Iterator[Path]:
+    for above, below, files in os.walk(folder):
+        yield from (Path(above, name) for name in [*below, *files])
+
+
+def _refuse_shared(place: Path) -> None:
+    if why := folders.why_distrusted(place, cache_root()):
+        raise DependencyError(
+            f"the environments in {root()} are not trusted, since other users can change what is "
+            f"in them: {why}; or set {CACHE_VARIABLE} to a folder of your own"
+        )
+
+
+def _not_writable(error: OSError) -> DependencyError:
+    full = error.errno in _NO_SPACE
+    advice = (
+        "'envhub cache remove --unused-for 30' frees what nobody used for long"
+        if full
+        else "Fix its permissions"
+    )
+    return DependencyError(
+        f"the environments in {root()} cannot be written: {error}. {advice}, or set "
+        f"{CACHE_VARIABLE} to another folder"
+    )

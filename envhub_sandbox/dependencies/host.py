@@ -1,0 +1,84 @@
+"""Whether this interpreter has all that a repository declares, so that nothing is to be installed.
+
+The metadata of what is installed is read, and nothing is imported.
+"""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Iterable
+from importlib import metadata
+
+from packaging.markers import default_environment
+from packaging.requirements import InvalidRequirement, Requirement
+from packaging.specifiers import SpecifierSet
+from packaging.utils import canonicalize_name
+from packaging.version import InvalidVersion
+
+from envhub_sandbox.dependencies.declared import Declared
+
+
+def lacks(declared: Declared) -> str | None:
+    """The first requirement that this interpreter does not meet, of those declared or of theirs.
+
+    None if it meets them all. Where hashes are given it never does: nobody knows any more which
+    files the packages here were made of.
+    """
+    python = SpecifierSet(declared.python)
+    if not python.contains(platform.python_version(), prereleases=True):
+        return f"python{declared.python}"
+    hashed = next((wanted for wanted in declared.wanted if wanted.hashes), None)
+    if hashed is not None:
+        return str(hashed.requirement)
+    return _Installed().lacks(wanted.requirement for wanted in declared.wanted)
+
+
+class _Installed:
+    def __init__(self) -> None:
+        self._met: set[tuple[str, frozenset[str]]] = set()
+        self._found: dict[str, metadata.Distribution | None] = {}
+        self._environment = {str(k): str(v) for k, v in default_environment().items()}
+
+    def lacks(self, requirements: Iterable[Requirement]) -> str | None:
+        """The first that is not met, of all that they lead to."""
+        waiting = [(one, frozenset[str]()) for one in requirements]
+        while waiting:
+            wanted, extras = waiting.pop()
+            if not self._applies(wanted, extras):
+                continue
+            found = self._distribution(wanted.name)
+            if found is None or not _is_among(found, wanted.specifier):
+                return str(wanted)
+            key = (canonicalize_name(wanted.name), frozenset(wanted.extras))
+            if key not in self._met:
+                self._met.add(key)
+                waiting += [(one, key[1]) for one in _needs(found)]
+        return None
+
+    def _applies(self, wanted: Requirement, extras: frozenset[str]) -> bool:
+        if wanted.marker is None:
+            return True
+        each = ({**self._environment, "extra": extra} for extra in extras or ("",))
+        return any(wanted.marker.evaluate(environment) for environment in each)
+
+    def _distribution(self, name: str) -> metadata.Distribution | None:
+        if name not in self._found:
+            try:
+                self._found[name] = metadata.distribution(name)
+            except (metadata.PackageNotFoundError, ValueError):
+                self._found[name] = None
+        return self._found[name]
+
+
+def _is_among(found: metadata.Distribution, versions: SpecifierSet) -> bool:
+    try:
+        return versions.contains(found.version, prereleases=True)
+    except (InvalidVersion, TypeError):
+        return False
+
+
+def _needs(found: metadata.Distribution) -> list[Requirement]:
+    try:
+        return [Requirement(text) for text in found.requires or ()]
+    except InvalidRequirement:
+        return []  # of old metadata; what is installed already works for its owner

@@ -1,0 +1,108 @@
+"""Where packages come from: the user's own settings for uv, or else for pip.
+
+uv gets an environment that is made here, name by name: what chooses an index, a proxy, a
+certificate or a cache is the user's to say, and nothing that would turn builds on gets through.
+Who is behind a mirror has mostly told pip of it; what uv was not told is taken from there.
+"""
+
+from __future__ import annotations
+
+import configparser
+import os
+import re
+import site
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+_KEPT = re.compile(
+    r"HOME|USER|LOGNAME|PATH|TMPDIR|LANG|LC_.*|XDG_CACHE_HOME|XDG_DATA_HOME|XDG_RUNTIME_DIR|NETRC"
+    r"|SSL_CERT_FILE|SSL_CERT_DIR|SSL_CLIENT_CERT|REQUESTS_CA_BUNDLE"
+    r"|(?i:http_proxy|https_proxy|all_proxy|no_proxy)"
+    r"|UV_(DEFAULT_INDEX|INDEX|INDEX_URL|EXTRA_INDEX_URL|FIND_LINKS|NO_INDEX|INDEX_STRATEGY"
+    r"|INDEX_[A-Z0-9_]+_(USERNAME|PASSWORD)|KEYRING_PROVIDER|INSECURE_HOST|NATIVE_TLS|SYSTEM_CERTS"
+    r"|CACHE_DIR|OFFLINE|HTTP_TIMEOUT|HTTP_RETRIES|REQUEST_TIMEOUT"
+    r"|CONCURRENT_(DOWNLOADS|INSTALLS)|EXCLUDE_NEWER|TORCH_BACKEND)"
+)
+_CHOOSE_AN_INDEX = (
+    *("UV_DEFAULT_INDEX", "UV_INDEX", "UV_INDEX_URL", "UV_EXTRA_INDEX_URL", "UV_FIND_LINKS"),
+    "UV_NO_INDEX",
+)
+_FIXED = {"UV_PYTHON_DOWNLOADS": "never", "UV_NO_PROGRESS": "1", "NO_COLOR": "1"}
+_YES = ("1", "true", "yes", "on")
+
+
+def environment(variables: Mapping[str, str] | None = None) -> dict[str, str]:
+    """The environment that uv runs in.
+
+    Args:
+        variables: The user's; those of this process by default.
+    """
+    given = os.environ if variables is None else variables
+    kept = {name: value for name, value in given.items() if value and _KEPT.fullmatch(name)}
+    if not any(name in kept for name in _CHOOSE_AN_INDEX):
+        kept |= _as_uv_says(pip_settings(given), kept)
+    return kept | _FIXED
+
+
+def places(variables: Mapping[str, str] | None = None) -> list[str]:
+    """What of it decides where packages come from, as ``NAME=value``; it may hold passwords."""
+    found = environment(variables)
+    names = (*_CHOOSE_AN_INDEX, "UV_INDEX_STRATEGY", "UV_EXCLUDE_NEWER", "UV_TORCH_BACKEND")
+    return [f"{name}={found[name]}" for name in names if name in found]
+
+
+def pip_settings(variables: Mapping[str, str]) -> dict[str, str]:
+    """pip's own settings by their long names; a variable wins over files, a later file over others.
+
+    Files that cannot be read are passed over, as they say nothing of ours.
+    """
+    found: dict[str, str] = {}
+    for path in _pip_files(variables):
+        parser = configparser.RawConfigParser()
+        try:
+            parser.read(path, "utf-8")
+            sections = [name for name in ("global", "install") if parser.has_section(name)]
+            for section in sections:
+                found |= {k.replace("_", "-"): v for k, v in parser.items(section)}
+        except (OSError, ValueError, configparser.Error):
+            continue
+    for name, value in variables.items():
+        if name.startswith("PIP_") and value:
+            found[name[4:].lower().replace("_", "-")] = value
+    return found
+
+
+def _pip_files(variables: Mapping[str, str]) -> list[Path]:
+    """In pip's order: the machine's, the user's, the environment's, and the one that is named."""
+    named = variables.get("PIP_CONFIG_FILE", "")
+    if named == os.devnull:
+        return []
+    home = Path(variables.get("HOME") or os.path.expanduser("~"))
+    shared = variables.get("XDG_CONFIG_DIRS") or "/etc/xdg"
+    own = Path(variables.get("XDG_CONFIG_HOME") or home / ".config")
+    files = [Path(folder, "pip", "pip.conf") for folder in shared.split(os.pathsep) if folder]
+    files += [Path("/etc/pip.conf"), home / ".pip/pip.conf", own / "pip/pip.conf"]
+    files += [Path(prefix, "pip.conf") for prefix in dict.fromkeys([*site.PREFIXES, sys.prefix])]
+    return [*files, Path(named)] if named else files
+
+
+def _as_uv_says(pip: Mapping[str, str], kept: Mapping[str, str]) -> dict[str, str]:
+    said: dict[str, str] = {}
+    if index := pip.get("index-url", "").strip():
+        said["UV_DEFAULT_INDEX"] = index
+    if more := pip.get("extra-index-url", "").split():
+        said["UV_INDEX"] = " ".join(more)
+        # pip has no first index: it takes the best version of all of them
+        said["UV_INDEX_STRATEGY"] = kept.get("UV_INDEX_STRATEGY", "unsafe-best-match")
+    if links := pip.get("find-links", "").split():
+        said["UV_FIND_LINKS"] = ",".join(links)
+    if pip.get("no-index", "").strip().lower() in _YES:
+        said["UV_NO_INDEX"] = "1"
+    if (certificate := pip.get("cert", "").strip()) and "SSL_CERT_FILE" not in kept:
+        said["SSL_CERT_FILE"] = certificate
+    if hosts := pip.get("trusted-host", "").split():
+        said["UV_INSECURE_HOST"] = " ".join(hosts)
+    if proxy := pip.get("proxy", "").strip():
+        said |= {name: proxy for name in ("HTTP_PROXY", "HTTPS_PROXY") if name not in kept}
+    return said

@@ -1,0 +1,152 @@
+"""Interpreters of this machine that a repository can run in. None is ever downloaded.
+
+A repository's packages lie in a folder of their own, so what is wanted is an interpreter and
+nothing of its packages: the one that a virtual environment was made of, and not the environment.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from packaging.specifiers import InvalidSpecifier, SpecifierSet
+from packaging.version import InvalidVersion, Version
+
+from envhub_sandbox.dependencies import uv
+from envhub_sandbox.errors import DependencyError, InterpreterUnavailableError
+
+_ASK_S = 60.0
+_FIND_S = 120.0
+_OLDEST = SpecifierSet(">=3.10")
+_ASK = (
+    "import json, os, platform, sys; print(json.dumps([sys.implementation.name,"
+    " platform.python_version(), os.uname().machine, platform.libc_ver()[1],"
+    " os.path.realpath(sys.executable)]))"
+)
+
+
+@dataclass(frozen=True)
+class Interpreter:
+    """An interpreter, without its packages.
+
+    Attributes:
+        path: Absolute, and no link.
+        implementation: ``"cpython"``.
+        version: ``"3.11.2"``.
+        machine: As ``os.uname`` says it.
+        libc: glibc's version.
+    """
+
+    path: str
+    implementation: str
+    version: str
+    machine: str
+    libc: str
+
+    def fits(self, versions: SpecifierSet) -> bool:
+        """Whether it is among these versions."""
+        return versions.contains(self.version, prereleases=True)
+
+
+def own() -> Interpreter:
+    """The one that this process runs in; what it was made of, if it is a virtual environment."""
+    name = f"python{sys.version_info[0]}.{sys.version_info[1]}"
+    base = os.path.realpath(os.path.join(sys.base_prefix, "bin", name))
+    if not os.access(base, os.X_OK):
+        base = os.path.realpath(sys.executable)
+    return Interpreter(
+        base,
+        sys.implementation.name,
+        platform.python_version(),
+        os.uname().machine,
+        platform.libc_ver()[1],
+    )
+
+
+def find(asked: str, declared: str = "") -> Interpreter:
+    """An interpreter that fits: this one if it does, else the newest that is at hand.
+
+    Args:
+        asked: The caller's choice: a version (``"3.11"``), versions (``">=3.11,<3.13"``) or a path;
+            empty for none.
+        declared: The versions that the repository runs in.
+
+    Raises:
+        InterpreterUnavailableError: There is none.
+    """
+    if os.sep in asked:
+        return _at(os.path.abspath(os.path.expanduser(asked)))
+    versions = _versions(asked) & SpecifierSet(declared) & _OLDEST
+    ours = own()
+    if ours.fits(versions):
+        return ours
+    found = [one for one in _others(versions) if one.fits(versions)]
+    if found:
+        return max(found, key=lambda one: Version(one.version))
+    why = f"you ask for Python {asked!r}" if asked else f"it runs in Python {declared}"
+    raise InterpreterUnavailableError(
+        f"{why}, and this machine has none that is 3.10 or later and fits; this one is "
+        f"{ours.version} ({ours.path}). Install one ('uv python install' does), or name one: "
+        "dependencies={'python': '/path/to/python3'}. None is downloaded by itself"
+    )
+
+
+def check_versions(asked: str) -> None:
+    """Refuse what is neither a version, nor versions, nor a path.
+
+    Raises:
+        ValueError: It is none of these.
+    """
+    if os.sep not in asked:
+        _versions(asked)
+
+
+def _versions(asked: str) -> SpecifierSet:
+    try:
+        return SpecifierSet(f"=={Version(asked)}.*" if asked.count(".") < 2 else f"=={asked}")
+    except (InvalidVersion, InvalidSpecifier):
+        return SpecifierSet(asked)
+
+
+def _at(path: str) -> Interpreter:
+    try:
+        done = subprocess.run(
+            [path, "-I", "-S", "-c", _ASK], capture_output=True, timeout=_ASK_S, check=True
+        )
+        *facts, real = json.loads(done.stdout)
+    except (OSError, ValueError, subprocess.SubprocessError) as error:
+        raise InterpreterUnavailableError(
+            f"{path} is no interpreter that answers: {error}"
+        ) from error
+    return Interpreter(real, *map(str, facts))
+
+
+def _others(versions: SpecifierSet) -> list[Interpreter]:
+    """What uv finds, and what pyenv keeps where uv does not look. All of it is this machine's."""
+    paths = [*_pyenvs()]
+    try:
+        found = uv.run(
+            ["python", "find", "--no-config", "--no-project", "--system", str(versions)],
+            what="no interpreter was found",
+            timeout_s=_FIND_S,
+        )
+        paths.append(found.strip())
+    except DependencyError:
+        pass  # which says that it found none
+    interpreters = []
+    for path in dict.fromkeys(os.path.realpath(path) for path in paths if path):
+        try:
+            interpreters.append(_at(path))
+        except InterpreterUnavailableError:
+            continue
+    return interpreters
+
+
+def _pyenvs() -> list[str]:
+    root = Path(os.environ.get("PYENV_ROOT") or os.path.expanduser("~/.pyenv"))
+    return [str(path) for path in root.glob("versions/3.*/bin/python3") if path.exists()]

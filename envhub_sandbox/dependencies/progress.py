@@ -1,0 +1,69 @@
+"""What is going on while packages are chosen and installed: on a terminal or in a notebook.
+
+It is shown only if it takes a moment. Elsewhere (in CI, under a program) there is the log.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+
+from envhub_sandbox.log import DEPENDENCIES
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.text import Text
+
+_WIDTH = 100
+_shown_by: list[Callable[[str], None]] = []
+
+
+@contextlib.contextmanager
+def shown_by(show: Callable[[str], None]) -> Iterator[None]:
+    """While it lasts, whoever shows something already shows this too: two share no line."""
+    _shown_by.append(show)
+    try:
+        yield
+    finally:
+        _shown_by.remove(show)
+
+
+@contextlib.contextmanager
+def shown(title: str) -> Iterator[Callable[[str], None]]:
+    """Gives what takes a line for each thing that happens."""
+    with contextlib.ExitStack() as stack:
+        shows = list(_shown_by[-1:])
+        console = None if shows else _console()
+        if console is not None:
+            status = stack.enter_context(console.status(""))
+            shows = [lambda text: status.update(_plain(text))]
+
+        def tell(line: str) -> None:
+            DEPENDENCIES.info("%s: %s", title, line)
+            for show in shows:
+                show(f"{title}: {line}"[:_WIDTH])
+
+        yield tell
+
+
+def _console() -> Console | None:
+    """A console that somebody looks at."""
+    if os.environ.get("CI") or not (sys.stderr.isatty() or _is_notebook()):
+        return None
+    from rich.console import Console
+
+    return Console(stderr=True, markup=False, highlight=False, emoji=False)
+
+
+def _is_notebook() -> bool:
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return type(shell).__name__ == "ZMQInteractiveShell"
+
+
+def _plain(text: str) -> Text:
+    from rich.text import Text
+
+    return Text(text)

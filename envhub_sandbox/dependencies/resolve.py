@@ -1,0 +1,159 @@
+"""Requirements to pins: every package with the hashes of its wheels, for one interpreter."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from packaging.utils import canonicalize_name
+
+from envhub_sandbox.dependencies import uv
+from envhub_sandbox.dependencies.declared import Wanted, one
+from envhub_sandbox.errors import PackageIntegrityError, ResolutionError
+
+WORKERS = ("cloudpickle>=3", "gymnasium>=0.29", "msgpack>=1.0.5", "numpy>=1.26")
+"""What the worker's jails import besides: the repository's versions must be among these.
+Gymnasium may be older in a jail than outside."""
+_RESOLVE_S = 600.0
+_PIN = re.compile(r"([a-z0-9][a-z0-9.-]*)==([A-Za-z0-9.!+_-]+) \\")
+_HASH = re.compile(r"    --hash=(sha(?:256|384|512):[0-9a-f]+)( \\)?")
+
+
+@dataclass(frozen=True)
+class Lock:
+    """Every package, pinned, with the hashes of its wheels.
+
+    Attributes:
+        text: As pip's ``--require-hashes`` reads it.
+    """
+
+    text: str
+
+    @property
+    def digest(self) -> str:
+        """Hexadecimal SHA-256 of the text."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+    @property
+    def packages(self) -> list[str]:
+        """``name==version`` of each."""
+        lines = [line.split()[0] for line in self.text.splitlines() if line[:1].isalnum()]
+        return [line for line in lines if "==" in line]
+
+
+@dataclass(frozen=True)
+class Target:
+    """What packages are for: an interpreter that is here, or one that is described.
+
+    Attributes:
+        python: Its path; empty where it is not on this machine.
+        version: Where it is not: its version, ``"3.12"``.
+        machine: Likewise, as ``os.uname`` says it; it has Linux with glibc.
+    """
+
+    python: str = ""
+    version: str = ""
+    machine: str = ""
+
+    def __str__(self) -> str:
+        return self.python or f"Python {self.version} on {self.machine}"
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """For uv."""
+        if self.python:
+            return ("--python", self.python)
+        platform = f"{self.machine}-manylinux_2_28"
+        return ("--python-version", self.version, "--python-platform", platform)
+
+
+def resolve(
+    wanted: Sequence[Wanted],
+    target: Target,
+    *,
+    exclude_newer: str | None = None,
+    tell: Callable[[str], None] = lambda line: None,
+) -> Lock:
+    """Pins for a target; wheels only, nothing is built.
+
+    Args:
+        wanted: What is asked for; what the worker needs comes on top.
+        target: What the packages are for.
+        exclude_newer: A date: packages of later are not seen.
+        tell: Gets each line of uv's progress.
+
+    Raises:
+        ResolutionError: There is no solution.
+        PackageIntegrityError: A version is there, but not with a hash that was asked for.
+        DependencyError: There is no uv, or it failed.
+    """
+    every = [*wanted, *(one(text, "the worker of envhub-sandbox") for text in WORKERS)]
+    try:
+        text = uv.run(
+            [
+                *("pip", "compile", "-", *uv.NO_BUILDS, "--generate-hashes", "--no-header"),
+                *("--no-annotate", *target.options),
+                *(() if exclude_newer is None else ("--exclude-newer", exclude_newer)),
+            ],
+            what=f"no versions of the packages could be chosen for {target}",
+            given="".join(f"{one.requirement}\n" for one in every),
+            timeout_s=_RESOLVE_S,
+            tell=tell,
+        )
+    except ResolutionError as error:
+        raise ResolutionError(f"{error}\n{_what_to_change(str(error), every)}") from error
+    return Lock(_with_their_hashes(_pins(text), wanted))
+
+
+def _pins(text: str) -> list[tuple[str, str, list[str]]]:
+    """Name, version and hashes of each package; anything else in there is refused."""
+    found: list[tuple[str, str, list[str]]] = []
+    for line in text.splitlines():
+        if pin := _PIN.fullmatch(line):
+            found.append((pin[1], pin[2], []))
+        elif (hashed := _HASH.fullmatch(line)) and found:
+            found[-1][2].append(hashed[1])
+        else:
+            raise ResolutionError(
+                f"uv gave {line[:200]!r}, which is no pinned package with hashes: only packages of "
+                "an index that gives their hashes are installed"
+            )
+    return found
+
+
+def _with_their_hashes(pins: Iterable[tuple[str, str, list[str]]], wanted: Sequence[Wanted]) -> str:
+    """The lock's text, with only those hashes of a package that its requirement permits."""
+    permitted: dict[str, tuple[set[str], str]] = {}
+    for asked in wanted:
+        if asked.hashes:
+            key = canonicalize_name(asked.requirement.name)
+            permitted.setdefault(key, (set(), asked.where))[0].update(asked.hashes)
+    lines = []
+    for name, version, hashes in pins:
+        among, where = permitted.get(canonicalize_name(name), (set(hashes), ""))
+        kept = [known for known in hashes if known in among]
+        if not kept:
+            raise PackageIntegrityError(
+                f"the index has {name}=={version}, but no file of it with a hash that {where} "
+                "names. It was replaced there, or the hash is another file's"
+            )
+        lines.append(" \\\n".join([f"{name}=={version}", *(f"    --hash={k}" for k in kept)]))
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _what_to_change(said: str, every: Sequence[Wanted]) -> str:
+    """The requirements that an explanation speaks of, with where each stands."""
+    words = {canonicalize_name(word) for word in re.findall(r"[A-Za-z0-9][A-Za-z0-9._-]*", said)}
+    told = [one for one in every if canonicalize_name(one.requirement.name) in words]
+    lines = [f"  {one.requirement}  ({one.where})" for one in (told or every)[:20]]
+    return "\n".join(
+        [
+            "What is required of these packages:",
+            *lines,
+            "Change one of them in the repository; or ask for another Python, dependencies="
+            "{'python': '3.12'}; or install what fits into an interpreter of your own and give "
+            "that with python=...",
+        ]
+    )

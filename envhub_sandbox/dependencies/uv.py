@@ -1,0 +1,193 @@
+"""uv: found, started in a folder of nobody's, and its refusals as errors of ours.
+
+It is told to build nothing, to read no settings but ours (``index.py``), and to download no
+interpreter. What it prints is the user's to read, but quotes a stranger's names: it is escaped.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sysconfig
+import tempfile
+import threading
+from collections.abc import Callable, Iterable, Sequence
+
+from envhub_sandbox.dependencies import index
+from envhub_sandbox.errors import (
+    DependencyError,
+    IndexUnavailableError,
+    PackageIntegrityError,
+    ResolutionError,
+)
+from envhub_worker.protocol.text import printable
+
+NO_BUILDS = ("--no-config", "--no-build")
+_SHOWN = 4000
+_KEPT_LINES = 400
+
+_NO_INDEX = (
+    "The package index did not answer. Look at the network, or name a mirror that can be reached "
+    "in UV_INDEX_URL or in pip's settings; what was made here before works offline"
+)
+
+# What uv says, and what that means for the user; the first that is found counts.
+_MEANINGS: tuple[tuple[str, type[DependencyError], str], ...] = (
+    (
+        r"No space left|os error 28|Disk quota|os error 122",
+        DependencyError,
+        "The disk is full; 'envhub cache remove --unused-for 30' frees what nobody used for long, "
+        "and 'uv cache prune' what uv keeps",
+    ),
+    (
+        r"Hash mismatch|hash mismatch",
+        PackageIntegrityError,
+        "A package is not the one whose hash is known: it was replaced on the index, or on its way "
+        "here. Nothing of it was kept. If the index is right, resolve again: envhub prefetch "
+        "--upgrade REF",
+    ),
+    (r"network was disabled", IndexUnavailableError, _NO_INDEX),
+    (
+        r"yanked",
+        ResolutionError,
+        "A release was taken back by its authors. Ask for another version, or name this one "
+        "exactly: 'name==version'",
+    ),
+    (r"No solution found|unsatisfiable", ResolutionError, ""),
+    (
+        r"Failed to fetch|error sending request|Request failed|Connection|dns error|timed out"
+        r"|certificate|Failed to download|HTTP status",
+        IndexUnavailableError,
+        _NO_INDEX,
+    ),
+)
+
+
+def run(
+    arguments: Sequence[str],
+    *,
+    what: str,
+    given: str = "",
+    timeout_s: float,
+    tell: Callable[[str], None] = lambda line: None,
+    keep: Iterable[int] = (),
+) -> str:
+    """Run uv to its end, and return what it printed.
+
+    Args:
+        arguments: After ``uv``.
+        what: What it is asked for, for errors.
+        given: Its standard input.
+        timeout_s: For how long at most.
+        tell: Gets each line of its progress as it comes.
+        keep: Descriptors that it keeps open for as long as it lives.
+
+    Raises:
+        DependencyError: It failed, or there is none.
+    """
+    with tempfile.TemporaryDirectory(prefix="envhub-uv-") as nowhere:
+        # uv reads projects and settings of the folder that it runs in
+        process = subprocess.Popen(
+            [command(), *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            cwd=nowhere,
+            env=index.environment(),
+            pass_fds=tuple(keep),
+            text=True,
+            errors="replace",
+        )
+        with process:
+            said = _Listener(process, tell)
+            try:
+                printed = said.exchange(given, timeout_s)
+            except subprocess.TimeoutExpired:
+                text = f"{what}: uv was not done after {timeout_s:.0f} s"
+                raise IndexUnavailableError(text) from None
+            finally:
+                process.kill()
+    if process.returncode != 0:
+        raise _error(what, said.text)
+    return printed
+
+
+class _Listener:
+    """Reads both outputs of a process at once; the first as a whole, the other by lines."""
+
+    def __init__(self, process: subprocess.Popen[str], tell: Callable[[str], None]) -> None:
+        self._process = process
+        self._tell = tell
+        self._lines: list[str] = []
+        self._printed = ""
+
+    @property
+    def text(self) -> str:
+        """The last lines that it wrote on stderr."""
+        return "\n".join(self._lines)
+
+    def exchange(self, given: str, timeout_s: float) -> str:
+        """Write to it, read until it ends, and return what it printed."""
+        threads = [threading.Thread(target=work) for work in (self._read, self._listen)]
+        for thread in threads:
+            thread.start()
+        try:
+            assert self._process.stdin is not None
+            try:
+                self._process.stdin.write(given)
+                self._process.stdin.close()
+            except BrokenPipeError:
+                pass  # it says on stderr why it has gone
+            self._process.wait(timeout_s)
+        except BaseException:
+            self._process.kill()
+            raise
+        finally:
+            for thread in threads:
+                thread.join()
+        return self._printed
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        self._printed = self._process.stdout.read()
+
+    def _listen(self) -> None:
+        assert self._process.stderr is not None
+        for line in self._process.stderr:
+            del self._lines[:-_KEPT_LINES]
+            self._lines.append(printable(line.rstrip(), 500))
+            self._tell(self._lines[-1].strip())
+
+
+def command() -> str:
+    """uv's path.
+
+    Raises:
+        DependencyError: It is not installed.
+    """
+    # pip puts it next to the interpreter, which need not be on PATH
+    path = os.pathsep.join([sysconfig.get_path("scripts"), os.environ.get("PATH", os.defpath)])
+    found = shutil.which("uv", path=path)
+    if found is None:
+        raise DependencyError(
+            "uv resolves and installs packages, and is not found: neither beside this interpreter "
+            "nor on PATH. Run: pip install uv"
+        )
+    return found
+
+
+def _error(what: str, said: str) -> DependencyError:
+    text = _in_the_users_words(said)[-_SHOWN:]
+    for pattern, kind, meaning in _MEANINGS:
+        if re.search(pattern, said):
+            return kind(f"{what}.{f' {meaning}.' if meaning else ''}\n{text}")
+    return DependencyError(f"{what}; uv says:\n{text}")
+
+
+def _in_the_users_words(said: str) -> str:
+    """uv speaks to whoever wrote the requirements, and that is not who reads it here."""
+    plain = re.sub(r"\byour requirements are unsatisfiable", "nothing satisfies all of them", said)
+    plain = re.sub(r"\b[Yy]ou require\b", "it is required that there be", plain)
+    return re.sub(r"^hint: ", "  ", plain, flags=re.MULTILINE).strip()

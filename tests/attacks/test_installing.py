@@ -1,0 +1,248 @@
+"""Packages that run code by themselves: while they are chosen, installed, or merely lie there.
+
+Each trap leaves a file in a folder that no jail can write to, so that the file says from outside
+whether it went off outside of one. The control springs the same trap with the same uv, or in an
+interpreter that has the same packages, as one does without this project.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import subprocess
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.dependencies import index as places
+from envhub_sandbox.dependencies import interpreters, uv
+from envhub_sandbox.errors import DependencyError, EnvHubError
+from tests.support.repositories import write_repository
+from tests.support.wheels import Index, make_wheel
+
+ENV = """
+import sys
+import gymnasium as gym
+import bait
+
+class Told(gym.Wrapper):
+    def sprung(self):
+        return sorted(name for name in sys.modules if name.startswith("trap_"))
+    def bait(self):
+        return bait.VERSION
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([lambda: Told(gym.make("CartPole-v1"))] * n_envs)
+"""
+BAIT = {"bait/__init__.py": "VERSION = 'swallowed'\n"}
+
+
+def trap(folder: Path, name: str) -> str:
+    """Code that leaves a file, if it can; what it cannot do does not stop it."""
+    lines = ("import os", "try:", f"    open({str(folder / name)!r}, 'a').write('sprung')")
+    return "\n".join([*lines, "except OSError:", "    pass", ""])
+
+
+@pytest.fixture
+def traces(tmp_path: Path) -> Path:
+    """The folder that shows what went off outside; everybody may write there but a jail."""
+    folder = tmp_path / "traces"
+    folder.mkdir()
+    folder.chmod(0o777)
+    return folder
+
+
+def sprung(traces: Path) -> set[str]:
+    """What went off, and forgotten again."""
+    found = {path.name for path in traces.iterdir()}
+    for path in traces.iterdir():
+        path.unlink()
+    return found
+
+
+def virtual_environment(folder: Path, wheels: list[Path]) -> Path:
+    """An interpreter with these packages among its own: where pip would put them."""
+    subprocess.run(
+        [interpreters.own().path, "-m", "venv", "--without-pip", str(folder)], check=True
+    )
+    [site] = folder.glob("lib/python3*/site-packages")
+    for wheel in wheels:
+        shutil.unpack_archive(wheel, site, "zip")
+    return folder / "bin" / "python"
+
+
+def what_starts_by_itself(folder: Path, traces: Path) -> Path:
+    """A wheel whose files an interpreter runs at its start."""
+    files = {
+        "trap_pth.py": trap(traces, "pth"),
+        "trap.pth": "import trap_pth\n",
+        "sitecustomize.py": trap(traces, "sitecustomize"),
+        "usercustomize.py": trap(traces, "usercustomize"),
+    }
+    return make_wheel(folder, "bait", "1.0", {**BAIT, **files})
+
+
+def test_what_an_interpreter_runs_at_its_start(
+    real_index: Index, tmp_path: Path, traces: Path
+) -> None:
+    """``.pth``, ``sitecustomize``, ``usercustomize``: no interpreter outside of a jail has them."""
+    wheel = what_starts_by_itself(real_index.folder, traces)
+    python = virtual_environment(tmp_path / "control", [wheel])
+    subprocess.run([str(python), "-c", "pass"], check=True)
+    assert "pth" in sprung(traces)
+    [site] = (tmp_path / "control").glob("lib/python3*/site-packages")
+    subprocess.run([str(python), "-c", "pass"], check=True, env={"PYTHONPATH": str(site)})
+    assert "sitecustomize" in sprung(traces)
+    folder = write_repository(tmp_path / "repo", ENV, requirements__txt="bait==1.0\n")
+    with make_env(folder) as suites:
+        suites.env.reset(seed=0)
+        assert suites.env.call("bait") == ("swallowed",)
+        assert suites.env.call("sprung") == (["trap_pth"],)  # and there it may
+    assert sprung(traces) == set()
+
+
+def test_a_plugin_of_a_package_that_is_loaded_early(
+    real_index: Index, tmp_path: Path, traces: Path
+) -> None:
+    """Gymnasium before 1.0 imports these; whatever reads entry points would."""
+    files = {**BAIT, "trap_plugin.py": trap(traces, "plugin") + "def register(): pass\n"}
+    files["bait-2.0.dist-info/entry_points.txt"] = (
+        "[gymnasium.envs]\n__root__ = trap_plugin:register\n"
+    )
+    wheel = make_wheel(real_index.folder, "bait", "2.0", files)
+    python = virtual_environment(tmp_path / "control", [wheel])
+    load = "from importlib.metadata import entry_points as e\n[x.load() for x in e(group={!r})]"
+    subprocess.run([str(python), "-c", load.format("gymnasium.envs")], check=True)
+    assert sprung(traces) == {"plugin"}
+    folder = write_repository(tmp_path / "repo", ENV, requirements__txt="bait==2.0\n")
+    with make_env(folder) as suites:
+        suites.env.reset(seed=0)
+    assert sprung(traces) == set()
+
+
+@pytest.mark.parametrize(
+    ("version", "names"),
+    [
+        ("3.0", ["numpy"]),
+        ("3.1", ["encodings", "json", "msgpack", "zmq", "envhub_worker"]),
+    ],
+)
+def test_a_package_of_a_name_that_we_import(
+    real_index: Index, tmp_path: Path, traces: Path, version: str, names: list[str]
+) -> None:
+    """What it calls so is imported by its own jails at most, and there confined."""
+    files = {**BAIT, **{f"{name}/__init__.py": trap(traces, name) for name in names}}
+    wheel = make_wheel(real_index.folder, "bait", version, files)
+    python = virtual_environment(tmp_path / "control", [wheel])
+    [site] = (tmp_path / "control").glob("lib/python3*/site-packages")
+    for name in names:
+        bare = f"import sys; sys.path.insert(0, {str(site)!r}); sys.modules.pop({name!r}, 0)"
+        subprocess.run([str(python), "-c", f"{bare}; import {name}"], check=True)
+    assert sprung(traces) == set(names)
+    folder = write_repository(tmp_path / "repo", ENV, requirements__txt=f"bait=={version}\n")
+    # it may well break its own jail
+    with contextlib.suppress(EnvHubError), make_env(folder) as suites:
+        suites.env.reset(seed=0)
+    assert sprung(traces) == set()
+
+
+BACKEND = """
+{trap}
+def build_wheel(*given, **named):
+    raise SystemExit("built")
+get_requires_for_build_wheel = prepare_metadata_for_build_wheel = build_editable = build_wheel
+get_requires_for_build_editable = prepare_metadata_for_build_editable = build_wheel
+"""
+PROJECT = """
+[build-system]
+requires = []
+build-backend = "backend"
+backend-path = ["."]
+[project]
+name = "{name}"
+dynamic = ["version", "dependencies"]
+"""
+
+
+def source(folder: Path, name: str, traces: Path) -> Path:
+    """A project that springs a trap when it is built, and needs nothing for that."""
+    folder.mkdir()
+    (folder / "backend.py").write_text(BACKEND.format(trap=trap(traces, name)))
+    (folder / "pyproject.toml").write_text(PROJECT.format(name=name))
+    return folder
+
+
+def plain_uv(given: str, cwd: Path) -> None:
+    """Choose versions as one does without this project."""
+    python = interpreters.own().path
+    command = [uv.command(), "pip", "compile", "-", "--no-config", "--python", python]
+    subprocess.run(
+        command, input=given, text=True, capture_output=True, cwd=cwd, env=places.environment()
+    )
+
+
+def only_source(index: Index, folder: Path, traces: Path) -> tuple[str, Callable[[], object]]:
+    """A package of the index that has no wheel."""
+    made = source(folder / "source", "sourced", traces)
+    with tarfile.open(index.folder / "sourced-1.0.tar.gz", "w:gz") as archive:
+        archive.add(made, "sourced-1.0")
+    return "sourced", lambda: plain_uv("sourced\n", folder)
+
+
+def editable(index: Index, folder: Path, traces: Path) -> tuple[str, Callable[[], object]]:
+    """An option that installs a folder; uv builds that although it is told to build nothing."""
+    made = source(folder / "source", "edited", traces)
+    line = f"-e {made}"
+    return line, lambda: plain_uv(f"{line}\n", folder)
+
+
+def linked(index: Index, folder: Path, traces: Path) -> tuple[str, Callable[[], object]]:
+    """A requirement that is a path, in the form of a URL."""
+    made = source(folder / "source", "linked", traces)
+    line = f"linked @ file://{made}"
+    return line, lambda: plain_uv(f"{line}\n", folder)
+
+
+def relative(index: Index, folder: Path, traces: Path) -> tuple[str, Callable[[], object]]:
+    """The repository's own folder, by a relative path."""
+    source(folder / "source", "relative", traces)
+    return "./source", lambda: plain_uv("./source\n", folder)
+
+
+@pytest.mark.parametrize("kind", [only_source, editable, linked, relative])
+def test_what_would_be_built_is_not(
+    real_index: Index,
+    tmp_path: Path,
+    traces: Path,
+    kind: Callable[[Index, Path, Path], tuple[str, Callable[[], object]]],
+) -> None:
+    """A build runs what the package says; it is refused before anything of it is read."""
+    line, control = kind(real_index, tmp_path, traces)
+    control()
+    assert sprung(traces), "the control builds nothing"
+    folder = write_repository(tmp_path / "repo", ENV, requirements__txt=f"{line}\n")
+    if (tmp_path / "source").is_dir():
+        shutil.copytree(tmp_path / "source", folder / "source")
+    with pytest.raises(DependencyError):
+        make_env(folder)
+    assert sprung(traces) == set()
+
+
+def test_making_bytecode_runs_nothing(real_index: Index, tmp_path: Path, traces: Path) -> None:
+    """Nor does a module that is called as what the compiler imports; nor one in ``tests``."""
+    names = ("compileall", "py_compile", "re", "resource", "struct", "concurrent", "tests")
+    files = {f"{name}.py": trap(traces, name) for name in names}
+    files["bait/tests/conftest.py"] = trap(traces, "conftest")
+    wheel = make_wheel(real_index.folder, "bait", "4.0", {**BAIT, **files})
+    site = tmp_path / "control"
+    shutil.unpack_archive(wheel, site, "zip")
+    command = [interpreters.own().path, "-S", "-m", "compileall", "-q", "bait"]
+    subprocess.run(command, cwd=site, capture_output=True)
+    assert sprung(traces)
+    folder = write_repository(tmp_path / "repo", ENV, requirements__txt="bait==4.0\n")
+    with make_env(folder) as suites:
+        suites.env.reset(seed=0)
+    assert sprung(traces) == set()

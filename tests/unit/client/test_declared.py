@@ -1,0 +1,176 @@
+"""What a stranger's files declare is data: what could build or run code does not get through."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox.dependencies import declared as module
+from envhub_sandbox.dependencies.declared import Declared, declared, read
+from envhub_sandbox.errors import RequirementError
+
+HASH = "sha256:" + "0a" * 32
+
+
+def repository(folder: Path, **files: str) -> Declared | None:
+    """What a repository of these files declares; ``__`` in a name is a dot."""
+    (folder / "env.py").write_text("")
+    for name, text in files.items():
+        (folder / name.replace("__", ".")).write_text(text)
+    return declared(folder, "env.py")
+
+
+def plain(found: Declared | None) -> list[str]:
+    """Its requirements as text."""
+    assert found is not None
+    return [str(one) for one in found.wanted]
+
+
+def script(*lines: str) -> str:
+    """An entry file with these lines of metadata."""
+    inside = "".join(f"# {line}\n" for line in lines)
+    return f"# /// script\n{inside}# ///\nimport this_never_runs\n"
+
+
+def test_plain_requirements_get_through(tmp_path: Path) -> None:
+    """With extras, versions, markers and comments."""
+    text = (
+        "# wanted\nnumpy>=2\n\n  # more\nminigrid[wfc]==3.0 # pinned\nfoo; python_version<'3.12'\n"
+    )
+    assert plain(repository(tmp_path, requirements__txt=text)) == [
+        *("numpy>=2", "minigrid[wfc]==3.0", 'foo; python_version < "3.12"'),
+    ]
+
+
+def test_hashes_stand_on_the_line_or_on_the_next(tmp_path: Path) -> None:
+    """As pip and uv write them; the line that is named is the first."""
+    text = f"numpy==2.0 --hash={HASH}\nfoo==1 \\\n    --hash={HASH} \\\n    --hash={HASH}\nbar\n"
+    found = repository(tmp_path, requirements__txt=text)
+    assert found is not None
+    assert [(len(one.hashes), one.where) for one in found.wanted] == [
+        (1, "line 1 of requirements.txt"),
+        (2, "line 2 of requirements.txt"),
+        (0, "line 5 of requirements.txt"),
+    ]
+    assert found.wanted[0].hashes == (HASH,)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *("-e ./here", "--index-url https://index.example", "-r other.txt", "--no-binary :all:"),
+        *("./here", "git+https://git.example/repo.git", "here @ file:///tmp/here", "/tmp/x.whl"),
+        *(
+            "here @ https://files.example/here.tar.gz",
+            "--find-links .",
+            "numpy --config-settings=a",
+        ),
+        *("numpy>=2 \\", "${SECRET}", "-c constraints.txt", "numpy==1.0 --hash=sha256:00"),
+        *(f"numpy --hash={HASH} -e .", f"numpy --hash={HASH}; --no-binary x", "a" * 3000),
+        *(f"-e . --hash={HASH}", f"./here --hash={HASH}", f"a @ file:///a --hash={HASH}"),
+        *("numpy; (" + "(" * 900, f"{'a' * 3000} --hash={HASH}"),
+    ],
+)
+def test_whatever_could_run_code_does_not(tmp_path: Path, line: str) -> None:
+    """The line is named, and the way for those who trust it."""
+    with pytest.raises(RequirementError, match=r"line 2 of requirements\.txt"):
+        repository(tmp_path, requirements__txt=f"numpy\n{line}\n")
+
+
+@pytest.mark.parametrize("line", ["-e ./here", "here @ file:///tmp/here", "a" * 3000])
+def test_nor_in_the_other_files(tmp_path: Path, line: str) -> None:
+    """Where a list of TOML holds it."""
+    with pytest.raises(RequirementError, match=r"in the script metadata of env\.py"):
+        repository(tmp_path, env__py=script(f"dependencies = ['{line}']"))
+    project = f"[project]\nname = 'x'\ndependencies = ['{line}']\n"
+    with pytest.raises(RequirementError, match=r"in \[project\] of pyproject\.toml"):
+        repository(tmp_path, env__py="", pyproject__toml=project)
+
+
+def test_a_line_joined_by_backslashes_is_one_requirement(tmp_path: Path) -> None:
+    """An option does not hide behind the end of a line."""
+    with pytest.raises(RequirementError, match="line 1 of"):
+        repository(tmp_path, requirements__txt="numpy \\\n  --no-binary \\\n  :all:\n")
+
+
+def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    """Or too long to be one that somebody wrote."""
+    path = tmp_path / "requirements.txt"
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(RequirementError, match="cannot be read"):
+        read(path)
+    path.write_text("numpy\n" * module.MAX_BYTES)
+    with pytest.raises(RequirementError, match="bytes"):
+        read(path)
+    path.write_text("numpy\n" * (module.MAX_REQUIREMENTS + 1))
+    with pytest.raises(RequirementError, match="requirements"):
+        read(path)
+
+
+def test_the_most_particular_file_counts(tmp_path: Path) -> None:
+    """The entry file's own metadata, then requirements.txt, then the project."""
+    project = "[project]\nname = 'x'\nrequires-python = '>=3.11'\ndependencies = ['of-project']\n"
+    assert repository(tmp_path) is None
+    found = repository(tmp_path, pyproject__toml=project)
+    assert found is not None
+    assert (found.source, plain(found), found.python) == (
+        *("pyproject.toml", ["of-project"]),
+        ">=3.11",
+    )
+    found = repository(tmp_path, requirements__txt="of-file\n")
+    assert found is not None
+    assert (found.source, plain(found), found.python) == ("requirements.txt", ["of-file"], ">=3.11")
+    text = script("requires-python = '<3.13'", "dependencies = [", "  'of-script',", "]")
+    found = repository(tmp_path, env__py=text)
+    assert found is not None
+    assert (found.source, plain(found), found.python) == ("env.py", ["of-script"], "<3.13")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("# /// script\n# dependencies = ['x']\n", "# /// other\n# dependencies = ['x']\n# ///\n"),
+        "# /// script\n# dependencies = ['x']\nx = 1\n# ///\n",
+        "'''\n  # /// script\n  # dependencies = ['x']\n  # ///\n'''\n",
+    ],
+)
+def test_what_is_no_block_is_a_comment(tmp_path: Path, text: str) -> None:
+    """As PEP 723 says: not closed, of another kind, interrupted, or not at the line's beginning."""
+    assert repository(tmp_path, env__py=text) is None
+
+
+def test_a_project_that_only_configures_tools_declares_nothing(tmp_path: Path) -> None:
+    """Nor does one whose dependencies nobody knows before it is built."""
+    assert repository(tmp_path, pyproject__toml="[tool.ruff]\nline-length = 100\n") is None
+    dynamic = "[project]\nname = 'x'\ndynamic = ['dependencies']\n"
+    assert repository(tmp_path, pyproject__toml=dynamic) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[project]\ndependencies = 'numpy'\n", "no list"),
+        ("[project]\ndependencies = [1]\n", "no list"),
+        ("[project]\nrequires-python = 3\n", "requires-python"),
+        ("[project]\nrequires-python = 'soon'\n", "requires-python"),
+        ("[project\n", "no TOML"),
+        ("x = " + "[" * 9000, "no TOML"),
+        ("a." * module.MAX_DOTS + "a.a = 1", "too long"),
+        ("#" * (module.MAX_BYTES + 1), "too long"),
+        ("[project]\ndependencies = [" + "'a'," * (module.MAX_REQUIREMENTS + 1) + "]", "at most"),
+    ],
+)
+def test_a_spoiled_project_is_refused(tmp_path: Path, text: str, said: str) -> None:
+    """With what is wrong and what to do; deep or dotted TOML costs no time."""
+    with pytest.raises(RequirementError, match=re.escape(said)) as caught:
+        repository(tmp_path, pyproject__toml=text)
+    assert "pyproject.toml" in str(caught.value)
+    assert "dependencies='host'" in str(caught.value)
+
+
+def test_two_blocks_are_refused(tmp_path: Path) -> None:
+    """PEP 723 permits one; to take either could be another's choice."""
+    with pytest.raises(RequirementError, match="2 blocks"):
+        repository(tmp_path, env__py=script("dependencies = []") + script("dependencies = []"))

@@ -1,0 +1,189 @@
+"""Where a repository's packages come from: what the caller says, and what this interpreter has."""
+
+from __future__ import annotations
+
+import datetime
+import platform
+import zipfile
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox.dependencies import host, interpreters
+from envhub_sandbox.dependencies.choice import AUTO, HOST, chosen
+from envhub_sandbox.dependencies.cure import cure
+from envhub_sandbox.dependencies.declared import Declared, one
+from envhub_sandbox.dependencies.environments import Environment
+from envhub_sandbox.dependencies.prepare import needs
+from envhub_sandbox.errors import InterpreterUnavailableError, PolicyError, RequirementError
+from envhub_sandbox.hub.snapshot import Snapshot, local
+from tests.support.wheels import make_wheel
+
+NUMPY = metadata.version("numpy")
+
+
+def declares(*lines: str, python: str = "") -> Declared:
+    """What a requirements.txt of these lines declares."""
+    wanted = (one(line, f"line {n} of requirements.txt") for n, line in enumerate(lines, start=1))
+    return Declared("requirements.txt", tuple(wanted), python)
+
+
+def snapshot(folder: Path, requirements: str | None = None) -> Snapshot:
+    """A repository that declares this."""
+    (folder / "env.py").write_text("")
+    if requirements is not None:
+        (folder / "requirements.txt").write_text(requirements)
+    return local(folder)
+
+
+def test_what_the_caller_says(tmp_path: Path) -> None:
+    """Two words, a path, or a mapping."""
+    assert chosen("auto", None) == (AUTO, None)
+    assert chosen("host", None) == (HOST, None)
+    assert chosen("auto", "python3.12") == (HOST, "python3.12")
+    assert chosen("/opt/python", None) == (HOST, Path("/opt/python"))
+    assert chosen(tmp_path, None) == (HOST, tmp_path / "bin/python")
+    choice, python = chosen({"extra": ["scipy>=1"], "python": "3.12"}, None)
+    assert python is None
+    assert (choice.where, choice.python) == ("own", "3.12")
+    assert [str(wanted) for wanted in choice.extra] == ["scipy>=1"]
+    assert chosen({"exclude_newer": datetime.date(2026, 1, 31)}, None)[0].exclude_newer == (
+        "2026-01-31"
+    )
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *("hots", "", 3, None, {"extras": []}, {"extra": "scipy"}, {"extra": [3]}),
+        *({"python": "soon"}, {"python": 3.11}, {"exclude_newer": "yesterday"}),
+        *({"exclude_newer": "2026-01-01 --index-url=x"}, {"exclude_newer": 2026}),
+    ],
+)
+def test_what_nobody_could_have_meant_is_refused(wrong: Any) -> None:
+    """By the name of the argument."""
+    with pytest.raises(PolicyError, match="dependencies"):
+        chosen(wrong, None)
+
+
+def test_a_further_requirement_is_a_plain_one() -> None:
+    """It comes from the caller, and still a link in it would build something outside of a jail."""
+    with pytest.raises(RequirementError, match="in dependencies"):
+        chosen({"extra": ["here @ file:///tmp/here"]}, None)
+
+
+@pytest.mark.parametrize("dependencies", ["/opt/python", {"extra": ["scipy"]}])
+def test_two_interpreters_are_one_too_many(dependencies: Any) -> None:
+    """``python`` names the packages as well."""
+    with pytest.raises(PolicyError, match="both"):
+        chosen(dependencies, "/usr/bin/python3")
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        *([], ["numpy"], [f"numpy=={NUMPY}"], ["numpy>=1.26", "gymnasium"], ["NumPy"]),
+        ["no-such-package; python_version < '3'"],
+    ],
+)
+def test_what_is_here_is_not_installed_again(lines: list[str]) -> None:
+    """By name and version, without importing any of it."""
+    assert host.lacks(declares(*lines)) is None
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *("no-such-package", f"numpy!={NUMPY}", "numpy<1"),
+        f"numpy=={NUMPY} --hash=sha256:{'0' * 64}",
+    ],
+)
+def test_what_is_not_here_is_named(line: str) -> None:
+    """Another version is not here; nor is one whose files nobody can compare."""
+    assert host.lacks(declares("gymnasium", line)) == str(one(line, "").requirement)
+
+
+def test_another_python_is_not_here() -> None:
+    """Whatever is installed."""
+    assert host.lacks(declares(python=f"=={platform.python_version()}")) is None
+    assert host.lacks(declares("numpy", python="<3")) == "python<3"
+
+
+def test_what_is_here_needs_what_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package that somebody installed without its own packages would not work; extras count."""
+    for requires in (["numpy"], ["absent; extra == 'more'"], ["absent"]):
+        name = f"here{len(requires[0])}"
+        with zipfile.ZipFile(make_wheel(tmp_path, name, requires=requires)) as wheel:
+            wheel.extractall(tmp_path / "site")
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    assert host.lacks(declares("here5")) is None
+    assert host.lacks(declares("here23")) is None
+    assert str(host.lacks(declares("here23[more]"))).startswith("absent")
+    assert host.lacks(declares("here6")) == "absent"
+
+
+def test_only_what_is_missing_makes_an_environment(tmp_path: Path) -> None:
+    """``auto`` leaves this interpreter alone where it has all; a mapping never does."""
+    own, _ = chosen({}, None)
+    for text, auto in ((None, False), ("numpy\n", False), ("no-such-package\n", True)):
+        folder = tmp_path / str(text).strip()
+        folder.mkdir()
+        found = snapshot(folder, text)
+        assert needs(found, HOST) is None
+        assert (needs(found, AUTO) is not None) == auto
+        assert needs(found, own) is not None
+
+
+def test_this_interpreter_without_its_packages_comes_first() -> None:
+    """A virtual environment has none that anybody else needs."""
+    found = interpreters.find("", ">=3.10")
+    assert found == interpreters.own()
+    assert Path(found.path).resolve() == Path(found.path)
+    assert found.version == platform.python_version()
+
+
+@pytest.mark.parametrize(("asked", "declared"), [("3.99", ""), ("", ">=3.99"), ("3.8", "")])
+def test_no_interpreter_is_an_error_that_says_what_to_do(asked: str, declared: str) -> None:
+    """Nothing is downloaded."""
+    with pytest.raises(InterpreterUnavailableError, match=r"uv python install"):
+        interpreters.find(asked, declared)
+
+
+def test_an_interpreter_by_its_path(tmp_path: Path) -> None:
+    """It is asked what it is; what does not answer is none."""
+    ours = interpreters.own()
+    assert interpreters.find(ours.path) == ours
+    with pytest.raises(InterpreterUnavailableError, match="no interpreter"):
+        interpreters.find(str(tmp_path / "python"))
+
+
+ENVIRONMENT = Environment("k", "/usr/bin/python3", "3.11.2", "0", (), 0, 0.0, Path("/cache"))
+
+
+@pytest.mark.parametrize(
+    ("place", "choice", "python", "environment", "said"),
+    [
+        ("process", AUTO, None, None, "{'extra': ['NAME-OF-THE-PACKAGE']}"),
+        ("process", AUTO, None, ENVIRONMENT, "{'extra': ['NAME-OF-THE-PACKAGE']}"),
+        ("process", HOST, None, None, "leave that out"),
+        ("process", HOST, "/opt/python", None, "/opt/python"),
+        ("docker", AUTO, None, None, "envhub image build"),
+        ("remote", AUTO, None, None, "whoever runs the server"),
+    ],
+)
+def test_a_missing_module_has_one_cure(
+    tmp_path: Path, place: str, choice: Any, python: Any, environment: Any, said: str
+) -> None:
+    """It depends on the place, and what the repository declares is told."""
+    text = cure(snapshot(tmp_path, "numpy>=1\n"), place, choice, python, environment)
+    assert said in text
+    assert "Its requirements.txt declares numpy>=1" in text
+
+
+def test_a_repository_that_declares_nothing_is_said_to(tmp_path: Path) -> None:
+    """And one whose file cannot be taken, why."""
+    assert "declares no packages" in cure(snapshot(tmp_path), "process", AUTO, None, None)
+    said = cure(snapshot(tmp_path, "-e .\n"), "docker", AUTO, None, None)
+    assert "line 1 of requirements.txt" in said

@@ -1,0 +1,308 @@
+"""Environments: made once, complete or not there, read-only, and of use without any index."""
+
+from __future__ import annotations
+
+import errno
+import importlib.util
+import os
+import stat
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox.dependencies import environments, prepare
+from envhub_sandbox.dependencies.choice import chosen
+from envhub_sandbox.dependencies.environments import Environment
+from envhub_sandbox.errors import DependencyError, IndexUnavailableError, PackageIntegrityError
+from envhub_sandbox.hub.snapshot import local
+from tests.support import inside
+from tests.support.processes import eventually
+from tests.support.wheels import Index, make_wheel
+
+OWN = chosen({}, None)[0]
+CHECKOUT = Path(__file__).resolve().parents[3]
+
+
+def repository(folder: Path, *lines: str) -> Path:
+    """A repository that needs these packages."""
+    folder.mkdir(exist_ok=True)
+    (folder / "env.py").write_text("")
+    (folder / "requirements.txt").write_text("".join(f"{line}\n" for line in lines))
+    return folder
+
+
+def made(folder: Path, **options: Any) -> Environment:
+    """Its environment."""
+    needed = prepare.needs(local(folder), OWN)
+    assert needed is not None
+    return prepare.prepare(needed, **options)
+
+
+def left_behind() -> list[str]:
+    """What is half-made."""
+    return [path.name for path in environments.root().glob(".*")]
+
+
+def test_packages_lie_in_a_folder_of_their_own(index: Index, tmp_path: Path) -> None:
+    """With what they need and what the worker imports; the pins are told."""
+    make_wheel(index.folder, "wanted")
+    env = made(repository(tmp_path / "repo", "wanted"))
+    assert (env.packages / "wanted/__init__.py").is_file()
+    assert (env.packages / "numpy/__init__.py").is_file()
+    assert "wanted==1.0" in env.pins
+    assert os.path.isabs(env.python)
+    assert left_behind() == []
+
+
+def test_it_can_be_read_by_all_and_written_by_nobody(index: Index, tmp_path: Path) -> None:
+    """Jails of root are another user; whatever the umask was."""
+    before = os.umask(0o077)
+    try:
+        env = made(repository(tmp_path / "repo"))
+    finally:
+        os.umask(before)
+    paths = [env.packages, *env.packages.rglob("*")]
+    assert len(paths) > 8
+    for path in paths:
+        mode = stat.S_IMODE(path.lstat().st_mode)
+        assert not mode & 0o222, path
+        assert mode & 0o444 == 0o444, path
+        assert mode & 0o111 == 0o111 or not path.is_dir(), path
+
+
+def test_its_bytecode_is_made_with_it(index: Index, tmp_path: Path) -> None:
+    """For the interpreter that it is for: nobody can write any later."""
+    make_wheel(index.folder, "wanted")
+    env = made(repository(tmp_path / "repo", "wanted"))
+    source = str(env.packages / "wanted/__init__.py")
+    tag = subprocess.run(
+        [env.python, "-I", "-S", "-c", "import sys; print(sys.implementation.cache_tag)"],
+        capture_output=True,
+        text=True,
+    ).stdout.strip()
+    compiled = Path(importlib.util.cache_from_source(source)).parent / f"__init__.{tag}.pyc"
+    assert compiled.is_file()
+
+
+def test_source_that_cannot_be_compiled_is_nobodys_error(index: Index, tmp_path: Path) -> None:
+    """Packages hold templates and code of other Pythons."""
+    make_wheel(index.folder, "wanted", files={"wanted.py": "print 'of another age'\n"})
+    assert (made(repository(tmp_path / "repo", "wanted")).packages / "wanted.py").is_file()
+
+
+def test_the_same_again_asks_nobody(index: Index, tmp_path: Path) -> None:
+    """Neither for versions nor for packages: it works without the index."""
+    folder = repository(tmp_path / "repo", "numpy")
+    first = made(folder)
+    index.broken, asked = 503, len(index.asked)
+    again = made(folder)
+    assert again.home == first.home
+    assert len(index.asked) == asked
+
+
+def test_two_repositories_that_need_the_same_share_it(index: Index, tmp_path: Path) -> None:
+    """It is called by what is in it."""
+    make_wheel(index.folder, "wanted")
+    one, two = (made(repository(tmp_path / name, "wanted")) for name in ("a", "b"))
+    other = made(repository(tmp_path / "c", "wanted==1.0", "numpy>=2"))
+    assert one.home == two.home == other.home
+    assert made(repository(tmp_path / "d")).home != one.home
+
+
+def test_newer_versions_come_when_they_are_asked_for(index: Index, tmp_path: Path) -> None:
+    """And not by themselves: the same repository gets what it got."""
+    folder = repository(tmp_path / "repo", "wanted")
+    make_wheel(index.folder, "wanted", "1.0")
+    first = made(folder)
+    make_wheel(index.folder, "wanted", "2.0")
+    assert made(folder).home == first.home
+    for cached in (tmp_path / "uv").glob("simple*"):
+        subprocess.run(["rm", "-r", str(cached)], check=True)
+    assert "wanted==2.0" in made(folder, upgrade=True).pins
+    assert "wanted==2.0" in made(folder).pins
+
+
+def test_many_threads_make_it_once(index: Index, tmp_path: Path) -> None:
+    """The others wait for the one; it lies there once."""
+    folder = repository(tmp_path / "repo", "numpy")
+    with ThreadPoolExecutor(4) as pool:
+        homes = {env.home for env in pool.map(lambda _: made(folder), range(4))}
+    assert len(homes) == 1
+    assert left_behind() == []
+
+
+MAKER = """\
+import sys
+from tests.unit.client.test_environments import made
+from pathlib import Path
+print(made(Path(sys.argv[1])).home, flush=True)
+"""
+
+
+def maker(folder: Path) -> subprocess.Popen[str]:
+    """A process that makes it."""
+    return subprocess.Popen(
+        [sys.executable, "-c", MAKER, str(folder)],
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        cwd=CHECKOUT,
+    )
+
+
+def test_ten_processes_make_it_once(index: Index, tmp_path: Path) -> None:
+    """By what the index is asked for: ten download what one does."""
+    make_wheel(index.folder, "wanted")
+    folder = repository(tmp_path / "repo", "wanted")
+    asked = []
+    for count in (1, 1, 10):  # the first one chooses versions as well
+        for env in environments.every():
+            environments.remove(env)
+            subprocess.run(["rm", "-r", str(tmp_path / "uv")], check=True)
+        index.asked.clear()
+        makers = [maker(folder) for _ in range(count)]
+        homes = {process.communicate()[0] for process in makers}
+        assert [process.returncode for process in makers] == [0] * count
+        assert len(homes) == 1
+        asked.append(sorted(index.asked))
+    assert any("wanted" in path for path in asked[1])
+    assert asked[2] == asked[1]
+    assert left_behind() == []
+
+
+KILLED = """\
+import sys, time
+from pathlib import Path
+from tests.support import inside
+from tests.unit.client.test_environments import made
+
+def stop(*given, **named):
+    Path(sys.argv[3]).touch()
+    time.sleep(600)
+
+setattr(*inside.making_an_environment(sys.argv[2]), stop)
+made(Path(sys.argv[1]))
+"""
+
+
+@pytest.mark.parametrize("step", ["install", "size", "compile", "close", "publish"])
+def test_a_maker_that_is_killed_leaves_nothing_that_is_used(
+    index: Index, tmp_path: Path, step: str
+) -> None:
+    """At each step: the next one takes away what is half-made, and makes it anew."""
+    make_wheel(index.folder, "wanted")
+    folder, reached = repository(tmp_path / "repo", "wanted"), tmp_path / "reached"
+    words = [sys.executable, "-c", KILLED, str(folder), step, str(reached)]
+    process = subprocess.Popen(words, cwd=CHECKOUT)
+    try:
+        assert eventually(reached.exists)
+    finally:
+        process.kill()
+        process.wait()
+    assert left_behind() != []
+    assert environments.every() == []
+    env = made(folder)
+    assert (env.packages / "wanted/__init__.py").is_file()
+    assert left_behind() == []
+
+
+def test_what_a_killed_maker_started_is_waited_for(index: Index, tmp_path: Path) -> None:
+    """uv outlives it, and still writes: nobody removes that from under it, or uses it."""
+    make_wheel(index.folder, "wanted")
+    folder = repository(tmp_path / "repo", "wanted")
+    environments.remove(made(folder))  # so that versions are known, and packages are not
+    subprocess.run(["rm", "-r", str(tmp_path / "uv")], check=True)
+    told: list[str] = []
+    index.hold("/files/wanted")
+    process = subprocess.Popen([sys.executable, "-c", MAKER, str(folder)], cwd=CHECKOUT)
+    assert eventually(lambda: bool(left_behind()) or process.poll() is not None)
+    assert eventually(index.held)
+    process.kill()
+    process.wait()
+    [half] = left_behind()
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(made, folder, tell=told.append)
+        try:
+            assert eventually(lambda: any("another process" in line for line in told))
+            assert left_behind() == [half]
+        finally:
+            index.let_go()
+        env = waiting.result()
+    assert (env.packages / "wanted/__init__.py").is_file()
+    assert left_behind() == []
+
+
+def test_what_was_left_half_made_is_collected(index: Index, tmp_path: Path) -> None:
+    """But not what somebody is making."""
+    env = made(repository(tmp_path / "repo"))
+    half = environments.root() / ".building-0123-x"
+    (half / "packages").mkdir(parents=True)
+    (half / "packages").chmod(0o555)
+    environments.remove_abandoned()
+    assert left_behind() == []
+    assert environments.every() == [env]
+
+
+def test_one_that_is_removed_is_made_again(index: Index, tmp_path: Path) -> None:
+    """Of the same packages, without asking for versions."""
+    folder = repository(tmp_path / "repo")
+    env = made(folder)
+    environments.remove(env)
+    assert environments.every() == []
+    assert left_behind() == []
+    assert made(folder).home == env.home
+
+
+def test_a_file_that_is_not_the_one_of_its_hash(index: Index, tmp_path: Path) -> None:
+    """What was replaced after versions were chosen is refused, and nothing stays."""
+    wheel = make_wheel(index.folder, "wanted")
+    folder = repository(tmp_path / "repo", "wanted")
+    env = made(folder)
+    environments.remove(env)
+    subprocess.run(["rm", "-r", str(tmp_path / "uv")], check=True)
+    index.replaced[wheel.name] = make_wheel(tmp_path, "wanted", files={"evil.py": ""}).read_bytes()
+    with pytest.raises(PackageIntegrityError, match="replaced"):
+        made(folder)
+    assert environments.every() == []
+    assert left_behind() == []
+
+
+def test_without_a_network_nothing_half_is_left(index: Index, tmp_path: Path) -> None:
+    """The index goes away between choosing and installing."""
+    folder = repository(tmp_path / "repo")
+    env = made(folder)
+    environments.remove(env)
+    subprocess.run(["rm", "-r", str(tmp_path / "uv")], check=True)
+    index.broken = 503
+    with pytest.raises(IndexUnavailableError):
+        made(folder)
+    assert left_behind() == []
+
+
+def test_a_full_disk_is_said(index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With what frees some; nothing half stays, and what was there stays whole."""
+    kept = made(repository(tmp_path / "other"))
+    make_wheel(index.folder, "wanted")
+
+    def full(*given: object, **named: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(*inside.making_an_environment("close"), full)
+    with pytest.raises(DependencyError, match="envhub cache remove"):
+        made(repository(tmp_path / "repo", "wanted"))
+    assert environments.every() == [kept]
+    assert left_behind() == []
+
+
+def test_where_others_can_write_nothing_is_used(index: Index, tmp_path: Path) -> None:
+    """Somebody could have put another package in its place."""
+    folder = repository(tmp_path / "repo")
+    made(folder)
+    environments.root().chmod(0o777)
+    with pytest.raises(DependencyError, match="other users"):
+        made(folder)
+    environments.root().chmod(0o755)

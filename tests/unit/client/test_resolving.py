@@ -1,0 +1,215 @@
+"""Requirements become pins with hashes: by uv, from the index that the user chose, wheels only."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import tarfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox.dependencies import index as places
+from envhub_sandbox.dependencies import resolve as module
+from envhub_sandbox.dependencies import uv
+from envhub_sandbox.dependencies.declared import one
+from envhub_sandbox.dependencies.resolve import Lock, Target
+from envhub_sandbox.errors import (
+    DependencyError,
+    IndexUnavailableError,
+    PackageIntegrityError,
+    ResolutionError,
+)
+from tests.support.wheels import WORKERS, Index, make_wheel
+from tests.unit.docs.test_image import project
+
+__all__ = ["project"]
+
+HERE = Target(python=os.path.realpath(sys.executable))
+
+
+def resolve(*lines: str, target: Target = HERE, **options: Any) -> Lock:
+    """The lock for these lines of a requirements.txt."""
+    wanted = [one(line, f"line {n} of requirements.txt") for n, line in enumerate(lines, start=1)]
+    return module.resolve(wanted, target, **options)
+
+
+def test_every_package_has_its_version_and_hashes(index: Index) -> None:
+    """Those of the repository, theirs, and what the worker imports."""
+    make_wheel(index.folder, "wanted", requires=["its-own>=2"])
+    make_wheel(index.folder, "its-own", "2.5")
+    lock = resolve("wanted")
+    assert set(lock.packages) == {
+        *("wanted==1.0", "its-own==2.5"),
+        *(f"{name}=={version}" for name, version in WORKERS.items()),
+    }
+    assert lock.text.count("--hash=sha256:") == len(lock.packages)
+
+
+def test_another_machines_interpreter_is_described(index: Index) -> None:
+    """For an image: wheels that this machine could not use are taken."""
+    make_wheel(index.folder, "wanted", tag="cp310-cp310-manylinux_2_28_aarch64")
+    assert (
+        "wanted==1.0"
+        in resolve("wanted", target=Target(version="3.10", machine="aarch64")).packages
+    )
+    with pytest.raises(ResolutionError):
+        resolve("wanted", target=Target(version="3.10", machine="x86_64"))
+
+
+def test_what_jails_import_is_what_the_image_installs(project: dict[str, Any]) -> None:
+    """But for ZeroMQ, which no jail has, and Gymnasium, which may be older in one."""
+    group = set(project["dependency-groups"]["worker"]) - {"pyzmq>=25", "gymnasium>=1.1"}
+    assert set(module.WORKERS) == {*group, "gymnasium>=0.29"}
+
+
+def test_a_contradiction_names_both_lines(index: Index) -> None:
+    """And not those that have nothing to do with it."""
+    make_wheel(index.folder, "one", requires=["shared<2"])
+    make_wheel(index.folder, "innocent")
+    make_wheel(index.folder, "shared", "1.0")
+    make_wheel(index.folder, "shared", "2.0")
+    with pytest.raises(ResolutionError) as caught:
+        resolve("one", "innocent", "shared>=2")
+    said = str(caught.value)
+    assert "shared>=2  (line 3 of requirements.txt)" in said
+    assert "one  (line 1 of requirements.txt)" in said
+    assert "line 2" not in said
+    assert "you require" not in said
+
+
+def test_what_the_worker_needs_can_be_in_the_way(index: Index) -> None:
+    """It is named as such, and not as a line of the repository."""
+    make_wheel(index.folder, "gymnasium", "0.21")
+    with pytest.raises(ResolutionError, match=r"gymnasium>=.*the worker of envhub-sandbox"):
+        resolve("gymnasium<0.22")
+
+
+def test_a_package_that_is_nowhere(index: Index) -> None:
+    """Its line is named."""
+    with pytest.raises(ResolutionError, match=r"no-such-package  \(line 1"):
+        resolve("no-such-package")
+
+
+def test_what_would_have_to_be_built_is_refused(index: Index, tmp_path: Path) -> None:
+    """A source distribution runs its setup.py; here nobody does. See tests/attacks, too."""
+    source = tmp_path / "setup.py"
+    source.write_text(f"open({str(tmp_path / 'built')!r}, 'w')\n")
+    with tarfile.open(index.folder / "only_source-1.0.tar.gz", "w:gz") as archive:
+        archive.add(source, "only_source-1.0/setup.py")
+    with pytest.raises(ResolutionError, match="wheels"):
+        resolve("only-source")
+    assert not (tmp_path / "built").exists()
+
+
+def test_a_hash_of_the_repositorys_is_kept(index: Index) -> None:
+    """Of several files of a version only the named one; a wrong one is no file at all."""
+    wheels = [make_wheel(index.folder, "wanted", tag=f"{py}-none-any") for py in ("py3", "py31")]
+    hashes = [hashlib.sha256(wheel.read_bytes()).hexdigest() for wheel in wheels]
+    assert all(known in resolve("wanted").text for known in hashes)
+    kept = resolve(f"wanted==1.0 --hash=sha256:{hashes[0]}").text
+    assert hashes[0] in kept
+    assert hashes[1] not in kept
+    with pytest.raises(PackageIntegrityError, match="line 1 of"):
+        resolve(f"wanted==1.0 --hash=sha256:{'0' * 64}")
+
+
+def test_a_release_that_was_taken_back(index: Index) -> None:
+    """It is not chosen by itself, and the text says why."""
+    index.yanked.add(make_wheel(index.folder, "wanted").name)
+    with pytest.raises(ResolutionError, match=r"(?s)taken back.*yanked"):
+        resolve("wanted")
+
+
+def test_no_index(index: Index) -> None:
+    """The one that is named does not answer; what to do is said."""
+    index.broken = 503
+    with pytest.raises(IndexUnavailableError, match="UV_INDEX_URL"):
+        resolve("numpy")
+
+
+def test_only_what_uploads_before_a_date(index: Index) -> None:
+    """The index gives no times here, so that nothing is old enough."""
+    with pytest.raises(DependencyError):
+        resolve("numpy", exclude_newer="2020-01-01")
+
+
+def test_no_setting_of_the_working_directory_counts(
+    index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A repository that is run from its own folder could bring one."""
+    (tmp_path / "uv.toml").write_text("no-index = true\n")
+    (tmp_path / "pyproject.toml").write_text("[tool.uv]\nno-index = true\n")
+    monkeypatch.chdir(tmp_path)
+    assert resolve("numpy").packages
+
+
+def test_no_uv_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """With how to get it."""
+    monkeypatch.setattr("sysconfig.get_path", lambda name: str(tmp_path))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(DependencyError, match="pip install uv"):
+        uv.command()
+
+
+NO_FILES = {"PIP_CONFIG_FILE": os.devnull}
+
+
+def test_a_mirror_that_pip_knows_is_used() -> None:
+    """Who is behind one has mostly told pip, and not uv."""
+    pip = {
+        "PIP_INDEX_URL": "https://mirror.example/simple",
+        "PIP_EXTRA_INDEX_URL": "https://a.example https://b.example",
+        "PIP_FIND_LINKS": "/wheels /more",
+        "PIP_CERT": "/ca.pem",
+    }
+    found = places.environment({**NO_FILES, **pip})
+    assert found["UV_DEFAULT_INDEX"] == "https://mirror.example/simple"
+    assert found["UV_INDEX"] == "https://a.example https://b.example"
+    assert found["UV_FIND_LINKS"] == "/wheels,/more"
+    assert found["SSL_CERT_FILE"] == "/ca.pem"
+
+
+def test_pips_files_are_read_in_pips_order(tmp_path: Path) -> None:
+    """The user's wins over the machine's, and a variable over both."""
+    config, home = tmp_path / "xdg", tmp_path / "home"
+    for folder, name in ((config / "pip", "machine"), (home / ".config/pip", "user")):
+        folder.mkdir(parents=True)
+        (folder / "pip.conf").write_text(f"[global]\nindex-url = https://{name}.example/simple\n")
+    variables = {"HOME": str(home), "XDG_CONFIG_DIRS": str(config)}
+    assert places.pip_settings(variables)["index-url"] == "https://user.example/simple"
+    named = tmp_path / "named.conf"
+    named.write_text("[install]\nindex-url = https://named.example/simple\n")
+    variables["PIP_CONFIG_FILE"] = str(named)
+    assert places.pip_settings(variables)["index-url"] == "https://named.example/simple"
+    variables["PIP_INDEX_URL"] = "https://variable.example/simple"
+    assert places.pip_settings(variables)["index-url"] == "https://variable.example/simple"
+
+
+def test_what_uv_was_told_wins_over_pip() -> None:
+    """Both name an index."""
+    variables = {"UV_INDEX_URL": "https://u.example", "PIP_INDEX_URL": "https://p.example"}
+    found = places.environment({**NO_FILES, **variables})
+    assert found["UV_INDEX_URL"] == "https://u.example"
+    assert "UV_DEFAULT_INDEX" not in found
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("UV_NO_BUILD_ISOLATION", "UV_CONFIG_FILE", "UV_PROJECT", "UV_CONSTRAINT", "UV_OVERRIDE"),
+        *("UV_PYTHON", "UV_NO_BINARY", "UV_LINK_MODE", "UV_REQUIRE_HASHES", "UV_NO_VERIFY_HASHES"),
+        *("PYTHONPATH", "PYTHONSTARTUP", "LD_PRELOAD", "VIRTUAL_ENV", "CONDA_PREFIX"),
+    ],
+)
+def test_no_other_variable_gets_through(name: str) -> None:
+    """What could turn builds on, take settings from elsewhere, or load code."""
+    assert name not in places.environment({**NO_FILES, name: "1"})
+
+
+def test_no_interpreter_is_downloaded() -> None:
+    """Whatever the user permits elsewhere."""
+    variables = {**NO_FILES, "UV_PYTHON_DOWNLOADS": "automatic"}
+    assert places.environment(variables)["UV_PYTHON_DOWNLOADS"] == "never"
