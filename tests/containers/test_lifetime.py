@@ -146,7 +146,7 @@ def test_client_and_monitor_killed_together_leave_no_container(engine: Engine) -
         monitor.kill()
         assert nothing_left(engine, made.identity)
         [folder] = folders(made.identity)
-        found = [one for one in prune.find() if one.name == str(folder)]
+        found = [one for one in prune.find().leftovers if one.name == str(folder)]
         assert [one.remove() for one in found] == [True]
         assert not folder.exists()
 

@@ -8,10 +8,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from envhub_sandbox.sandboxes.owner import identity_of
 
 
-def gc(temporary: Path, *options: str) -> subprocess.CompletedProcess[str]:
+def gc(temporary: Path, *options: str, check: bool = True) -> subprocess.CompletedProcess[str]:
     """Run it with a folder for temporary files of its own, and without an engine."""
     variables = {"TMPDIR": str(temporary), "PATH": str(temporary)}
     return subprocess.run(
@@ -19,7 +21,7 @@ def gc(temporary: Path, *options: str) -> subprocess.CompletedProcess[str]:
         env=os.environ | variables,
         capture_output=True,
         text=True,
-        check=True,
+        check=check,
     )
 
 
@@ -48,3 +50,20 @@ def test_what_was_left_behind_is_removed(tmp_path: Path) -> None:
     assert not folder.exists()
     again = json.loads(gc(tmp_path, "--json").stdout)
     assert [one for one in again["found"] if one["kind"] == "folder"] == []
+
+
+@pytest.mark.parametrize(
+    "docker", ["exit 1", 'echo "{\\"ServerVersion\\": \\"28\\"}"; [ $1 != ps ]']
+)
+def test_an_engine_that_is_down_is_said_to_be_so(tmp_path: Path, docker: str) -> None:
+    """Nobody knows its containers; what else was left behind is removed all the same."""
+    folder, program = left_behind(tmp_path), tmp_path / "docker"
+    program.write_text(f"#!/bin/sh\n{docker}\n")
+    program.chmod(0o755)
+    done = gc(tmp_path, check=False)
+    assert done.returncode == 9
+    assert "docker could not be asked, so its containers are not known" in done.stderr
+    assert not folder.exists()
+    again = gc(tmp_path, "--json", check=False)
+    assert again.returncode == 9
+    assert set(json.loads(again.stdout)["unasked"]) == {"docker"}

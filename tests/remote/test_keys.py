@@ -57,7 +57,13 @@ def test_keygen_writes_a_secret_that_nobody_else_reads(tmp_path: Path) -> None:
     assert "secret" not in repr(pair).replace("KeyPair", "")
     again = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     assert again.returncode == 1
+    assert "client.key is there already" in again.stderr
+    assert "Errno" not in again.stderr
     assert keys.load(secret) == pair
+    secret.unlink()
+    again = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert "client.pub is there already" in again.stderr
+    assert not secret.exists()
 
 
 def test_the_list_of_clients_knows_names_and_comments(tmp_path: Path) -> None:

@@ -138,6 +138,12 @@ def _keygen(arguments: argparse.Namespace) -> int:
     pair = keys.generate()
     try:
         secret, public = keys.save(pair, arguments.out, arguments.name)
+    except FileExistsError as error:
+        sys.stderr.write(
+            f"envhub-worker keygen: {error.filename} is there already, and is not replaced: its "
+            "key may be in use. Choose another --name or --out, or move it away first\n"
+        )
+        return 1
     except OSError as error:
         sys.stderr.write(f"envhub-worker keygen: {error}\n")
         return 1

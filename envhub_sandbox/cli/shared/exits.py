@@ -31,6 +31,7 @@ class Exit(IntEnum):
     SANDBOX = 6
     DIFFERENT = 7
     SURVIVED = 8
+    UNASKED = 9
     BUG = 70
     INTERRUPTED = 130
     PIPE = 141
@@ -42,8 +43,8 @@ EXIT_CODES = (
     "policy or limit; 3 the files could not be had, or are not what the commit says; 4 the "
     "repository did not load, or a package is missing; 5 the worker died or took too long; "
     "6 this host cannot enforce the policy; 7 a replay that ended in another way, or elsewhere; "
-    "8 a replay in which nothing died; 70 a bug of ours; 130 interrupted; 141 broken pipe; "
-    "143 terminated."
+    "8 a replay in which nothing died; 9 a container engine could not be asked; 70 a bug of ours; "
+    "130 interrupted; 141 broken pipe; 143 terminated."
 )
 
 _CODES: tuple[tuple[type[EnvHubError], Exit], ...] = (

@@ -103,6 +103,15 @@ SandboxName = Annotated[
         rich_help_panel=_LIMITS,
     ),
 ]
+ServerKey = Annotated[
+    str | None,
+    typer.Option(
+        metavar="KEY",
+        help="With --sandbox tcp://...: that server's public key; else $ENVHUB_SERVER_KEY, or "
+        "what known_hosts says.",
+        rich_help_panel=_LIMITS,
+    ),
+]
 Trust = Annotated[
     bool,
     typer.Option(
@@ -216,6 +225,7 @@ class MakeOptions:
     token: str | None
     endpoint: str | None
     hub_cache_dir: str | None
+    server_key: str | None = None
     output: str | None = None
     validate: bool = False
 
@@ -243,6 +253,7 @@ class MakeOptions:
             "hub_cache_dir": self.hub_cache_dir,
             "trust_remote_code": self.trust,
             "sandbox": None if self.in_process else self.sandbox,
+            "server_key": self.server_key,
             "env_kwargs": read_env_kwargs(self.env_kwargs or ()),
             "policy": self._policy(),
             "timeouts": self._timeouts(),

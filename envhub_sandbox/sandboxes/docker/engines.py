@@ -104,12 +104,18 @@ def find_engine(name: str | None) -> Engine:
     raise SandboxUnavailableError("no container engine can be used. " + " ".join(problems))
 
 
+def is_elsewhere(name: str) -> bool:
+    """Whether an engine was told to work on another machine: nothing of ours can be there."""
+    host = os.environ.get("DOCKER_HOST")
+    return name == "docker" and bool(host) and not str(host).startswith("unix:")
+
+
 @lru_cache(maxsize=8)
 def _engine(name: str, path: str | None, host: str | None) -> Engine:
     command = shutil.which(name, path=path)
     if command is None:
         raise SandboxUnavailableError(f"there is no {name} on PATH; run: {_INSTALL[name]}.")
-    if name == "docker" and host and not host.startswith("unix:"):
+    if is_elsewhere(name):
         raise SandboxUnavailableError(
             f"DOCKER_HOST is {host}: a container over there cannot share memory with this process. "
             "Run the worker there, and connect to it with sandbox='tcp://...'."

@@ -16,11 +16,17 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from envhub_sandbox.errors import SandboxUnavailableError
 from envhub_sandbox.sandboxes import runtime_folder
-from envhub_sandbox.sandboxes.docker.engines import ENGINES, Engine, EngineError, find_engine
+from envhub_sandbox.sandboxes.docker.engines import (
+    ENGINES,
+    Engine,
+    EngineError,
+    find_engine,
+    is_elsewhere,
+)
 from envhub_sandbox.sandboxes.docker.run_arguments import CLIENT_LABEL, USER_LABEL
 from envhub_sandbox.sandboxes.owner import has_ended, is_of_this_boot
 
@@ -56,27 +62,42 @@ class Leftover:
         return _remove_groups(Path(self.name))
 
 
-def find() -> list[Leftover]:
-    """Everything that can be removed. Removes nothing."""
-    engines = list(_engines())
-    containers = [found for engine in engines for found in stale_containers(engine)]
+class Found(NamedTuple):
+    """What a search found.
+
+    Attributes:
+        leftovers: Everything that can be removed.
+        unasked: The engines that are installed and could not be asked, with the reason.
+    """
+
+    leftovers: list[Leftover]
+    unasked: dict[str, str]
+
+
+def find() -> Found:
+    """Look everywhere. Removes nothing."""
+    containers, unasked = _containers()
     folders = [
         Leftover("folder", str(path))
         for place in runtime_folder.places()
         for path in runtime_folder.stale_folders(place)
     ]
-    return [*containers, *folders, *stale_groups(_CGROUPS)]
+    return Found([*containers, *folders, *stale_groups(_CGROUPS)], unasked)
 
 
-def _engines() -> Iterator[Engine]:
-    """Every engine that answers; a machine need not have one."""
-    commands = set()
+def _containers() -> tuple[list[Leftover], dict[str, str]]:
+    """Those of every engine that answers, and why others do not; a machine need not have any."""
+    found: dict[str, list[Leftover]] = {}
+    unasked = {}
     for name in ENGINES:
-        with contextlib.suppress(SandboxUnavailableError):
+        try:
             engine = find_engine(name)
-            if engine.kind not in commands:
-                commands.add(engine.kind)
-                yield engine
+            if engine.kind not in found:
+                found[engine.kind] = list(stale_containers(engine))
+        except (SandboxUnavailableError, EngineError) as error:
+            if shutil.which(name) and not is_elsewhere(name):
+                unasked[name] = str(error)
+    return [one for some in found.values() for one in some], unasked
 
 
 def stale_containers(engine: Engine) -> Iterator[Leftover]:

@@ -138,3 +138,10 @@ def test_a_selection_of_nothing_names_what_there_is() -> None:
     """Escaped, since the names are the worker's."""
     with pytest.raises(UsageError, match=r"a/0, .*evil\\x1b/0"):
         select({**SUITES, "evil\x1b": {0: 1}}, ["c"], None)
+
+
+def test_a_servers_key_reaches_make_env_and_is_none_without_a_word() -> None:
+    """For ``--sandbox tcp://...``; ``make_env`` says where it does not belong."""
+    given = options(sandbox="tcp://127.0.0.1:5555", server_key="k").arguments()
+    assert (given["sandbox"], given["server_key"]) == ("tcp://127.0.0.1:5555", "k")
+    assert options().arguments()["server_key"] is None

@@ -53,7 +53,11 @@ def save(pair: KeyPair, folder: Path, name: str) -> tuple[Path, Path]:
     folder.mkdir(parents=True, exist_ok=True)
     secret, public = folder / f"{name}.key", folder / f"{name}.pub"
     _write(secret, key_text(pair.secret), _SECRET_MODE)
-    _write(public, key_text(pair.public), 0o644)
+    try:
+        _write(public, key_text(pair.public), 0o644)
+    except OSError:
+        secret.unlink()  # or it would look like that one's
+        raise
     return secret, public
 
 
