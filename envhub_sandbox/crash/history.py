@@ -27,7 +27,9 @@ _REQUEST_BYTES = 500
 """What Python's objects take beside the bytes of a step, and of another request."""
 _EVICTED = 64
 _PRELUDE = 256
-_LASTING = (m.Call, m.SetAttr, m.CallOwn)
+_LASTING = (m.Call, m.SetAttr, m.CallOwn, m.CallOne)
+_PASSING = frozenset({"reset", "step", "render"})
+"""What is over with the next seed, also where one sub-environment does it alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +166,7 @@ class History:
         if isinstance(message, m.Reset) and message.mask is None:
             self._reset(message.seeds)
         made = encoded(message)
-        if isinstance(message, _LASTING):
+        if isinstance(message, _LASTING) and not _passes(message):
             self._keep_lasting(message, made)
         self._append(made)
         self._take_room(made)
@@ -183,6 +185,7 @@ class History:
         plain = isinstance(message, m.SetAttr) or not (
             getattr(message, "args", ()) or getattr(message, "kwargs", {})
         )
+        plain = plain and not isinstance(message, m.CallOne)  # each has one of that name
         key: object = (type(message), name) if plain else made.frames[0]
         self._lasting.pop(key, None)  # the last one counts, in its place
         self._lasting[key] = made
@@ -242,6 +245,10 @@ class History:
             elif entry is not None:
                 found.append(encoded(m.Step(0, entry.actions)))
         return found
+
+
+def _passes(message: m.Message) -> bool:
+    return isinstance(message, m.CallOne) and message.name in _PASSING
 
 
 def _nothing(actions: Any) -> None:

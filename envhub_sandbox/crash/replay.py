@@ -135,6 +135,35 @@ def _get_own(env: Any, message: m.GetOwn) -> None:
         getattr(env, message.name)
 
 
+def _get_one(env: Any, message: m.GetOne) -> None:
+    _one(env, message, message.name)
+
+
+def _call_one(env: Any, message: m.CallOne) -> None:
+    if message.name == "__setattr__":
+        name, value = message.args
+        setattr(_one(env, message), str(name), value)
+        return
+    method = _one(env, message, message.name)
+    if method is not None:
+        method(*message.args, **message.kwargs)
+
+
+def _one(env: Any, message: m.GetOne | m.CallOne, name: str | None = None) -> Any:
+    """The sub-environment that was asked, or what it has under a name; None for one of ours."""
+    index, depth = message.index, message.depth
+    if index is None or not 0 <= index < env.num_envs or (name or "").startswith("_"):
+        return None
+    one = env.envs[index]
+    if depth is None:
+        one = one.unwrapped
+    elif depth < 0:
+        return one if name is None else one.get_wrapper_attr(name)
+    for _ in range(depth or 0):
+        one = one.env
+    return one if name is None else getattr(one, name)
+
+
 def _is_remote(env: Any, name: str) -> bool:
     """Whether a name means the repository's: a bundle has no business with the proxy's own."""
     return not name.startswith("_") and name not in vars(env) and not hasattr(type(env), name)
@@ -152,6 +181,8 @@ _REPEATED: dict[type[m.Message], Callable[[Any, Any], object]] = {
     m.Render: lambda env, message: env.render(),
     m.CallOwn: _call_own,
     m.GetOwn: _get_own,
+    m.CallOne: _call_one,
+    m.GetOne: _get_one,
     m.GetRandom: lambda env, message: env.np_random,
 }
 

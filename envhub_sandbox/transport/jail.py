@@ -20,6 +20,7 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.transport import pickles
 from envhub_sandbox.transport.connection import WorkerClient, death, expect
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.described import Described
 from envhub_sandbox.transport.tensors import to_tensor
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
@@ -166,7 +167,7 @@ class RemoteJail:
         return RunnersDiedError(living, deaths)
 
     def _unpack(self, frames: Sequence[Buffer]) -> m.Message:
-        return m.unpack(frames, limits=self._limits, tensors=to_tensor)[1]
+        return m.unpack(frames, limits=self._limits, tensors=to_tensor, things=Described)[1]
 
     def exchange(
         self, operation: str, requests: Sequence[tuple[int, m.Message]], deadline: Deadline

@@ -6,12 +6,13 @@ Trust: the manifest is input from the worker.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NoReturn
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
+from envhub_sandbox.transport.specs import spec_of
 from envhub_sandbox.vector.actions import ActionReader
 from envhub_worker.protocol.manifest import EnvManifest
 from envhub_worker.protocol.spaces.spaces import OpaqueSpace
@@ -35,41 +36,9 @@ def metadata(manifest: EnvManifest) -> dict[str, Any]:
     return {**manifest.metadata, "autoreset_mode": mode}
 
 
-_REFUSAL = f"{__name__}:not_here"
-
-
 def spec(manifest: EnvManifest, reference: str) -> EnvSpec | None:
-    """``env.spec``, where the repository gave one: its facts, and nothing that makes anything.
-
-    A string names what refuses, so that it can be written as JSON like any other.
-    """
-    given = manifest.spec
-    # gym.make imports what stands before a colon
-    if given is None or given.get("id") is None or ":" in given["id"]:
-        return None
-    facts = {name: value for name, value in given.items() if value is not None}
-    try:
-        return EnvSpec(
-            **facts,
-            entry_point=_REFUSAL,
-            vector_entry_point=_REFUSAL,
-            kwargs={"reference": reference},
-        )
-    except Exception:  # an id that this Gymnasium cannot read: not worth failing for
-        return None
-
-
-def not_here(*args: Any, reference: str = "", **kwargs: Any) -> NoReturn:
-    """What ``gym.make(env.spec)`` calls.
-
-    Raises:
-        gymnasium.error.Error: Always.
-    """
-    raise gym.error.Error(
-        f"this spec is of an environment in a sandbox, {reference}: gym.make would need its code "
-        "in this process, which it never enters. Use envhub_sandbox.make_env with that repository, "
-        "or copy.deepcopy(env) for another one like it"
-    )
+    """``env.spec``, where the repository gave one: its facts, and nothing that makes anything."""
+    return spec_of(manifest.spec, reference)
 
 
 def check_mask(mask: Any, num_envs: int) -> None:

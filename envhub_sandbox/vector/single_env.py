@@ -136,11 +136,11 @@ class SingleEnv(gym.Env[Any, Any]):
         return int(found[0] if isinstance(found, tuple) else found)  # type: ignore[arg-type]
 
     def __getattr__(self, name: str) -> Any:
-        """An attribute or a method of the environment itself, as ``envs[0]`` has it."""
+        """An attribute or a method of the environment, whichever of its wrappers has it."""
         vector = self.__dict__.get("_vector")
         if vector is None or not is_servable(name):
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        return getattr(vector.envs[0], name)
+        return vector.envs[0].get_wrapper_attr(name)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # copy and deepcopy, too: another one like it, with processes of its own

@@ -24,9 +24,12 @@ from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.session.env_session import EnvSession
+from envhub_sandbox.transport import generators
 from envhub_sandbox.transport.jail import typed
 from envhub_sandbox.transport.results import StepResult
-from envhub_sandbox.vector import from_manifest, generators
+from envhub_sandbox.vector import from_manifest
+from envhub_sandbox.vector.sub_environment import MessageFor as OneMessageFor
+from envhub_sandbox.vector.sub_environment import SubEnvironment
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.names import is_servable
 from envhub_worker.protocol.untrusted import UNTRUSTED
@@ -34,6 +37,8 @@ from envhub_worker.protocol.untrusted import UNTRUSTED
 _NOT_CALLED = frozenset({"reset", "step", "close"})
 """What ``AsyncVectorEnv.call`` refuses: it would take one sub-environment from under the others."""
 Bounds = tuple[int, int]
+_SHOWN = 64
+"""Characters of a name that are told of what is asked."""
 
 
 class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
@@ -256,8 +261,18 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
     @property
     def envs(self) -> tuple[SubEnvironment, ...]:
-        """A handle on each sub-environment, to read attributes as ``env.envs[0].task`` does."""
-        return tuple(SubEnvironment(self, index) for index in range(self.num_envs))
+        """A handle on each sub-environment, to read, to call, and to drive it by itself."""
+        return tuple(SubEnvironment(self, self._ask_one, i) for i in range(self.num_envs))
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the repository returned Gymnasium's own class, as it is."""
+        return self._manifest.shardable
+
+    @property
+    def is_sync(self) -> bool:
+        """Whether the sub-environments are at hand one by one, as in ``SyncVectorEnv``."""
+        return self._manifest.sync
 
     @property
     def sandbox_report(self) -> list[dict[str, Any]]:
@@ -346,6 +361,25 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             self._raise_if_closed()
             raise
 
+    def _ask_one(self, name: str, index: int, message: OneMessageFor) -> m.Message:
+        """Ask about one sub-environment; other shards have nothing to say to it."""
+        operation = f"envs[{index}].{name[:_SHOWN]}"  # which is no reset or step of all
+        self._refuse_if_busy(operation)
+
+        def message_for(number: int, bounds: Bounds) -> m.Message:
+            start, stop = bounds
+            return message(number, index - start if start <= index < stop else None)
+
+        timeouts = {"reset": self._timeouts.reset_s, "step": self._timeouts.step_s}
+        timeout_s = timeouts.get(name, self._timeouts.call_s)
+        try:
+            replies = self._remote.request(operation, message_for, timeout_s)
+        except WorkerDiedError:
+            self._raise_if_closed()  # close() in another thread ended it under us
+            raise
+        holds = (start <= index < stop for start, stop in self._remote.bounds)
+        return next(reply for reply, here in zip(replies, holds, strict=True) if here)
+
     def _ask(self, operation: str, message: Callable[[int, Bounds], m.Message]) -> list[m.Value]:
         self._refuse_if_busy(operation)
         self._submit(operation, message)
@@ -416,38 +450,3 @@ def _seed(given: Any) -> int:
     if not isinstance(given, (int, np.integer)):
         raise Error(f"Seed must be a python integer, actual type: {type(given)}")
     return int(given)
-
-
-class SubEnvironment:
-    """Reads attributes of one sub-environment: ``env.envs[0].task``, ``hasattr`` included.
-
-    What Gymnasium's environments have is answered here: looking at a method does not run it.
-    """
-
-    def __init__(self, vector: SandboxVectorEnv, index: int) -> None:
-        self._vector = vector
-        self._index = index
-        self.action_space = vector.single_action_space
-        self.observation_space = vector.single_observation_space
-        metadata = vector.metadata.items()  # the mode is the vector environment's alone
-        self.metadata = {key: value for key, value in metadata if key != "autoreset_mode"}
-        self.render_mode = vector.render_mode
-        self.spec = vector.spec
-
-    @property
-    def unwrapped(self) -> SubEnvironment:
-        """Itself: wrappers are not told from what they wrap."""
-        return self
-
-    def render(self) -> Any:
-        """What this one renders; the others do, too."""
-        return self._vector.call("render")[self._index]
-
-    def __getattr__(self, name: str) -> Any:
-        """The attribute; methods are called without arguments, as ``get_attr`` does."""
-        if not is_servable(name):
-            raise AttributeError(f"a sub-environment shows no {name!r}; ask the vector environment")
-        return self._vector.get_attr(name)[self._index]
-
-    def __repr__(self) -> str:
-        return f"<sub-environment {self._index} of {self._vector!r}>"

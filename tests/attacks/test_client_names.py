@@ -23,11 +23,12 @@ import pytest
 from gymnasium.vector import VectorWrapper
 
 from envhub_sandbox import make_env
+from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol import messages as m
 from tests.attacks.harness import Arena
-from tests.attacks.lying_server import NUM_ENVS, Asked, Frames, LyingServer, lying, manifest
+from tests.attacks.lying_server import Asked, Frames, LyingServer, lying, manifest
 from tests.attacks.test_client_lies import opened, relayed
 from tests.attacks.test_client_values import SCRIPT, spec_of
 from tests.support import inside
@@ -114,7 +115,7 @@ class Forwarding(VectorWrapper):
 
 def asked_for(liar: LyingServer) -> set[str]:
     """The names of attributes and methods that the worker was asked for."""
-    kinds = (m.GetOwn, m.CallOwn, m.Call)
+    kinds = (m.GetOwn, m.CallOwn, m.Call, m.GetOne, m.CallOne)
     return {request.name for request in liar.asked if isinstance(request, kinds)}
 
 
@@ -269,17 +270,34 @@ def test_the_clients_own_names_are_nobody_elses(liar: LyingServer, folder: str) 
 
 
 def test_sub_environments_run_nothing_when_looked_at(liar: LyingServer, folder: str) -> None:
-    """``hasattr(env.envs[0], "reset")`` asks; it does not reset."""
+    """``hasattr(env.envs[0], "reset")`` does not reset; what is no method of ours is asked for."""
     with greedy(liar, folder) as suites:
         sub = suites.env.envs[0]
-        for name in ("reset", "step", "close", "render", "unwrapped", "action_space", "metadata"):
-            hasattr(sub, name)
+        for name in ("reset", "step", "close", "render", "unwrapped"):
+            assert hasattr(sub.unwrapped, name)
         assert not asked_for(liar)
-        assert not any(isinstance(request, m.Reset) for request in liar.asked)
-        assert sub.unwrapped is sub
-        liar.lies[m.Call] = relayed(m.Value(("lift",) * NUM_ENVS))
-        assert sub.task == "lift"
+        liar.lies[m.GetOne] = relayed(m.Method())
+        liar.lies[m.CallOne] = relayed(m.Value("lift"))
+        method = sub.task
         assert asked_for(liar) == {"task"}
+        assert not any(isinstance(request, (m.Reset, m.CallOne)) for request in liar.asked)
+        assert method(1) == "lift"
+        assert any(isinstance(request, m.CallOne) for request in liar.asked)
+        liar.lies[m.GetOne] = relayed(m.Value("lift"))
+        assert sub.task == "lift"
+
+
+@pytest.mark.parametrize("lie", [m.Done(), m.ResetDone(0, {}), m.Built({})], ids=repr)
+def test_sub_environments_take_only_values_and_methods(
+    liar: LyingServer, folder: str, lie: m.Message
+) -> None:
+    """Any other answer breaks the rules."""
+    with greedy(liar, folder) as suites:
+        liar.lies |= {m.GetOne: relayed(lie), m.CallOne: relayed(lie)}
+        sub = suites.env.envs[0]
+        for ask in (lambda: sub.task, lambda: sub.reset(), lambda: sub.spec):
+            with pytest.raises((RemoteProtocolError, WorkerDiedError)):
+                ask()
 
 
 # --- a real jail ----------------------------------------------------------------------------

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 
-from envhub_sandbox.transport import results
+from envhub_sandbox.transport import described, results
 from envhub_worker.protocol import messages as m
 from tests.fuzz import child, traffic
 from tests.fuzz.oracle import WrongError, fits
@@ -121,6 +122,16 @@ def test_a_memory_that_fails_is_noticed(
         monkeypatch.setattr(*spot, m.templates.Forms())
     monkeypatch.setattr(m.templates, "Incoming", forgetful)
     assert first_wrong(recorded, "unpack") == "another end"
+
+
+def test_specs_that_are_not_read_as_facts_are_noticed(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without what makes a spec of facts alone, the fuzzer says so; with it, nothing."""
+    assert first_wrong(recorded, "things") == ""
+    naive = {"id": "A-v0", "entry_point": "os:system"}
+    monkeypatch.setattr(described, "spec_of", lambda facts: EnvSpec(**naive))
+    assert "an entry point" in first_wrong(recorded, "things")
 
 
 def forgetful(*_: object) -> None:

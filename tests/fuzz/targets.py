@@ -11,22 +11,28 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.transport import described, specs
 from envhub_sandbox.transport.connection import death, expect
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.described import Described
+from envhub_sandbox.transport.generators import generator
 from envhub_sandbox.transport.jail import RemoteJail, RunnersDiedError, check, open_jail
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.vector import from_manifest
-from envhub_sandbox.vector.generators import generator
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import decode
+from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
 from envhub_worker.protocol.compression import pack_frames, unpack_frames
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.manifest import decode_env, decode_manifest
 from envhub_worker.protocol.shared_memory import columns
 from envhub_worker.protocol.spaces import batches
+from envhub_worker.protocol.spaces.spaces import OpaqueSpace, encode_space
 from envhub_worker.protocol.stream import PacketReader, pack_packet
 from envhub_worker.protocol.untrusted import UNTRUSTED
 from tests.attacks.lying_server import env_manifest
@@ -36,6 +42,7 @@ from tests.fuzz.traffic import Frames
 from tests.unit.protocol.test_batches import SINGLE_SPACES, parts_of
 
 ELEMENTS = 2_000_000
+_SMALL = WireLimits(message_bytes=ELEMENTS)
 SIZES = ((3,), (1, 2), (2, 2))
 
 
@@ -103,14 +110,14 @@ def unpack(dice: Dice) -> None:
     frames = dice.rng.choice(dice.corpus)
     for _ in range(dice.often()):
         frames = dice.spoiler.frames(frames, dice.corpus)
-    first = attempt(lambda: m.unpack(frames)[1])
+    first = attempt(lambda: m.unpack(frames, things=Described)[1])
     for _ in range(3):
-        again = attempt(lambda: m.unpack(frames)[1])
+        again = attempt(lambda: m.unpack(frames, things=Described)[1])
         demand(type(first) is type(again) or is_error(first) == is_error(again) == 1, "another end")
         demand(is_error(first) or alike(parts(first), parts(again)), "another message")
     if is_error(first):
         raise first
-    plain = decode(frames)
+    plain = decode(frames, things=Described)
     demand(alike(parts(first), plain[2:]), "not what the codec says")  # type: ignore[index]
     usable(parts(first))
     m.pack(first, 1)
@@ -257,7 +264,7 @@ def manifest(dice: Dice) -> None:
         usable((env.metadata, env.attributes, env.render_mode, env.suite, env.task))
         from_manifest.metadata(env)
         spec = from_manifest.spec(env, "a/b@c")
-        entry = f"{from_manifest.__name__}:{from_manifest.not_here.__name__}"
+        entry = f"{specs.__name__}:{specs.not_here.__name__}"
         demand(spec is None or spec.entry_point == entry, "an entry point of the worker's")
         for space in (env.single_observation_space, env.single_action_space):
             repr(space)
@@ -269,6 +276,25 @@ def built(dice: Dice) -> None:
     """The same for the answer to ``Build``."""
     found = [one for one in dice.messages if isinstance(one, m.Built)]
     decode_env(dice.spoiled(dice.rng.choice(found).manifest), max_elements=ELEMENTS)
+
+
+def things(dice: Dice) -> None:
+    """What is described in an answer is made of facts, costs what it may, and can be used."""
+    code, honest = dice.rng.choice(
+        [
+            *((SPACE, encode_space(space)) for space in SINGLE_SPACES),
+            (SPEC, {"id": "A-v0", "max_episode_steps": 7}),
+            (GENERATOR, dict(np.random.PCG64(7).state)),
+        ]
+    )
+    made = described.Described(_SMALL)(code, dice.spoiled(honest))
+    usable(made)
+    if isinstance(made, gym.Space) and not isinstance(made, OpaqueSpace):
+        made.sample()
+    if isinstance(made, EnvSpec):
+        demand("not_here" in str(made.entry_point), "an entry point of the worker's")
+    if isinstance(made, np.random.Generator):
+        made.integers(0, 9, 700)
 
 
 def generators(dice: Dice) -> None:
@@ -444,8 +470,8 @@ def column_schemas(dice: Dice) -> None:
 TARGETS: dict[str, Callable[[Dice], None]] = {
     one.__name__: one
     for one in (
-        unpack, results, infos, apart, restore, manifest, built, generators, relay, server, stream,
-        packed, column_schemas,
+        unpack, things, results, infos, apart, restore, manifest, built, generators, relay, server,
+        stream, packed, column_schemas,
     )
 }  # fmt: skip
 

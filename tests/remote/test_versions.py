@@ -8,15 +8,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import pytest
 import zmq
 
+from envhub_sandbox import make_env
 from envhub_sandbox.errors import VersionMismatchError
 from envhub_sandbox.sandboxes.process import PROCESS
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.tcp import Far
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.inert import RemoteObject
+from tests.support.samples import SAMPLES
 
 # Taken from version 1 as it was released; never to be written anew.
 HELLO_OF_1 = bytes.fromhex("170000009501070101c410000102030405060708090a0b0c0d0e0f")
@@ -65,6 +69,18 @@ def test_a_client_that_shares_no_version_hears_whom_to_upgrade(
     assert isinstance(reply, m.Refused)
     assert reply.error == "VersionMismatchError"
     assert upgrade in reply.message
+
+
+@pytest.mark.parametrize(("version", "kind"), [(5, RemoteObject), (m.VERSION, gym.Space)])
+def test_an_older_client_is_sent_texts(
+    monkeypatch: pytest.MonkeyPatch, version: int, kind: type
+) -> None:
+    """What it could not read is a description in words, as it was before."""
+    monkeypatch.setattr(m, "VERSION", version)
+    with make_env(str(SAMPLES / "counter"), n_envs=2) as suites:
+        suites.env.reset(seed=0)
+        found = suites.env.get_attr("action_space")[0]
+        assert isinstance(found, kind)
 
 
 @contextmanager

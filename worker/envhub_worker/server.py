@@ -129,7 +129,9 @@ class Server:
         except Exception as error:
             self._refuse_unread(identity, key, frames[0], error)
             return
-        asker = Asker(identity, request_id, b"" if session is None else session.owner, key)
+        asker = Asker(identity, request_id, key=key)
+        if session is not None:
+            asker = asker._replace(session=session.owner, version=session.version)
         try:
             self._dispatch(asker, request, arrived)
         except RefusedError as refused:
@@ -200,6 +202,9 @@ class Server:
         if not request.session:
             raise RefusedError("LocalProtocolError", "a session has a name")
         self._gate.greet(Greeting(arrived, request.session, self._sessions, self._jails))
+        session = self._sessions.find(arrived.identity, arrived.key)
+        if session is not None:
+            session.version = version
         self.reply(asker, m.Welcome(version, __version__, os.getpid()))
 
     def _agree(self, asker: Asker, request: m.Agree) -> None:

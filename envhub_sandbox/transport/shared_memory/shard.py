@@ -14,6 +14,7 @@ from time import perf_counter_ns
 from typing import Any
 
 from envhub_sandbox.errors import RemoteProtocolError
+from envhub_sandbox.transport.described import Described
 from envhub_sandbox.transport.shared_memory.doorbell import OwnBell, RunnerBell
 from envhub_sandbox.transport.shared_memory.memfd import SEAL_FUTURE_WRITE, slab
 from envhub_sandbox.transport.tensors import to_tensor
@@ -151,7 +152,9 @@ class LaneShard:
         if not length:
             return kind, None
         start = self.layout.infos
-        message = m.unpack([self._reply[start : start + length]], tensors=to_tensor)[1]
+        message = m.unpack(
+            [self._reply[start : start + length]], tensors=to_tensor, things=Described
+        )[1]
         if isinstance(message, m.Value) and type(message.value) is dict:
             with UNTRUSTED:
                 self._learn(message.value)
@@ -169,7 +172,7 @@ class LaneShard:
         start = self.layout.answer
         with UNTRUSTED:
             packet = read_packet(self._reply[start : start + length])
-        return m.unpack(packet.frames, tensors=to_tensor)[1]
+        return _unpacked(packet.frames)
 
     def _learn(self, infos: dict[Any, Any]) -> None:
         start = self.layout.infos
@@ -190,3 +193,8 @@ class LaneShard:
         self._asks.release()
         self._tells.release()
         # the maps go with the last array over them
+
+
+def _unpacked(frames: Sequence[Any]) -> m.Message:
+    """A runner's message. Trust: input from the worker."""
+    return m.unpack(frames, tensors=to_tensor, things=Described)[1]

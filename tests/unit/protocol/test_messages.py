@@ -73,6 +73,8 @@ SAMPLES: list[m.Message] = [
     m.Method(),
     m.CallOwn(1, "describe", (), {}),
     m.GetRandom(1),
+    m.GetOne(1, 0, None, "task"),
+    m.CallOne(1, None, 0, "add", (1, "x"), {"flag": True}),
     m.Close(1),
     m.Value((None, "a", 1.5)),
     m.Attach(1, 2, 8, 5),

@@ -14,7 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_sandbox.errors import RemoteEnvError, RemoteProtocolError, remote_error
-from envhub_sandbox.vector import from_manifest, generators
+from envhub_sandbox.transport import generators
+from envhub_sandbox.vector import from_manifest
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.codec.codec import decode, encode
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject

@@ -7,6 +7,8 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
+from envhub_worker.protocol.messages import OLDEST_VERSION
+
 MAX_CONNECTIONS = 4096
 """Of one session; the longest unused is dropped."""
 
@@ -36,12 +38,14 @@ class Session:
         name: The client's own random bytes.
         heard: When it last said anything.
         held: The jails that it last said it holds, and when; None before it said so.
+        version: The version of the protocol that it last agreed to.
     """
 
     key: bytes
     name: bytes
     heard: float
     held: dict[int, float] | None = None
+    version: int = OLDEST_VERSION
     connections: OrderedDict[tuple[bytes, bytes], Connection] = field(default_factory=OrderedDict)
 
     @property

@@ -27,12 +27,14 @@ class JailSpec:
         entry: The entry file, relative to it.
         confinement: What the jail is permitted.
         name: For logs.
+        version: Of the protocol, as its client reads it.
     """
 
     snapshot: str
     entry: str
     confinement: Confinement
     name: str
+    version: int = 1
 
     def to_wire(self) -> dict[str, Any]:
         """Plain data for a channel between our own processes."""

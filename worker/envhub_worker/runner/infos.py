@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from envhub_worker.protocol import messages as m
@@ -9,6 +10,7 @@ from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.shared_memory.columns import Column, columns_of
 from envhub_worker.protocol.spaces import batches
 
+Pack = Callable[[m.Message, int], list[Any]]
 Pairs = list[tuple[int, dict[Any, Any]]]
 """Infos with the index of their sub-environment, in the order in which they came."""
 
@@ -37,13 +39,17 @@ class InfoWriter:
         reply: The mapped reply slab.
         start: Offset of its info area.
         count: Sub-environments of the shard.
+        pack: Gives the frames of a message.
         sliced: Whether there are other shards.
     """
 
-    def __init__(self, reply: Any, start: int, count: int, *, sliced: bool) -> None:
+    def __init__(
+        self, reply: Any, start: int, count: int, pack: Pack = m.pack, *, sliced: bool
+    ) -> None:
         self._reply = reply
         self._start = start
         self._count = count
+        self._pack = pack
         self._sliced = sliced
         self._keys: list[Any] | None = None
         self._types: list[type] = []
@@ -60,7 +66,7 @@ class InfoWriter:
         if self._keys is not None and self._write_columns(pairs):
             return slabs.COLUMNS, 0
         infos = join(pairs, self._count, sliced=self._sliced)
-        frames = m.pack(m.Value(infos), 0)
+        frames = self._pack(m.Value(infos), 0)
         if len(frames) > 1 or memoryview(frames[0]).nbytes > slabs.INFO_BYTES:
             return slabs.FETCH, 0
         self._learn(pairs, infos)

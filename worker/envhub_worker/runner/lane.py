@@ -38,6 +38,7 @@ class Lane:
         fds: Request slab, reply slab, observation slab, our doorbell, the client's. Owned from
             now on.
         answer: Gives the frames of the answer to a message.
+        pack: Gives the frames of a message.
 
     Attributes:
         number: The environment's.
@@ -50,6 +51,7 @@ class Lane:
         attach: m.Attach,
         fds: list[int],
         answer: Callable[[Packet], list[Any]],
+        pack: Callable[[m.Message, int], list[Any]],
     ) -> None:
         self.number = attach.env
         self.unsent: list[Any] = []
@@ -77,7 +79,7 @@ class Lane:
         self._codes: list[int] = []
         self._views: list[Any] = []
         self._pairs: Pairs = []
-        self._writer = InfoWriter(self._reply, layout.infos, layout.count, sliced=env.sliced)
+        self._writer = InfoWriter(self._reply, layout.infos, layout.count, pack, sliced=env.sliced)
         self._changes = self._cpu = self._spin_ns = 0
         self._move(attach.start, observed)
 

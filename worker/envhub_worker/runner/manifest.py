@@ -13,13 +13,13 @@ from gymnasium.vector.utils import batch_space
 from envhub_worker.protocol.manifest import EnvManifest, Manifest
 from envhub_worker.protocol.names import MAX_NAMES
 from envhub_worker.runner import gymnasium_compat as compat
+from envhub_worker.runner.described import facts_of
 from envhub_worker.runner.tasks import Task
 
 _GYMNASIUMS = frozenset(dir(VectorEnv)) | compat.OWN_NAMES | {"num_envs", "env", "envs"}
 _HEAD_BYTES = 2048
 """The name and the version come first."""
 _LINES = 16
-_SPEC_FIELDS = ("id", "max_episode_steps", "reward_threshold", "nondeterministic")
 
 
 def describe(tasks: list[Task]) -> Manifest:
@@ -100,7 +100,7 @@ def _spec(env: Any) -> dict[str, Any] | None:
     spec = getattr(env, "spec", None)
     if getattr(spec, "id", None) is None:
         return None
-    return {name: getattr(spec, name, None) for name in _SPEC_FIELDS}
+    return facts_of(spec)
 
 
 def _attributes(env: Any) -> tuple[str, ...]:

@@ -24,6 +24,7 @@ from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
 from envhub_worker.runner import loader, manifest
 from envhub_worker.runner.deferred import standing_in
+from envhub_worker.runner.described import described
 from envhub_worker.runner.exceptions import raised
 from envhub_worker.runner.gymnasium_compat import joined_infos
 from envhub_worker.runner.infos import join
@@ -33,11 +34,13 @@ from envhub_worker.runner.tasks import ResultError, Task, tasks_of
 
 _ANCILLARY_BYTES = socket.CMSG_SPACE(8 * array("i").itemsize)
 _RECHECK_MS = 2
+_FIRST_WITH_DESCRIPTIONS = 7
+"""The version of the protocol."""
 
 
 def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
     """Serve until the other side closes the stream. Runs confined, as the jail's main program."""
-    runner = Runner(spec.snapshot, spec.entry)
+    runner = Runner(spec.snapshot, spec.entry, spec.version)
     reader = PacketReader()
     poller = select.poll()
     poller.register(stream, select.POLLIN)
@@ -79,9 +82,18 @@ def _send(stream: socket.socket, request_id: int, frames: list[Any]) -> None:
 
 
 class Runner:
-    """The state of one runner: the repository's tasks and the environments built of them."""
+    """The state of one runner: the repository's tasks and the environments built of them.
 
-    def __init__(self, snapshot: str, entry: str) -> None:
+    Args:
+        snapshot: The folder of the repository.
+        entry: The entry file in it.
+        version: Of the protocol, as the client reads it: an older one's answers hold descriptions
+            as texts.
+    """
+
+    def __init__(self, snapshot: str, entry: str, version: int = m.VERSION) -> None:
+        reads = version >= _FIRST_WITH_DESCRIPTIONS
+        self._pack = partial(m.pack, describer=described) if reads else m.pack
         self._snapshot = snapshot
         self._entry = entry
         self._tasks: dict[tuple[str, Any], Task] = {}
@@ -107,7 +119,7 @@ class Runner:
             reply = _HANDLERS[type(request)](self, request)
             if by_lane and isinstance(reply, m.ResetDone):
                 reply = m.Value(reply.info)  # the observation lies in the slab already
-            return m.pack(reply, request_id)
+            return self._pack(reply, request_id)
         except ResultError as error:
             return m.pack(raised(error, "return"), request_id)
         except BaseException as error:
@@ -191,7 +203,8 @@ class Runner:
         env = self._envs[request.env]
         if not isinstance(env, SubEnvs) or env.reward_shape:
             return m.Value(False)
-        self.lane = Lane(env, request, self.descriptors, partial(self.answer, by_lane=True))
+        answer = partial(self.answer, by_lane=True)
+        self.lane = Lane(env, request, self.descriptors, answer, self._pack)
         return m.Value(True)
 
     def fetch_infos(self, request: m.FetchInfos) -> m.Message:
@@ -230,6 +243,39 @@ class Runner:
         """A method of the vector environment, or of what it wraps."""
         method = _own(self._envs[request.env], request.name)
         return m.Value(method(*request.args, **request.kwargs))
+
+    def get_one(self, request: m.GetOne) -> m.Message:
+        """An attribute of one sub-environment."""
+        if request.index is None:
+            return m.Value(None)
+        value = self._found(request)
+        return m.Method() if callable(value) else m.Value(value)
+
+    def call_one(self, request: m.CallOne) -> m.Message:
+        """A method of one sub-environment."""
+        if request.index is None:
+            return m.Value(None)
+        return m.Value(self._found(request)(*request.args, **request.kwargs))
+
+    def _found(self, request: m.GetOne | m.CallOne) -> Any:
+        one, depth = self._one(request), request.depth
+        if depth is None:
+            return getattr(one.unwrapped, request.name)
+        if depth < 0:
+            return one.get_wrapper_attr(request.name)
+        for _ in range(depth):
+            one = one.env
+        return getattr(one, request.name)
+
+    def _one(self, request: m.GetOne | m.CallOne) -> Any:
+        try:
+            return _own(self._envs[request.env], "envs")[request.index]
+        except AttributeError:
+            kind = type(self._envs[request.env]).__qualname__
+            raise AttributeError(
+                f"a {kind} shows no sub-environments; ask it for one value each, by get_attr or "
+                "call"
+            ) from None
 
     def get_random(self, request: m.GetRandom) -> m.Message:
         """The states of the random number generators: of all sub-environments, or just one."""
@@ -277,6 +323,8 @@ _HANDLERS: dict[type[m.Message], Callable[[Runner, Any], m.Message]] = {
     m.Render: Runner.render,
     m.GetOwn: Runner.get_own,
     m.CallOwn: Runner.call_own,
+    m.GetOne: Runner.get_one,
+    m.CallOne: Runner.call_one,
     m.GetRandom: Runner.get_random,
     m.Close: Runner.close,
     m.Attach: Runner.attach,

@@ -20,13 +20,15 @@ from envhub_worker.supervisor.runner_stream import RunnerLink
 class Asker(NamedTuple):
     """Who asked: the reply goes to this identity under this id. Jails belong to its session.
 
-    ``key`` was proved in the handshake; empty where none is needed.
+    ``key`` was proved in the handshake; empty where none is needed. ``version`` is what its client
+    can read.
     """
 
     identity: bytes
     request_id: int
     session: bytes = b""
     key: bytes = b""
+    version: int = m.OLDEST_VERSION
 
 
 @dataclass

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 
 from envhub_worker.protocol.codec import structure
 from envhub_worker.protocol.codec.arrays import ArrayReader, Buffer
-from envhub_worker.protocol.codec.decoder import Decoder, TensorMaker, Unpickler
-from envhub_worker.protocol.codec.encoder import Encoder
+from envhub_worker.protocol.codec.decoder import Decoder, TensorMaker, ThingReader, Unpickler
+from envhub_worker.protocol.codec.encoder import Describer, Encoder
 from envhub_worker.protocol.codec.exact import Pickler
 from envhub_worker.protocol.codec.explain import explain
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
@@ -34,6 +34,7 @@ def encode(
     pickler: Pickler | None = None,
     limits: WireLimits = DEFAULT_LIMITS,
     names: Sequence[str] = (),
+    describer: Describer | None = None,
 ) -> list[Buffer]:
     """Encodes a value as frames: the header, then one per large array.
 
@@ -43,6 +44,7 @@ def encode(
         pickler: Encodes objects that have no form of their own instead. Client to worker only.
         limits: What the receiver accepts.
         names: What to call the elements of the value in an error.
+        describer: Describes what the receiver can make again. Worker to client only.
 
     Returns:
         Frames to be sent in this order. Large contiguous arrays are not copied: nobody may
@@ -52,7 +54,7 @@ def encode(
         LocalProtocolError: The value is cyclic, too deep, too large, or holds a dtype that
             cannot cross. The text names the path to the offender. Nothing was sent.
     """
-    encoder = Encoder(pickler, limits)
+    encoder = Encoder(pickler, limits, describer)
     try:
         frames = encoder.frames(value)
     except Exception as error:
@@ -69,6 +71,7 @@ def decode(
     unpickler: Unpickler | None = None,
     tensors: TensorMaker | None = None,
     copy: bool = True,
+    things: ThingReader | None = None,
 ) -> object:
     """Decodes frames into the value that was encoded.
 
@@ -83,12 +86,13 @@ def decode(
             bits). Without it tensors come as arrays, bfloat16 as float32.
         copy: Arrays own their memory and can be written. Otherwise they are read-only and the
             large ones are views of ``frames``.
+        things: Begins to make what is described. Decoders without it refuse descriptions.
 
     Raises:
         MessageTooLargeError: Over one of ``limits``.
         RemoteProtocolError: Malformed in any other way.
     """
-    return decode_parts(*split(frames, limits), limits, unpickler, tensors, copy)
+    return decode_parts(*split(frames, limits), limits, unpickler, tensors, things, copy)
 
 
 def decode_parts(
@@ -98,12 +102,13 @@ def decode_parts(
     limits: WireLimits,
     unpickler: Unpickler | None,
     tensors: TensorMaker | None,
+    things: ThingReader | None,
     copy: bool = True,
 ) -> object:
     """``decode`` for frames that ``split`` has taken apart."""
     structure.check(document, limits)
     reader = ArrayReader(tail, buffers, limits, copy)
-    decoder = Decoder(reader, limits, unpickler, tensors)
+    decoder = Decoder(reader, limits, unpickler, tensors, things)
     value = decoder.value(document)
     reader.finish()
     return value

@@ -30,6 +30,7 @@ from envhub_worker.protocol.codec.kinds import (
     COMPLEX_BYTES,
     ENUM,
     FROZENSET,
+    GENERATOR,
     INTEGER,
     OBJECTS,
     PICKLE,
@@ -39,6 +40,8 @@ from envhub_worker.protocol.codec.kinds import (
     SCALAR,
     SET,
     SLICE,
+    SPACE,
+    SPEC,
     TENSOR,
     TENSOR_DTYPES,
     TEXT_SCALAR,
@@ -49,6 +52,8 @@ from envhub_worker.protocol.limits import WireLimits
 
 Unpickler = Callable[[Buffer], object]
 TensorMaker = Callable[[Array, str], object]
+ThingReader = Callable[[WireLimits], Callable[[int, object], object]]
+"""Begins the reading of one message: makes what makes a thing of its code and its description."""
 
 # Maps and sets up to this size are too small for colliding keys to cost anything.
 _FEW_KEYS = 64
@@ -67,7 +72,9 @@ class _Head:
 class Decoder:
     """Rebuilds one value; msgpack calls its hooks in the order of the document."""
 
-    __slots__ = ("_hashed_keys", "_heads", "limits", "reader", "tensors", "unpickler")
+    __slots__ = (
+        *("_hashed_keys", "_heads", "_make", "limits", "reader", "tensors", "things", "unpickler"),
+    )
 
     def __init__(
         self,
@@ -75,9 +82,11 @@ class Decoder:
         limits: WireLimits,
         unpickler: Unpickler | None,
         tensors: TensorMaker | None,
+        things: ThingReader | None = None,
     ) -> None:
         self.reader, self.limits = reader, limits
-        self.unpickler, self.tensors = unpickler, tensors
+        self.unpickler, self.tensors, self.things = unpickler, tensors, things
+        self._make: Callable[[int, object], object] | None = None
         self._heads = self._hashed_keys = 0
 
     def value(self, document: bytes) -> object:
@@ -132,6 +141,14 @@ class Decoder:
         if len(result) != len(pairs):
             raise RemoteProtocolError("A map has a key twice.")
         return result
+
+    def make(self, code: int, items: list[Any]) -> object:
+        """What is described; all of one message share a budget."""
+        if self.things is None or len(items) != 1:
+            raise RemoteProtocolError("The message describes what is not made here.")
+        if self._make is None:
+            self._make = self.things(self.limits)
+        return self._make(code, items[0])
 
     def check_keys(self, keys: list[Any]) -> None:
         """Refuses keys chosen to collide, which would make a dict or set take quadratic time."""
@@ -270,6 +287,18 @@ def _inert_texts(items: list[Any]) -> tuple[str, str]:
     return one_line(items[0], MAX_NAME_CHARS), one_line(items[1], MAX_REPR_CHARS)
 
 
+def _build_space(decoder: Decoder, items: list[Any], payload: bytes) -> object:
+    return decoder.make(SPACE, items)
+
+
+def _build_spec(decoder: Decoder, items: list[Any], payload: bytes) -> object:
+    return decoder.make(SPEC, items)
+
+
+def _build_generator(decoder: Decoder, items: list[Any], payload: bytes) -> object:
+    return decoder.make(GENERATOR, items)
+
+
 _READERS: dict[int, Callable[[Decoder, bytes], object]] = {
     ARRAY: _read_array,
     SCALAR: _read_scalar,
@@ -289,4 +318,7 @@ _BUILDERS: dict[int, Callable[[Decoder, list[Any], bytes], object]] = {
     TENSOR: _build_tensor,
     ENUM: _build_enum,
     REMOTE: _build_remote,
+    SPACE: _build_space,
+    SPEC: _build_spec,
+    GENERATOR: _build_generator,
 }

@@ -21,6 +21,7 @@ from envhub_worker.protocol.codec.kinds import (
     DOCUMENT_BYTES,
     ENUM,
     FROZENSET,
+    GENERATOR,
     INTEGER,
     OBJECTS,
     PICKLE,
@@ -38,14 +39,19 @@ from envhub_worker.protocol.codec.kinds import (
 from envhub_worker.protocol.errors import LocalProtocolError
 from envhub_worker.protocol.limits import WireLimits
 
+Describer = Callable[[object], "tuple[int, object] | None"]
+"""The code and the plain value of what the peer can make again; None of all else."""
+
 
 class Encoder:
     """Turns one value into frames; msgpack calls ``default`` for what it cannot pack itself."""
 
-    __slots__ = ("limits", "pickler", "writer")
+    __slots__ = ("describer", "limits", "pickler", "writer")
 
-    def __init__(self, pickler: Pickler | None, limits: WireLimits) -> None:
-        self.pickler, self.limits = pickler, limits
+    def __init__(
+        self, pickler: Pickler | None, limits: WireLimits, describer: Describer | None = None
+    ) -> None:
+        self.pickler, self.limits, self.describer = pickler, limits, describer
         self.writer = ArrayWriter()
 
     def frames(self, value: object) -> list[Buffer]:
@@ -173,6 +179,9 @@ def _write_foreign(encoder: Encoder, value: Any) -> object:
 
 def _write_unknown(encoder: Encoder, value: object) -> object:
     if encoder.pickler is None:
+        found = None if encoder.describer is None else encoder.describer(value)
+        if found is not None:
+            return [_HEADS[found[0]], found[1]]
         return _write_remote(encoder, describe(value))
     try:
         data = encoder.pickler(value)
@@ -188,7 +197,7 @@ def _write_pickled(encoder: Encoder, pickled: Pickled) -> object:
     return msgpack.ExtType(PICKLE_FRAME, encoder.writer.add(np.frombuffer(data, np.uint8)))
 
 
-_HEADS = {code: msgpack.ExtType(code, b"") for code in range(TUPLE, REMOTE + 1)}
+_HEADS = {code: msgpack.ExtType(code, b"") for code in range(TUPLE, GENERATOR + 1)}
 
 _WRITERS: dict[type, Callable[[Encoder, Any], object]] = {
     np.ndarray: _write_array,

@@ -8,6 +8,8 @@ import struct
 ARRAY, SCALAR, INTEGER, COMPLEX, PICKLE, PICKLE_FRAME = 1, 2, 3, 4, 5, 6
 # Extensions that head a msgpack array and say what its other elements make.
 TUPLE, SET, FROZENSET, RANGE, SLICE, OBJECTS, TEXT_SCALAR, TENSOR, ENUM, REMOTE = range(16, 26)
+# The same, of what only a client makes: one plain value that describes it.
+SPACE, SPEC, GENERATOR = range(26, 29)
 
 # The header frame: length of the msgpack document, the document, bytes of small arrays.
 DOCUMENT_BYTES = struct.Struct("<I")

@@ -15,7 +15,8 @@ import msgpack  # type: ignore[import-untyped]
 
 from envhub_worker.protocol.codec import templates
 from envhub_worker.protocol.codec.codec import Buffer, decode_parts, encode, split
-from envhub_worker.protocol.codec.decoder import Unpickler
+from envhub_worker.protocol.codec.decoder import ThingReader, Unpickler
+from envhub_worker.protocol.codec.encoder import Describer
 from envhub_worker.protocol.codec.exact import Pickler, handed_over
 from envhub_worker.protocol.codec.explain import unpicklable
 from envhub_worker.protocol.codec.kinds import DOCUMENT_BYTES
@@ -36,6 +37,7 @@ def pack(
     *,
     pickler: Pickler | None = None,
     limits: WireLimits = DEFAULT_LIMITS,
+    describer: Describer | None = None,
 ) -> list[Buffer]:
     """The frames of a message.
 
@@ -50,7 +52,7 @@ def pack(
         values = _handed(message, values, pickler, limits)
     found = templates.outline(values)
     if found is None:
-        return _encoded(message, request_id, values, pickler, limits)
+        return _encoded(message, request_id, values, pickler, limits, describer)
     outline, arrays = found
     form = _OUTGOING.get((cls, outline))
     if form is not None and form.limits is limits:
@@ -82,10 +84,12 @@ def _encoded(
     values: list[Any],
     pickler: Pickler | None,
     limits: WireLimits,
+    describer: Describer | None = None,
 ) -> list[Buffer]:
     value, names = [message.kind, request_id, *values], ("kind", "id", *message.FIELDS)
     try:
-        return encode(value, pickler=pickler, limits=limits, names=names)
+        how: Any = {"limits": limits, "names": names, "describer": describer}
+        return encode(value, pickler=pickler, **how)
     except LocalProtocolError as error:
         raise LocalProtocolError(f"{_asked(message)}{error}") from error.__cause__
 
@@ -104,6 +108,7 @@ def unpack(
     limits: WireLimits = DEFAULT_LIMITS,
     unpickler: Unpickler | None = None,
     tensors: Callable[[Any, str], object] | None = None,
+    things: ThingReader | None = None,
 ) -> tuple[int, Message]:
     """The request id and the message of some frames.
 
@@ -114,12 +119,13 @@ def unpack(
         document, tail, buffers = split(frames, limits)
         plain = templates.without_id(document)
         if plain is None:
-            return _decode(document, tail, buffers, limits, unpickler, tensors)
+            return _decode(document, tail, buffers, limits, unpickler, tensors, things)
         key, packed_id = plain
         form = _INCOMING.get(key)
         if form is not None and form.limits is limits:
             return templates.read_id(packed_id), form.message(tail, buffers)
-        request_id, message = _decode(document, tail, buffers, limits, unpickler, tensors)
+        how = (limits, unpickler, tensors, things)
+        request_id, message = _decode(document, tail, buffers, *how)
         _INCOMING.met(key, lambda: templates.Incoming(document, type(message), limits))
         return request_id, message
 
@@ -147,8 +153,9 @@ def _decode(
     limits: WireLimits,
     unpickler: Unpickler | None,
     tensors: Callable[[Any, str], object] | None,
+    things: ThingReader | None,
 ) -> tuple[int, Message]:
-    value = decode_parts(document, tail, buffers, limits, unpickler, tensors)
+    value = decode_parts(document, tail, buffers, limits, unpickler, tensors, things)
     if type(value) is not list or len(value) < 2:
         raise RemoteProtocolError("a message is a list that starts with its kind and its id")
     kind, request_id, *rest = value

@@ -118,6 +118,31 @@ class CallOwn(Message, kind=45, asks="method", handed=("args", "kwargs")):
     kwargs: dict[str, object]
 
 
+class GetOne(Message, kind=55):
+    """An attribute of one sub-environment. Reply: ``Value``, or ``Method`` if it can be called.
+
+    ``index`` is its place in the slice; None where the slice does not hold it, whose reply is a
+    ``Value`` of None. ``depth`` wrappers are looked through, or all of them if it is None; if it is
+    -1, whichever has it.
+    """
+
+    env: int
+    index: int | None
+    depth: int | None
+    name: str
+
+
+class CallOne(Message, kind=56, asks="envs", handed=("args", "kwargs")):
+    """Call a method of one sub-environment, which ``GetOne`` describes. Reply: ``Value``."""
+
+    env: int
+    index: int | None
+    depth: int | None
+    name: str
+    args: tuple[object, ...]
+    kwargs: dict[str, object]
+
+
 class GetRandom(Message, kind=46):
     """Ask for the generators. Reply: ``Value``, one state each, or the one state there is."""
 

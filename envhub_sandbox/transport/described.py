@@ -1,0 +1,57 @@
+"""Spaces, specs and generators that a worker describes in an answer, made here of plain values.
+
+Trust: every description is input from the worker. Nothing of the worker's is executed: what comes
+is fields of a fixed form, each held against what such a thing can have.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from envhub_sandbox.errors import RemoteProtocolError
+from envhub_sandbox.transport.generators import generator
+from envhub_sandbox.transport.specs import spec_of
+from envhub_worker.protocol.codec.inert import RemoteObject, one_line
+from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
+from envhub_worker.protocol.facts import read_spec
+from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.spaces.reader import ELEMENT_BYTES, SPACE_BYTES, SpaceReader
+
+_GENERATOR_BYTES = 4 * SPACE_BYTES
+"""The largest state, and the objects around it."""
+_SPEC_TYPE = "gymnasium.envs.registration.EnvSpec"
+_SHOWN = 200
+
+
+class Described:
+    """What one message describes, out of one budget: all of it costs no more than its bytes may.
+
+    Args:
+        limits: What the message may hold.
+    """
+
+    def __init__(self, limits: WireLimits) -> None:
+        self._reader = SpaceReader(limits.message_bytes // ELEMENT_BYTES)
+
+    def __call__(self, code: int, value: object) -> object:
+        """The thing that is described. Trust: input from the worker.
+
+        Raises:
+            RemoteProtocolError: There can be none like it, or it costs too much.
+        """
+        if code == SPACE:
+            return self._reader.space(value)
+        if code == SPEC:
+            self._reader.spend(SPACE_BYTES)
+            return _spec(value)
+        if code == GENERATOR:
+            self._reader.spend(_GENERATOR_BYTES)
+            return generator(value)
+        raise RemoteProtocolError(f"nothing is described by {code}")
+
+
+def _spec(value: object) -> Any:
+    """An id that this Gymnasium cannot read is only told."""
+    facts = read_spec(value)
+    made = spec_of(facts)
+    return RemoteObject(_SPEC_TYPE, one_line(str(facts), _SHOWN)) if made is None else made

@@ -1,0 +1,256 @@
+"""One sub-environment: ``env.envs[0]``, as an ``Env`` that lives in the jail.
+
+Followed: ``gymnasium.vector.SyncVectorEnv.envs``, which holds the environments themselves. So what
+is done to one of them is done behind the vector environment's back: it keeps the observation and
+the end of an episode that its own last step has seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import gymnasium as gym
+
+from envhub_sandbox.errors import RemoteProtocolError
+from envhub_sandbox.transport import generators
+from envhub_sandbox.transport.jail import typed
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.inert import RemoteObject
+from envhub_worker.protocol.names import is_servable
+from envhub_worker.protocol.spaces import batches
+from envhub_worker.protocol.untrusted import UNTRUSTED
+
+MessageFor = Callable[[int, "int | None"], m.Message]
+"""Makes a message of the environment's number and the place in the slice, None elsewhere."""
+_OUTERMOST = 0
+_SEARCHED = -1
+"""In place of a depth: whichever wrapper has it."""
+_OURS = frozenset({"_vector", "_ask", "_index", "_depth"})
+
+
+class Vector(Protocol):
+    """What a sub-environment asks of its vector environment."""
+
+    num_envs: int
+    metadata: dict[str, Any]
+    render_mode: str | None
+    single_action_space: Any
+    single_observation_space: Any
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the repository returned Gymnasium's own class, as it is."""
+
+    @property
+    def is_sync(self) -> bool:
+        """Whether the sub-environments are at hand one by one, as in ``SyncVectorEnv``."""
+
+
+class SubEnvironment(gym.Env[Any, Any]):
+    """One sub-environment of a vector environment, and what its wrappers wrap.
+
+    Looking at a method asks whether it is one, and runs nothing. Attributes with an underscore and
+    names that libraries look for in any object are not asked for: ``get_wrapper_attr`` names them.
+
+    Args:
+        vector: Its vector environment.
+        ask: Asks the worker about it.
+        index: Which of the sub-environments it is.
+        depth: How many wrappers are looked through; None for all.
+    """
+
+    def __init__(
+        self,
+        vector: Vector,
+        ask: Callable[[str, int, MessageFor], m.Message],
+        index: int,
+        depth: int | None = _OUTERMOST,
+    ) -> None:
+        self._vector = vector
+        self._ask = ask
+        self._index = index
+        self._depth = depth
+
+    # --- what every environment has ------------------------------------------------------------
+
+    def reset(self, *args: Any, **kwargs: Any) -> Any:
+        """Reset this one alone. The vector environment goes on as if it had not been."""
+        self._refuse_unless_sync("reset")
+        return self._restored(self._call("reset", args, kwargs))
+
+    def step(self, *args: Any, **kwargs: Any) -> Any:
+        """Step this one alone; as ``reset``."""
+        self._refuse_unless_sync("step")
+        return self._restored(self._call("step", args, kwargs))
+
+    def render(self, *args: Any, **kwargs: Any) -> Any:
+        """What this one renders."""
+        return self._call("render", args, kwargs)
+
+    def close(self) -> None:
+        """Close it, if there are no others.
+
+        Raises:
+            ValueError: There are, and a vector environment cannot go on without one of them.
+        """
+        if self._vector.num_envs > 1:
+            raise ValueError(
+                f"cannot close sub-environment {self._index} of {self._vector.num_envs}: the "
+                "others could not go on without it; close the vector environment"
+            )
+        self._call("close", (), {})
+
+    @property
+    def unwrapped(self) -> SubEnvironment:
+        """The innermost environment."""
+        if self._depth is None:
+            return self
+        return SubEnvironment(self._vector, self._ask, self._index, None)
+
+    @property
+    def env(self) -> Any:
+        """What this wrapper wraps.
+
+        Raises:
+            AttributeError: It is no wrapper.
+        """
+        found = self._get("env")
+        if self._depth is None or not (callable(found) or isinstance(found, RemoteObject)):
+            return found
+        return SubEnvironment(self._vector, self._ask, self._index, self._depth + 1)
+
+    @property
+    def action_space(self) -> Any:  # type: ignore[override]
+        """Its action space; a copy, but for the first one's, which is the vector environment's."""
+        return self._vector.single_action_space if self._is_shown else self._get("action_space")
+
+    @property
+    def observation_space(self) -> Any:  # type: ignore[override]
+        """Its observation space; as ``action_space``."""
+        if self._is_shown:
+            return self._vector.single_observation_space
+        return self._get("observation_space")
+
+    @property
+    def metadata(self) -> Any:  # type: ignore[override]
+        """Its metadata."""
+        if not self._is_shown:
+            return self._get("metadata")
+        shown = self._vector.metadata.items()  # the mode is the vector environment's alone
+        return {key: value for key, value in shown if key != "autoreset_mode"}
+
+    @property
+    def render_mode(self) -> Any:  # type: ignore[override]
+        """As in Gymnasium."""
+        return self._vector.render_mode if self._is_shown else self._get("render_mode")
+
+    @property
+    def spec(self) -> Any:  # type: ignore[override]
+        """Its spec: facts, of which ``gym.make`` makes nothing."""
+        return self._get("spec")
+
+    @property  # type: ignore[misc]  # there is nothing to set
+    def np_random(self) -> Any:
+        """A copy of its generator."""
+        return self._get("np_random")
+
+    @property
+    def np_random_seed(self) -> Any:
+        """Its seed."""
+        with UNTRUSTED:
+            return generators.seeds(self._get("np_random_seed"))
+
+    @property
+    def _is_shown(self) -> bool:
+        """Whether the vector environment shows this one's spaces and metadata as its own."""
+        return self._vector.is_plain and not self._index and self._depth == _OUTERMOST
+
+    # --- what this one has ---------------------------------------------------------------------
+
+    def has_wrapper_attr(self, name: str) -> bool:
+        """Whether it has an attribute, or a wrapper of it."""
+        return bool(self._call("has_wrapper_attr", (name,), {}))
+
+    def get_wrapper_attr(self, name: str) -> Any:
+        """An attribute of the outermost wrapper that has it."""
+        return self._get(name, _SEARCHED)
+
+    def set_wrapper_attr(self, name: str, value: Any, **kwargs: Any) -> Any:
+        """Set an attribute of the outermost wrapper that has it."""
+        return self._call("set_wrapper_attr", (name, value), kwargs)
+
+    def __getattr__(self, name: str) -> Any:
+        """An attribute, or a function that calls the method of that name."""
+        if not is_servable(name):
+            raise AttributeError(
+                f"a sub-environment shows no {name!r}; if it has one that is meant, ask "
+                f"get_wrapper_attr({name!r})"
+            )
+        return self._get(name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute of it, there."""
+        if name in _OURS:
+            object.__setattr__(self, name, value)
+        else:
+            self._call("__setattr__", (name, value), {})
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, SubEnvironment) and self._identity() == other._identity()
+
+    def __hash__(self) -> int:
+        return hash(self._identity())
+
+    def __repr__(self) -> str:
+        return f"<sub-environment {self._index} of {self._vector!r}>"
+
+    __str__ = __repr__
+
+    # --- inside --------------------------------------------------------------------------------
+
+    def _identity(self) -> tuple[int, int, int | None]:
+        return id(self._vector), self._index, self._depth
+
+    def _get(self, name: str, depth: int | None = None) -> Any:
+        where = self._depth if depth is None else depth
+        reply = self._ask(
+            name, self._index, lambda number, place: m.GetOne(number, place, where, name)
+        )
+        if isinstance(reply, m.Value):
+            return reply.value
+        if not isinstance(reply, m.Method):
+            raise RemoteProtocolError(f"the worker answered GetOne with {type(reply).__name__}")
+
+        def method(*args: Any, **kwargs: Any) -> Any:
+            return self._call(name, args, kwargs, where)
+
+        method.__name__ = method.__qualname__ = name
+        return method
+
+    def _call(
+        self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], depth: int | None = None
+    ) -> Any:
+        where = self._depth if depth is None else depth
+
+        def message(number: int, place: int | None) -> m.Message:
+            given = (args, kwargs) if place is not None else ((), {})
+            return m.CallOne(number, place, where, name, *given)
+
+        return typed(self._ask(name, self._index, message), m.Value).value
+
+    def _restored(self, result: Any) -> Any:
+        """The result of a reset or a step, with the classes that the space gives observations."""
+        space = self._vector.single_observation_space
+        if type(result) is not tuple or not result or not batches.restores(space):
+            return result
+        with UNTRUSTED:
+            return (batches.restore(space, result[0]), *result[1:])
+
+    def _refuse_unless_sync(self, name: str) -> None:
+        if not self._vector.is_sync:
+            raise ValueError(
+                f"cannot {name} one sub-environment of an AsyncVectorEnv: use `{name}` of the "
+                "vector environment, or have the repository return a SyncVectorEnv "
+                "(use_async_envs=False)"
+            )
