@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
+from envhub_worker.protocol.runtime import OWN, Runtime
+
 if TYPE_CHECKING:
     from envhub_sandbox.policy import Policy
     from envhub_sandbox.transport.connection import WorkerClient
     from envhub_sandbox.transport.deadline import Deadline
     from envhub_sandbox.transport.tcp import Far
-    from envhub_worker.protocol.runtime import Runtime
 
 
 class WorkerServer(Protocol):
@@ -36,8 +37,12 @@ class Sandbox(Protocol):
 
     name: str
 
-    def acquire(self, store: Path) -> WorkerServer:
+    def acquire(self, store: Path, runtime: Runtime = OWN) -> WorkerServer:
         """A server that may show snapshots below ``store`` to jails.
+
+        Args:
+            store: The folder.
+            runtime: What its first jail runs on. A hint: others may run on something else.
 
         Raises:
             SandboxUnavailableError: There is no such place here.

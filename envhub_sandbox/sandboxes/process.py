@@ -24,6 +24,7 @@ from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.base import WorkerServer
 from envhub_sandbox.sandboxes.lingering import Lingering
 from envhub_sandbox.sandboxes.refcount import Sharing
+from envhub_worker.protocol.runtime import OWN, Runtime
 
 BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
 _STARTUP_S = 60.0
@@ -75,14 +76,14 @@ class ProcessSandbox:
     def __init__(self) -> None:
         self._servers: Sharing[ProcessServer] = Sharing(Lingering())
 
-    def acquire(self, store: Path) -> ProcessServer:
+    def acquire(self, store: Path, runtime: Runtime = OWN) -> ProcessServer:
         """The server for this process, started if there is none."""
         if not sys.platform.startswith("linux"):
             raise SandboxUnavailableError(
                 f"sandbox='process' needs Linux, and this is {sys.platform}: nothing here can "
                 "confine a process. Run the worker in a container or on a Linux host."
             )
-        return self._servers.acquire(store, partial(_start, store))
+        return self._servers.acquire(store, partial(_start, store, runtime))
 
     def release(self, server: WorkerServer, idle_s: float | None = 0.0) -> None:
         """Give a server back; the last one who does gives it up."""
@@ -90,12 +91,12 @@ class ProcessSandbox:
         self._servers.release(server, idle_s)
 
 
-def _start(store: Path) -> ProcessServer:
+def _start(store: Path, runtime: Runtime) -> ProcessServer:
     folder = runtime_folder.make(runtime_folder.SERVER)  # of mode 0700: the endpoint is ours alone
     endpoint = f"ipc://{folder}/server"
     ready, ready_end = os.pipe()
     try:
-        process = _execute(folder, store, endpoint, ready_end)
+        process = _execute(folder, store, runtime, endpoint, ready_end)
     except BaseException:
         os.close(ready)
         shutil.rmtree(folder, ignore_errors=True)
@@ -115,13 +116,16 @@ def _start(store: Path) -> ProcessServer:
     return server
 
 
-def _execute(folder: Path, store: Path, endpoint: str, ready: int) -> subprocess.Popen[bytes]:
+def _execute(
+    folder: Path, store: Path, runtime: Runtime, endpoint: str, ready: int
+) -> subprocess.Popen[bytes]:
     ourselves = os.pidfd_open(os.getpid())
     arguments = [
         *(sys.executable, "-I", str(BOOTSTRAP), "worker", "serve"),
         *("--endpoint", endpoint, "--runtime-dir", str(folder)),
         *("--readable-root", str(store)),
-        *("--ready-fd", str(ready), "--client-pidfd", str(ourselves), "--ahead"),
+        *("--ready-fd", str(ready), "--client-pidfd", str(ourselves)),
+        *("--ahead", "--python", runtime.python, "--packages", runtime.packages),
     ]
     try:
         with (folder / "server.log").open("wb") as log:

@@ -29,7 +29,7 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.tcp import Far
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import parse_key
-from envhub_worker.protocol.runtime import Runtime
+from envhub_worker.protocol.runtime import OWN, Runtime
 
 SERVER_KEY_VARIABLE = "ENVHUB_SERVER_KEY"
 CLIENT_KEY_VARIABLE = "ENVHUB_CLIENT_KEY"
@@ -99,7 +99,7 @@ class RemoteSandbox:
         server_key = _server_key(self.endpoint, self.server_key)
         return Far(server_key, _client_key(self.client_key), self.heartbeat_s)
 
-    def acquire(self, store: Path) -> WorkerServer:
+    def acquire(self, store: Path, runtime: Runtime = OWN) -> WorkerServer:
         """Not without a repository: its files have to be brought there."""
         raise SandboxUnavailableError("a remote server is asked for a repository, not for a store")
 
@@ -246,7 +246,7 @@ class RemoteRepository:
         self._snapshot, self._policy = snapshot, policy
         self._files: tuple[upload.Sent, ...] = ()
 
-    def acquire(self, store: Path) -> RemoteServer:
+    def acquire(self, store: Path, runtime: Runtime = OWN) -> RemoteServer:
         """The server; nothing is sent before a jail is opened."""
         where = (self._endpoint, self._far)
         host = HOSTS.acquire(where, partial(Host, *where))

@@ -256,7 +256,7 @@ class Repository:
         return self._hold.enter()
 
     def _acquire(self) -> WorkerServer:
-        return self._sandbox.acquire(self._store)
+        return self._sandbox.acquire(self._store, self.runtime)
 
     def _release(self, server: WorkerServer) -> None:
         self._sandbox.release(server, self.timeouts.server_idle_s)

@@ -1,7 +1,7 @@
 """The worker's program. Its contract:
 
 ``envhub-worker serve --endpoint E --runtime-dir D [--readable-root P ...] [--ready-fd N]
-[--client-pidfd N] [--fd-path F] [--until-eof] [--announce] [--ahead]``
+[--client-pidfd N] [--fd-path F] [--until-eof] [--announce] [--ahead [--python X] [--packages Y]]``
 
 - argv: ``E`` is the ZeroMQ endpoint to bind, ``ipc://`` in a folder of mode 0700. ``D`` is an
   existing private folder for what lives as long as the server; it is removed at the end. ``P``
@@ -14,7 +14,8 @@
 - in a container: ``F`` is where the socket that takes descriptors shall lie, in a folder that is
   shared with the client; ``D`` need not be. ``D`` is made if it is missing. ``--announce`` prints
   one line of JSON once the endpoint is bound: what holds around this process (``container.py``).
-- ``--ahead`` starts a zygote at once, in this interpreter, for whoever opens the first jail.
+- ``--ahead`` starts a zygote at once, in the interpreter ``X`` and for the packages ``Y``, by
+  default this interpreter with its own, for whoever opens the first jail.
 - environment: nothing is read from it but what Python itself needs.
 - exit code: 0 after a stop, 2 for wrong arguments.
 
@@ -96,9 +97,16 @@ def _serve_in(arguments: argparse.Namespace) -> int:
 
 
 def _ahead(arguments: argparse.Namespace) -> ZygoteProcess | None:
+    from envhub_worker.protocol.runtime import Runtime
     from envhub_worker.spawn.zygote_process import ZygoteProcess
 
-    return ZygoteProcess.ahead(arguments.runtime_dir) if arguments.ahead else None
+    if not arguments.ahead:
+        return None
+    runtime = Runtime(arguments.python, arguments.packages)
+    try:
+        return ZygoteProcess.ahead(arguments.runtime_dir, runtime)
+    except OSError:  # whoever opens a jail in that interpreter is told
+        return None
 
 
 def _announced() -> str:
@@ -167,6 +175,8 @@ def _parser(*, remote: bool) -> argparse.ArgumentParser:
     serve.add_argument("--until-eof", action="store_true")
     serve.add_argument("--announce", action="store_true")
     serve.add_argument("--ahead", action="store_true")
+    serve.add_argument("--python", default="")
+    serve.add_argument("--packages", default="")
     serve.set_defaults(run=_serve)
     if remote:
         _add_remote(commands)

@@ -39,7 +39,7 @@ from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.lingering import Lingering
 from envhub_sandbox.sandboxes.owner import identity_of
 from envhub_sandbox.sandboxes.refcount import Sharing
-from envhub_worker.protocol.runtime import Runtime
+from envhub_worker.protocol.runtime import OWN, Runtime
 
 _MONITOR = Path(__file__).with_name("monitor.py")
 _STARTUP_S = 120.0
@@ -116,7 +116,7 @@ class DockerSandbox:
         _check_users(engine)
         return RepositoryContainer(self, engine, find_image(engine, self.image), snapshot, policy)
 
-    def acquire(self, store: Path) -> WorkerServer:
+    def acquire(self, store: Path, runtime: Runtime = OWN) -> WorkerServer:
         """Not without a repository: a container sees the files of one only."""
         raise SandboxUnavailableError("a container is started for a repository, not for a store")
 
@@ -196,7 +196,7 @@ class RepositoryContainer:
         self._servers: Sharing[ContainerServer] = Sharing(_IDLE)
         self._key = repr((options, engine, image, str(snapshot), policy))
 
-    def acquire(self, store: Path) -> ContainerServer:
+    def acquire(self, store: Path, runtime: Runtime = OWN) -> ContainerServer:
         """The repository's container, started if there is none."""
         return self._servers.acquire(self._key, self._start)
 

@@ -19,3 +19,7 @@ class Runtime:
 
     python: str
     packages: str = ""
+
+
+OWN = Runtime("")
+"""The worker server's own interpreter, with its packages."""

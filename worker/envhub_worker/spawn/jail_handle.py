@@ -25,7 +25,7 @@ from envhub_worker.lockdown.mechanisms.scratch import Scratch, remove_tree
 from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.confinement import Confinement
-from envhub_worker.protocol.runtime import Runtime
+from envhub_worker.protocol.runtime import OWN, Runtime
 from envhub_worker.spawn.events import (
     Failed,
     JailEvent,
@@ -34,7 +34,7 @@ from envhub_worker.spawn.events import (
     RunnerStarted,
     ZygoteDied,
 )
-from envhub_worker.spawn.zygote_process import OWN, ZygoteProcess, resolved
+from envhub_worker.spawn.zygote_process import ZygoteProcess, resolved
 
 __all__ = [
     "RUNNER_TARGET",

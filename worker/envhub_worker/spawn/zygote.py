@@ -4,10 +4,11 @@ It is executed with ``-I``, a built environment and named descriptors, never run
 code and never sees what a jail is for: a jail's specification, with the secrets that its caller
 may grant, goes straight from the server to the jail's init, so that no later fork inherits it.
 
-argv: the descriptor of its control channel, and ``ahead`` if what every runner needs shall be
-imported at once, and not only when it is confined. The first message on the channel is its
-configuration (a command line can be read by every jail), with the fields of ``ZygoteConfig``. Then
-requests::
+argv: the descriptor of its control channel, and what shall be imported at once, and not only when
+it is confined: ``ahead`` for what every runner needs, ``standard`` for no more than the standard
+library, where the packages of its jails are not the interpreter's own. The first message on the
+channel is its configuration (a command line can be read by every jail), with the fields of
+``ZygoteConfig``. Then requests::
 
     {"op": "spawn", "id": N} + [init's control socket, the jail's output pipe]
 
@@ -70,6 +71,8 @@ def main(argv: Sequence[str]) -> int:
     gc.disable()  # what is imported stays, and to look through it again and again takes a tenth
     if argv[1:] == ["ahead"]:
         preload(_JAIL)
+    elif argv[1:] == ["standard"]:
+        import_all(packages.STANDARD)
     received = channel.receive()
     if received is None:
         return 0
@@ -83,9 +86,7 @@ def main(argv: Sequence[str]) -> int:
     process.become_subreaper()
     # what a repository prints must not lie in a buffer when its process dies
     cast(io.TextIOWrapper, sys.stdout).reconfigure(line_buffering=True)
-    if config.packages:
-        import_all(packages.STANDARD)
-    else:
+    if not config.packages:
         preload(config.target)
         common = replace(common, set_blas_threads=blas.find_setter())
     gc.freeze()  # without looking through it: there is next to nothing that could go

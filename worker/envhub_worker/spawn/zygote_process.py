@@ -1,8 +1,8 @@
 """The process of a zygote, from its start until it hears what it is for.
 
 What a server needs first is a zygote, and that takes longest: so ``serve --ahead`` starts one
-before anything else is imported. It is in the server's own interpreter, imports what every runner
-needs, and waits.
+before anything else is imported. In the server's own interpreter it imports what every runner
+needs; in another one, or where jails bring packages of their own, no package at all. Then it waits.
 """
 
 from __future__ import annotations
@@ -15,10 +15,8 @@ from pathlib import Path
 from envhub_worker import bootstrap
 from envhub_worker.channel import Channel
 from envhub_worker.lockdown.mechanisms.environment import zygote_environment
-from envhub_worker.protocol.runtime import Runtime
+from envhub_worker.protocol.runtime import OWN, Runtime
 
-OWN = Runtime("")
-"""The server's own interpreter, with its packages."""
 _END_S = 8.0
 
 
@@ -34,8 +32,8 @@ class ZygoteProcess:
         runtime: Its interpreter, and the packages of its jails. Where it has any, it starts without
             ``site``, and so sees none: not those, and not the interpreter's own.
         runtime_dir: An existing folder of the server's own.
-        ahead: Import before the configuration comes, and so before any confinement: only in an
-            interpreter from which the server has imported the same.
+        ahead: Import before the configuration comes, and so before any confinement: only where that
+            is from what the server has imported the same from.
 
     Attributes:
         channel: Its first message is the configuration.
@@ -51,7 +49,9 @@ class ZygoteProcess:
         self.folder.mkdir(mode=0o700)
         self.log = self.folder / "log"
         self.channel, theirs = Channel.pair()
-        arguments = [str(theirs.fileno()), *(["ahead"] if ahead else [])]
+        at_once = "ahead" if ahead and self.runtime == resolved(OWN) else ""
+        at_once = "standard" if runtime.packages else at_once
+        arguments = [str(theirs.fileno()), *([at_once] if at_once else [])]
         with theirs, open(self.log, "ab") as log:
             self._process = subprocess.Popen(
                 bootstrap.command(python, "zygote", *arguments, site=site),
@@ -66,9 +66,9 @@ class ZygoteProcess:
         self.pid = self._process.pid
 
     @classmethod
-    def ahead(cls, runtime_dir: Path) -> ZygoteProcess:
-        """One that imports at once."""
-        return cls(OWN, runtime_dir, ahead=True)
+    def ahead(cls, runtime_dir: Path, runtime: Runtime = OWN) -> ZygoteProcess:
+        """One that imports at once, as far as it may."""
+        return cls(runtime, runtime_dir, ahead=True)
 
     def wait(self) -> int:
         """Its exit code; it is killed if it does not end by itself soon."""

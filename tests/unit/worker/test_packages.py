@@ -1,0 +1,134 @@
+"""Packages of a repository's own in a jail: where they are found, and by whom."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from envhub_worker.protocol.confinement import Confinement
+from envhub_worker.protocol.runtime import Runtime
+from envhub_worker.spawn.jail_handle import Failed
+from envhub_worker.spawn.zygote_process import ZygoteProcess
+from tests.integration.confinement_kit import (
+    Cell,
+    Ready,
+    make_snapshot,
+    new_cell,
+    open_folder,
+    spawner_in,
+)
+from tests.support import inside
+from tests.support.environments import base_interpreter
+from tests.support.interpreter import profiles
+
+MODULE = "mine = 'from the packages'\n"
+WHERE = "import mine, sys; result = [mine.mine, sys.path[-1], sys.executable, sys.prefix]"
+CHILD = """
+import subprocess, sys
+code = "import mine, sys; print(mine.mine, sys.prefix)"
+result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout
+"""
+
+
+@pytest.fixture(params=profiles("strict", "no-userns"))
+def confinement(request: pytest.FixtureRequest) -> Confinement:
+    """With a private root, and without."""
+    return Confinement(profile=request.param)
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """A folder that a jail's user may cross."""
+    with open_folder() as folder:
+        yield folder
+
+
+@pytest.fixture
+def runtime(folder: Path) -> Runtime:
+    """One module, and one that has the name of a module of the standard library."""
+    packages = folder / "packages"
+    packages.mkdir()
+    (packages / "mine.py").write_text(MODULE)
+    (packages / "colorsys.py").write_text(MODULE)
+    (packages / "first.pth").write_text("import sys; sys.started = True\n")
+    return Runtime(base_interpreter(), str(packages))
+
+
+@pytest.fixture
+def cell(folder: Path, confinement: Confinement, runtime: Runtime) -> Iterator[Cell]:
+    """A jail with these packages."""
+    with spawner_in(folder, confinement, runtime=runtime) as spawner:
+        cell = new_cell(spawner, make_snapshot(folder), confinement)
+        cell.start()
+        yield cell
+
+
+def test_packages_lie_behind_the_standard_library(cell: Cell, runtime: Runtime) -> None:
+    """As those of any interpreter; their .pth files count."""
+    found, last, *_ = cell.run(WHERE)["result"]
+    assert (found, last) == ("from the packages", runtime.packages)
+    assert cell.run("import colorsys; result = hasattr(colorsys, 'mine')") == {"result": False}
+    assert cell.run("import sys; result = sys.started") == {"result": True}
+    assert cell.run("result = callable(exit)") == {"result": True}
+
+
+def test_packages_of_the_interpreter_are_not_there(cell: Cell) -> None:
+    """Neither those of the tests' interpreter, nor what a distribution added to its base."""
+    paths = cell.run("import sys; result = sys.path")["result"]
+    assert not [path for path in paths if "site-packages" in path or "dist-packages" in path]
+    assert cell.run("import gymnasium")["error"] == "ModuleNotFoundError"
+
+
+def test_programs_that_are_started_have_the_packages_too(cell: Cell) -> None:
+    """``sys.executable`` is a virtual environment around them."""
+    _, _, executable, prefix = cell.run(WHERE)["result"]
+    assert cell.run(CHILD)["result"].split() == ["from", "the", "packages", prefix]
+    assert executable.startswith(f"{prefix}/")
+    assert cell.start() == 2  # a second runner finds it made
+    assert cell.run(CHILD, runner=2)["result"].split()[-1] == prefix
+
+
+def test_packages_cannot_be_written(cell: Cell, runtime: Runtime) -> None:
+    """Whoever needs the same packages shares the folder; the modes shall not be what saves it."""
+    os.chmod(runtime.packages, 0o777)
+    source = f"open({runtime.packages + '/added'!r}, 'w')"
+    assert cell.run(source)["error"] in ("OSError", "PermissionError")
+    (Path(runtime.packages) / "added").write_text("")  # the control
+
+
+def test_the_zygote_imports_no_package(
+    folder: Path, confinement: Confinement, runtime: Runtime
+) -> None:
+    """What was started ahead for these packages is used, and has none of the server's either."""
+    ahead = ZygoteProcess.ahead(folder, runtime)
+    with spawner_in(folder, confinement, runtime=runtime, ahead=ahead) as spawner:
+        cell = new_cell(spawner, make_snapshot(folder), confinement)
+        cell.start()
+        names = cell.run("import sys; result = sorted(sys.modules)")["result"]
+        assert inside.zygote_pid(spawner) == ahead.pid
+    ours = {name for name in names if name.partition(".")[0] not in sys.stdlib_module_names}
+    assert {name.partition(".")[0] for name in ours} <= {"__main__", "__mp_main__", "envhub_worker"}
+
+
+@pytest.mark.parametrize("what", ["missing", "closed", "closed inside"])
+def test_packages_that_cannot_be_read_are_told(
+    folder: Path, confinement: Confinement, runtime: Runtime, what: str
+) -> None:
+    """Before anything runs, with the path and what to do."""
+    packages = Path(runtime.packages)
+    if what == "missing":
+        runtime = Runtime(runtime.python, str(folder / "nowhere"))
+    (packages / "mine.py" if what == "closed inside" else packages).chmod(0)
+    with spawner_in(folder, confinement, runtime=runtime) as spawner:
+        cell = new_cell(spawner, make_snapshot(folder), confinement)
+        cell.start()
+        failed = cell.wait_for(Failed)
+        assert not [event for event in cell.events if isinstance(event, Ready)]
+    packages.chmod(0o755)
+    assert failed.layer == "packages"
+    assert str(runtime.packages) in failed.reason
+    assert "chmod -R a+rX" in failed.fix
