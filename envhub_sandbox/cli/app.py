@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from envhub_sandbox.cli import cache, doctor, gc, image, inspect, replay, run, version
+from envhub_sandbox.cli import cache, doctor, gc, image, inspect, prefetch, replay, run, version
 from envhub_sandbox.cli.shared.exits import EXIT_CODES
 
 app = typer.Typer(
@@ -45,6 +45,7 @@ def envhub(
 
 app.command("run", epilog=EXIT_CODES)(run.run)
 app.command("inspect", epilog=EXIT_CODES)(inspect.inspect)
+app.command("prefetch", epilog=EXIT_CODES)(prefetch.prefetch)
 app.command("replay", epilog=EXIT_CODES)(replay.replay)
 app.command("doctor")(doctor.doctor)
 app.add_typer(cache.app, name="cache")

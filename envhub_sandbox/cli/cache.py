@@ -1,4 +1,4 @@
-"""``envhub cache``: what lies in the store of snapshots, and how it gets away."""
+"""``envhub cache``: what lies in the stores of snapshots and of environments, and how it goes."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ import shutil
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say
+from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say, size_of
 from envhub_sandbox.cli.shared.exits import UsageError, reported
+
+if TYPE_CHECKING:
+    from envhub_sandbox.dependencies.environments import Environment
 
 app = typer.Typer(
     help="List and remove what was downloaded.", no_args_is_help=True, rich_markup_mode="rich"
@@ -80,18 +83,55 @@ def _repository(name: str) -> str:
 def list_(
     json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """List snapshots, the latest used first."""
+    """List snapshots, and the environments of their packages, the latest used first."""
+    from envhub_sandbox.dependencies import environments
     from envhub_sandbox.hub import store
 
     with reported(debug=False):
-        found = stored_snapshots()
+        found, made = stored_snapshots(), environments.every()
         if json:
-            print_json({"folder": str(store.cache_root()), "snapshots": _data(found)})
+            document = {"folder": str(store.cache_root()), "snapshots": _data(found)}
+            print_json({**document, "environments": _environment_data(made)})
             return
         if found:
             _print(found)
-        total = sum(one.size for one in found)
-        say(f"{len(found)} snapshots, {_size(total)}, in {store.cache_root()}")
+        if made:
+            _print_environments(made)
+        say(f"{_told(found, made)}, in {store.cache_root()}")
+
+
+def _told(found: list[Stored], made: list[Environment]) -> str:
+    total = sum(one.size for one in found) + sum(one.size for one in made)
+    return f"{len(found)} snapshots, {len(made)} environments, {size_of(total)}"
+
+
+def _environment_data(made: list[Environment]) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": one.key,
+            "python": one.python,
+            "version": one.version,
+            "packages": list(one.pins),
+            "last_used": time.strftime("%FT%TZ", time.gmtime(one.used)),
+            "bytes": one.size,
+        }
+        for one in made
+    ]
+
+
+def _print_environments(made: list[Environment]) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for title in ("environment", "Python", "packages", "last used"):
+        table.add_column(title, overflow="fold")
+    table.add_column("size", justify="right")
+    for one in made:
+        used = time.strftime("%F", time.localtime(one.used))
+        pins = safe_line(" ".join(one.pins), 300)
+        table.add_row(one.key[:12], safe_line(one.version), pins, used, size_of(one.size))
+    console().print(table)
 
 
 def _data(found: list[Stored]) -> list[dict[str, Any]]:
@@ -118,16 +158,8 @@ def _print(found: list[Stored]) -> None:
     for one in found:
         used = time.strftime("%F", time.localtime(one.used))
         revision = safe_line(one.revision or "", 40)
-        table.add_row(safe_line(one.repository), one.commit, revision, used, _size(one.size))
+        table.add_row(safe_line(one.repository), one.commit, revision, used, size_of(one.size))
     console().print(table)
-
-
-def _size(count: float) -> str:
-    for unit in ("B", "KiB", "MiB"):
-        if count < 1024:
-            return f"{count:.0f} {unit}"
-        count /= 1024
-    return f"{count:.1f} GiB"
 
 
 @app.command("remove", no_args_is_help=True)
@@ -136,7 +168,8 @@ def remove(
         list[str] | None,
         typer.Argument(
             metavar="[NAME]...",
-            help="A repository, a commit (at least 7 characters of it), or repository@commit.",
+            help="A repository, repository@commit, or at least 7 characters of a commit or of an "
+            "environment.",
         ),
     ] = None,
     everything: Annotated[
@@ -146,28 +179,38 @@ def remove(
         float | None, typer.Option(metavar="DAYS", min=0, help="What nobody used for so long.")
     ] = None,
 ) -> None:
-    """Remove snapshots. Not while an environment of theirs runs."""
+    """Remove snapshots and environments, and what was left half-made. Not while one is used."""
+    from envhub_sandbox.dependencies import environments
     from envhub_sandbox.hub import store
 
     with reported(debug=False):
-        found = stored_snapshots()
+        found, made = stored_snapshots(), environments.every()
         if everything:
-            chosen = found
-            shutil.rmtree(store.cache_root() / "manifests", ignore_errors=True)
+            for folder in ("manifests", "resolutions"):
+                shutil.rmtree(store.cache_root() / folder, ignore_errors=True)
         else:
-            chosen = _chosen(found, names or [], unused_for)
-        for one in chosen:
+            found, made = _chosen(found, made, names or [], unused_for)
+        for one in found:
             store.remove_tree(one.home)
-        say(f"Removed {len(chosen)} snapshots, {_size(sum(one.size for one in chosen))}.")
+        for environment in made:
+            environments.remove(environment)
+        environments.remove_abandoned()
+        say(f"Removed {_told(found, made)}.")
 
 
-def _chosen(found: list[Stored], names: list[str], unused_for: float | None) -> list[Stored]:
+def _chosen(
+    found: list[Stored], made: list[Environment], names: list[str], unused_for: float | None
+) -> tuple[list[Stored], list[Environment]]:
+    everyone: list[Stored | Environment] = [*found, *made]
     for name in names:
-        if not any(one.answers_to(name) for one in found):
+        if not any(one.answers_to(name) for one in everyone):
             raise UsageError(f"nothing in the store is called {name!r}; see: envhub cache list")
-    chosen = [one for one in found if any(one.answers_to(name) for name in names)]
-    if unused_for is not None:
-        oldest = time.time() - unused_for * _DAY_S
-        pool = chosen if names else found
-        chosen = [one for one in pool if one.used < oldest]
-    return chosen
+    oldest = None if unused_for is None else time.time() - unused_for * _DAY_S
+    if not names and oldest is None:
+        return [], []
+
+    def is_chosen(one: Stored | Environment) -> bool:
+        meant = not names or any(one.answers_to(name) for name in names)
+        return meant and (oldest is None or one.used < oldest)
+
+    return [one for one in found if is_chosen(one)], [one for one in made if is_chosen(one)]

@@ -90,6 +90,10 @@ class Environment:
         """The folder for the path of an interpreter."""
         return self.home / "packages"
 
+    def answers_to(self, name: str) -> bool:
+        """Whether a name means it: at least seven characters of its key."""
+        return len(name) >= 7 and self.key.startswith(name)
+
     @property
     def facts(self) -> dict[str, Any]:
         """What is in it, as plain data."""

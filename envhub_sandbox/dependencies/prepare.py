@@ -91,12 +91,12 @@ def _lock(
         return known
     tell(f"choosing versions for {needed.source}")
     target = Target(python=interpreter.path)
-    lock = resolve(wanted, target, exclude_newer=exclude_newer, tell=tell)
+    lock = resolve(wanted, target, exclude_newer=exclude_newer, refresh=upgrade, tell=tell)
     resolutions.remember(key, lock)
     return lock
 
 
-def provided(snapshot: Snapshot, choice: Choice) -> Environment | None:
+def provided(snapshot: Snapshot, choice: Choice, *, upgrade: bool = False) -> Environment | None:
     """The environment that a repository runs in; None for this interpreter as it is.
 
     Progress is shown where somebody looks.
@@ -109,7 +109,7 @@ def provided(snapshot: Snapshot, choice: Choice) -> Environment | None:
         if needed is None:
             return None
         with progress.shown("packages") as tell:
-            return prepare(needed, tell)
+            return prepare(needed, tell, upgrade=upgrade)
     except DependencyError as error:
         name_source(error, snapshot.label)
         raise

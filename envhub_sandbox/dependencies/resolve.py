@@ -74,6 +74,7 @@ def resolve(
     target: Target,
     *,
     exclude_newer: str | None = None,
+    refresh: bool = False,
     tell: Callable[[str], None] = lambda line: None,
 ) -> Lock:
     """Pins for a target; wheels only, nothing is built.
@@ -82,6 +83,7 @@ def resolve(
         wanted: What is asked for; what the worker needs comes on top.
         target: What the packages are for.
         exclude_newer: A date: packages of later are not seen.
+        refresh: Ask the index anew for what uv has seen a moment ago.
         tell: Gets each line of uv's progress.
 
     Raises:
@@ -96,6 +98,7 @@ def resolve(
                 *("pip", "compile", "-", *uv.NO_BUILDS, "--generate-hashes", "--no-header"),
                 *("--no-annotate", *target.options),
                 *(() if exclude_newer is None else ("--exclude-newer", exclude_newer)),
+                *(("--refresh",) if refresh else ()),
             ],
             what=f"no versions of the packages could be chosen for {target}",
             given="".join(f"{one.requirement}\n" for one in every),

@@ -13,9 +13,11 @@ from typer.testing import CliRunner
 from envhub_sandbox import __version__
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.cache import stored_snapshots
+from envhub_sandbox.dependencies import environments
 from envhub_sandbox.hub import snapshot
 from envhub_sandbox.hub.store import cache_root
 from tests.support.repositories import write_repository
+from tests.support.wheels import Index, make_wheel
 
 RUNNER = CliRunner()
 
@@ -107,3 +109,72 @@ def test_version_names_everything_that_matters() -> None:
     assert {"protocol", "python", "gymnasium", "huggingface_hub"} <= set(versions)
     for words in (["version"], ["--version"]):
         assert __version__ in RUNNER.invoke(app, words).stdout
+
+
+@pytest.fixture
+def environment(index: Index, tmp_path: Path) -> str:
+    """A repository whose packages have been made ready by the command; its environment's name."""
+    make_wheel(index.folder, "wanted")
+    folder = write_repository(tmp_path / "repo", "X = 1\n", requirements__txt="wanted\n")
+    done = RUNNER.invoke(app, ["prefetch", str(folder), "--json"])
+    assert done.exit_code == 0, done.stderr
+    made = json.loads(done.stdout)["environment"]
+    assert "wanted==1.0" in made["packages"]
+    assert Path(made["folder"], "packages/wanted/__init__.py").is_file()
+    return Path(made["folder"]).name
+
+
+def test_environments_are_listed(environment: str) -> None:
+    """Beside the snapshots, with their packages and sizes."""
+    [found] = json.loads(RUNNER.invoke(app, ["cache", "list", "--json"]).stdout)["environments"]
+    assert found["name"] == environment
+    assert "wanted==1.0" in found["packages"]
+    assert found["bytes"] > 0
+    done = RUNNER.invoke(app, ["cache", "list"])
+    assert environment[:12] in done.stdout
+    assert "1 snapshots, 1 environments" in done.stderr
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_environments_are_removed(environment: str, named: bool) -> None:
+    """By name, or since nobody used them; what was left half-made goes as well."""
+    half = environments.root() / ".building-0-x"
+    half.mkdir()
+    used = time.time() - 86400 * 3
+    os.utime(environments.root() / environment / "environment.json", (used, used))
+    kept = RUNNER.invoke(app, ["cache", "remove", "--unused-for", "4"])
+    assert "0 environments" in kept.stderr
+    words = [environment[:9]] if named else ["--unused-for", "2"]
+    assert "1 environments" in RUNNER.invoke(app, ["cache", "remove", *words]).stderr
+    assert environments.every() == []
+    assert not half.exists()
+
+
+def test_newer_versions_are_chosen_when_asked_for(
+    index: Index, environment: str, tmp_path: Path
+) -> None:
+    """And then the next ``make_env`` has them, too."""
+    make_wheel(index.folder, "wanted", "2.0")
+    folder = str(tmp_path / "repo")
+    same = json.loads(RUNNER.invoke(app, ["prefetch", folder, "--json"]).stdout)
+    assert Path(same["environment"]["folder"]).name == environment
+    newer = json.loads(RUNNER.invoke(app, ["prefetch", folder, "--upgrade", "--json"]).stdout)
+    assert "wanted==2.0" in newer["environment"]["packages"]
+
+
+def test_a_repository_that_needs_nothing_is_only_downloaded(tmp_path: Path) -> None:
+    """It says where it runs."""
+    folder = write_repository(tmp_path / "repo", "X = 1\n", requirements__txt="numpy\n")
+    done = RUNNER.invoke(app, ["prefetch", str(folder)])
+    assert done.exit_code == 0
+    assert str(folder) in done.stdout
+    assert "this interpreter" in done.stderr
+    assert RUNNER.invoke(app, ["prefetch", str(folder), "--dependencies", "{"]).exit_code == 2
+
+
+def test_a_package_that_is_nowhere_is_an_error_of_loading(index: Index, tmp_path: Path) -> None:
+    """With the exit code of what did not load, and the line."""
+    folder = write_repository(tmp_path / "repo", "X = 1\n", requirements__txt="not-there\n")
+    done = RUNNER.invoke(app, ["prefetch", str(folder)])
+    assert done.exit_code == 4
+    assert "line 1 of requirements.txt" in done.stderr

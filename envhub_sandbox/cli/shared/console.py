@@ -52,6 +52,15 @@ def safe_line(text: object, limit: int = _LINE) -> str:
     return line if len(line) <= limit else f"{line[: limit - 1]}…"
 
 
+def size_of(count: float) -> str:
+    """Bytes in a unit that people read."""
+    for unit in ("B", "KiB", "MiB"):
+        if count < 1024:
+            return f"{count:.0f} {unit}"
+        count /= 1024
+    return f"{count:.1f} GiB"
+
+
 def print_json(document: Mapping[str, Any]) -> None:
     """Print one document on stdout, as JSON that every parser takes."""
     sys.stdout.write(json.dumps(plain(document), indent=2, allow_nan=False, ensure_ascii=True))

@@ -120,8 +120,6 @@ def test_newer_versions_come_when_they_are_asked_for(index: Index, tmp_path: Pat
     first = made(folder)
     make_wheel(index.folder, "wanted", "2.0")
     assert made(folder).home == first.home
-    for cached in (tmp_path / "uv").glob("simple*"):
-        subprocess.run(["rm", "-r", str(cached)], check=True)
     assert "wanted==2.0" in made(folder, upgrade=True).pins
     assert "wanted==2.0" in made(folder).pins
 

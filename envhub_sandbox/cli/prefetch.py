@@ -1,0 +1,77 @@
+"""``envhub prefetch``: everything that an environment needs, for a machine without network."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from envhub_sandbox.cli.shared import options as opt
+from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say, size_of
+from envhub_sandbox.cli.shared.exits import reported
+from envhub_sandbox.cli.shared.progress import Bar
+
+if TYPE_CHECKING:
+    from envhub_sandbox.dependencies.environments import Environment
+    from envhub_sandbox.hub.snapshot import Snapshot
+
+
+def prefetch(
+    ref: opt.Ref,
+    dependencies: opt.Dependencies = "auto",
+    upgrade: Annotated[
+        bool, typer.Option("--upgrade", help="Choose versions again, the newest that fit.")
+    ] = False,
+    json: opt.Json = False,
+    token: opt.Token = None,
+    endpoint: opt.Endpoint = None,
+    hub_cache_dir: opt.HubCacheDir = None,
+    debug: opt.Debug = False,
+) -> None:
+    """Download a repository and make the environment that it runs in, and run nothing of it.
+
+    Afterwards the printed reference works without network.
+    """
+    with reported(debug=debug):
+        with Bar(quiet=json) as bar:
+            bar.begin(f"reading {ref}")
+            from envhub_sandbox.hub.snapshot import named
+
+            snapshot = named(ref, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
+            environment = _environment(snapshot, opt.read_dependencies(dependencies), upgrade)
+        if json:
+            print_json(_document(snapshot, environment))
+        else:
+            _print(snapshot, environment)
+
+
+def _environment(snapshot: Snapshot, given: Any, upgrade: bool) -> Environment | None:
+    from envhub_sandbox.dependencies.choice import chosen
+    from envhub_sandbox.dependencies.prepare import provided
+
+    choice, _ = chosen(given, None)
+    return provided(snapshot, choice, upgrade=upgrade)
+
+
+def _document(snapshot: Snapshot, environment: Environment | None) -> dict[str, Any]:
+    from envhub_sandbox.session.recipe import pinned
+
+    made = environment and {
+        "folder": str(environment.home),
+        "python": environment.python,
+        "version": environment.version,
+        "bytes": environment.size,
+        **environment.facts,
+    }
+    return {"reference": pinned(snapshot), "commit": snapshot.commit, "environment": made}
+
+
+def _print(snapshot: Snapshot, environment: Environment | None) -> None:
+    from envhub_sandbox.session.recipe import pinned
+
+    console().print(safe_line(pinned(snapshot), 300), soft_wrap=True)
+    if environment is None:
+        say("It runs in this interpreter, which has all that it declares.")
+        return
+    packages = f"{len(environment.pins)} packages, {size_of(environment.size)}"
+    say(f"{packages}, for Python {environment.version}, in {environment.home}")
