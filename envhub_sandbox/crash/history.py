@@ -140,6 +140,9 @@ class History:
         self._first_dtype: np.dtype[Any] | None = None
 
     def _flat_step(self, actions: Any) -> None:
+        if type(actions) is list:
+            self._any_step(actions)
+            return
         if actions.dtype is not self._dtype:
             self._change(actions.dtype)
         self._append(actions.tobytes())
@@ -285,6 +288,8 @@ def _copied(value: Any) -> Any:
         return {key: _copied(item) for key, item in value.items()}
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         return type(value)(*map(_copied, value))
+    if type(value) is list:
+        return list(map(_copied, value))
     if isinstance(value, (tuple, list)):
         return tuple(map(_copied, value))
     return value

@@ -21,6 +21,8 @@ from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
 
 _INTEGERS = frozenset("iub")
 _NUMBERS = frozenset("fiub")
+_PYTHONS = {np.dtype(kind): kind for kind in (bool, int, float)}
+"""What numpy makes of lists of such numbers."""
 
 
 @singledispatch
@@ -34,7 +36,8 @@ def batch_of(space: gym.Space[Any], value: Any, count: int, where: str = "action
         where: What to call it in an error.
 
     Returns:
-        Arrays of shape ``(count, *space.shape)``, in dicts and tuples as the space has them.
+        Arrays of shape ``(count, *space.shape)``, in dicts and tuples as the space has them; in
+        place of an array, a list of so many numbers of Python, or of lists of them.
 
     Raises:
         ActionError: A wrong shape, dtype or structure.
@@ -64,7 +67,8 @@ def _batch_of_arrays(space: gym.Space[Any], value: Any, count: int, where: str =
             f"{where}: expected {dtype} of shape {shape} for {space} in {count} sub-environments, "
             f"got {array.dtype} of shape {array.shape}"
         )
-    return _native(array)
+    # an environment in this process would see the caller's own numbers
+    return list(value) if _is_listed(value, array) else _native(array)
 
 
 @batch_of.register(spaces.Dict)
@@ -120,6 +124,18 @@ class ActionReader:
         ):
             return actions
         return batch_of(self._space, actions, self._count)
+
+
+def _is_listed(value: Any, array: Any) -> bool:
+    """Whether the array's ``tolist`` gives just this back: lists of numbers of one class."""
+    kind = _PYTHONS.get(array.dtype)
+    if kind is None or type(value) not in (list, tuple):
+        return False
+    for _ in range(array.ndim - 1):
+        if any(type(item) is not list for item in value):
+            return False
+        value = [part for item in value for part in item]
+    return all(type(item) is kind for item in value)
 
 
 def _native(array: Any) -> Any:

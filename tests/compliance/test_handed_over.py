@@ -30,6 +30,7 @@ class Told(gym.Env):
 
     def __init__(self, given):
         self.given = given
+        self.action_space = given.get("space", self.action_space)
         self.note = None
 
     def reset(self, *, seed=None, options=None):
@@ -38,7 +39,7 @@ class Told(gym.Env):
         return np.zeros(2, np.float32), {}
 
     def step(self, action):
-        return np.zeros(2, np.float32), 0.0, False, False, {}
+        return np.zeros(2, np.float32), 0.0, False, False, {"action": repr(action)}
 
     def again(self, *args, **kwargs):
         # bytes come back as they are; only the tests make something of them
@@ -143,6 +144,43 @@ def test_so_do_arguments_of_make_env(folder: Path, own: bool) -> None:
     if own:
         args, _ = cloudpickle.loads(env.again(handed.Pose(1.0)))
         assert_identical(handed.Pose(1.0), args[0])
+    env.close()
+
+
+BOX = gym.spaces.Box(-1, 1, (2,))
+ACTIONS: dict[str, tuple[gym.Space[Any], Any]] = {
+    "ints": (gym.spaces.Discrete(3), [0, 2, 1]),
+    "a tuple": (gym.spaces.Discrete(3), (0, 2, 1)),
+    "bools": (gym.spaces.Discrete(3), [True, False, True]),
+    "numpy's ints": (gym.spaces.Discrete(3), [np.int64(0), np.int64(2), np.int64(1)]),
+    "an array": (gym.spaces.Discrete(3), np.array([0, 2, 1])),
+    "lists of floats": (BOX, [[0.1, 1.0], [0.0, -0.0], [0.5, 0.25]]),
+    "lists of ints": (BOX, [[0, 1], [1, 0], [1, 1]]),
+    "arrays": (BOX, list(np.ones((3, 2), np.float32))),
+    "multi": (gym.spaces.MultiDiscrete([2, 3]), [[0, 1], [1, 0], [1, 2]]),
+    "in a dict": (
+        gym.spaces.Dict({"a": gym.spaces.Discrete(3), "b": BOX}),
+        {"a": [0, 1, 2], "b": np.ones((3, 2), np.float32)},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ACTIONS)
+@pytest.mark.parametrize("options", [{}, {"num_workers": 2}, {"lane": "frames", "num_workers": 2}])
+def test_an_action_reaches_the_environment_as_it_is(
+    folder: Path, name: str, options: dict[str, Any]
+) -> None:
+    """A list of Python's numbers as such; what follows it as what that is."""
+    space, actions = ACTIONS[name]
+    told: dict[str, Any] = {}
+    exec(REPOSITORY, told)
+    reference = told["make_env"](3, space=space)
+    env = made_of(folder, n_envs=3, env_kwargs={"space": space}, **options)
+    reference.reset(seed=1)
+    env.reset(seed=1)
+    for asked in (actions, env.action_space.sample(), actions):
+        expected, found = reference.step(asked)[4], env.step(asked)[4]
+        assert found["action"].tolist() == expected["action"].tolist()
     env.close()
 
 

@@ -40,6 +40,8 @@ _BY_SERVER = ""
 """In place of an operation's name, where it is the relay that is owed the answer."""
 _BULKY = frozenset({"render"})
 """What hardly ever fits the slabs."""
+_FIRST_WITH_LISTS = 7
+"""The version of the protocol."""
 _NOTHING: list[Outcome] = []
 
 
@@ -72,7 +74,7 @@ class SharedMemoryLane:
         self.jail, self.runners, self.number = relay.jail, relay.runners, relay.number
         self.elapsed_ns = 0
         self.observations = ObservationSlab(manifest.single_observation_space, observed)
-        self.shards = [LaneShard(layout, self.observations.fd) for layout in layouts]
+        self.shards = [self._shard(layout) for layout in layouts]
         self._relay = relay
         self._results = results
         self._attachment = attachment
@@ -141,7 +143,7 @@ class SharedMemoryLane:
         for index in dead:
             old = self.shards[index]
             self._attachment.forget(index, old)
-            self.shards[index] = LaneShard(old.layout, self.observations.fd)
+            self.shards[index] = self._shard(old.layout)
             old.close()
         self._sleepers = self.shards[self._awake :]
         self._wakers = self.shards[: self._awake]
@@ -160,6 +162,10 @@ class SharedMemoryLane:
         return all(typed(reply, m.Value).value is True for reply in replies)
 
     # --- steps ---------------------------------------------------------------------------------
+
+    def _shard(self, layout: slabs.Layout) -> LaneShard:
+        lists = self.jail.client.version >= _FIRST_WITH_LISTS
+        return LaneShard(layout, self.observations.fd, lists=lists)
 
     def send_step(self, actions: Any) -> None:
         """See ``Lane``."""

@@ -13,6 +13,8 @@ from collections.abc import Sequence
 from time import perf_counter_ns
 from typing import Any
 
+import numpy as np
+
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_sandbox.transport.described import Described
 from envhub_sandbox.transport.shared_memory.doorbell import OwnBell, RunnerBell
@@ -35,14 +37,16 @@ class LaneShard:
     Args:
         layout: Where everything lies.
         observations: The descriptor of the slab that all shards share.
+        lists: Whether the runner can make lists of actions; an older one cannot.
 
     Attributes:
         fds: What the runner gets: three slabs, its doorbell, ours.
         bell: Our doorbell, to be watched.
     """
 
-    def __init__(self, layout: slabs.Layout, observations: int) -> None:
+    def __init__(self, layout: slabs.Layout, observations: int, *, lists: bool = True) -> None:
         self.layout = layout
+        self._listed = slabs.LISTED if lists else 0
         self._request, request_fd = slab("request", layout.request_bytes, SEAL_FUTURE_WRITE)
         self._reply, reply_fd = slab("reply", layout.reply_bytes)
         self._runner_bell, self.bell = RunnerBell(), OwnBell()
@@ -72,11 +76,15 @@ class LaneShard:
             asks[slabs.MESSAGE] = 0
             self._told = False
         for index, leaf in enumerate(leaves):
+            listed = type(leaf) is list
+            if listed:
+                leaf = np.asarray(leaf)
             found = self._views.get((index, leaf.dtype))
             if found is None:
                 found = self._view(index, leaf.dtype)
-            if self._codes[index] != found[0]:
-                asks[slabs.DTYPES + index] = self._codes[index] = found[0]
+            code = found[0] + self._listed if listed else found[0]
+            if self._codes[index] != code:
+                asks[slabs.DTYPES + index] = self._codes[index] = code
                 asks[slabs.CHANGES] += 1
             found[1][...] = leaf
         wishes = (spin_ns, slot, cpu)

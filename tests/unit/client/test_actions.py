@@ -52,8 +52,8 @@ def test_samples_of_the_batched_space_are_taken_as_they_are(
 @pytest.mark.parametrize(
     ("space", "value", "expected"),
     [
-        (DISCRETE, [0, 2], np.array([0, 2])),
-        (DISCRETE, (0, 2), np.array([0, 2])),
+        (DISCRETE, [0, 2], [0, 2]),
+        (DISCRETE, (0, 2), [0, 2]),
         (DISCRETE, np.array([0, 2], np.int8), np.array([0, 2], np.int8)),
         (DISCRETE, np.array([False, True]), np.array([False, True])),
         (BOX, [[0.5, 1], [0, 0]], np.array([[0.5, 1], [0, 0]])),
@@ -61,7 +61,7 @@ def test_samples_of_the_batched_space_are_taken_as_they_are(
         (BOX, np.zeros((2, 2), np.int64), np.zeros((2, 2), np.int64)),
         (BOX, [np.zeros(2), np.ones(2)], np.array([[0.0, 0], [1, 1]])),
         (TEXT, ["a", "b"], ("a", "b")),
-        (TUPLE, [[0, 1], {"x": np.zeros((2, 2))}], (np.array([0, 1]), {"x": np.zeros((2, 2))})),
+        (TUPLE, [[0, 1], {"x": np.zeros((2, 2))}], ([0, 1], {"x": np.zeros((2, 2))})),
     ],
 )
 def test_lists_tuples_and_other_dtypes_are_taken(
@@ -81,7 +81,7 @@ def test_mappings_of_any_class_become_dicts_in_the_spaces_order() -> None:
 
 def test_values_outside_the_bounds_are_the_environments_business() -> None:
     """Only shapes and kinds of numbers are looked at."""
-    assert_same(np.array([7, -1]), batch_of(DISCRETE, [7, -1], 2))
+    assert_same([7, -1], batch_of(DISCRETE, [7, -1], 2))
 
 
 def test_tensors_are_taken() -> None:

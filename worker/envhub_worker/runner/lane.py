@@ -77,7 +77,7 @@ class Lane:
         self._assemble = slabs.assembler(env.single_action_space)
         self._served = 0
         self._codes: list[int] = []
-        self._views: list[Any] = []
+        self._takes: list[Callable[[], Any]] = []
         self._pairs: Pairs = []
         self._writer = InfoWriter(self._reply, layout.infos, layout.count, pack, sliced=env.sliced)
         self._changes = self._cpu = self._spin_ns = 0
@@ -159,7 +159,7 @@ class Lane:
                 return self._run_message(self._asked[slabs.MESSAGE])
             self.unsent = []  # what is fetched after this step are its infos
             # copied, because an environment may keep its action and the client writes the next one
-            actions = self._assemble([view.copy() for view in self._views])
+            actions = self._assemble([take() for take in self._takes])
             pairs = self._pairs = self._env.run_step(actions)
             return self._writer.write(pairs) if pairs else (slabs.DONE, 0)
         except BaseException as error:
@@ -194,9 +194,13 @@ class Lane:
         if codes != self._codes:
             self._codes = codes
             pairs = zip(self._layout.actions, codes, strict=True)
-            self._views = [
-                slabs.view(self._request, leaf, slabs.ACTION_DTYPES[code]) for leaf, code in pairs
-            ]
+            self._takes = [self._taker(leaf, code) for leaf, code in pairs]
+
+    def _taker(self, leaf: slabs.Leaf, code: int) -> Callable[[], Any]:
+        """Gives a leaf of the actions as the caller has given it."""
+        listed, code = divmod(code, slabs.LISTED)
+        view = slabs.view(self._request, leaf, slabs.ACTION_DTYPES[code])
+        return view.tolist if listed else view.copy
 
     def _keep_to(self, cpu: int) -> None:
         self._cpu = cpu
