@@ -201,7 +201,7 @@ CONTAINER_MARKS: Spot = (listen, "_CONTAINER_MARKS")
 """The files by which a container is told."""
 CGROUP_WRITE: Spot = (cgroups, "_write")
 """What writes a file of a control group."""
-DECODING: Spot = (m, "_decode")
+DECODING: Spot = (packing, "_decode")
 """What makes a message of a document that has no form yet."""
 FORMS: tuple[Spot, Spot] = ((packing, "_OUTGOING"), (packing, "_INCOMING"))
 """What is remembered of the shape of messages, each way."""
