@@ -446,6 +446,7 @@ class EnvSession:
         A reply that nobody waits for any more, because of Ctrl-C, counts as late. After a death
         a fresh jail is started only if the policy says ``restart="on_reset"``.
         """
+        self._note_if_awaited()
         with self._turn("reset"):
             if self._warm:
                 self._look_whether_warm_lives()
@@ -550,6 +551,11 @@ class EnvSession:
             tell, self._first_use = self._first_use, None
             tell()
 
+    def _note_if_awaited(self) -> None:
+        """Who asks for what is on its way up uses it: the next one need not wait for that."""
+        if self._warming is not None:
+            self._note_first_use()
+
     def _look_whether_warm_lives(self) -> None:
         """What was started ahead and has died unused is started again, as if it never had been."""
         self._warm = False
@@ -594,7 +600,7 @@ class EnvSession:
                 self.lease.close_politely()
         finally:
             try:
-                self.lease.let_go()
+                self.lease.let_go(wait=False)
             finally:
                 self._lock.release()
 

@@ -33,8 +33,8 @@ class JailSource(Protocol):
     def end(self, loaded: LoadedJail) -> None:
         """End the jail now, over another connection: somebody may be waiting on its own."""
 
-    def give_back(self, loaded: LoadedJail) -> None:
-        """Drop the connection; the last user's jail ends."""
+    def give_back(self, loaded: LoadedJail, *, wait: bool = True) -> None:
+        """Drop the connection; the last user's jail ends, which one need not wait for."""
 
 
 class OwnJails:
@@ -55,9 +55,9 @@ class OwnJails:
         """End it."""
         self.repository.interrupt(loaded)
 
-    def give_back(self, loaded: LoadedJail) -> None:
+    def give_back(self, loaded: LoadedJail, *, wait: bool = True) -> None:
         """End it and drop the connection."""
-        self.repository.close(loaded)
+        self.repository.close(loaded, wait=wait)
 
 
 class SharedJail:
@@ -95,7 +95,7 @@ class SharedJail:
             if self._first is not None and self._first.jail.number == loaded.jail.number:
                 self._close_first()
 
-    def give_back(self, loaded: LoadedJail) -> None:
+    def give_back(self, loaded: LoadedJail, *, wait: bool = True) -> None:
         """Drop a connection; with the last one the jail ends."""
         self.repository.disconnect(loaded)
         with self._lock:

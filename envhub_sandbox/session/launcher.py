@@ -409,16 +409,30 @@ class Repository:
         loaded.jail.client.close()
         self._release(loaded.server)
 
-    def close(self, loaded: LoadedJail) -> None:
-        """End a jail and give its server back. Idempotent."""
+    def close(self, loaded: LoadedJail, *, wait: bool = True) -> None:
+        """End a jail and give its server back. Idempotent.
+
+        Args:
+            loaded: The jail.
+            wait: Until nothing of it is left; else whoever closes another environment of the
+                repository does, if there is one: no later than the last.
+        """
         if loaded.closed:
             return
         loaded.closed = True
         WORKER.info("%s: jail %x closes", self.label, loaded.jail.number)
         try:
-            loaded.jail.close(Deadline(_CLOSE_S))
+            parting = loaded.jail.ask_to_close()
+            if wait or not self._hold.goes_on(loaded.server):
+                parting(Deadline(_CLOSE_S))
+            else:
+                self._hold.partings.add(lambda: parting(Deadline(_CLOSE_S)))
         finally:
             self._release(loaded.server)
+
+    def settle(self) -> bool:
+        """Wait for the jails that are on their way out; whether there was one."""
+        return self._hold.partings.settle()
 
     def states(self, loaded: LoadedJail) -> tuple[str, ...]:
         """What a jail's runners are doing, one word each; asked over a connection of its own.

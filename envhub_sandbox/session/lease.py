@@ -143,7 +143,9 @@ class Lease:
             return self._jails.take(deadline)
         except WorkerError as error:
             # of this very type: the server's refusal, which may be for want of room
-            if type(error) is not WorkerError or deadline.unasked or not self.make_room():
+            if type(error) is not WorkerError or deadline.unasked:
+                raise
+            if not self.repository.settle() | self.make_room():
                 raise
         return self._jails.take(deadline)
 
@@ -181,13 +183,13 @@ class Lease:
         finally:
             self.give_back()
 
-    def give_back(self) -> None:
-        """Give the jail back, if there is one."""
+    def give_back(self, *, wait: bool = True) -> None:
+        """Give the jail back, if there is one; see ``Repository.close``."""
         with self._ending:
             loaded, self.loaded = self.loaded, None
             try:
                 if loaded is not None:
-                    self._jails.give_back(loaded)
+                    self._jails.give_back(loaded, wait=wait)
             finally:
                 self._close_lane()
 
@@ -206,12 +208,12 @@ class Lease:
         if pace:
             self._paces.note(self._results.manifest, pace)
 
-    def let_go(self) -> None:
+    def let_go(self, *, wait: bool = True) -> None:
         """Give back whatever is left, for good. A fork of its owner gives back nothing."""
         if os.getpid() != self._owner:
             return
         try:
-            self.give_back()
+            self.give_back(wait=wait)
         finally:
             self._let_server_go()
             self._departs()

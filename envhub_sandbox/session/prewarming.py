@@ -19,7 +19,8 @@ from envhub_sandbox.session.env_session import EnvSession
 class Prewarming:
     """Starts the tasks after the one that was used last, and gives up what nobody came for.
 
-    Thread-safe; the starting is done in one thread, one task after the other.
+    Thread-safe. Each task is started in a thread of its own, so that where starting takes longer
+    than playing, the next is begun while somebody waits for the one before it.
 
     Args:
         suites: The environments of each suite, in order.
@@ -36,7 +37,7 @@ class Prewarming:
         self._wanted: list[weakref.ref[EnvSession]] = []
         self._tried: set[weakref.ref[EnvSession]] = set()
         self._ahead: list[weakref.ref[EnvSession]] = []  # started here and not used yet
-        self._thread: threading.Thread | None = None
+        self._giving_up = 0
         for suite in suites:
             for env in suite:
                 env.on_first_use(partial(self._used, weakref.ref(env)), self.make_room)
@@ -55,11 +56,14 @@ class Prewarming:
             self._tried.add(used)
             self._ahead = [one for one in self._ahead if one != used]
             self._wanted = list(self._following(used))
-            if self._thread is None and (self._stale() or self._untried()):
-                self._thread = threading.Thread(
-                    target=self._run, name="envhub-prewarm", daemon=True
-                )
-                self._thread.start()
+            self._staff()
+
+    def _staff(self) -> None:
+        """A thread for each that is to be given up or started. The lock is held."""
+        while (todo := self._next()) is not None:
+            threading.Thread(
+                target=self._run, args=todo, name="envhub-prewarm", daemon=True
+            ).start()
 
     def _stale(self) -> list[weakref.ref[EnvSession]]:
         return [one for one in self._ahead if one not in self._wanted]
@@ -76,30 +80,32 @@ class Prewarming:
         left = [env for env in suite[index + 1 :] if env in self._ahead or env not in self._tried]
         yield from [env for env in left if not _is_closed(env)][:count]
 
-    def _run(self) -> None:
-        while (todo := self._next()) is not None:
+    def _run(self, env: EnvSession, start: bool) -> None:
+        try:
             with contextlib.suppress(Exception):  # whoever asks for it meets it, too
-                env, start = todo
                 env.warm_up() if start else env.cool_down()
-            del todo, env  # nobody may hold one while this waits for nothing
+        finally:
+            if not start:
+                with self._lock:
+                    self._giving_up -= 1
+                    self._staff()
 
     def _next(self) -> tuple[EnvSession, bool] | None:
         """What to give up (False) or start (True); first the former, which bounds their number."""
-        with self._lock:
-            for ref in self._stale():
-                self._ahead.remove(ref)
-                self._tried.discard(ref)
-                env = ref()
-                if env is not None:
-                    return env, False
-            for ref in self._untried():
-                env = ref()
-                self._tried.add(ref)
-                if env is not None:
-                    self._ahead.append(ref)
-                    return env, True
-            self._thread = None
-            return None
+        for ref in self._stale():
+            self._ahead.remove(ref)
+            self._tried.discard(ref)
+            env = ref()
+            if env is not None:
+                self._giving_up += 1
+                return env, False
+        for ref in [] if self._giving_up else self._untried():
+            env = ref()
+            self._tried.add(ref)
+            if env is not None:
+                self._ahead.append(ref)
+                return env, True
+        return None
 
 
 def _is_closed(ref: weakref.ref[EnvSession]) -> bool:

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable
 
 from envhub_sandbox.sandboxes.base import WorkerServer
+from envhub_sandbox.session.partings import Partings
 
 
 class ServerHold:
@@ -18,12 +19,16 @@ class ServerHold:
     Args:
         acquire: Asks for the server.
         release: Gives it back.
+
+    Attributes:
+        partings: The ends of jails in it that have not been waited for.
     """
 
     def __init__(
         self, acquire: Callable[[], WorkerServer], release: Callable[[WorkerServer], None]
     ) -> None:
         self._acquire, self._release = acquire, release
+        self.partings = Partings()
         # reentrant: the garbage collector may close an environment in the midst of this
         self._lock = threading.RLock()
         self._owner = os.getpid()
@@ -48,6 +53,11 @@ class ServerHold:
         if before is not None:
             self._release(before)  # the same, mostly; or one that has died
 
+    def goes_on(self, server: WorkerServer) -> bool:
+        """Whether this one is kept for more than the one who asks."""
+        with self._lock:
+            return self._server is server and len(self._open) > 1
+
     def _leave(self, ticket: object) -> None:
         if os.getpid() != self._owner:
             return  # a fork: the server is the parent's, and somebody may have held the lock
@@ -56,4 +66,7 @@ class ServerHold:
             if self._open or self._server is None:
                 return
             server, self._server = self._server, None
-        self._release(server)
+        try:
+            self.partings.settle()
+        finally:
+            self._release(server)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import islice
 from typing import Any
 
@@ -210,9 +211,25 @@ class RemoteJail:
 
     def close(self, deadline: Deadline) -> None:
         """End the jail and everything in it. A server that has gone has ended it already."""
+        self.ask_to_close()(deadline)
+
+    def ask_to_close(self) -> Callable[[Deadline], None]:
+        """``close`` in two: returns what waits until nothing of it is left."""
         self.before_end()
+        request: int | None = None
         try:
-            self.client.request(m.CloseJail(self.number), deadline=deadline)
+            request = self.client.send(m.CloseJail(self.number))
+        except WorkerError:
+            pass
+        except BaseException:
+            self._part(None, Deadline(0))
+            raise
+        return partial(self._part, request)
+
+    def _part(self, request: int | None, deadline: Deadline) -> None:
+        try:
+            if request is not None:
+                self.client.receive(request, deadline)
         except WorkerError:
             pass
         finally:

@@ -176,6 +176,38 @@ def test_what_was_given_up_starts_again_when_it_is_asked(tasks: Callable[..., Ta
     assert observations[0][0] == 1.0
 
 
+def test_while_one_is_waited_for_the_next_is_started(tmp_path: Path) -> None:
+    """Else, where starting takes longer than playing, nothing would be gained."""
+    held_up = f"        while task == 1 and not os.path.exists({str(tmp_path / 'gate/open')!r}):"
+    suite = SUITE.replace(
+        "        self.task, self.made", f"{held_up}\n            pass\n        self.task, self.made"
+    )
+    repository = write_repository(tmp_path / "repository", f"import os\n{suite}")
+    gate = tmp_path / "gate"
+    gate.mkdir()
+    gate.chmod(0o755)
+    (gate / "open").touch()
+    policy = {"readable": (str(gate),)}
+    with make_env(repository, policy=policy):
+        pass  # its manifest is remembered
+    (gate / "open").unlink()
+    stop_idle()
+    elsewhere = descendants()
+    with make_env(repository, policy=policy, prewarm=1) as suites:
+        envs = list(suites.envs())
+        envs[0].reset()
+        # the server, its zygote's two, and two jails of two: the second one is at the gate
+        assert eventually(lambda: len(descendants() - elsewhere) == 7)
+        with concurrent.futures.ThreadPoolExecutor(1) as pool:
+            asked = pool.submit(envs[1].reset)
+            begun = eventually(lambda: ahead(envs) == [2])
+            waited = not asked.done()
+            (gate / "open").touch()
+            assert asked.result()[0][0][0] == 1.0
+        assert begun
+        assert waited
+
+
 def test_what_fails_is_raised_by_the_first_request_of_that_task(
     tasks: Callable[..., Tasks],
 ) -> None:
@@ -226,6 +258,18 @@ def test_closed_in_the_midst_it_leaves_nothing(repository: Path) -> None:
         assert states(envs) == ["CLOSED"] * 5
     assert eventually(lambda: descendants() <= before)
     assert set(_bundles()) == bundles
+
+
+def test_the_last_close_waits_for_all(tasks: Callable[..., Tasks]) -> None:
+    """The others do not, and that is not left to chance: nothing of a jail is there after it."""
+    elsewhere = descendants()
+    envs = tasks(4, prewarm=0)
+    server = descendants()
+    for env in envs[:3]:
+        env.reset()
+    for env in envs:
+        env.close()
+    assert descendants() - elsewhere <= server - elsewhere
 
 
 def test_a_suite_that_nobody_holds_gives_up_what_it_started_ahead(repository: Path) -> None:
