@@ -326,14 +326,16 @@ def _gymnasiums() -> dict[str, Any]:
 
 
 def _builtin_of(cls: type[RemoteEnvError]) -> str:
-    return cls.__name__.removeprefix("Remote")
+    name = cls.__name__.removeprefix("Remote")
+    return name if name in _TWINS else f"{_GYMNASIUM}.{name}"
 
 
 def remote_error(builtin: str, type_name: str, message: str, traceback: str = "") -> RemoteEnvError:
     """The exception for a remote failure: its class's twin, or plain ``RemoteEnvError``."""
     twin = _TWINS.get(builtin, RemoteEnvError)
-    if type_name.startswith(_GYMNASIUM) and _GYMNASIUM in sys.modules:
-        twin = _gymnasiums().get(type_name, twin)
+    for name in (builtin, type_name):
+        if name.startswith(_GYMNASIUM) and _GYMNASIUM in sys.modules:
+            twin = _gymnasiums().get(name, twin)
     error: RemoteEnvError = twin(type_name, message, traceback)
     return error
 

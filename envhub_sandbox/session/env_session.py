@@ -25,6 +25,7 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_sandbox.log import WORKER
+from envhub_sandbox.session.concurrent import collision
 from envhub_sandbox.session.counters import LEDGER, Counters, Labels
 from envhub_sandbox.session.failures import Failures, refusal
 from envhub_sandbox.session.jail_sources import JailSource
@@ -245,9 +246,21 @@ class EnvSession:
     def _make_ready(self, operation: str) -> None:
         refused = refusal(self.lifecycle.state, operation, self.repository.policy.restart)
         if refused is not None:
+            self._refuse_others(operation)
             raise refused
         if self.lifecycle.state is State.IDLE:
             self._start(StartupDeadline(self.repository.timeouts.startup_s))
+
+    def _refuse_others(self, operation: str) -> None:
+        """A request that another thread waits for is not late: it is in use.
+
+        Raises:
+            AlreadyPendingCallError: It is.
+        """
+        if self.lifecycle.state is State.PENDING:
+            found = collision(self, operation)
+            if found is not None:
+                raise found
 
     def _send(self, operation: str, send: Callable[[], None]) -> None:
         self.lifecycle.request = operation
@@ -450,6 +463,7 @@ class EnvSession:
         with self._turn("reset"):
             if self._warm:
                 self._look_whether_warm_lives()
+            self._refuse_others("reset")
             if self.lifecycle.state is State.PENDING:
                 self.lifecycle.on(Event.INTERRUPT)
             if self.lifecycle.state is State.READY and self.repository.timeouts.idle_s is not None:

@@ -45,7 +45,7 @@ def not_here(*args: Any, reference: str = "", **kwargs: Any) -> NoReturn:
     """
     where = f", {reference}" if reference else ""
     raise gym.error.Error(
-        f"this spec is of an environment in a sandbox{where}: gym.make would need its code "
+        f"this is of an environment in a sandbox{where}: to make one here would need its code "
         "in this process, which it never enters. Use envhub_sandbox.make_env with that repository, "
         "or copy.deepcopy(env) for another one like it"
     )

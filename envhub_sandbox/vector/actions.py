@@ -88,8 +88,10 @@ def _batch_of_dicts(space: spaces.Dict, value: Any, count: int, where: str = "ac
 def _batch_of_tuples(
     space: spaces.Tuple[Any], value: Any, count: int, where: str = "actions"
 ) -> Any:
-    if not isinstance(value, (tuple, list)) or len(value) != len(space.spaces):
-        raise ActionError(
+    sequence = isinstance(value, (tuple, list))
+    if not sequence or len(value) != len(space.spaces):
+        kind = ActionError if sequence else ActionTypeError
+        raise kind(
             f"{where}: expected a tuple of {len(space.spaces)} batches for {space}, "
             f"got {_named(value)}"
         )

@@ -6,13 +6,14 @@ Trust: the manifest is input from the worker.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, NoReturn
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from envhub_sandbox.transport.specs import spec_of
+from envhub_sandbox.transport.specs import not_here, spec_of
 from envhub_sandbox.vector.actions import ActionReader
 from envhub_worker.protocol.manifest import EnvManifest
 from envhub_worker.protocol.spaces.spaces import OpaqueSpace
@@ -39,6 +40,14 @@ def metadata(manifest: EnvManifest) -> dict[str, Any]:
 def spec(manifest: EnvManifest, reference: str) -> EnvSpec | None:
     """``env.spec``, where the repository gave one: its facts, and nothing that makes anything."""
     return spec_of(manifest.spec, reference)
+
+
+def env_fns(manifest: EnvManifest, reference: str) -> list[Callable[[], NoReturn]]:
+    """``env.env_fns``: one for each sub-environment, as many as ``SyncVectorEnv`` was given.
+
+    The functions are in the sandbox; what stands for them here says so when it is called.
+    """
+    return [partial(not_here, reference=reference)] * manifest.num_envs
 
 
 def check_mask(mask: Any, num_envs: int) -> None:

@@ -74,6 +74,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         if manifest.shardable:  # another one's are its own, if it has them
             self.autoreset_mode = self.metadata.get("autoreset_mode")
             self.copy = remote.repository.copy
+            self.env_fns = from_manifest.env_fns(manifest, remote.repository.label)
             self.observation_mode = "same"
         # a proxy that nobody holds any more must not keep processes alive
         weakref.finalize(self, remote.close).atexit = False
@@ -200,6 +201,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
         """Send the call; ``call_wait`` returns its results."""
         self._refuse_if_busy("call_async")
+        _check_name(name)
         if name in _NOT_CALLED and not self._manifest.sync:
             raise ValueError(
                 f"Trying to call function `{name}` with `call`, use `{name}` directly instead."
@@ -220,6 +222,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set an attribute of every sub-environment: one value each, or one for all."""
+        _check_name(name)
         each = list(values) if isinstance(values, (list, tuple)) else [values] * self.num_envs
         if len(each) != self.num_envs:
             raise ValueError(
@@ -444,6 +447,12 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
                 f"num_envs={self.num_envs} but got length={len(seeds)}."
             )
         return seeds
+
+
+def _check_name(name: object) -> None:
+    """In Python's words; nothing was sent."""
+    if not isinstance(name, str):
+        raise TypeError(f"attribute name must be string, not '{type(name).__name__}'")
 
 
 def _seed(given: Any) -> int:

@@ -225,3 +225,27 @@ class Holding(Told):
     def __init__(self, held: object) -> None:
         super().__init__()
         self.held = object()
+
+
+@pytest.mark.parametrize("name", [5, None, b"number"])
+def test_names_are_strings(name: Any) -> None:
+    """As ``getattr`` says it, and the environment can be used on."""
+    expected, actual = SyncVectorEnv(told(2)), vector(told(2))
+    for ask in (lambda e: e.get_attr(name), lambda e: e.call(name), lambda e: e.set_attr(name, 1)):
+        texts = []
+        for env in (expected, actual):
+            with pytest.raises(TypeError) as info:
+                ask(env)
+            texts.append(str(info.value))
+        assert texts[0] == texts[1]
+    actual.reset(seed=0)
+    actual.close()
+
+
+def test_the_functions_are_elsewhere() -> None:
+    """There are as many as in ``SyncVectorEnv``; what stands for them says where they are."""
+    env = vector(told(3))
+    assert len(env.env_fns) == len(SyncVectorEnv(told(3)).env_fns)
+    with pytest.raises(gym.error.Error, match="in a sandbox"):
+        env.env_fns[0]()
+    env.close()

@@ -16,6 +16,7 @@ from envhub_sandbox.transport.connection import death, expect, refusal
 from envhub_sandbox.transport.jail import check, raised
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import REASONS
+from envhub_worker.runner.exceptions import raised as described
 
 ESCAPE = "\x1b]0;owned\x07\x1b[2J\r"
 
@@ -46,6 +47,33 @@ def test_errors_are_the_builtin_that_they_were(name: str) -> None:
         "no",
         "Traceback ...",
     )
+
+
+class Own(gym.error.InvalidAction):
+    """An error of a repository's own, that is one of Gymnasium's."""
+
+
+class Both(gym.error.Error, ValueError):
+    """One that is a builtin as well."""
+
+
+@pytest.mark.parametrize(
+    ("raises", "kind"),
+    [
+        (gym.error.ResetNeeded, gym.error.ResetNeeded),
+        (Own, gym.error.InvalidAction),
+        (Both, ValueError),
+        (gym.error.Error, gym.error.Error),
+    ],
+)
+def test_errors_are_gymnasiums_nearest(raises: type[Exception], kind: type[Exception]) -> None:
+    """A worker names the ancestor, and a table in the client has its twin; so has a pickle."""
+    error = raised(described(raises("no"), "step"))
+    for found in (error, pickle.loads(pickle.dumps(error)), copy.copy(error)):
+        assert isinstance(found, kind)
+        assert isinstance(found, errors.RemoteEnvError)
+        assert type(found) is type(error)
+        assert str(found).endswith("no")
 
 
 @pytest.mark.parametrize("name", ["KeyboardInterrupt", "SystemExit", "Oops", "", "print", "open"])

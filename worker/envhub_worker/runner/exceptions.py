@@ -11,6 +11,7 @@ from envhub_worker.unreadable import why_hidden
 
 _MAX_MESSAGE = 8_192
 _MAX_TRACEBACK = 32_768
+_GYMNASIUM = "gymnasium.error"
 _OURS = f"{__name__.rpartition('.')[0]}."
 
 
@@ -36,10 +37,12 @@ def raised(error: BaseException, stage: str) -> Raised:
 
 
 def _builtin(kind: type[BaseException]) -> str:
-    for base in kind.__mro__:
-        if getattr(builtins, base.__name__, None) is base:
-            return str(base.__name__)
-    return "Exception"
+    """Its nearest builtin ancestor that says anything, or else its nearest one of Gymnasium's."""
+    own = [base for base in kind.__mro__ if getattr(builtins, base.__name__, None) is base]
+    theirs = [base for base in kind.__mro__ if base.__module__ == _GYMNASIUM]
+    if theirs and own and own[0] is Exception:
+        return f"{_GYMNASIUM}.{theirs[0].__name__}"
+    return str(own[0].__name__) if own else "Exception"
 
 
 def _text(error: BaseException) -> str:
