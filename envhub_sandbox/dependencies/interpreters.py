@@ -6,13 +6,13 @@ nothing of its packages: the one that a virtual environment was made of, and not
 
 from __future__ import annotations
 
+import glob
 import json
 import os
 import platform
 import subprocess
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 from packaging.specifiers import InvalidSpecifier, SpecifierSet
 from packaging.version import InvalidVersion, Version
@@ -148,5 +148,6 @@ def _others(versions: SpecifierSet) -> list[Interpreter]:
 
 
 def _pyenvs() -> list[str]:
-    root = Path(os.environ.get("PYENV_ROOT") or os.path.expanduser("~/.pyenv"))
-    return [str(path) for path in root.glob("versions/3.*/bin/python3") if path.exists()]
+    root = os.environ.get("PYENV_ROOT") or os.path.expanduser("~/.pyenv")
+    # which may be another user's; this glob finds nothing where it may not look
+    return glob.glob(f"{glob.escape(root)}/versions/3.*/bin/python3")

@@ -151,6 +151,20 @@ def test_no_interpreter_is_an_error_that_says_what_to_do(asked: str, declared: s
         interpreters.find(asked, declared)
 
 
+def test_a_pyenv_that_is_closed_to_us_has_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is another user's, and no error; nor is one that holds something else."""
+    (tmp_path / "versions/3.99.0/bin").mkdir(parents=True)
+    (tmp_path / "versions/3.99.0/bin/python3").write_text("")
+    monkeypatch.setenv("PYENV_ROOT", str(tmp_path))
+    with pytest.raises(InterpreterUnavailableError):
+        interpreters.find("3.99")
+    monkeypatch.setenv("PYENV_ROOT", "/proc/1/root")
+    with pytest.raises(InterpreterUnavailableError):
+        interpreters.find("3.99")
+
+
 def test_an_interpreter_by_its_path(tmp_path: Path) -> None:
     """It is asked what it is; what does not answer is none."""
     ours = interpreters.own()
