@@ -38,6 +38,7 @@ from envhub_sandbox.session.recipe import Recipe
 from envhub_sandbox.session.server_hold import ServerHold
 from envhub_sandbox.transport.connection import WorkerClient, expect
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.generators import generator
 from envhub_sandbox.transport.jail import RemoteJail, open_jail, typed
 from envhub_sandbox.transport.output import OutputFollower, Wanted
 from envhub_worker.protocol import messages as m
@@ -342,7 +343,9 @@ class Repository:
             raise LoadError(f"the worker answered Load with {type(reply).__name__}")
         elements = self.policy.limits.elements
         in_time = partial(_refuse_late, deadline)
-        manifest = decode_manifest(reply.manifest, max_elements=elements, check=in_time)
+        manifest = decode_manifest(
+            reply.manifest, max_elements=elements, check=in_time, generator=generator
+        )
         return LoadedJail(jail, manifest, reply.manifest, {runner}, server)
 
     def _wanted_output(self) -> Wanted:

@@ -18,6 +18,7 @@ from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.policy import Policy
 from envhub_sandbox.transport import pickles
+from envhub_sandbox.transport.generators import generator
 from envhub_sandbox.transport.shared_memory.sharding import PaceBook
 from envhub_worker import protocol
 from envhub_worker.protocol import messages as m
@@ -55,7 +56,9 @@ class ManifestCache:
             [packet] = PacketReader().feed(self._path.read_bytes())
             _, message = m.unpack(packet.frames)
             if isinstance(message, m.Loaded):
-                return decode_manifest(message.manifest, max_elements=max_elements)
+                return decode_manifest(
+                    message.manifest, max_elements=max_elements, generator=generator
+                )
         except FileNotFoundError:
             return None
         except (OSError, ValueError, EnvHubError):

@@ -15,10 +15,13 @@ from envhub_worker.protocol.codec.inert import RemoteObject, one_line
 from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
 from envhub_worker.protocol.facts import read_spec
 from envhub_worker.protocol.limits import WireLimits
-from envhub_worker.protocol.spaces.reader import ELEMENT_BYTES, SPACE_BYTES, SpaceReader
+from envhub_worker.protocol.spaces.reader import (
+    ELEMENT_BYTES,
+    GENERATOR_BYTES,
+    SPACE_BYTES,
+    SpaceReader,
+)
 
-_GENERATOR_BYTES = 4 * SPACE_BYTES
-"""The largest state, and the objects around it."""
 _SPEC_TYPE = "gymnasium.envs.registration.EnvSpec"
 _SHOWN = 200
 
@@ -31,7 +34,7 @@ class Described:
     """
 
     def __init__(self, limits: WireLimits) -> None:
-        self._reader = SpaceReader(limits.message_bytes // ELEMENT_BYTES)
+        self._reader = SpaceReader(limits.message_bytes // ELEMENT_BYTES, generator=generator)
 
     def __call__(self, code: int, value: object) -> object:
         """The thing that is described. Trust: input from the worker.
@@ -45,7 +48,7 @@ class Described:
             self._reader.spend(SPACE_BYTES)
             return _spec(value)
         if code == GENERATOR:
-            self._reader.spend(_GENERATOR_BYTES)
+            self._reader.spend(GENERATOR_BYTES)
             return generator(value)
         raise RemoteProtocolError(f"nothing is described by {code}")
 

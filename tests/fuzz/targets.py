@@ -258,7 +258,7 @@ def manifest(dice: Dice) -> None:
     value = dice.spoiled(dice.rng.choice(loaded).manifest)
     if dice.rng.random() < 0.2 and type(value) is dict and type(value.get("envs")) is tuple:
         value["envs"] *= dice.rng.choice((2, 50))
-    found = decode_manifest(value, max_elements=ELEMENTS)
+    found = decode_manifest(value, max_elements=ELEMENTS, generator=generator)
     usable((found.interpreter, found.packages))
     for env in found.envs:
         usable((env.metadata, env.attributes, env.render_mode, env.suite, env.task))

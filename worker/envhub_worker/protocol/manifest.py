@@ -23,7 +23,7 @@ from envhub_worker.protocol.names import (
     optional_name,
     string_keys,
 )
-from envhub_worker.protocol.spaces.reader import SpaceReader
+from envhub_worker.protocol.spaces.reader import GeneratorMaker, SpaceReader
 from envhub_worker.protocol.spaces.spaces import encode_space
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
@@ -96,16 +96,20 @@ _ENV_FIELDS = frozenset(EnvManifest.__dataclass_fields__)
 _FIELDS = frozenset(Manifest.__dataclass_fields__)
 
 
-def encode_env(manifest: EnvManifest) -> dict[str, object]:
-    """The plain value of one environment's manifest."""
+def encode_env(manifest: EnvManifest, *, seeded: bool = False) -> dict[str, object]:
+    """The plain value of one environment's manifest; with the generators of ``seeded`` spaces."""
     value = {name: getattr(manifest, name) for name in _ENV_FIELDS}
-    return value | {name: encode_space(value[name]) for name in _SPACES}
+    described = {
+        name: encode_space(value[name], seeded=seeded, single=value.get(f"single_{name}"))
+        for name in _SPACES
+    }
+    return value | described
 
 
-def encode_manifest(manifest: Manifest) -> dict[str, object]:
-    """The plain value of a manifest."""
+def encode_manifest(manifest: Manifest, *, seeded: bool = False) -> dict[str, object]:
+    """The plain value of a manifest; with the generators of ``seeded`` spaces."""
     return {
-        "envs": tuple(encode_env(env) for env in manifest.envs),
+        "envs": tuple(encode_env(env, seeded=seeded) for env in manifest.envs),
         "lazy": manifest.lazy,
         "interpreter": manifest.interpreter,
         "packages": manifest.packages,
@@ -113,7 +117,11 @@ def encode_manifest(manifest: Manifest) -> dict[str, object]:
 
 
 def decode_manifest(
-    value: object, *, max_elements: int, check: Callable[[], None] | None = None
+    value: object,
+    *,
+    max_elements: int,
+    check: Callable[[], None] | None = None,
+    generator: GeneratorMaker | None = None,
 ) -> Manifest:
     """Read a manifest. Trust: input from the worker.
 
@@ -121,12 +129,13 @@ def decode_manifest(
         value: What the wire brought.
         max_elements: What all spaces of all environments may cost together.
         check: Called before each space; raises what ends the reading, such as a deadline.
+        generator: Makes a generator of a seeded space, of a state that it checks.
 
     Raises:
         RemoteProtocolError: It is not a manifest, or over a limit.
     """
     with UNTRUSTED:
-        return _decode_manifest(value, SpaceReader(max_elements, check))
+        return _decode_manifest(value, SpaceReader(max_elements, check, generator))
 
 
 def _decode_manifest(value: object, reader: SpaceReader) -> Manifest:

@@ -29,7 +29,7 @@ def described(value: object) -> tuple[int, object] | None:
     """What kind of thing it is, and the plain values that it is made of; None if it is no such."""
     try:
         if isinstance(value, gym.Space):
-            return SPACE, encode_space(value)
+            return SPACE, encode_space(value, seeded=True)
         if isinstance(value, EnvSpec):
             return SPEC, facts_of(value)
         if type(value) is np.random.Generator and type(value.bit_generator) in _BIT_GENERATORS:

@@ -93,6 +93,7 @@ class Runner:
 
     def __init__(self, snapshot: str, entry: str, version: int = m.VERSION) -> None:
         reads = version >= _FIRST_WITH_DESCRIPTIONS
+        self._reads = reads
         self._pack = partial(m.pack, describer=described) if reads else m.pack
         self._snapshot = snapshot
         self._entry = entry
@@ -127,7 +128,8 @@ class Runner:
 
     def load(self, request: m.Load) -> m.Message:
         """Import the repository, call ``make_env``, describe what came back."""
-        return m.Loaded(encode_manifest(manifest.describe(self._load(request))))
+        made = manifest.describe(self._load(request))
+        return m.Loaded(encode_manifest(made, seeded=self._reads))
 
     def load_task(self, request: m.LoadTask) -> m.Message:
         """Import the repository, call ``make_env``, and describe nothing: it is known."""

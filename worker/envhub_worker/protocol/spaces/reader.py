@@ -24,6 +24,7 @@ from envhub_worker.protocol.spaces.opaque import (
     is_charset,
     is_shape,
 )
+from envhub_worker.protocol.spaces.seeded import nodes
 
 # Children of one Dict, Tuple or OneOf; a batch of custom spaces is a Tuple of as many.
 MAX_CHILDREN = 65_536
@@ -38,11 +39,16 @@ SPACE_BYTES = 1024
 """A space without elements: objects of Python."""
 CHARACTER_BYTES = 256
 """One character of a Text's set, which stands in a set, a list and a dict."""
+GENERATOR_BYTES = 4 * SPACE_BYTES
+"""The largest state of a generator, and the objects around it."""
+GENERATORS = "generators"
+"""The key of what the generators of a space and its parts are to begin with."""
 _SHARED_BYTES = 256
 
 _DISCRETE_HAS_DTYPE = "dtype" in signature(spaces.Discrete.__init__).parameters
 
 Space = gym.Space[Any]
+GeneratorMaker = Callable[[object], np.random.Generator]
 
 
 def decode_space(value: object, *, max_elements: int) -> Space:
@@ -69,11 +75,18 @@ class SpaceReader:
     Args:
         max_elements: The budget, in elements of a float32 Box, each ``ELEMENT_BYTES``.
         check: Called before each space is built; raises what ends the reading.
+        generator: Makes a generator of a state, which it checks. Without it there may be none.
     """
 
-    __slots__ = ("_boxes", "_check", "_left", "_max_elements", "_twice")
+    __slots__ = ("_boxes", "_check", "_generator", "_left", "_max_elements", "_twice")
 
-    def __init__(self, max_elements: int, check: Callable[[], None] | None = None) -> None:
+    def __init__(
+        self,
+        max_elements: int,
+        check: Callable[[], None] | None = None,
+        generator: GeneratorMaker | None = None,
+    ) -> None:
+        self._generator = generator
         self._left, self._max_elements = max_elements * ELEMENT_BYTES, max_elements
         self._check = check
         self._boxes: dict[tuple[object, ...], spaces.Box] = {}
@@ -86,13 +99,29 @@ class SpaceReader:
             RemoteProtocolError: As ``decode_space``.
         """
         try:
-            return self.read(value, 0)
+            if self._generator is None or type(value) is not dict or GENERATORS not in value:
+                return self.read(value, 0)
+            space = self.read({k: part for k, part in value.items() if k != GENERATORS}, 0)
+            self._start(space, value[GENERATORS], self._generator)
+            return space
         except EnvHubError:
             raise
         except Exception as error:
             # Gymnasium's constructors refuse in many ways; whatever they raise, the peer is wrong.
             text = f"Gymnasium refuses the described space: {one_line(str(error))}"
             raise RemoteProtocolError(text) from error
+
+    def _start(self, space: Space, states: object, generator: GeneratorMaker) -> None:
+        """Have a space and its parts draw what those of the worker would."""
+        parts = list(nodes(space))
+        if type(states) is not list or len(states) != len(parts):
+            raise RemoteProtocolError("A space does not have one generator for each part.")
+        for index, (part, state) in enumerate(zip(parts, states, strict=True)):
+            if type(state) is int and 0 <= state < index:
+                part._np_random = parts[state]._np_random
+            elif state is not None:
+                self.spend(GENERATOR_BYTES)
+                part._np_random = generator(state)
 
     def read(self, value: object, depth: int) -> Space:
         """One space and all that is in it, at a depth."""
@@ -140,7 +169,11 @@ class SpaceReader:
     def like(self, key: tuple[object, ...]) -> spaces.Box | None:
         """Another Box of the same description, which has the bounds of the first."""
         found = None if self._twice else self._boxes.get(key)
-        return None if found is None else copy.copy(found)
+        if found is None:
+            return None
+        another = copy.copy(found)
+        another._np_random = None  # type: ignore[assignment]  # that one draws by itself
+        return another
 
     def keep(self, key: tuple[object, ...], box: spaces.Box) -> None:
         """Takes note of a Box, for those that are described alike."""

@@ -24,7 +24,8 @@ from envhub_worker.protocol.spaces.opaque import (
     is_charset,
     is_shape,
 )
-from envhub_worker.protocol.spaces.reader import decode_space
+from envhub_worker.protocol.spaces.reader import GENERATORS, decode_space
+from envhub_worker.protocol.spaces.seeded import states_of
 
 __all__ = ["ARRAY_SPACES", "OpaqueSpace", "decode_space", "encode_space"]
 
@@ -33,16 +34,25 @@ ARRAY_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiB
 """Whose members are arrays or numbers, and whose batches are one array."""
 
 
-def encode_space(space: Space) -> dict[str, object]:
+def encode_space(
+    space: Space, *, seeded: bool = False, single: Space | None = None
+) -> dict[str, object]:
     """Describes a space by plain values and arrays.
 
     A subclass is described as its nearest Gymnasium base, any other custom space by its type
-    and ``repr``. The state of a space's random generator does not travel.
+    and ``repr``.
+
+    Args:
+        space: The space.
+        seeded: Whether the generators of seeded spaces are described, too.
+        single: The space that it is a batch of, if it is.
 
     Raises:
         LocalProtocolError: Spaces nested deeper than 12.
     """
-    return _encode(space, 0)
+    described = _encode(space, 0)
+    states = states_of(space, single) if seeded else None
+    return described if states is None else {**described, GENERATORS: states}
 
 
 @singledispatch
