@@ -11,7 +11,7 @@ import pytest
 
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.runtime import Runtime
-from envhub_worker.spawn.jail_handle import Failed
+from envhub_worker.spawn.jail_handle import RUNNER_TARGET, Failed, RunnerExited
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from tests.integration.confinement_kit import (
     Cell,
@@ -132,3 +132,16 @@ def test_packages_that_cannot_be_read_are_told(
     assert failed.layer == "packages"
     assert str(runtime.packages) in failed.reason
     assert "chmod -R a+rX" in failed.fix
+
+
+def test_what_every_jail_imports_is_named_where_it_is_missing(
+    folder: Path, confinement: Confinement, runtime: Runtime
+) -> None:
+    """The runner ends, and its output says in one line what the folder lacks."""
+    with spawner_in(folder, confinement, runtime=runtime, target=RUNNER_TARGET) as spawner:
+        cell = new_cell(spawner, make_snapshot(folder), confinement)
+        cell.start()
+        assert cell.wait_for(RunnerExited).code == 1
+        cell.wait_for_output(b"make the environment anew with these")
+    assert runtime.packages.encode() in cell.output
+    assert b"Traceback" not in cell.output

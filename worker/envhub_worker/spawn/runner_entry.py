@@ -88,8 +88,14 @@ def _main(order: Order) -> Callable[[socket.socket, JailSpec, list[int]], int | 
     if not config.packages:
         return _resolve(config.target)
     packages.bring_in(config.packages, order.jail.scratch.home)
-    with blas.threads_at_load(order.runners):
-        return _resolve(config.target)
+    try:
+        with blas.threads_at_load(order.runners):
+            return _resolve(config.target)
+    except ModuleNotFoundError as error:
+        raise SystemExit(
+            f"ModuleNotFoundError: {error}, in {config.packages}. What every jail imports of it "
+            "is cloudpickle, gymnasium, msgpack and numpy: make the environment anew with these"
+        ) from None
 
 
 def _resolve(target: str) -> Callable[[socket.socket, JailSpec, list[int]], int | None]:
