@@ -22,6 +22,7 @@ from envhub_sandbox.sandboxes.base import Sandbox
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.jail_sources import JailSource, OwnJails, SharedJail
 from envhub_sandbox.session.launcher import Known, LoadArguments, LoadedJail, Repository
+from envhub_sandbox.session.line import wait_in_line
 from envhub_sandbox.session.manifest_cache import ManifestCache, manifest_key
 from envhub_sandbox.session.prewarming import Prewarming
 from envhub_sandbox.session.provenance import provenance_of
@@ -237,7 +238,9 @@ class _Maker:
         if manifest is not None:
             return self._suites(manifest, None)
         with repository.named():
-            loaded = repository.open(Deadline(repository.timeouts.startup_s))
+            deadline = Deadline(repository.timeouts.startup_s)
+            ask = partial(repository.open, deadline)
+            loaded = wait_in_line(ask, repository.retry_s, deadline, repository.label)
         self._cache.save(loaded.value)
         try:
             return self._suites(loaded.manifest, loaded)

@@ -26,6 +26,7 @@
         WorkerStartupError
         WorkerDiedError
         WorkerTimeoutError (TimeoutError, multiprocessing.TimeoutError)
+        ServerBusyError
       ProtocolError
         LocalProtocolError
         RemoteProtocolError
@@ -78,6 +79,7 @@ __all__ = [
     "RequirementError",
     "ResolutionError",
     "SandboxUnavailableError",
+    "ServerBusyError",
     "SnapshotError",
     "SnapshotIntegrityError",
     "SnapshotTooLargeError",
@@ -182,6 +184,29 @@ class WorkerError(EnvHubError):
 
 class WorkerStartupError(WorkerError):
     """The worker did not come up."""
+
+
+class ServerBusyError(WorkerError):
+    """A server has no room for it at present: what a key may have is used up.
+
+    ``RemoteSandbox(retry_s=...)`` waits in line instead. The env is as it was.
+
+    Attributes:
+        quota: Which: ``"sessions"``, ``"jails"``, ``"runners"``, ``"memory"`` or ``"inflight"``
+            (bytes both); empty if the server did not say.
+        used: How much of it the same key's processes have.
+        limit: How much they may have.
+        retry_s: After how many seconds it is worth asking again.
+    """
+
+    def __init__(
+        self, message: str, *, quota: str = "", used: int = 0, limit: int = 0, retry_s: float = 1.0
+    ) -> None:
+        super().__init__(message)
+        self.quota = quota
+        self.used = used
+        self.limit = limit
+        self.retry_s = retry_s
 
 
 class WorkerDiedError(WorkerError):

@@ -110,6 +110,17 @@ class RepositorySandbox(Sandbox, Protocol):
 
 
 @runtime_checkable
+class Crowded(Protocol):
+    """A place that others use, too, and that may have no room at present.
+
+    Attributes:
+        retry_s: For how long to wait for it.
+    """
+
+    retry_s: float
+
+
+@runtime_checkable
 class PerRepository(Protocol):
     """A place where each repository gets a server of its own, which sees no other's files."""
 

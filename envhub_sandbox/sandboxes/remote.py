@@ -53,6 +53,8 @@ class RemoteSandbox:
         insecure_loopback: Without keys, for a server on this machine that has none either.
         heartbeat_s: After so many seconds without a sign of life the connection counts as lost.
             On a line where one batch of observations takes longer than that, raise it.
+        retry_s: For how long to wait in line when the server has no room for this key; 0, the
+            default, raises ``ServerBusyError`` at once.
     """
 
     endpoint: str
@@ -60,6 +62,7 @@ class RemoteSandbox:
     client_key: str | os.PathLike[str] | None = field(default=None, repr=False)
     insecure_loopback: bool = False
     heartbeat_s: float = 30.0
+    retry_s: float = 0.0
     name: str = field(default="remote", init=False)
 
     def __post_init__(self) -> None:
@@ -71,6 +74,8 @@ class RemoteSandbox:
             )
         if not self.heartbeat_s > 0:
             raise PolicyError(f"heartbeat_s is {self.heartbeat_s!r}; it takes seconds above 0")
+        if not 0 <= self.retry_s < float("inf"):
+            raise PolicyError(f"retry_s is {self.retry_s!r}; it takes seconds, or 0 for none")
 
     def __getstate__(self) -> dict[str, Any]:
         """No secret key is in a pickle: its reader has one, or the file that is named."""
@@ -91,7 +96,7 @@ class RemoteSandbox:
             SandboxUnavailableError: A key is missing.
         """
         check_policy(policy, runtime)
-        return RemoteRepository(self.endpoint, self._far(), snapshot, policy)
+        return RemoteRepository(self.endpoint, self._far(), snapshot, policy, self.retry_s)
 
     def _far(self) -> Far:
         if self.insecure_loopback:
@@ -235,13 +240,17 @@ class RemoteRepository:
 
     Attributes:
         interpreter: Names the server; a remembered manifest holds for this one only.
+        retry_s: For how long to wait for room there.
     """
 
     name = "remote"
 
-    def __init__(self, endpoint: str, far: Far, snapshot: Path, policy: Policy) -> None:
+    def __init__(
+        self, endpoint: str, far: Far, snapshot: Path, policy: Policy, retry_s: float
+    ) -> None:
         key = "" if far.server_key is None else far.server_key.hex()
         self.interpreter = f"{endpoint} {key}"
+        self.retry_s = retry_s
         self._endpoint, self._far = endpoint, far
         self._snapshot, self._policy = snapshot, policy
         self._files: tuple[upload.Sent, ...] = ()

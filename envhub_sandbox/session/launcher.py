@@ -27,6 +27,7 @@ from envhub_sandbox.hub.store import cache_root
 from envhub_sandbox.log import CRASHES, WORKER
 from envhub_sandbox.policy import Policy, Timeouts
 from envhub_sandbox.sandboxes.base import (
+    Crowded,
     EnclosedServer,
     FarServer,
     PerRepository,
@@ -158,6 +159,7 @@ class Repository:
         if isinstance(sandbox, PerRepository):
             own = sandbox.for_repository(snapshot.root, policy, runtime)
             self._sandbox, self.runs_on = own, Runtime(own.interpreter)
+        self.retry_s = self._sandbox.retry_s if isinstance(self._sandbox, Crowded) else 0.0
         self._store = store
         self._hold = ServerHold(self._acquire, self._release)
         self._jail_numbers = count(1)

@@ -10,12 +10,14 @@ import os
 import threading
 import weakref
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError
+from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerDiedError, WorkerError
 from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.jail_sources import JailSource, SharedJail
 from envhub_sandbox.session.launcher import LoadedJail, Repository
+from envhub_sandbox.session.line import wait_in_line
 from envhub_sandbox.session.placement import Builder, Place
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.lane import Lane
@@ -142,12 +144,15 @@ class Lease:
         try:
             return self._jails.take(deadline)
         except WorkerError as error:
-            # of this very type: the server's refusal, which may be for want of room
-            if type(error) is not WorkerError or deadline.unasked:
+            # or of this very type: an older server's refusal, which may be for want of room
+            full = isinstance(error, ServerBusyError) or type(error) is WorkerError
+            if not full or deadline.unasked:
                 raise
-            if not self.repository.settle() | self.make_room():
+            room = self.repository.settle() | self.make_room()
+            if not room and not self.repository.retry_s:
                 raise
-        return self._jails.take(deadline)
+        ask = partial(self._jails.take, deadline)
+        return wait_in_line(ask, self.repository.retry_s, deadline, self.repository.label)
 
     def _move(self, deadline: Deadline) -> None:
         self.leave()

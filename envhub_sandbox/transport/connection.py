@@ -13,6 +13,7 @@ from envhub_sandbox.errors import (
     PolicyError,
     RemoteProtocolError,
     SandboxUnavailableError,
+    ServerBusyError,
     SnapshotIntegrityError,
     VersionMismatchError,
     WorkerDiedError,
@@ -23,6 +24,7 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.tcp import Far, Link
 from envhub_worker.protocol import compression
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.busy import ERROR, Busy
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.confinement import Reason
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimits
@@ -283,6 +285,11 @@ def refusal(reply: m.Refused) -> Exception:
         return SandboxUnavailableError(f"this host cannot enforce {layer}{message}{fix}")
     if reply.error == "WorkerDiedError":
         return WorkerDiedError(message, reason="gone")
+    if reply.error == ERROR:
+        busy = Busy.read(reply.layer, reply.fix)
+        return ServerBusyError(
+            message, quota=busy.quota, used=busy.used, limit=busy.limit, retry_s=busy.retry_s
+        )
     return _REFUSALS.get(reply.error, WorkerError)(message)
 
 

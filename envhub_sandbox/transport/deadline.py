@@ -35,6 +35,11 @@ class Deadline:
         left = self.left_s()
         return None if left is None else int(min(left * 1000 + 1, _LONGEST_WAIT_MS))
 
+    def postpone(self, seconds: float) -> None:
+        """So much of the time does not count."""
+        if self._at:  # 0 has been given up
+            self._at += seconds
+
     @property
     def passed(self) -> bool:
         """Whether it has come."""

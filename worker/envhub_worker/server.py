@@ -135,7 +135,7 @@ class Server:
         try:
             self._dispatch(asker, request, arrived)
         except RefusedError as refused:
-            self.refuse(asker, refused.error, refused.message)
+            self.refuse(asker, refused.error, refused.message, refused.layer, refused.fix)
         except Exception as error:
             self.refuse(asker, "WorkerError", f"{type(error).__name__}: {error}")
 

@@ -16,7 +16,9 @@ import zmq
 
 from envhub_worker.access.connection_limit import MAX_CONNECTIONS, Doorman
 from envhub_worker.access.keys import AuthorizedClients, KeyPair
+from envhub_worker.access.line import RETRY_S, Line
 from envhub_worker.access.quotas import (
+    BusyError,
     InFlight,
     Permissions,
     Quotas,
@@ -33,6 +35,7 @@ from envhub_worker.lockdown.spec import confinement_from_wire
 from envhub_worker.loop import Loop
 from envhub_worker.multipart import receive
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.busy import Busy
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.keys import KEY_BYTES, key_text
 from envhub_worker.supervisor.jails import Jails
@@ -194,6 +197,7 @@ class RemoteGate:
         self._uploads = uploads
         self._log = log
         self._in_flight = InFlight()
+        self._lines = {"sessions": Line(), "jails": Line()}
         self._closers: list[Callable[[], None]] = []
         self._doorman: Doorman | None = None
         self.handlers: Mapping[type[m.Message], Handler] = {
@@ -264,10 +268,15 @@ class RemoteGate:
         if name != WATCHER and len(others) >= quota:
             gone = _longest_gone(others)
             if gone is None:
-                raise RefusedError(
-                    "WorkerError", f"your key has {quota} sessions, which is the server's quota"
+                self._lines["sessions"].wait(key, name)
+                raise BusyError(
+                    Busy("sessions", len(others), quota, RETRY_S),
+                    f"your key has {quota} sessions, which is the server's quota (--max-sessions)",
                 )
             self._end(gone, sessions, jails, _PLACE_NEEDED)
+        elif name not in {one.name for one in sessions.of_key(key)}:
+            self._refuse_behind("sessions", key, name, len(others), quota)
+        self._lines["sessions"].leave(key, name)
         wire = 0 if self._doorman is None else self._doorman.wire(fd)
         sessions.connect(identity, key, name, wire)
 
@@ -301,16 +310,31 @@ class RemoteGate:
         while True:
             try:
                 check_jail(_uses(jails, asker.key), more, self._rules.quotas)
-            except RefusedError:
+            except BusyError:
                 self._disconnect(sessions)
                 # its own may look so, too: what it said last is read after it has gone
                 others = [one for one in sessions.of_key(asker.key) if one.owner != asker.session]
                 gone = _longest_gone(others)
                 if gone is None:
+                    if more.memory_bytes:
+                        self._lines["jails"].wait(asker.key, asker.session)
                     raise
                 self._end(gone, sessions, jails, _PLACE_NEEDED)
             else:
-                return
+                break
+        if more.memory_bytes:
+            used, quota = len(_uses(jails, asker.key)), self._rules.quotas.jails
+            self._refuse_behind("jails", asker.key, asker.session, used, quota)
+            self._lines["jails"].leave(asker.key, asker.session)
+
+    def _refuse_behind(self, quota: str, key: bytes, owner: bytes, used: int, limit: int) -> None:
+        """There is room, and others of the same key have waited for it."""
+        line = self._lines[quota]
+        ahead = line.ahead(key, owner)
+        if ahead:
+            line.wait(key, owner)
+            text = f"{ahead} other processes of your key wait for the server's {quota}"
+            raise BusyError(Busy(quota, used, limit, RETRY_S), text)
 
     def _authorize_open(self, asked: Asked, request: m.OpenJail) -> m.OpenJail:
         try:

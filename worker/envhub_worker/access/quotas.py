@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
+from envhub_worker.access.line import RETRY_S
+from envhub_worker.protocol import busy as busy_words
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.busy import Busy
 from envhub_worker.protocol.confinement import GIB, MIB, PROFILES, Confinement
 from envhub_worker.supervisor.records import Asker
 
@@ -13,10 +16,21 @@ from envhub_worker.supervisor.records import Asker
 class RefusedError(Exception):
     """A request is not done. ``error`` is a name out of the client's table."""
 
+    layer = ""
+    fix = ""
+
     def __init__(self, error: str, message: str) -> None:
         super().__init__(message)
         self.error = error
         self.message = message
+
+
+class BusyError(RefusedError):
+    """There is no room at present."""
+
+    def __init__(self, busy: Busy, message: str) -> None:
+        super().__init__(busy_words.ERROR, message)
+        self.layer, self.fix = busy.quota, busy.words()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,17 +122,21 @@ def check_jail(open_jails: Iterable[Use], more: Use, quotas: Quotas) -> None:
     jails = len(uses) + (more.memory_bytes > 0)
     memory = sum(use.memory_bytes for use in uses) + more.memory_bytes
     runners = sum(use.runners for use in uses) + more.runners
-    for what, number, quota, option in (
-        ("jails", jails, quotas.jails, "--max-jails"),
-        ("runners", runners, quotas.runners, "--max-runners"),
-        ("bytes of memory limits", memory, quotas.memory_bytes, "--max-memory"),
+    for name, what, number, quota, option in (
+        ("jails", "jails", jails, quotas.jails, "--max-jails"),
+        ("runners", "runners", runners, quotas.runners, "--max-runners"),
+        ("memory", "bytes of memory limits", memory, quotas.memory_bytes, "--max-memory"),
     ):
         if number > quota:
-            raise RefusedError(
-                "WorkerError",
+            text = (
                 f"this would make {number} {what} of your key, over the server's quota of {quota} "
-                f"({option}); close environments, or lower their limits",
+                f"({option}); close environments, or lower their limits"
             )
+            if not uses:
+                raise RefusedError("WorkerError", text)  # no waiting makes it fit
+            used = {"jails": len(uses), "memory": memory - more.memory_bytes}
+            used["runners"] = runners - more.runners
+            raise BusyError(Busy(name, used[name], quota, RETRY_S), text)
 
 
 @dataclass
@@ -138,11 +156,13 @@ class InFlight:
         if (asker.identity, asker.request_id) in self._requests:
             raise RefusedError("LocalProtocolError", "a request with this id is not answered yet")
         if taken + size > quota:
-            raise RefusedError(
-                "WorkerError",
+            text = (
                 f"{taken} bytes of your key's requests are not answered yet, and {size} more are "
-                f"over the server's quota of {quota}; wait for replies",
+                f"over the server's quota of {quota}; wait for replies"
             )
+            if not taken:
+                raise RefusedError("WorkerError", text)
+            raise BusyError(Busy("inflight", taken, quota, RETRY_S), text)
         self._of[key] = taken + size
         self._requests[asker.identity, asker.request_id] = asker, key, size
 

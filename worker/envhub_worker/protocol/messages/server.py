@@ -27,7 +27,8 @@ class Welcome(Message, kind=2):
 class Refused(Message, kind=3):
     """The server did not do it. ``error`` is a name out of a table in the client.
 
-    ``layer`` and ``fix`` are filled where a layer of the confinement is missing.
+    ``layer`` and ``fix`` are filled where a layer of the confinement is missing, and where there
+    is no room (``busy.py``).
     """
 
     error: str
