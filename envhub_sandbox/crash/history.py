@@ -1,8 +1,8 @@
 """What was asked of an environment since it was last seeded: enough to ask it all again.
 
 Kept in memory, bounded by count and by bytes, and read only when the environment's jail has died.
-A step costs a copy of its actions as bytes. Whatever else is asked is encoded at once: the caller
-may change it afterwards.
+A step costs a copy of its actions as bytes. Of whatever else is asked the very frames that were
+sent are copied: the caller may change what they were made of afterwards.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 
 from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.transport.request import Request, whole
+from envhub_sandbox.transport.tensors import to_tensor
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.manifest import EnvManifest
@@ -30,6 +32,8 @@ _PRELUDE = 256
 _LASTING = (m.Call, m.SetAttr, m.CallOwn, m.CallOne)
 _PASSING = frozenset({"reset", "step", "render"})
 """What is over with the next seed, also where one sub-environment does it alone."""
+_SLICED = (m.Reset, m.SetAttr, m.GetOne, m.CallOne)
+"""What each shard is sent another part of."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +63,19 @@ class _Held:
     """A step whose actions are not one array; a copy of them."""
 
     actions: Any
+
+
+@dataclass(frozen=True, slots=True)
+class _Sent:
+    """A request as it was sent: plain, so that what it held is told when somebody asks.
+
+    Attributes:
+        frames: Of each shard's message.
+        bounds: The slices of the shards.
+    """
+
+    frames: list[list[bytes]]
+    bounds: list[tuple[int, int]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,9 +123,9 @@ class History:
         size = 8 * int(np.prod(self._shape, dtype=np.int64)) if self._flat else 0
         self._unit = _ENTRY_BYTES + size
         self._capacity = min(limit, max(1, HISTORY_BYTES // self._unit))
-        self._log: deque[bytes | np.dtype[Any] | Requested | _Held] = deque()
+        self._log: deque[bytes | np.dtype[Any] | _Sent | Requested | _Held] = deque()
         self._append = self._log.append
-        self._lasting: dict[object, Requested] = {}
+        self._lasting: dict[object, _Sent | Requested] = {}
         self.step: Callable[[Any], None] = _nothing
         if limit:
             self.step = self._flat_step if self._flat else self._any_step
@@ -117,7 +134,7 @@ class History:
     def started(self) -> None:
         """A fresh jail: whatever was asked of another is of no concern."""
         self._lasting.clear()
-        self._before: tuple[Requested, ...] = ()
+        self._before: tuple[_Sent | Requested, ...] = ()
         self._forgotten = 0
         self._mixed = self._seeded = False
         self._restart()
@@ -161,49 +178,49 @@ class History:
         self._append(held)
         self._take_room(held)
 
-    def requested(self, message_for: Callable[[int, tuple[int, int]], m.Message]) -> None:
-        """Record another request, given what makes its message for a slice."""
+    def requested(self, request: Request) -> None:
+        """Record another request, as it was sent."""
         if not self._capacity:
             return
-        message = message_for(0, (0, self._num_envs))
+        message = request.messages[0]
         if isinstance(message, m.Reset) and message.mask is None:
-            self._reset(message.seeds)
-        made = encoded(message)
+            self._reset([one.seeds for one in request.messages if isinstance(one, m.Reset)])
+        made = _entry(request)
         if isinstance(message, _LASTING) and not _passes(message):
             self._keep_lasting(message, made)
         self._append(made)
         self._take_room(made)
 
-    def _reset(self, seeds: Any) -> None:
+    def _reset(self, seeds: list[Any]) -> None:
         """A reset of all: what it seeds does not depend on anything before, but for attributes."""
-        each = seeds if isinstance(seeds, list) else [seeds]
+        each = [one for some in seeds for one in (some if isinstance(some, list) else [some])]
         seeding = all(seed is not None for seed in each)
         if seeding or not self._seeded:
             self._seeded = seeding
             self._before = tuple(self._lasting.values())
             self._restart()
 
-    def _keep_lasting(self, message: m.Message, made: Requested) -> None:
+    def _keep_lasting(self, message: m.Message, made: _Sent | Requested) -> None:
         name = getattr(message, "name", "")
         plain = isinstance(message, m.SetAttr) or not (
             getattr(message, "args", ()) or getattr(message, "kwargs", {})
         )
         plain = plain and not isinstance(message, m.CallOne)  # each has one of that name
-        key: object = (type(message), name) if plain else made.frames[0]
+        key: object = (type(message), name) if plain else _heads(made)
         self._lasting.pop(key, None)  # the last one counts, in its place
         self._lasting[key] = made
         if len(self._lasting) > _PRELUDE:
             del self._lasting[next(iter(self._lasting))]
             self._forgotten += 1
 
-    def _take_room(self, entry: Requested | _Held) -> None:
+    def _take_room(self, entry: _Sent | Requested | _Held) -> None:
         self._room -= self._units(entry)
         if self._room < 0:
             self._evict()
 
     def _units(self, entry: object) -> int:
-        if isinstance(entry, Requested):
-            return 1 + (_REQUEST_BYTES + sum(map(len, entry.frames))) // self._unit
+        if isinstance(entry, (_Sent, Requested)):
+            return 1 + (_REQUEST_BYTES + _bytes(entry)) // self._unit
         return 1 + _size(entry.actions) // self._unit if isinstance(entry, _Held) else 1
 
     def _evict(self) -> None:
@@ -223,7 +240,7 @@ class History:
         """What is kept, in order."""
         return Recording(
             seeded=self._seeded,
-            before=self._before,
+            before=tuple(map(_requested, self._before)),
             requests=tuple(self._runs()),
             dropped=self._dropped + self._forgotten,
             mixed=self._mixed,
@@ -243,8 +260,8 @@ class History:
                 run = []
             if isinstance(entry, np.dtype):
                 dtype = entry
-            elif isinstance(entry, Requested):
-                found.append(entry)
+            elif isinstance(entry, (_Sent, Requested)):
+                found.append(_requested(entry))
             elif entry is not None:
                 found.append(encoded(m.Step(0, entry.actions)))
         return found
@@ -256,6 +273,36 @@ def _passes(message: m.Message) -> bool:
 
 def _nothing(actions: Any) -> None:
     """Nothing is recorded."""
+
+
+def _entry(request: Request) -> _Sent | Requested:
+    """What is kept of a request. What only pickle could carry is described at once."""
+    if not request.plain:
+        return encoded(whole(request.messages, request.bounds))
+    kept = request.kept()
+    if not isinstance(request.messages[0], _SLICED):
+        kept = kept[:1]  # the others have been sent the same
+    return _Sent(kept, request.bounds)
+
+
+def _requested(entry: _Sent | Requested) -> Requested:
+    """An entry as a recording has it."""
+    if isinstance(entry, Requested):
+        return entry
+    messages = [m.unpack(frames, tensors=to_tensor)[1] for frames in entry.frames]
+    return encoded(whole(messages, entry.bounds))
+
+
+def _heads(entry: _Sent | Requested) -> bytes:
+    """What tells it from others: all but large values."""
+    if isinstance(entry, Requested):
+        return entry.frames[0]
+    return b"".join(frames[0] for frames in entry.frames)
+
+
+def _bytes(entry: _Sent | Requested) -> int:
+    parts = [entry.frames] if isinstance(entry, Requested) else entry.frames
+    return sum(len(frame) for frames in parts for frame in frames)
 
 
 def encoded(message: m.Message) -> Requested:

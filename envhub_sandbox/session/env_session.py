@@ -131,19 +131,20 @@ class EnvSession:
             lane = self._lane()
             messages = [message_for(lane.number, bounds) for bounds in self.bounds]
             try:
-                packed = lane.pack(messages)
+                request = lane.request(operation, messages)
             except LocalProtocolError:
-                self._refuse_whole(lane, message_for)
+                self._refuse_whole(operation, message_for)
                 raise
-            self._send(operation, lambda: lane.send(operation, packed))
-            self._recovery.sent(messages, packed)
-            self.history.requested(message_for)
+            self._send(operation, lambda: lane.send(request))
+            self._recovery.sent(request)
+            self.history.requested(request)
             self._note_first_use()
 
-    def _refuse_whole(self, lane: Lane, message_for: MessageFor) -> None:
+    def _refuse_whole(self, operation: str, message_for: MessageFor) -> None:
         """Raise what cannot be sent as it is called in the caller's arguments, not in a shard's."""
         if len(self.bounds) > 1:
-            lane.pack([message_for(lane.number, (0, self.manifest.num_envs))])
+            lane = self._lane()
+            lane.request(operation, [message_for(lane.number, (0, self.manifest.num_envs))])
 
     def collect(self, timeout_s: float | None) -> list[m.Message]:
         """The shards' replies to the last ``submit``; the environment is usable afterwards.

@@ -13,13 +13,15 @@ from envhub_sandbox.errors import WorkerDiedError, WorkerError, WorkerTimeoutErr
 from envhub_sandbox.log import WORKER
 from envhub_sandbox.session.failures import Failures
 from envhub_sandbox.session.lease import Lease
-from envhub_sandbox.session.reseed import Frames, SeedBook, Settings, marked, resets, truncated
+from envhub_sandbox.session.reseed import SeedBook, Settings, marked, resets, truncated
 from envhub_sandbox.session.restart_policy import Restarts
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.jail import RunnersDiedError, typed
 from envhub_sandbox.transport.lane import Lane
+from envhub_sandbox.transport.request import Request
 from envhub_sandbox.transport.results import Results
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 Requests = Callable[[Lane, int], list[m.Message]]
@@ -32,8 +34,8 @@ class Recovery(Protocol):
     def started(self) -> None:
         """There is a fresh jail: whatever was asked of another is of no concern."""
 
-    def sent(self, messages: Sequence[m.Message], packed: Sequence[Frames]) -> None:
-        """A request has gone out: a message for each shard, and its frames."""
+    def sent(self, request: Request) -> None:
+        """A request has gone out."""
 
     def answered(self) -> None:
         """Every shard has answered it, and none has raised."""
@@ -59,7 +61,7 @@ class Fail:
     def started(self) -> None:
         """Nothing is remembered."""
 
-    def sent(self, messages: Sequence[m.Message], packed: Sequence[Frames]) -> None:
+    def sent(self, request: Request) -> None:
         """Nothing is remembered."""
 
     def answered(self) -> None:
@@ -99,23 +101,22 @@ class Revive:
         self._failures = failures
         self._seeds = SeedBook(manifest.num_envs, manifest.shardable)
         self._settings = Settings()
-        self._setting: tuple[str, list[Frames]] | None = None  # what is being set
+        self._setting: tuple[str, list[list[bytes]]] | None = None  # what is being set
         self._asked: Sequence[m.Message] = ()
 
     def started(self) -> None:
         """See ``Recovery``."""
         self._settings.clear()
 
-    def sent(self, messages: Sequence[m.Message], packed: Sequence[Frames]) -> None:
+    def sent(self, request: Request) -> None:
         """See ``Recovery``."""
-        self._asked = messages
+        self._asked = messages = request.messages
         self._setting = None
         for message, (start, _) in zip(messages, self._bounds, strict=True):
             if isinstance(message, m.Reset):
                 self._seeds.remember(message, start)
         if isinstance(messages[0], m.SetAttr):
-            # copies: large values are sent from where they lie, and may change
-            self._setting = messages[0].name, [list(map(bytes, frames)) for frames in packed]
+            self._setting = messages[0].name, request.kept()
 
     def answered(self) -> None:
         """See ``Recovery``."""
@@ -178,7 +179,9 @@ class Revive:
     def _set_again(self, lane: Lane, dead: Sequence[int], deadline: Deadline) -> None:
         """Set attributes in fresh runners; what one's setter raises is only logged."""
         for name, frames in self._settings.messages():
-            asked = [(lane.runners[index], frames[index]) for index in dead]
+            asked: list[tuple[int, list[Buffer]]] = [
+                (lane.runners[index], [*frames[index]]) for index in dead
+            ]
             replies = lane.jail.ask("set_attr", asked, deadline)
             if any(isinstance(reply, m.Raised) for reply in replies):
                 label = self._lease.repository.label

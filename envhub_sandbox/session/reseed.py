@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import Buffer
 
 RESTARTED = "worker_restarted"
 """In the infos: whether a sub-environment was lost and came back reset."""
 
 Bounds = tuple[int, int]
 Seeds = list[int | None]
-Frames = list[Buffer]
+Frames = list[bytes]
 _SETTINGS = 256
 """Attributes that are remembered, the last ones."""
 

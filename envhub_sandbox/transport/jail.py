@@ -121,10 +121,14 @@ class RemoteJail:
 
     def pack(self, message: m.Message) -> list[Buffer]:
         """The frames of a message to a runner."""
+        return self.pack_noting(message)[0]
+
+    def pack_noting(self, message: m.Message) -> tuple[list[Buffer], bool]:
+        """The frames of a message to a runner, and whether nothing had to be pickled for them."""
         # the only way in for the caller's own objects; nothing is ever unpickled here
         new = self.client.version >= _FIRST_WITH_FRAMED_PICKLES
-        pickler = pickles.framed if new else pickles.pickled
-        return m.pack(message, 0, pickler=pickler, limits=self._limits)
+        pickler = _Noting(pickles.framed if new else pickles.pickled)
+        return m.pack(message, 0, pickler=pickler, limits=self._limits), pickler.plain
 
     def send(self, operation: str, requests: Sequence[tuple[int, m.Message]]) -> int:
         """Send one message to each of some runners, in one request; returns its id."""
@@ -243,6 +247,18 @@ def _cut(payload: list[Buffer], counts: Sequence[int]) -> list[list[Buffer]]:
         raise RemoteProtocolError("the worker's frames do not add up")
     frames = iter(payload)
     return [list(islice(frames, count)) for count in counts]
+
+
+class _Noting:
+    """Pickles, and notes that it has."""
+
+    def __init__(self, pickler: Callable[[object], bytes | memoryview]) -> None:
+        self._pickler = pickler
+        self.plain = True
+
+    def __call__(self, value: object) -> bytes | memoryview:
+        self.plain = False
+        return self._pickler(value)
 
 
 def _nothing() -> None:

@@ -13,13 +13,11 @@ from typing import Any, Protocol
 from envhub_sandbox.errors import EnvHubError, WorkerError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RemoteJail, RunnersDiedError, check, typed
+from envhub_sandbox.transport.request import Frames, Request
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.sharding import Pace
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.spaces import batches
-
-Frames = list[Buffer]
 
 
 class Lane(Protocol):
@@ -71,14 +69,14 @@ class Lane(Protocol):
             RemoteProtocolError: A runner broke the rules.
         """
 
-    def pack(self, messages: Sequence[m.Message]) -> list[Frames]:
-        """The frames of a message for each shard.
+    def request(self, operation: str, messages: Sequence[m.Message]) -> Request:
+        """A request of a message for each shard, ready to be sent.
 
         Raises:
-            LocalProtocolError: One cannot be sent.
+            LocalProtocolError: It cannot be sent.
         """
 
-    def send(self, operation: str, packed: Sequence[Frames]) -> None:
+    def send(self, request: Request) -> None:
         """Send each shard its message.
 
         Raises:
@@ -153,7 +151,8 @@ class RelayLane:
         parts = [actions]
         if len(bounds) > 1:
             parts = batches.split(self._results.manifest.single_action_space, actions, bounds)
-        self.send("step", self.pack([m.Step(self.number, part) for part in parts]))
+        messages = [m.Step(self.number, part) for part in parts]
+        self.send_some("step", self.runners, list(map(self.jail.pack, messages)))
 
     def wait(self, deadline: Deadline) -> None:
         """See ``Lane``."""
@@ -166,13 +165,16 @@ class RelayLane:
             check(reply)
         return self._results.step([typed(reply, m.StepDone) for reply in self._answers], infos)
 
-    def pack(self, messages: Sequence[m.Message]) -> list[Frames]:
+    def request(self, operation: str, messages: Sequence[m.Message]) -> Request:
         """See ``Lane``."""
-        return [self.jail.pack(message) for message in messages]
+        packed = [self.jail.pack_noting(message) for message in messages]
+        plain = all(plain for _, plain in packed)
+        frames = [frames for frames, _ in packed]
+        return Request(operation, messages, frames, self._results.bounds, plain=plain)
 
-    def send(self, operation: str, packed: Sequence[Frames]) -> None:
+    def send(self, request: Request) -> None:
         """See ``Lane``."""
-        self.send_some(operation, self.runners, packed)
+        self.send_some(request.operation, self.runners, request.frames)
 
     def send_some(self, operation: str, runners: Sequence[int], packed: Sequence[Frames]) -> None:
         """Send some runners a message each; ``replies`` has what they answer."""
@@ -187,7 +189,8 @@ class RelayLane:
 
     def send_for_infos(self) -> None:
         """See ``Lane``."""
-        self.send("step", self.pack([m.FetchInfosApart(self.number)]) * len(self.runners))
+        packed = [self.jail.pack(m.FetchInfosApart(self.number))] * len(self.runners)
+        self.send_some("step", self.runners, packed)
 
     def replies(self, deadline: Deadline) -> list[m.Message]:
         """See ``Lane``."""

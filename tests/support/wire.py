@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import struct
 from typing import Any
+from unittest.mock import Mock
 
 import msgpack
 
+from envhub_sandbox.transport.jail import RemoteJail
+from envhub_sandbox.transport.lane import RelayLane
+from envhub_sandbox.transport.request import Request
+from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.limits import DEFAULT_LIMITS
 
 
 def message(document: bytes, tail: bytes = b"", *frames: bytes) -> list[Buffer]:
@@ -31,3 +37,10 @@ def deep(levels: int) -> list[Any]:
     for _ in range(levels - 1):
         value = [value]
     return value
+
+
+def requested(*messages: m.Message) -> Request:
+    """A request of a message for each shard of two sub-environments, as it is sent."""
+    jail = RemoteJail(Mock(version=m.VERSION), 1, [], [], DEFAULT_LIMITS)
+    bounds = [(2 * index, 2 * index + 2) for index in range(len(messages))]
+    return RelayLane(jail, [], 1, Mock(bounds=bounds)).request("a test", messages)

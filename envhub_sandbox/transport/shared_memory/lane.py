@@ -14,7 +14,8 @@ from typing import Any
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RunnersDiedError, typed
-from envhub_sandbox.transport.lane import Frames, RelayLane
+from envhub_sandbox.transport.lane import RelayLane
+from envhub_sandbox.transport.request import Request
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.affinity import CPUS, Cores
 from envhub_sandbox.transport.shared_memory.attachment import Attachment, sleep_for
@@ -228,24 +229,25 @@ class SharedMemoryLane:
 
     def _fetch(self, shards: Sequence[int], deadline: Deadline) -> list[m.Message]:
         """What some shards' runners could not put into their slabs."""
-        packed = self._relay.pack([m.FetchInfos(self.number)]) * len(shards)
+        packed = [self.jail.pack(m.FetchInfos(self.number))] * len(shards)
         self._relay.send_some(self._owed, [self.runners[index] for index in shards], packed)
         return self._relay.replies(deadline)
 
     # --- messages ------------------------------------------------------------------------------
 
-    def pack(self, messages: Sequence[m.Message]) -> list[Frames]:
+    def request(self, operation: str, messages: Sequence[m.Message]) -> Request:
         """See ``Lane``."""
-        return self._relay.pack(messages)
+        return self._relay.request(operation, messages)
 
-    def send(self, operation: str, packed: Sequence[Frames]) -> None:
+    def send(self, request: Request) -> None:
         """See ``Lane``."""
+        operation = request.operation
         # what may have to be repeated in a fresh runner goes by the server, who knows the dead
-        if self.jail.kept or operation in _BULKY or not all(map(fits, packed)):
+        if self.jail.kept or operation in _BULKY or not all(map(fits, request.frames)):
             self._owed = _BY_SERVER
             if operation == "reset":
                 self.observations.leave()
-            self._relay.send(operation, packed)
+            self._relay.send(request)
             return
         self._owed = operation  # first, as for a step
         self._asked_ns = perf_counter_ns()
@@ -255,7 +257,7 @@ class SharedMemoryLane:
         slot = self.observations.choose() if choose else self.observations.chosen
         # one shard alone is left to the kernel
         cpus = self._cores.of_shards() if len(self.shards) > 1 else [0]
-        for index, (shard, frames) in enumerate(zip(self.shards, packed, strict=True)):
+        for index, (shard, frames) in enumerate(zip(self.shards, request.frames, strict=True)):
             spin_ns = self._spin.budget_ns if index < self._awake else 0
             shard.tell(b"".join(pack_packet(0, frames)), slot, spin_ns, cpus[index])
 

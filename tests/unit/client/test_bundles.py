@@ -24,6 +24,7 @@ from envhub_sandbox.errors import ActionError, BundleError, WorkerDiedError
 from envhub_sandbox.policy import Limits, Policy, Timeouts
 from envhub_worker.protocol import messages as m
 from tests.support import inside
+from tests.support.wire import requested
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
@@ -32,7 +33,7 @@ def bundle(folder: Path, **options: Any) -> Path:
     """A bundle of a reset and three steps, as ``writer`` writes it."""
     manifest: Any = SimpleNamespace(single_action_space=spaces.Discrete(5), num_envs=2)
     history = History(manifest, 100)
-    history.requested(lambda number, bounds: m.Reset(0, [1, 2], None, None))
+    history.requested(requested(m.Reset(0, [1, 2], None, None)))
     for number in range(3):
         history.step(np.array([number, number]))
     given = {"policy": Policy(), "timeouts": Timeouts(), "python": None, "endpoint": None}

@@ -15,6 +15,7 @@ from envhub_sandbox.crash import history
 from envhub_sandbox.crash.history import History, Recording, Requested, Steps
 from envhub_worker.protocol import messages as m
 from tests.support.compare import assert_same
+from tests.support.wire import requested
 
 
 def made(space: Any = None, num_envs: int = 2, limit: int = 1000) -> History:
@@ -27,12 +28,43 @@ def made(space: Any = None, num_envs: int = 2, limit: int = 1000) -> History:
 
 def ask(kept: History, message: m.Message) -> None:
     """Record any request but a step."""
-    kept.requested(lambda number, bounds: message)
+    kept.requested(requested(message))
 
 
 def reset(kept: History, seeds: Any = None, mask: Any = None) -> None:
     """Record a reset."""
     ask(kept, m.Reset(0, seeds, None, mask))
+
+
+def test_what_shards_were_sent_is_kept_as_it_was_asked() -> None:
+    """Each was sent its slice; the recording has the whole, as it was then."""
+    kept, values = made(num_envs=3), [np.zeros(2), np.ones(2), np.full(2, 7.0)]
+    kept.requested(
+        requested(
+            m.Reset(5, [1, 2], {"a": 1}, np.array([True, False])),
+            m.Reset(5, [3], {"a": 1}, np.array([True])),
+        )
+    )
+    kept.requested(
+        requested(m.SetAttr(5, "x", tuple(values[:2])), m.SetAttr(5, "x", tuple(values[2:])))
+    )
+    kept.requested(requested(m.Call(5, "f", (1,), {}), m.Call(5, "f", (1,), {})))
+    kept.requested(requested(m.CallOne(5, None, 0, "g", (), {}), m.CallOne(5, 1, 0, "g", (), {})))
+    values[0][:] = 9.0
+    recording = kept.recording()
+    assert recording.exact
+    found = [m.unpack(one.frames)[1] for one in recording.requests if isinstance(one, Requested)]
+    assert [one.operation for one in recording.requests if isinstance(one, Requested)] == [
+        *("reset", "setattr", "call", "callone"),
+    ]
+    reset_of_all, set_for_all, called, called_one = found
+    assert isinstance(reset_of_all, m.Reset)
+    assert isinstance(set_for_all, m.SetAttr)
+    assert_same(reset_of_all.seeds, [1, 2, 3])
+    assert_same(reset_of_all.mask, np.array([True, False, True]))
+    assert_same(set_for_all.values, (np.zeros(2), np.ones(2), np.full(2, 7.0)))
+    assert called == m.Call(0, "f", (1,), {})
+    assert called_one == m.CallOne(0, 3, 0, "g", (), {})
 
 
 def actions_of(recording: Recording) -> list[Any]:
