@@ -77,6 +77,7 @@ class EnvSession:
         paces: PaceBook,
     ) -> None:
         policy = jails.repository.policy
+        self.repository: Repository = jails.repository
         self.manifest = manifest
         self.bounds = list(bounds)
         self.lifecycle = Lifecycle()
@@ -97,11 +98,6 @@ class EnvSession:
         labels = Labels(self.repository.label, manifest.suite, str(manifest.task))
         LEDGER.add(self, labels, self._restarts)
         _living.add(self)
-
-    @property
-    def repository(self) -> Repository:
-        """The repository that it comes from."""
-        return self.lease.repository
 
     @property
     def closed(self) -> bool:
@@ -138,7 +134,8 @@ class EnvSession:
             self._send(operation, lambda: lane.send(request))
             self._recovery.sent(request)
             self.history.requested(request)
-            self._note_first_use()
+            if self._first_use is not None:
+                self._note_first_use()
 
     def _refuse_whole(self, operation: str, message_for: MessageFor) -> None:
         """Raise what cannot be sent as it is called in the caller's arguments, not in a shard's."""
@@ -245,12 +242,13 @@ class EnvSession:
     # --- out and back --------------------------------------------------------------------------
 
     def _make_ready(self, operation: str) -> None:
+        if self.lifecycle.state is State.READY:
+            return
         refused = refusal(self.lifecycle.state, operation, self.repository.policy.restart)
         if refused is not None:
             self._refuse_others(operation)
             raise refused
-        if self.lifecycle.state is State.IDLE:
-            self._start(StartupDeadline(self.repository.timeouts.startup_s))
+        self._start(StartupDeadline(self.repository.timeouts.startup_s))
 
     def _refuse_others(self, operation: str) -> None:
         """A request that another thread waits for is not late: it is in use.
@@ -372,7 +370,7 @@ class EnvSession:
             except BaseException as error:
                 self._after_close(operation, error)
                 raise
-            if self.closed:
+            if self.lifecycle.state is State.CLOSED:
                 self.lease.let_go()
 
     def _after_close(self, operation: str, error: BaseException) -> None:

@@ -44,6 +44,7 @@ class Lease:
         paces: Takes note of what its steps took.
 
     Attributes:
+        repository: Whose jails they are.
         loaded: The jail; None while there is none.
         lane: The way to its runners there.
         make_room: Asked to end what was started ahead, where a server has no place left.
@@ -57,6 +58,7 @@ class Lease:
         counters: Counters,
         paces: PaceBook,
     ) -> None:
+        self.repository: Repository = jails.repository
         self.lifecycle = lifecycle
         self.loaded: LoadedJail | None = None
         self.lane: Lane | None = None
@@ -72,11 +74,6 @@ class Lease:
         self._release_server: Callable[[], None] = _nothing
         self._departs = weakref.finalize(self, jails.repository.stay())
         self._departs.atexit = False
-
-    @property
-    def repository(self) -> Repository:
-        """The repository that its jails are of."""
-        return self._jails.repository
 
     @property
     def shared(self) -> bool:

@@ -87,9 +87,12 @@ def sleep_for(watch: Watch, shard: LaneShard, deadline: Deadline) -> bool:
         # a ring may cross with our going to sleep: look again soon, once
         timeout: int | None = _RECHECK_MS
         while not shard.answered():
-            if watch.wait(timeout):
-                return shard.answered()
-            if deadline.passed and not shard.answered():
+            died = watch.wait(timeout)
+            if shard.answered():
+                return True
+            if died:
+                return False
+            if deadline.passed:
                 raise WorkerTimeoutError("the worker did not answer in time")
             timeout = deadline.left_ms()
         return True
