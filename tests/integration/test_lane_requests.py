@@ -10,7 +10,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvError
-from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.deadline import Deadline, StepDeadline
 from envhub_sandbox.transport.jail import RemoteJail
 from envhub_worker.protocol.shared_memory import slabs
 from tests.support import inside
@@ -107,11 +107,15 @@ def test_an_operation_has_one_deadline(
     Or else runners that answer at the last moment would make a step last as long as they please.
     """
     made: list[float | None] = []
-    initialize = Deadline.__init__
+    initialize, again = Deadline.__init__, StepDeadline.again
 
     def counted(self: Deadline, timeout_s: float | None) -> None:
         made.append(timeout_s)
         initialize(self, timeout_s)
+
+    def counted_again(self: StepDeadline) -> None:
+        made.append(self.timeout_s)
+        again(self)
 
     timeouts = {"step_s": 1001.0, "reset_s": 1002.0, "call_s": 1003.0}
     options = {"lane": lane, "num_workers": 4, "policy": {"restart": restart}}
@@ -119,6 +123,7 @@ def test_an_operation_has_one_deadline(
         env = suites.env
         env.reset()
         monkeypatch.setattr(Deadline, "__init__", counted)
+        monkeypatch.setattr(StepDeadline, "again", counted_again)
         for act, timeout_s in (
             (lambda: env.step([1, 1, 1, 1]), 1001.0),
             (lambda: env.reset(options={"large": True}), 1002.0),
