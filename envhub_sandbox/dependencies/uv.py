@@ -6,11 +6,9 @@ interpreter. What it prints is the user's to read, but quotes a stranger's names
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import subprocess
-import sysconfig
 import tempfile
 import threading
 from collections.abc import Callable, Iterable, Sequence
@@ -167,13 +165,16 @@ def command() -> str:
     Raises:
         DependencyError: It is not installed.
     """
-    # pip puts it next to the interpreter, which need not be on PATH
-    path = os.pathsep.join([sysconfig.get_path("scripts"), os.environ.get("PATH", os.defpath)])
-    found = shutil.which("uv", path=path)
+    try:
+        from uv import find_uv_bin  # it knows where pip has put it, which need not be on PATH
+
+        return str(find_uv_bin())
+    except (ImportError, FileNotFoundError):
+        found = shutil.which("uv")
     if found is None:
         raise DependencyError(
-            "uv resolves and installs packages, and is not found: neither beside this interpreter "
-            "nor on PATH. Run: pip install uv"
+            "uv resolves and installs packages, and is not found: neither among this interpreter's "
+            "packages nor on PATH. Run: pip install uv"
         )
     return found
 

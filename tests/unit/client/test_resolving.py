@@ -148,7 +148,7 @@ def test_no_setting_of_the_working_directory_counts(
 
 def test_no_uv_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """With how to get it."""
-    monkeypatch.setattr("sysconfig.get_path", lambda name: str(tmp_path))
+    monkeypatch.setitem(sys.modules, "uv", None)
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(DependencyError, match="pip install uv"):
         uv.command()
