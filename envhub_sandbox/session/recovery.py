@@ -161,6 +161,7 @@ class Revive:
             self._restarts.spend(operation)
         except WorkerDiedError as spent:
             raise deaths.first from spent
+        self._tell(deaths)
         dead = sorted(deaths.deaths)
         timeouts = self._lease.repository.timeouts
         deadline = StartupDeadline(timeouts.startup_s)
@@ -175,6 +176,12 @@ class Revive:
             return _ask_anew(lane, dead, requests, deadline_of_reset)
         except WorkerTimeoutError as error:
             raise self._failures.late("reset", deadline_of_reset) from error
+
+    def _tell(self, deaths: RunnersDiedError) -> None:
+        """Log a death that the caller sees in the infos only."""
+        rows = [row for index in sorted(deaths.deaths) for row in range(*self._bounds[index])]
+        why, label = str(deaths.first).partition("\n")[0], self._lease.repository.label
+        WORKER.info("%s: %s; sub-environments %s begin anew in fresh processes", label, why, rows)
 
     def _set_again(self, lane: Lane, dead: Sequence[int], deadline: Deadline) -> None:
         """Set attributes in fresh runners; what one's setter raises is only logged."""

@@ -305,6 +305,20 @@ def test_an_attribute_that_cannot_be_set_again_is_left_out(
 
 
 @lanes
+def test_a_death_that_is_mended_is_logged(lane: str, caplog: pytest.LogCaptureFixture) -> None:
+    """How it died and whose rows begin anew: the caller sees it in the infos only."""
+    with made(lane) as suites:
+        env = suites.env
+        env.reset(seed=SEED)
+        with caplog.at_level("INFO", "envhub_sandbox.worker"):
+            env.step(LAST_DIES)
+        told = [one for one in caplog.messages if "begin anew" in one]
+    assert len(told) == 1
+    assert "the worker process died during step: it exited (exit code" in told[0]
+    assert "sub-environments [2, 3]" in told[0]
+
+
+@lanes
 def test_a_fresh_jail_has_no_attributes_of_the_last(lane: str) -> None:
     """What was set in a jail that was given up, no row of the next one gets."""
     with made(lane, timeouts={"step_s": 0.05}) as suites:
