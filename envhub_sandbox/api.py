@@ -16,7 +16,7 @@ from envhub_sandbox.dependencies.prepare import provided
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.hub import store
 from envhub_sandbox.hub.snapshot import named
-from envhub_sandbox.policy import Limits, Policy, Timeouts, limits_from, policy_from, timeouts_from
+from envhub_sandbox.policy import Limits, Policy, Timeouts, policy_from, timeouts_from
 from envhub_sandbox.sandboxes import inprocess
 from envhub_sandbox.sandboxes.base import Sandbox
 from envhub_sandbox.session.env_session import EnvSession
@@ -74,7 +74,7 @@ def make_env(
         env_kwargs: Further keyword arguments for the repository's ``make_env``.
         policy: What the code may reach; see ``Policy``.
         timeouts: How long operations may take; see ``Timeouts``.
-        limits: Hard caps; replaces ``policy.limits``.
+        limits: Hard caps; a mapping changes those of ``policy.limits`` that it names.
         token: As in huggingface_hub.
         endpoint: As in huggingface_hub.
         python: The interpreter that runs the repository; this one by default. It needs cloudpickle,
@@ -142,12 +142,13 @@ def make_env(
             "dependencies={...} is for sandbox='process'. For a container, build an image: envhub "
             "image build REF; on another host, whoever runs the server chooses its packages"
         )
-    chosen_policy = policy_from(policy, limits_from(limits))
+    chosen_policy = policy_from(policy, limits)
     chosen_timeouts = timeouts_from(timeouts)
     place = None if sandbox is None else _sandbox(sandbox, server_key)
     runs_on = Runtime(arguments.interpreter(python))
     if sandbox == "process":
         arguments.check_executable(runs_on.python)
+        arguments.check_readable(chosen_policy.readable)
     snapshot = named(reference, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
     if place is None:
         envs = inprocess.make(snapshot, n_envs, use_async_envs, config, further)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, SupportsIndex
 
@@ -119,3 +119,17 @@ def check_executable(python: str) -> None:
             f"python is {python!r}, which is no program; it takes the path of an interpreter, such "
             "as '.venv/bin/python'"
         )
+
+
+def check_readable(paths: Iterable[str]) -> None:
+    """Refuse to grant what is not on this machine: it would silently not be there.
+
+    Raises:
+        PolicyError: A path leads to nothing.
+    """
+    for path in paths:
+        if not os.path.exists(path):
+            raise PolicyError(
+                f"policy: readable holds {path!r}, and there is no such file or folder on this "
+                "machine"
+            )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from numbers import Real
 from typing import Any, TypeVar
 
@@ -140,13 +140,30 @@ class Policy:
 T = TypeVar("T", Policy, Limits, Timeouts)
 
 
-def policy_from(value: Policy | Mapping[str, Any] | None, limits: Limits | None) -> Policy:
-    """A policy from what ``make_env`` was given; ``limits`` replaces the policy's own."""
+def policy_from(
+    value: Policy | Mapping[str, Any] | None, limits: Limits | Mapping[str, Any] | None
+) -> Policy:
+    """A policy from what ``make_env`` was given.
+
+    A mapping of ``limits`` changes those that it names. An object says all of them, so that beside
+    limits of the policy's own nobody could tell which are meant.
+
+    Raises:
+        PolicyError: It is no policy, or the limits are said twice.
+    """
     policy = _from(Policy, value, "policy")
-    if limits is None:
+    chosen = limits_from(limits)
+    if limits is None or chosen is None:
         return policy
-    values = {item.name: getattr(policy, item.name) for item in fields(policy)}
-    return Policy(**(values | {"limits": limits}))
+    if isinstance(limits, Mapping):
+        named = {name: getattr(chosen, name) for name in limits}
+        chosen = replace(policy.limits, **named)
+    elif policy.limits not in (Limits(), chosen):
+        raise PolicyError(
+            "limits is given beside the limits of the policy: give one of them, or limits={...} "
+            "with those that are to be other than the policy's"
+        )
+    return replace(policy, limits=chosen)
 
 
 def limits_from(value: Limits | Mapping[str, Any] | None) -> Limits | None:

@@ -215,14 +215,14 @@ class _Run:
 
     def _roll_out(self, env: Any, bar: Bar, writer: VideoWriter | None) -> Rollout:
         from envhub_sandbox.cli.rollout.episodes import rollout
-        from envhub_sandbox.cli.rollout.video import first_frame
+        from envhub_sandbox.cli.rollout.video import frame_of
 
         filming = writer is not None
 
         def observe(counter: EpisodeCounter) -> None:
             nonlocal filming
             if writer is not None and filming:
-                writer.add(first_frame(env.render(), env.render_mode))
+                writer.add(frame_of(env))
                 filming = counter.wants(0)  # so that the last episode's last frame is in
             bar.update(counter)
 

@@ -61,7 +61,8 @@ def _batch_of_arrays(space: gym.Space[Any], value: Any, count: int, where: str =
     array = value if type(value) is np.ndarray else _array(space, value, where)
     shape = (count, *(space.shape or ()))
     dtype = np.dtype(space.dtype)
-    if array.shape != shape or array.dtype.kind not in _kinds_for(space):
+    # an empty list has numbers of no kind
+    if array.shape != shape or (array.size and array.dtype.kind not in _kinds_for(space)):
         kind = ActionError if array.shape else ActionTypeError
         raise kind(
             f"{where}: expected {dtype} of shape {shape} for {space} in {count} sub-environments, "

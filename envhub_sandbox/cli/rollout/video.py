@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.errors import EnvHubError, RemoteEnvError
+from envhub_worker.protocol.codec.inert import one_line
 
 MAX_SIDE = 4096
 """Pixels: H.264 encoders stop there, and a frame stays below 50 MB."""
@@ -58,6 +59,16 @@ def fps_of(metadata: Any) -> float:
     if isinstance(fps, (int, float)) and MIN_FPS <= fps <= MAX_FPS:
         return float(fps)
     return DEFAULT_FPS
+
+
+def frame_of(env: Any) -> Frame:
+    """What the first sub-environment renders; raises as ``first_frame`` does."""
+    try:
+        rendered = env.render()
+    except RemoteEnvError as error:
+        reason = one_line(f"{error.type_name}: {error.message}", 300)
+        raise VideoError(f"render() failed: {reason}. {_advice(env.render_mode)}") from error
+    return first_frame(rendered, env.render_mode)
 
 
 def first_frame(rendered: Any, render_mode: str | None) -> Frame:

@@ -16,7 +16,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from tests.compliance.differential.scripted import Scripted
 from tests.compliance.differential.spaces import space
-from tests.compliance.theirs.through_sandbox import vector
+from tests.compliance.theirs.through_sandbox import by_value, vector
+from tests.support import handed
 from tests.support.compare import differences
 
 Call = tuple[str, tuple[Any, ...], dict[str, Any]]
@@ -31,6 +32,7 @@ class Case:
         mode: The autoreset mode.
         is_async: Whether the repository makes an ``AsyncVectorEnv``.
         options: What else ``make_env`` is told.
+        observation_mode: How the sub-environments' spaces are taken together.
     """
 
     number: int
@@ -38,6 +40,7 @@ class Case:
     mode: AutoresetMode
     is_async: bool
     options: dict[str, Any]
+    observation_mode: str
 
     def __str__(self) -> str:
         words = [f"{len(self.env_fns)} sub-environments", self.mode.value, str(self.options)]
@@ -58,7 +61,11 @@ def case(number: int) -> Case:
         options["num_workers"] = draw.randrange(1, 4)
     # its repository's own class is driven as it is: a space without a layout has no async there
     is_async = draw.random() < 0.5 and "env_kwargs" not in options
-    return Case(number, list(env_fns), draw.choice(list(AutoresetMode)), is_async, options)
+    mode = draw.choice(list(AutoresetMode))
+    observing = "same" if loose else draw.choice(["same", "same", "different"])
+    if observing == "different":  # driven as it is, too: classes by value do not pass its pipes
+        is_async = False
+    return Case(number, list(env_fns), mode, is_async, options, observing)
 
 
 def made(*args: Any) -> gym.Env[Any, Any]:
@@ -77,10 +84,20 @@ def calls(drawn: Case, reference: SyncVectorEnv, number: int) -> list[Call]:
 def _call(draw: Random, reference: SyncVectorEnv) -> Call:
     name = draw.choice(["step"] * 8 + ["reset", "reset", *_OTHERS])
     if name == "step":
-        return "step", (reference.action_space.sample(),), {}
+        actions = reference.action_space.sample()
+        return "step", (listed(actions) if draw.random() < 0.3 else actions,), {}
     if name == "reset":
         return "reset", (), _reset(draw, reference.num_envs)
     return _OTHERS[name](draw, reference.num_envs)
+
+
+def listed(actions: Any) -> Any:
+    """The same actions in lists of Python's numbers."""
+    if isinstance(actions, dict):
+        return {key: listed(item) for key, item in actions.items()}
+    if isinstance(actions, tuple) and not hasattr(actions, "_fields"):
+        return tuple(map(listed, actions))
+    return actions.tolist() if isinstance(actions, np.ndarray) and actions.ndim else actions
 
 
 def _reset(draw: Random, count: int) -> dict[str, Any]:
@@ -97,8 +114,29 @@ def _each(draw: Random, count: int) -> Call:
     return "set_attr", ("note", values), {}
 
 
+_HANDED = {
+    name: value
+    for name, value in (handed.PLAIN | handed.PICKLED).items()
+    # what is large, or has an address in its repr
+    if not name.startswith(("long", "many", "huge", "memoryview", "partial", "Random", "Generator"))
+}
+
+
+def _held(draw: Random, count: int) -> Call:
+    values = [_HANDED[draw.choice(list(_HANDED))] for _ in range(count)]
+    return "set_attr", ("held", values), {}
+
+
+def _told(draw: Random, count: int) -> Call:
+    given, named = (_HANDED[draw.choice(list(_HANDED))] for _ in range(2))
+    return "call", ("told", given), {"named": named}
+
+
 _OTHERS: dict[str, Callable[[Random, int], Call]] = {
     "told": lambda draw, count: ("call", ("told", draw.randrange(9), "x"), {"deep": {"a": [1.5]}}),
+    "told of anything": _told,
+    "held": _held,
+    "holds": lambda draw, count: ("call", ("holds",), {}),
     "fails": lambda draw, count: ("call", ("fails", draw.choice(["value", "key", "zero"])), {}),
     "missing": lambda draw, count: ("call", ("not_here",), {}),
     "get_attr": lambda draw, count: ("get_attr", (draw.choice(["note", "number"]),), {}),
@@ -109,31 +147,42 @@ _OTHERS: dict[str, Callable[[Random, int], Call]] = {
 }
 
 
-def difference(drawn: Case, number: int) -> str | None:
-    """The first difference in words, or None if there is none in so many calls."""
-    with warnings.catch_warnings():
+def difference(drawn: Case, number: int, further: dict[str, Any] | None = None) -> str | None:
+    """The first difference in words, or None if there is none in so many calls.
+
+    Args:
+        drawn: The case.
+        number: How many calls follow the first reset.
+        further: What else ``make_env`` is told: where to run it, for instance.
+    """
+    modes: dict[str, Any] = {
+        "autoreset_mode": drawn.mode,
+        "observation_mode": drawn.observation_mode,
+    }
+    with warnings.catch_warnings(), by_value():
         warnings.simplefilter("ignore")
-        reference = SyncVectorEnv(drawn.env_fns, autoreset_mode=drawn.mode)
+        reference = SyncVectorEnv(drawn.env_fns, **modes)
         env = vector(
             drawn.env_fns,
             use_async_envs=drawn.is_async,
-            options=drawn.options,
-            autoreset_mode=drawn.mode,
+            options={**drawn.options, **(further or {})},
+            **modes,
         )
         try:
-            return _first(reference, env, calls(drawn, reference, number))
+            return _first(drawn, reference, env, calls(drawn, reference, number))
         finally:
             env.close()
             reference.close()
 
 
-def _first(reference: Any, env: Any, asked: list[Call]) -> str | None:
+def _first(drawn: Case, reference: Any, env: Any, asked: list[Call]) -> str | None:
+    draw = Random(f"halves {drawn.number}")
     for position, call in enumerate(asked):
-        expected, actual = _outcome(reference, call), _outcome(env, call)
+        expected, actual = _outcome(reference, call), _outcome(env, call, draw.random() < 0.3)
         name, args, kwargs = call
         where = f"call {position}, {name}{args[:1] if name != 'step' else ''} {kwargs or ''}"
         if isinstance(expected, Exception) or isinstance(actual, Exception):
-            if not _same_failure(expected, actual):
+            if not _same_failure(drawn, name, expected, actual):
                 return f"{where}: expected {expected!r:.500}, got {actual!r:.500}"
             if name in ("step", "reset"):  # half of the sub-environments have been asked
                 return None
@@ -144,16 +193,28 @@ def _first(reference: Any, env: Any, asked: list[Call]) -> str | None:
     return None
 
 
-def _outcome(env: Any, call: Call) -> Any:
+def _outcome(env: Any, call: Call, in_halves: bool = False) -> Any:
+    """What comes of a call; ``in_halves`` sends it, and waits for it then."""
     name, args, kwargs = deepcopy(call)
     try:
+        if in_halves and name in ("reset", "step", "call"):
+            getattr(env, f"{name}_async")(*args, **kwargs)
+            return getattr(env, f"{name}_wait")()
         found = getattr(env, name)
         return found(*args, **kwargs) if callable(found) else found
     except Exception as error:
         return error
 
 
-def _same_failure(expected: Any, actual: Any) -> bool:
-    """Whether both failed alike; that some episode is over may be noticed at another moment."""
-    over = isinstance(actual, AssertionError)
-    return isinstance(expected, Exception) and (over or isinstance(actual, type(expected)))
+def _same_failure(drawn: Case, name: str, expected: Any, actual: Any) -> bool:
+    """Whether both failed alike, and what a call raised says the same.
+
+    That an episode is over is noticed in its own process, while another may fail by itself.
+    """
+    if not isinstance(expected, Exception) or not isinstance(actual, Exception):
+        return False
+    if name == "step" and drawn.mode is AutoresetMode.DISABLED:
+        return isinstance(actual, (type(expected), AssertionError))
+    if name == "call" and str(expected) not in str(actual):
+        return False
+    return isinstance(actual, type(expected))

@@ -37,6 +37,7 @@ class Scripted(gym.Env[Any, Any]):
         self.render_mode = "rgb_array"
         self.variety = variety
         self.note: Any = None
+        self.held: Any = None
         self.number = number
         self.draw = random.Random(f"{number} {index}")
         self.observation_space.seed(1000 * number % 2**31 + index)
@@ -65,6 +66,10 @@ class Scripted(gym.Env[Any, Any]):
     def told(self, *args: Any, **kwargs: Any) -> Any:
         """What it was given, and a value of any kind."""
         return said((args, kwargs)), self.value(self.draw.choice(KINDS), 0)
+
+    def holds(self) -> str:
+        """What was set, in words: it may be what does not come back."""
+        return said(self.held)
 
     def fails(self, kind: str) -> None:
         """Raises one of Python's own exceptions."""

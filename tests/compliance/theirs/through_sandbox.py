@@ -48,7 +48,7 @@ def vector(
     """
     env_fns = list(env_fns)
     options = dict(options or {})
-    with _by_value():
+    with by_value():
         pickled = cloudpickle.dumps((env_fns, kwargs))
     suites = make_env(
         REPOSITORY,
@@ -63,10 +63,12 @@ def vector(
 
 
 @contextlib.contextmanager
-def _by_value() -> Iterator[None]:
+def by_value() -> Iterator[None]:
     """The tests' own modules are not to be had in the sandbox: what is in them travels along."""
     named = [name for name in sys.modules if name.partition(".")[0] in ("tests", "conftest")]
     modules = [sys.modules[name] for name in named if hasattr(sys.modules[name], "__file__")]
+    known = cloudpickle.list_registry_pickle_by_value()
+    modules = [module for module in modules if module.__name__ not in known]
     for module in modules:
         cloudpickle.register_pickle_by_value(module)
     try:

@@ -16,7 +16,9 @@ from envhub_sandbox.cli.rollout.video import (
     check_target,
     first_frame,
     fps_of,
+    frame_of,
 )
+from envhub_sandbox.errors import RemoteEnvError
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 
@@ -175,3 +177,18 @@ def test_hostile_frames_are_refused_before_they_are_copied(rendered: Any) -> Non
     """Ten thousand million pixels, objects, nothing."""
     with pytest.raises(VideoError):
         first_frame(rendered, None)
+
+
+def test_an_environment_that_cannot_render_says_what_to_do() -> None:
+    """Whatever its ``render`` raises is told, with what a video needs."""
+
+    class Blind:
+        render_mode = None
+
+        def render(self) -> None:
+            raise RemoteEnvError("NotImplementedError", "no\x1b[2J picture")
+
+    with pytest.raises(VideoError, match="render_mode=rgb_array") as caught:
+        frame_of(Blind())
+    assert "NotImplementedError" in str(caught.value)
+    assert "\x1b" not in str(caught.value)

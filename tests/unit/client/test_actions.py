@@ -54,6 +54,7 @@ def test_samples_of_the_batched_space_are_taken_as_they_are(
     [
         (DISCRETE, [0, 2], [0, 2]),
         (DISCRETE, (0, 2), [0, 2]),
+        (spaces.Box(0, 1, (0,), np.int16), [[], []], [[], []]),
         (DISCRETE, np.array([0, 2], np.int8), np.array([0, 2], np.int8)),
         (DISCRETE, np.array([False, True]), np.array([False, True])),
         (BOX, [[0.5, 1], [0, 0]], np.array([[0.5, 1], [0, 0]])),

@@ -115,10 +115,20 @@ def test_lists_become_tuples() -> None:
     assert Policy(readable=["/data"]) == Policy(readable=("/data",))  # type: ignore[arg-type]
 
 
-def test_limits_argument_replaces_the_policys_own() -> None:
-    """``make_env(limits=...)`` is the last word, and leaves the rest of the policy alone."""
-    policy = policy_from({"network": "host", "limits": {"processes": 5}}, Limits(processes=7))
-    assert policy == Policy(network="host", limits=Limits(processes=7))
+def test_limits_argument_changes_what_it_names() -> None:
+    """``make_env(limits=...)`` is the last word on these, and leaves the others alone."""
+    given = {"network": "host", "limits": {"processes": 5, "output_bytes": 9}}
+    policy = policy_from(given, {"processes": 7})
+    assert policy == Policy(network="host", limits=Limits(processes=7, output_bytes=9))
+    assert policy_from({"gpu": True}, Limits(processes=7)).limits == Limits(processes=7)
+
+
+def test_limits_said_twice_are_refused() -> None:
+    """An object says all of them: neither of two can be meant to be dropped."""
+    given = {"limits": {"processes": 5}}
+    with pytest.raises(PolicyError, match="give one of them"):
+        policy_from(given, Limits(processes=7))
+    assert policy_from(given, Limits(processes=5)).limits.processes == 5
 
 
 def test_mappings_and_objects_mean_the_same() -> None:

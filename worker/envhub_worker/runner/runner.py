@@ -139,7 +139,7 @@ class Runner:
 
     def _load(self, request: m.Load | m.LoadTask) -> list[Task]:
         self._stage = "import"
-        make_env = loader.import_entry(self._snapshot, self._entry, os.environ["HOME"])
+        make_env = loader.import_entry(self._snapshot, self._entry, _scratch())
         self._stage = "make_env"
         with standing_in():
             result = loader.call_make_env(make_env, request)
@@ -292,6 +292,12 @@ class Runner:
         if env is not None:
             env.close()
         return m.Value(None)
+
+
+def _scratch() -> str:
+    """A folder of the jail's own: its home, unless the caller has granted another one's name."""
+    home = os.environ.get("HOME", "")
+    return home if os.access(home, os.W_OK | os.X_OK) else os.getcwd()
 
 
 def _caller(env: Any) -> Callable[..., Any]:

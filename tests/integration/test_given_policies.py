@@ -1,0 +1,46 @@
+"""What a policy grants reaches the repository, or is refused with what to do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import PolicyError
+
+REPOSITORY = """
+import os
+import gymnasium as gym
+
+
+def make_env(n_envs=1, use_async_envs=False):
+    print(os.environ["HOME"])
+    return gym.make_vec("CartPole-v1", n_envs, vectorization_mode="sync")
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A repository that looks at its home."""
+    (tmp_path / "env.py").write_text(REPOSITORY)
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", ["HOME", "TMPDIR"])
+def test_a_granted_home_does_not_break_loading(
+    folder: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The variable has the caller's value; what we write lies in a folder of the jail's own."""
+    monkeypatch.setenv(name, "/nowhere/at/all")
+    env = make_env(folder, policy={"environment": (name,)}).env
+    env.reset(seed=1)
+    env.close()
+
+
+def test_a_path_that_is_not_there_is_refused(folder: Path) -> None:
+    """Before anything is started; one that is there is not."""
+    missing = str(folder / "missing")
+    with pytest.raises(PolicyError, match="there is no such file or folder"):
+        make_env(folder, policy={"readable": (missing,)})
+    make_env(folder, policy={"readable": (str(folder),)}).close()
