@@ -161,9 +161,15 @@ class RelayLane:
 
     def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
         """See ``Lane``. Trust: input from the worker."""
-        for reply in self._answers:
+        # not kept: a large batch that its owner has dropped is memory for the next
+        answers, self._answers = self._answers, []
+        for reply in answers:
             check(reply)
-        return self._results.step([typed(reply, m.StepDone) for reply in self._answers], infos)
+        try:
+            return self._results.step([typed(reply, m.StepDone) for reply in answers], infos)
+        except batches.Misfit:
+            self._answers = answers  # to be joined once more, with other infos
+            raise
 
     def request(self, operation: str, messages: Sequence[m.Message]) -> Request:
         """See ``Lane``."""
