@@ -37,10 +37,11 @@ def main() -> None:
     parser.add_argument("variant", choices=(*VARIANTS, LAZY))
     parser.add_argument("folder")
     parser.add_argument("--tasks", type=int, default=10)
-    parser.add_argument("--heavy", action="store_true")
+    parser.add_argument("--heavy", metavar="FOLDER", default="", help="where the simulator lies")
     parser.add_argument("--evaluator", choices=(LOOP, LEROBOT), default=LOOP)
     options = parser.parse_args()
-    given = {"tasks": options.tasks, "heavy": options.heavy}
+    heavy = options.heavy
+    given = {"tasks": options.tasks, "heavy": bool(heavy), "packages": heavy}
     prepare = _with_lerobot if options.evaluator == LEROBOT else _with_loop
     play = prepare(options.variant, options.folder, given)
     imports_cpu_s = _cpu_s()
@@ -99,9 +100,9 @@ def _ours(
     from envhub_sandbox import make_env
 
     def play() -> list[list[float]]:
-        with make_env(
-            folder, N_ENVS, use_async, env_kwargs=given, timeouts={"startup_s": 300}
-        ) as suites:
+        policy = {"readable": [given["packages"]] if given["packages"] else []}
+        options: dict[str, Any] = {"policy": policy, "timeouts": {"startup_s": 300}}
+        with make_env(folder, N_ENVS, use_async, env_kwargs=given, **options) as suites:
             return evaluate(suites)
 
     return play
@@ -109,7 +110,7 @@ def _ours(
 
 def _built_later(folder: str, given: dict[str, Any], later: Callable[..., Any]) -> Suites:
     """The suite, of environments that are built when they are used."""
-    sys.path.insert(0, folder)
+    sys.path[:0] = [folder, *([given["packages"]] if given["packages"] else [])]
     repository = importlib.import_module("env")
     like = repository.Reach(0)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import py_compile
 import statistics
 import subprocess
 import sys
@@ -27,6 +28,7 @@ from benchmarks.interpreters import PEER_VENVS
 from benchmarks.watching import Watched, watch
 from benchmarks.workloads import REPOSITORIES
 
+HEAVY_TASKS = 6
 _MODULE_BYTES = 2_000_000
 _FIRST_ROUNDS = 7
 
@@ -38,7 +40,7 @@ class Suite:
     Attributes:
         folder: The repository.
         tasks: How many it has.
-        heavy: Whether each is a simulator.
+        heavy: Where the simulator lies that each of them is; empty if none is.
         python: The interpreter.
         evaluator: Its module that evaluates.
     """
@@ -47,13 +49,13 @@ class Suite:
     python: str
     evaluator: str
     tasks: int = 10
-    heavy: bool = False
+    heavy: str = ""
 
     def evaluate(self, variant: str, *, memory: bool = False) -> Watched:
         """Once, in an interpreter of its own."""
         command = [self.python, "-m", "benchmarks.evaluations", variant, self.folder]
         command += ["--tasks", str(self.tasks), "--evaluator", self.evaluator]
-        command += ["--heavy"] if self.heavy else []
+        command += ["--heavy", self.heavy] if self.heavy else []
         path = os.pathsep.join([str(ROOT), str(ROOT / "worker")])
         return watch(command, memory=memory, variables={"PYTHONPATH": path})
 
@@ -150,7 +152,9 @@ def _tables(options: argparse.Namespace, suite: Suite) -> Iterator[str]:
         for part in ("light", "heavy"):
             if part in options.parts:
                 rounds = options.rounds if part == "light" else max(options.rounds // 2, 1)
-                chosen = replace(suite, heavy=part == "heavy")
+                chosen = suite
+                if part == "heavy":
+                    chosen = replace(suite, heavy=options.simulator, tasks=HEAVY_TASKS)
                 yield f"{part}: {chosen.tasks} tasks"
                 yield from _rows(compare(chosen, rounds, options.variants))
         if "growth" in options.parts:
@@ -201,12 +205,20 @@ def main() -> None:
         folder = Path(parent) / "suite"
         folder.mkdir()
         (folder / "env.py").write_text((REPOSITORIES / "suite" / "env.py").read_text())
-        (folder / "simulator.py").write_text(_simulator())
+        options.simulator = _install_simulator(Path(parent) / "packages")
         os.chmod(parent, 0o755)
         python = options.lerobot or sys.executable
         suite = Suite(str(folder), python, evaluator, options.tasks)
         for line in _tables(options, suite):
             print(line, flush=True)
+
+
+def _install_simulator(packages: Path) -> str:
+    """Where it is, with its byte code, as what is installed has."""
+    packages.mkdir()
+    (packages / "simulator.py").write_text(_simulator())
+    py_compile.compile(str(packages / "simulator.py"), doraise=True)
+    return str(packages)
 
 
 def _simulator() -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 
 import gymnasium as gym
@@ -50,8 +51,16 @@ class Reach(gym.Env):
         return {"agent_pos": np.concatenate([self.place, self.target])}
 
 
-def make_env(n_envs: int = 1, use_async_envs: bool = False, tasks: int = 10, heavy: bool = False):
-    """A mapping of tasks, as LeRobot expects it."""
+def make_env(
+    n_envs: int = 1,
+    use_async_envs: bool = False,
+    tasks: int = 10,
+    heavy: bool = False,
+    packages: str = "",
+):
+    """A mapping of tasks, as LeRobot expects it; ``packages`` is where the simulator lies."""
+    if packages:
+        sys.path.append(packages)
     # what is heavy is so once a task, as where sub-environments share a simulator
     kind = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv
 
