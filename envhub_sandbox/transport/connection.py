@@ -103,7 +103,7 @@ class WorkerClient:
 
     def hello(self, deadline: Deadline) -> m.Welcome:
         """Agree on a protocol version."""
-        self._compression = ""
+        self._compression, self.version = "", 0  # any server reads how this is said
         session = SESSION if self._far is None else far_session()
         greeting = m.Hello(m.OLDEST_VERSION, m.VERSION, session)
         reply, _ = self.request(greeting, deadline=deadline)
@@ -144,7 +144,9 @@ class WorkerClient:
                 f"the worker speaks protocol 1, and {type(message).__name__} needs 2: upgrade it"
             )
         request_id = next(self._ids)
-        self._send(request_id, [*m.pack(message, request_id), *payload])
+        numbered = self.version >= m.FIRST_NUMBERED_VERSION
+        header = m.pack_header(message, request_id, numbered=numbered)
+        self._send(request_id, [*header, *payload])
         return request_id
 
     def _send(self, request_id: int, frames: list[Buffer]) -> None:
@@ -174,7 +176,7 @@ class WorkerClient:
             if self._link is not None:
                 with UNTRUSTED:
                     frames = compression.unpack_frames(frames, self._limits)
-            reply_id, reply = m.unpack(frames[:1], limits=self._limits)
+            reply_id, reply, _ = m.unpack_header(frames[0], limits=self._limits)
             if reply_id != request_id:
                 self._sent.pop(reply_id, None)
                 self.stale_replies += 1

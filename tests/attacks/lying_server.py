@@ -26,6 +26,7 @@ from gymnasium.vector.utils import batch_space
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.manifest import EnvManifest, Manifest, encode_env, encode_manifest
+from envhub_worker.protocol.runtime import OWN, Runtime
 
 Frames = list[Buffer]
 NUM_ENVS = 2
@@ -45,21 +46,24 @@ class Asked:
         request: The message for the runner, or for the server where there is no runner in it.
         relayed: Whether it was for the runner.
         honest: The honest answer.
+        numbered: Whether the client's id stands in front of its message.
     """
 
     request_id: int
     request: m.Message
     relayed: bool
     honest: m.Message
+    numbered: bool
 
     def answer(self, message: m.Message | Frames, request_id: int | None = None) -> Frames:
         """An answer to this request: the server's own, or the runner's wrapped as it is relayed."""
         number = self.request_id if request_id is None else request_id
         if not self.relayed:
             assert isinstance(message, m.Message)
-            return m.pack(message, number)
-        frames = m.pack(message, number) if isinstance(message, m.Message) else message
-        return [*m.pack(m.Relayed((len(frames),)), number), *frames]
+            return m.pack_header(message, number, numbered=self.numbered)
+        frames = m.pack(message) if isinstance(message, m.Message) else message
+        relayed = m.Relayed((len(frames),))
+        return [*m.pack_header(relayed, number, numbered=self.numbered), *frames]
 
 
 @dataclass
@@ -94,12 +98,12 @@ class LyingServer:
 
     def _answers(self, frames: list[bytes]) -> list[Frames]:
         self.heard += b"".join(frames)
-        request_id, request = m.unpack(frames[:1])
+        request_id, request, numbered = m.unpack_header(frames[0])
         relayed = isinstance(request, m.Relay)
         if relayed:
             _, request = m.unpack(frames[1:], unpickler=lambda data: data)
         self.asked.append(request)
-        asked = Asked(request_id, request, relayed, honest(request))
+        asked = Asked(request_id, request, relayed, honest(request), numbered)
         lie = self.lies.get(type(request))
         return lie(asked) if lie else [asked.answer(asked.honest)]
 
@@ -122,7 +126,7 @@ class LyingSandbox:
     def __init__(self, server: LyingServer) -> None:
         self._server = server
 
-    def acquire(self, store: Path) -> LyingServer:
+    def acquire(self, store: Path, runtime: Runtime = OWN) -> LyingServer:
         """The liar."""
         return self._server
 

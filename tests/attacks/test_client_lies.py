@@ -519,7 +519,7 @@ def test_stale_unasked_and_double_answers_are_dropped(liar: LyingServer, folder:
 
     def lie(asked: Asked) -> list[Frames]:
         right = asked.request_id
-        stale = [asked.answer(evil, number) for number in (0, right - 1, -1, 2**62)]
+        stale = [asked.answer(evil, number) for number in (1, right - 1, 2**62, 2**63 - 1)]
         return [*stale, asked.answer(good), asked.answer(evil), *stale]
 
     liar.lies[m.Step] = lie

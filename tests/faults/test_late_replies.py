@@ -16,6 +16,7 @@ from envhub_sandbox import errors
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.codec import Buffer
 
 _SOON_S = 0.02
 
@@ -28,6 +29,7 @@ def connected() -> Iterator[tuple[WorkerClient, zmq.Socket[bytes]]]:
         router.bind(f"ipc://{folder}/server")
         never, end = os.pipe()
         client = WorkerClient(f"ipc://{folder}/server", never)
+        client.version = m.VERSION
         try:
             yield client, router
         finally:
@@ -35,6 +37,11 @@ def connected() -> Iterator[tuple[WorkerClient, zmq.Socket[bytes]]]:
             router.close(0)
             os.close(never)
             os.close(end)
+
+
+def answer(number: int) -> list[Buffer]:
+    """What the server says to a request."""
+    return m.pack_header(m.Output(f"to {number}"), number, numbered=True)
 
 
 # which earlier requests are answered late, and how often, before the next one is
@@ -49,13 +56,13 @@ def test_late_replies_are_dropped_and_counted(plan: list[list[int]], data: st.Da
         for number, earlier in enumerate(plan):
             request = client.send(m.ReadOutput(0, str(number)))
             identity, frame = router.recv_multipart()
-            assert m.unpack([frame])[0] == request
+            assert m.unpack_header(frame)[::2] == (request, True)
             stale = [one + 1 for one in earlier if one + 1 < request]
             for one in stale:
-                router.send_multipart([identity, *m.pack(m.Output(f"to {one}"), one)])
+                router.send_multipart([identity, *answer(one)])
             answered = data.draw(st.booleans())
             if answered:
-                router.send_multipart([identity, *m.pack(m.Output(f"to {request}"), request)])
+                router.send_multipart([identity, *answer(request)])
                 reply, _ = client.receive(request, Deadline(60))
                 assert reply == m.Output(f"to {request}")
                 dropped += len(stale)

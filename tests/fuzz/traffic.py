@@ -27,7 +27,7 @@ _LARGEST = 1 << 16
 @contextmanager
 def recording(found: dict[tuple[object, ...], Frames]) -> Iterator[None]:
     """Every message that is unpacked here meanwhile, one of each kind and size."""
-    unpack = m.unpack
+    unpack, unpack_header = m.unpack, m.unpack_header
 
     def listen(frames: Sequence[Any], **options: Any) -> Any:
         copied = [bytes(frame) for frame in frames]
@@ -37,11 +37,16 @@ def recording(found: dict[tuple[object, ...], Frames]) -> Iterator[None]:
             found.setdefault(key, copied)
         return number, message
 
-    m.unpack = listen  # type: ignore[assignment]
+    def listen_to_header(frame: Any, **options: Any) -> Any:
+        header = unpack_header(frame, **options)
+        listen(m.pack(header.message))
+        return header
+
+    m.unpack, m.unpack_header = listen, listen_to_header
     try:
         yield
     finally:
-        m.unpack = unpack
+        m.unpack, m.unpack_header = unpack, unpack_header
 
 
 def record() -> list[Frames]:

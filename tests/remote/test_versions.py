@@ -83,6 +83,23 @@ def test_an_older_client_is_sent_texts(
         assert isinstance(found, kind)
 
 
+def test_a_client_with_its_ids_inside_is_served(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Up to version 7 they were the second item of each message: so it asks, and so it is told."""
+    monkeypatch.setattr(m, "VERSION", m.FIRST_NUMBERED_VERSION - 1)
+    asked: list[bool] = []
+    pack = m.pack_header
+
+    def noted(message: m.Message, number: int, *, numbered: bool) -> list[Any]:
+        asked.append(numbered)
+        return pack(message, number, numbered=numbered)
+
+    monkeypatch.setattr(m, "pack_header", noted)
+    with make_env(str(SAMPLES / "counter"), n_envs=2, lane="frames") as suites:
+        suites.env.reset(seed=1)
+        suites.env.step(suites.env.action_space.sample())
+    assert set(asked) == {False}
+
+
 @contextmanager
 def worker_of_version_1(tmp_path: Path) -> Iterator[tuple[str, int]]:
     """A worker that knows only version 1: its endpoint, and a descriptor that never ends."""
@@ -96,11 +113,12 @@ def worker_of_version_1(tmp_path: Path) -> Iterator[tuple[str, int]]:
         while not stop.is_set():
             if router.poll(50):
                 identity, header = router.recv_multipart()
-                request_id, request = m.unpack([header])
-                assert isinstance(request, m.Hello)
-                assert request.oldest == 1  # a worker of version 1 compares only with that
-                reply = m.pack(m.Welcome(1, "0.1.0", 4242), request_id)
-                router.send_multipart([identity, *reply])
+                request_id, request = m.unpack([header])  # it knows of no numbered headers
+                reply: m.Message = m.Status(())
+                if isinstance(request, m.Hello):
+                    assert request.oldest == 1  # a worker of version 1 compares only with that
+                    reply = m.Welcome(1, "0.1.0", 4242)
+                router.send_multipart([identity, *m.pack(reply, request_id)])
 
     thread = threading.Thread(target=serve)
     thread.start()
@@ -119,6 +137,7 @@ def test_a_worker_of_version_1_is_understood(tmp_path: Path) -> None:
         client = WorkerClient(endpoint, never)
         try:
             assert client.hello(Deadline(30)).version == 1
+            assert client.request(m.GetStatus(), deadline=Deadline(30)) == (m.Status(()), [])
             with pytest.raises(VersionMismatchError, match="KeepJail needs 2: upgrade it"):
                 client.send(m.KeepJail(1))
         finally:

@@ -125,15 +125,15 @@ class Server:
         try:
             if self._compression(identity, key):
                 frames[:] = compression.unpack_frames(frames, self._limits)
-            request_id, request = m.unpack(frames[:1], limits=self._limits)
+            header = m.unpack_header(frames[0], limits=self._limits)
         except Exception as error:
             self._refuse_unread(identity, key, frames[0], error)
             return
-        asker = Asker(identity, request_id, key=key)
+        asker = Asker(identity, header.number, key=key, numbered=header.numbered)
         if session is not None:
             asker = asker._replace(session=session.owner, version=session.version)
         try:
-            self._dispatch(asker, request, arrived)
+            self._dispatch(asker, header.message, arrived)
         except RefusedError as refused:
             self.refuse(asker, refused.error, refused.message, refused.layer, refused.fix)
         except Exception as error:
@@ -141,10 +141,11 @@ class Server:
 
     def _refuse_unread(self, identity: bytes, key: bytes, frame: Any, error: Exception) -> None:
         """A request that cannot be read: as long as its id can be, its sender need not wait."""
-        request_id = m.id_of(frame)
-        if request_id is None:
+        found = m.id_of(frame)
+        if found is None:
             return  # not our protocol
-        asker = Asker(identity, request_id, b"", key)
+        number, numbered = found
+        asker = Asker(identity, number, b"", key, numbered)
         known = isinstance(error, ProtocolError)
         said = str(error) if known else type(error).__name__
         self.refuse(asker, "LocalProtocolError", f"the request cannot be read: {said}")
@@ -173,7 +174,8 @@ class Server:
     def reply(self, asker: Asker, message: m.Message, payload: Sequence[Buffer] = ()) -> None:
         """Answer a request."""
         self._gate.answered(asker)
-        frames: list[Buffer] = [*m.pack(message, asker.request_id), *payload]
+        header = m.pack_header(message, asker.request_id, numbered=asker.numbered)
+        frames = [*header, *payload]
         agreed = self._compression(asker.identity, asker.key)
         if agreed:
             frames = compression.pack_frames(frames, agreed)

@@ -11,9 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from envhub_worker.protocol import compression
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import encode
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
+from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from tests.support.compare import assert_same
 from tests.support.wire import deep
 
@@ -120,10 +122,52 @@ def test_golden_bytes_are_read(name: str) -> None:
     assert_same(values_of(BY_NAME[name]), values_of(message))
 
 
-@pytest.mark.parametrize("request_id", [0, 1, 2**62])
-def test_request_ids_arrive(request_id: int) -> None:
-    """An id of any size in use comes back as it was."""
-    assert m.unpack(m.pack(m.Done(), request_id))[0] == request_id
+@pytest.mark.parametrize("request_id", [1, 200, 2**62, 2**63 - 1])
+@pytest.mark.parametrize("numbered", [False, True])
+def test_request_ids_arrive(request_id: int, numbered: bool) -> None:
+    """An id of any size comes back as it was, in front as within."""
+    [frame] = m.pack_header(m.Done(), request_id, numbered=numbered)
+    assert m.unpack_header(frame) == (request_id, m.Done(), numbered)
+    assert m.id_of(frame) == m.id_of(memoryview(frame)) == (request_id, numbered)
+
+
+def test_a_numbered_header_is_golden() -> None:
+    """A mark that no document's length can be, the id, and the message with an id of 0."""
+    [frame] = m.pack_header(m.CloseJail(3), REQUEST_ID, numbered=True)
+    assert bytes(frame).hex() == "ffffffff000000000000000704000000930a0003"
+
+
+def test_the_id_of_a_numbered_header_that_cannot_be_read_is_known() -> None:
+    """So its sender need not wait for an answer."""
+    [frame] = m.pack_header(m.CloseJail(3), REQUEST_ID, numbered=True)
+    for spoiled in (bytes(frame[:12]), bytes(frame[:-1]), bytes(frame) + b"x"):
+        assert m.id_of(spoiled) == (REQUEST_ID, True)
+        with pytest.raises(RemoteProtocolError):
+            m.unpack_header(spoiled)
+
+
+@pytest.mark.parametrize("number", [0, 2**63, 2**64 - 1])
+def test_a_number_that_nobody_can_answer_under_is_refused(number: int) -> None:
+    """A server that failed to pack its answer would end for everybody."""
+    [header] = m.pack(m.Done())
+    frame = b"\xff" * 4 + number.to_bytes(8, "big") + bytes(header)
+    assert m.id_of(frame) is None
+    with pytest.raises(RemoteProtocolError, match="nobody can answer"):
+        m.unpack_header(frame)
+
+
+def test_a_numbered_header_has_no_other_id() -> None:
+    """Two ids could mean two requests."""
+    [header] = m.pack(m.Done(), 5)
+    with pytest.raises(RemoteProtocolError, match="nobody can answer"):
+        m.unpack_header(b"\xff" * 4 + (5).to_bytes(8, "big") + bytes(header))
+
+
+@pytest.mark.parametrize("number", [148 + 25 * 256, 0x94190000_00000000 >> 1, 2**63 - 1])
+def test_a_numbered_header_is_never_taken_for_packed(number: int) -> None:
+    """Whatever the id: where ``Packed`` is looked for, its first byte stands."""
+    header = m.pack_header(m.Done(), number, numbered=True)
+    assert compression.unpack_frames(header, DEFAULT_LIMITS) == header
 
 
 @pytest.mark.parametrize(
@@ -153,6 +197,18 @@ def test_what_is_no_message_is_refused(value: object, complaint: str) -> None:
     """A kind, an id, a count of fields or a type that does not fit is the peer's fault."""
     with pytest.raises(RemoteProtocolError, match=complaint):
         m.unpack(encode(value))
+
+
+@given(st.binary(max_size=64), st.booleans())
+def test_arbitrary_headers_raise_nothing_but_protocol_errors(noise: bytes, marked: bool) -> None:
+    """Whatever arrives, it is a message with an id, or a RemoteProtocolError."""
+    frame = b"\xff" * 4 + noise if marked else noise
+    try:
+        number, message, _ = m.unpack_header(frame)
+    except RemoteProtocolError:
+        return
+    assert type(message) in m.KINDS.values()
+    assert number.bit_length() <= 63
 
 
 @given(st.lists(st.binary(max_size=64), max_size=3))

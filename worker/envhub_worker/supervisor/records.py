@@ -21,7 +21,7 @@ class Asker(NamedTuple):
     """Who asked: the reply goes to this identity under this id. Jails belong to its session.
 
     ``key`` was proved in the handshake; empty where none is needed. ``version`` is what its client
-    can read.
+    can read; ``numbered`` is how it asks and is answered (see ``messages.packing``).
     """
 
     identity: bytes
@@ -29,6 +29,7 @@ class Asker(NamedTuple):
     session: bytes = b""
     key: bytes = b""
     version: int = m.OLDEST_VERSION
+    numbered: bool = False
 
 
 @dataclass

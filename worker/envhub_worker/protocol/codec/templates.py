@@ -1,4 +1,4 @@
-"""What recurs in messages: documents that differ in nothing but the id, and in their arrays' bytes.
+"""What recurs in messages: documents that differ in nothing but their arrays' bytes.
 
 In a run of steps nearly every message is of that kind. So what the codec has made of a document
 is kept, when it is met again: a *form*, into which only the arrays are put. The key is the whole
@@ -28,7 +28,7 @@ from envhub_worker.protocol.codec.kinds import ARRAY, DOCUMENT_BYTES, TUPLE
 from envhub_worker.protocol.errors import MessageTooLargeError
 from envhub_worker.protocol.limits import WireLimits
 
-_MAX_DOCUMENT_BYTES = 1024
+MAX_DOCUMENT_BYTES = 1024
 _MAX_FORMS = 256
 _MAX_ITEMS = 32
 _MAX_TEXT = 256
@@ -36,16 +36,6 @@ _CONSTANTS = frozenset({int, bool, str, bytes, type(None)})
 _BITS = struct.Struct("<d")
 _TEXTS = frozenset({str, bytes})
 _NUMBERS = frozenset("biufc")
-_ID = 2
-"""Where a message's id begins: after the array's head and the kind, a byte each."""
-_ID_BYTES = {0xCC: 2, 0xCD: 3, 0xCE: 5, 0xCF: 9}
-_ID_FORMS = (
-    (b"", struct.Struct(">B"), 0x80),
-    (b"\xcc", struct.Struct(">B"), 1 << 8),
-    (b"\xcd", struct.Struct(">H"), 1 << 16),
-    (b"\xce", struct.Struct(">I"), 1 << 32),
-    (b"\xcf", struct.Struct(">Q"), 1 << 64),
-)
 
 K = TypeVar("K")
 F = TypeVar("F")
@@ -75,42 +65,34 @@ class Outgoing:
     Args:
         frames: What the codec has made of one of them.
         arrays: That one's arrays.
-        limits: For which it was encoded.
-
-    Attributes:
-        limits: For which it holds; None if it does not hold at all.
+        limits: For which it was encoded, and holds.
     """
 
-    __slots__ = ("_after", "_before", "_in_header", "limits")
+    __slots__ = ("_head", "_in_header", "limits")
 
     def __init__(self, frames: list[Buffer], arrays: list[Array], limits: WireLimits) -> None:
         document, tail, buffers = split(frames, limits)
-        cut = without_id(document)
-        self.limits = None if cut is None else limits
-        document = b"" if cut is None else cut[0]
-        self._before, self._after = document[:_ID], document[_ID:]
-        longest = DOCUMENT_BYTES.size + len(document) + len(pack_id(2**63)) + len(tail)
+        self.limits = limits
+        self._head = DOCUMENT_BYTES.pack(len(document)) + document
+        longest = len(self._head) + len(tail)
         self._in_header = (
             not buffers
             and longest <= min(limits.header_bytes, limits.message_bytes)
             and all(array.dtype.isnative for array in arrays)
         )
 
-    def frames(self, request_id: int, arrays: list[Array]) -> list[Buffer]:
+    def frames(self, arrays: list[Array]) -> list[Buffer]:
         """What ``encode`` would return.
 
         Raises:
             LocalProtocolError: More than the receiver accepts.
         """
-        assert self.limits is not None
-        document = self._before + pack_id(request_id) + self._after
-        prefix = DOCUMENT_BYTES.pack(len(document))
         if self._in_header:
-            return [b"".join([prefix, document, *[array.tobytes() for array in arrays]])]
+            return [b"".join([self._head, *[array.tobytes() for array in arrays]])]
         writer = ArrayWriter()
         for array in arrays:
             writer.add(array)
-        frames: list[Buffer] = [b"".join((prefix, document, *writer.tail)), *writer.frames]
+        frames: list[Buffer] = [b"".join((self._head, *writer.tail)), *writer.frames]
         check_outgoing(frames, self.limits)
         return frames
 
@@ -119,7 +101,7 @@ class Incoming(Generic[T]):
     """What to make of a document that was decoded before.
 
     Args:
-        document: With its id.
+        document: All of it.
         make: Makes the message of its fields.
         limits: For which it was decoded.
 
@@ -193,33 +175,6 @@ def _own(raw: Buffer, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
     if dtype.kind == "b":
         check_content(array)
     return array
-
-
-def pack_id(number: int) -> bytes:
-    """An id as msgpack packs it, in less time."""
-    for head, form, limit in _ID_FORMS:
-        if 0 <= number < limit:
-            return head + form.pack(number)
-    packed: bytes = msgpack.packb(number)
-    return packed
-
-
-def without_id(document: bytes) -> tuple[bytes, bytes] | None:
-    """A message's document without the id, and the id's own bytes; None if that is not plain."""
-    if not _ID < len(document) <= _MAX_DOCUMENT_BYTES:
-        return None
-    array, kind, first = document[: _ID + 1]
-    size = 1 if first < 0x80 else _ID_BYTES.get(first, 0)
-    if not (size and _ID + size <= len(document) and 0x92 <= array <= 0x9F and kind < 0x80):
-        return None
-    if size == _ID_BYTES[0xCF] and document[_ID + 1] > 0x7F:
-        return None  # larger than an id may be
-    return document[:_ID] + document[_ID + size :], document[_ID : _ID + size]
-
-
-def read_id(packed: bytes) -> int:
-    """The id of its own bytes."""
-    return int.from_bytes(packed if len(packed) == 1 else packed[1:], "big")
 
 
 class _Place:

@@ -1,15 +1,19 @@
 """Messages to frames and back.
 
 A message is the value ``[kind, id, field, ...]`` in the codec's encoding: one msgpack header and
-raw buffers. ``id`` ties a reply to its request. ``unpack`` checks the kind, the number of fields
-and each field's type, so that a decoded message is what its class says. Trust: what comes from a
-jail is hostile.
+raw buffers. ``unpack`` checks the kind, the number of fields and each field's type, so that a
+decoded message is what its class says. Trust: what comes from a jail is hostile.
+
+The id ties a reply to its request. Between client and runner it is 0: packets have their own ids.
+Between client and server it was the second item up to version 7. From version 8 on that is 0 too,
+and the id stands in front of the header, so that a message that recurs is the same bytes again.
 """
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgpack  # type: ignore[import-untyped]
 
@@ -25,15 +29,22 @@ from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.messages.base import KINDS, Message, check_fields, values_of
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
+FIRST_NUMBERED_VERSION = 8
 _HEAD_BYTES = 64
 """Enough for the length of a document, its kind and its id."""
+_NUMBER = struct.Struct(">IQ")
+"""What stands in front of a numbered header: the mark, and the id, whose first byte is below 0x80.
+In other headers there is the head of a msgpack array, which is not: ``compression`` looks there."""
+_MARK = 0xFFFFFFFF
+"""No document is so long: a header without a number begins with its document's length."""
+_MOST = (1 << 63) - 1
 _OUTGOING: templates.Forms[Any, templates.Outgoing] = templates.Forms()
 _INCOMING: templates.Forms[bytes, templates.Incoming[Message]] = templates.Forms()
 
 
 def pack(
     message: Message,
-    request_id: int,
+    request_id: int = 0,
     *,
     pickler: Pickler | None = None,
     limits: WireLimits = DEFAULT_LIMITS,
@@ -50,13 +61,13 @@ def pack(
     values = values_of(message)
     if pickler is not None and cls.HANDED:
         values = _handed(message, values, pickler, limits)
-    found = templates.outline(values)
+    found = None if request_id else templates.outline(values)
     if found is None:
         return _encoded(message, request_id, values, pickler, limits, describer)
     outline, arrays = found
     form = _OUTGOING.get((cls, outline))
     if form is not None and form.limits is limits:
-        return form.frames(request_id, arrays)
+        return form.frames(arrays)
     frames = _encoded(message, request_id, values, pickler, limits)
     _OUTGOING.met((cls, outline), lambda: templates.Outgoing(frames, arrays, limits))
     return frames
@@ -117,33 +128,83 @@ def unpack(
     """
     with UNTRUSTED:
         document, tail, buffers = split(frames, limits)
-        plain = templates.without_id(document)
-        if plain is None:
-            return _decode(document, tail, buffers, limits, unpickler, tensors, things)
-        key, packed_id = plain
-        form = _INCOMING.get(key)
+        form = _INCOMING.get(document)
         if form is not None and form.limits is limits:
-            return templates.read_id(packed_id), form.message(tail, buffers)
+            return 0, form.message(tail, buffers)
         how = (limits, unpickler, tensors, things)
         request_id, message = _decode(document, tail, buffers, *how)
-        _INCOMING.met(key, lambda: templates.Incoming(document, type(message), limits))
+        if not request_id and len(document) <= templates.MAX_DOCUMENT_BYTES:
+            _INCOMING.met(document, lambda: templates.Incoming(document, type(message), limits))
         return request_id, message
 
 
-def id_of(frame: Buffer) -> int | None:
-    """The id of a header that may be unreadable otherwise; None if there is none.
+class Header(NamedTuple):
+    """What stands in the first frame of client or server.
 
-    Trust: input from the other side. Only the first bytes are looked at.
+    Attributes:
+        number: The id.
+        message: The message.
+        numbered: Whether the id stands in front, as it does from version 8 on.
     """
+
+    number: int
+    message: Message
+    numbered: bool
+
+
+def pack_header(message: Message, number: int, *, numbered: bool) -> list[Buffer]:
+    """The frames of a message between client and server."""
+    if not numbered:
+        return pack(message, number)
+    header, *buffers = pack(message)
+    return [_NUMBER.pack(_MARK, number) + header, *buffers]
+
+
+def unpack_header(frame: Buffer, *, limits: WireLimits = DEFAULT_LIMITS) -> Header:
+    """The opposite of ``pack_header``. Trust: input from the other side.
+
+    Raises:
+        RemoteProtocolError: The peer broke the rules.
+    """
+    number = _number(frame)
+    if number is None:
+        return Header(*unpack([frame], limits=limits), numbered=False)
+    rest = frame if type(frame) is bytes else memoryview(frame).cast("B")
+    inner, message = unpack([rest[_NUMBER.size :]], limits=limits)
+    if inner or not 0 < number <= _MOST:
+        raise RemoteProtocolError(f"nobody can answer under the id {number}")
+    return Header(number, message, numbered=True)
+
+
+def id_of(frame: Buffer) -> tuple[int, bool] | None:
+    """The id of a header that cannot be read otherwise, and whether it is numbered.
+
+    None if it has none. Trust: input from the other side. Only the first bytes are looked at.
+    """
+    in_front = _number(frame)
+    number = _number_in_document(frame) if in_front is None else in_front
+    if type(number) is not int or not 0 < number <= _MOST:
+        return None
+    return number, in_front is not None
+
+
+def _number(frame: Buffer) -> int | None:
+    """What stands in front of a header, if it is numbered."""
+    plain = frame if type(frame) is bytes else memoryview(frame).cast("B")
+    if len(plain) < _NUMBER.size:
+        return None
+    mark, number = _NUMBER.unpack_from(plain)
+    return number if mark == _MARK else None
+
+
+def _number_in_document(frame: Buffer) -> object:
     head = msgpack.Unpacker(max_buffer_size=_HEAD_BYTES)
     head.feed(bytes(memoryview(frame).cast("B")[DOCUMENT_BYTES.size : _HEAD_BYTES]))
     try:
         items, kind, number = head.read_array_header(), head.unpack(), head.unpack()
     except Exception:  # whatever a decoder makes of noise
         return None
-    if items < 2 or type(kind) is not int or type(number) is not int:
-        return None
-    return number if 0 < number < 1 << 63 else None
+    return number if items >= 2 and type(kind) is int else None
 
 
 def _decode(
