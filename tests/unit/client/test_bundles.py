@@ -217,6 +217,17 @@ def test_repetition_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         load_bundle(folder)
 
 
+@pytest.mark.parametrize("given", [{"extra": ["scipy"], "python": "/tmp/python"}, "host"])
+def test_packages_of_a_bundles_choice_are_a_wish(tmp_path: Path, given: Any) -> None:
+    """They could be any; what every repository gets by itself is none."""
+    found = load_bundle(bundle(tmp_path / "a", dependencies=given))
+    [wish] = wishes(found)
+    assert wish.startswith("dependencies=")
+    assert "dependencies" not in replayed_arguments(found, granted=False)
+    assert replayed_arguments(found, granted=True)["dependencies"] == given
+    assert wishes(load_bundle(bundle(tmp_path / "b", dependencies="auto"))) == []
+
+
 def test_wishes_beyond_an_ordinary_run_are_told(tmp_path: Path) -> None:
     """They are granted by the user, or left out."""
     policy = Policy(
