@@ -12,6 +12,8 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, WorkerError
+from envhub_sandbox.policy import Policy
+from envhub_sandbox.sandboxes.remote import check_policy as check_place
 from envhub_worker.access.quotas import (
     InFlight,
     Permissions,
@@ -25,6 +27,7 @@ from envhub_worker.access.sessions import MAX_HELD, Sessions
 from envhub_worker.cli import listen
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import Confinement
+from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.supervisor.records import Asker
 from tests.remote.listening import Listening, listening
 from tests.support.processes import eventually
@@ -57,6 +60,17 @@ def test_a_policy_needs_the_operators_permission(
     assert caught.value.error == "PolicyError"
     if permitted is not None:
         check_policy(*order(**asked), Permissions(**permitted))
+
+
+def test_packages_of_the_repositorys_own_are_not_for_other_hosts() -> None:
+    """A folder there cannot be named, however it is asked for; the text says what to do."""
+    asked, confinement = order()
+    wanted = m.OpenJailWith("x", "", asked.snapshot, "env.py", asked.confinement, 1, "/packages")
+    with pytest.raises(RefusedError, match="start it in the environment or image") as caught:
+        check_policy(wanted, confinement, Permissions())
+    assert caught.value.error == "PolicyError"
+    with pytest.raises(PolicyError, match="start it in the environment or image"):
+        check_place(Policy(), Runtime("", "/packages"))
 
 
 def test_the_sums_of_a_key_are_bounded() -> None:

@@ -25,6 +25,8 @@ def base_interpreter() -> str:
 
 def install(folder: Path, *requirements: str) -> Runtime:
     """``requirements``, and what the worker needs, as wheels for this interpreter."""
+    if sys.version_info >= (3, 13) and "numpy==1.26.4" in requirements:
+        pytest.skip("numpy 1.26 has wheels up to Python 3.12")
     python = base_interpreter()
     command = [uv.find_uv_bin(), "pip", "install", "--quiet", "--no-config", "--no-build"]
     command += ["--compile-bytecode", "--python", python, "--target", str(folder)]
