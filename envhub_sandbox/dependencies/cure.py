@@ -66,7 +66,7 @@ def _advice(
     if place == "remote":
         return (
             "It ran on another host: whoever runs the server installs the package into its "
-            "interpreter, or name one that has it there with python=..."
+            "interpreter, or starts it in one that has it"
         )
     if python is not None:
         return f"It ran in {python}: install the package there, or leave out that argument"

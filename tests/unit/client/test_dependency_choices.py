@@ -193,6 +193,7 @@ def test_a_missing_module_has_one_cure(
     """It depends on the place, and what the repository declares is told."""
     text = cure(snapshot(tmp_path, "numpy>=1\n"), place, choice, python, environment)
     assert said in text
+    assert place == "process" or "python=" not in text  # which is refused elsewhere
     assert "Its requirements.txt declares numpy>=1" in text
 
 
