@@ -30,7 +30,9 @@ In every cell:
 - Another environment of the same client, and the other tasks of a suite, go on undisturbed.
 - After `close()` no process, zombie, descriptor, mapped slab, socket, file, mount or control group
   of a jail is there that was not there before. This is read from `/proc` and the file system. The
-  worker server lingers (see below).
+  worker server lingers (see below). Where other tasks of a suite are open yet, `close()` has
+  asked for the end of its jail and does not wait for it: whoever closes the next one does, and the
+  last.
 
 "In seconds" is the median of a row's six cells, on two busy cores, from the request to the error
 or the answer. Timeouts were 1 second for requests, 5 for starting and 1 for closing. `reset()`
@@ -107,9 +109,12 @@ was 60 MB when this was written). It ends with the client at the latest, however
 
 `tests/faults/test_nothing_left.py` ends clients: by return without `close()`, exceptions,
 `sys.exit`, `os._exit`, a crash, and by SIGINT, SIGTERM, SIGHUP and SIGKILL while idle, in a step
-and in `make_env`. Nothing of theirs remains, their temporary folders included. (If the *server* is
-killed its client removes the folder; if both are killed at once, a folder and empty control groups
-stay.)
+and in `make_env`; `tests/faults/test_starting.py` while their server starts, at moments that it
+waits for, and `python -m tests.faults.starts --rounds 200` at random ones. Nothing of theirs
+remains, their temporary folders included. (If the *server* is killed its client removes the folder.
+If both are killed at once, or a client that has no server yet, a folder and empty control groups
+stay. The folder says whose it was: the next server that this user starts removes it, and
+`envhub gc` both.)
 
 - **Ctrl-C in a step** comes at once. The reply is then late: a step says so, `reset()` recovers.
 - **A fork of the client** refuses its parent's environments with a `WorkerError` and may make its
