@@ -15,6 +15,7 @@ torch = pytest.importorskip("torch")
 sb3 = pytest.importorskip("stable_baselines3")
 
 from stable_baselines3.common.evaluation import evaluate_policy  # noqa: E402
+from stable_baselines3.common.logger import Logger  # noqa: E402
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor  # noqa: E402
 
 from envhub_sandbox.integrations.sb3 import SandboxVecEnv  # noqa: E402
@@ -100,6 +101,7 @@ def test_training_ends_in_the_same_weights(mode: str) -> None:
 
     def weights(env: Any) -> list[Any]:
         model = sb3.PPO("MlpPolicy", env, n_steps=32, n_epochs=2, seed=3, device="cpu")
+        model.set_logger(Logger(None, []))  # by default it makes a folder in /tmp, and leaves it
         model.learn(192)
         returns, lengths = evaluate_policy(
             model, VecMonitor(env), n_eval_episodes=3, return_episode_rewards=True
