@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.session import placement
+from envhub_sandbox.transport.shared_memory import attachment
 from tests.attacks.harness import HOSTILE, Arena, Run, call, control_run, new_alias, token
 from tests.attacks.listeners import listening
 from tests.attacks.victim import Victim, victim
@@ -234,13 +234,13 @@ def test_other_clients_are_out_of_reach(arena: Arena, home: Path, title: str) ->
 def test_deposits_need_the_session(arena: Arena, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever reached the socket for descriptors would have to know a random number as well."""
     known: list[tuple[str, bytes, int, int]] = []
-    deposit = placement.deposit
+    deposit = attachment.deposit
 
     def noted(path: str, session: bytes, jail: int, runner: int, fds: Any) -> int:
         known.append((path, session, jail, runner))
         return deposit(path, session, jail, runner, fds)
 
-    monkeypatch.setattr(placement, "deposit", noted)
+    monkeypatch.setattr(attachment, "deposit", noted)
     with arena.environment() as env, ExitStack() as held:
         env.reset()
         fds = [os.memfd_create("mine") for _ in range(5)]
