@@ -20,7 +20,16 @@ import psutil
 import pytest
 
 from envhub_sandbox.errors import WorkerDiedError
-from tests.attacks.harness import USER, Arena, Run, call, control_run, new_alias, start_control
+from tests.attacks.harness import (
+    USER,
+    Arena,
+    Run,
+    StoppedNowError,
+    call,
+    control_run,
+    new_alias,
+    start_control,
+)
 from tests.support.processes import eventually
 
 FAMILY = "Bombs"
@@ -167,7 +176,7 @@ def test_memory_bomb_stops_at_the_limit(arena: Arena, kind: str) -> None:
         left.append(run)
         return stays(run, lambda run: grown[0](run) > MEMORY + 16 * MIB)
 
-    try:
+    def attack() -> None:
         arena.attack(
             f"memory bomb: {kind}",
             "memory_bomb",
@@ -178,6 +187,15 @@ def test_memory_bomb_stops_at_the_limit(arena: Arena, kind: str) -> None:
             kind=kind,
             size=BOMB,
         )
+
+    try:
+        # the machine's account falls by what others free meanwhile: who was not seen growing is
+        # looked at again
+        for _ in range(2):
+            with contextlib.suppress(StoppedNowError):
+                return attack()
+            arena.rows.pop()
+        attack()
     finally:
         for run in left:
             if not run.inside and isinstance(run.value, list):

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import uv
 
+from envhub_sandbox.dependencies import index
 from envhub_worker.protocol.runtime import Runtime
 from tests.support import inside
 
@@ -30,7 +31,9 @@ def install(folder: Path, *requirements: str) -> Runtime:
     python = base_interpreter()
     command = [uv.find_uv_bin(), "pip", "install", "--quiet", "--no-config", "--no-build"]
     command += ["--compile-bytecode", "--python", python, "--target", str(folder)]
-    subprocess.run([*command, *NEEDED, *requirements], check=True, timeout=300)
+    # from where the user's own settings say, those for pip included
+    where = index.environment()
+    subprocess.run([*command, *NEEDED, *requirements], check=True, timeout=300, env=where)
     return Runtime(python, str(folder))
 
 
