@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from envhub_sandbox.transport.results import is_batch
 from envhub_worker.protocol import messages as m
 
 RESTARTED = "worker_restarted"
@@ -115,10 +116,14 @@ def _filled(seeds: Any, derived: Any) -> Any:
 
 
 def truncated(reply: m.StepDone, count: int) -> m.StepDone:
-    """A fresh runner's rows of the step in which another died. Trust: its flags are not asked."""
+    """A fresh runner's rows of the step in which another died. Trust: its flags are not asked.
+
+    Nor is anything but an array for a shape, which it has paid for: that of a space is only told.
+    """
+    rewards: Any = reply.rewards
     return m.StepDone(
         reply.observation,
-        np.zeros(getattr(reply.rewards, "shape", (count,))),
+        np.zeros(rewards.shape if is_batch(rewards) else (count,)),
         np.zeros(count, np.bool_),
         np.ones(count, np.bool_),
         marked(reply.info, count),

@@ -157,9 +157,14 @@ def _own_infos(value: Any, size: int) -> Sequence[tuple[int, dict[Any, Any]]]:
     return cast("Sequence[tuple[int, dict[Any, Any]]]", pairs)
 
 
+def is_batch(part: Any) -> bool:
+    """Whether this is an array or a tensor. A space that is described has a shape, too."""
+    return isinstance(part, np.ndarray) or hasattr(type(part), "__array__")
+
+
 def _numeric(part: Any) -> bool:
     """Whether these are numbers or booleans; a tensor's always are."""
-    return not isinstance(part, np.ndarray) or part.dtype.kind in "biuf"
+    return is_batch(part) and (not isinstance(part, np.ndarray) or part.dtype.kind in "biuf")
 
 
 def _flags(part: Any) -> bool:

@@ -6,15 +6,21 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.session.reseed import SeedBook, derived_seed, resets, truncated
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.described import Described
 from envhub_sandbox.transport.jail import RemoteJail, RunnersDiedError
+from envhub_sandbox.transport.results import Results
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
+from envhub_worker.protocol.spaces.opaque import OpaqueSpace
+from envhub_worker.runner.described import described
+from tests.attacks.lying_server import env_manifest
 
 DIED = m.Died(2, "exit", 3, None, "", "last words", "step")
 ASKED = [(1, m.Render(1)), (2, m.Render(1))]
@@ -145,3 +151,20 @@ def test_rows_of_the_dead_are_truncated_whatever_the_fresh_say() -> None:
     assert row.rewards.tolist() == [[0.0] * 3] * 2  # type: ignore[attr-defined]
     assert (row.terminations.tolist(), row.truncations.tolist()) == ([False] * 2, [True] * 2)  # type: ignore[attr-defined]
     assert row.info["worker_restarted"].tolist() == [True, True]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (2, 2**31 - 1)])
+def test_a_shape_that_is_only_told_is_not_taken_for_rewards(shape: tuple[int, ...]) -> None:
+    """A space of the repository's own costs nothing, whatever it says of itself."""
+    no = np.zeros(2, np.bool_)
+    told = m.StepDone(np.zeros((2, 1)), OpaqueSpace("a.Space", "Space()", shape), no, no, {})
+    frames = m.pack(told, describer=described)
+    said = m.unpack(frames, things=Described)[1]
+    assert isinstance(said, m.StepDone)
+    assert getattr(said.rewards, "shape", None) == shape
+    assert truncated(said, 2).rewards.shape == (2,)  # type: ignore[attr-defined]
+    for shardable in (True, False):
+        space = spaces.Box(-1, 1, (1,), np.float64)
+        found = Results(env_manifest(single_observation_space=space, shardable=shardable), [(0, 2)])
+        with pytest.raises(RemoteProtocolError, match="rewards"):
+            found.step([said])
