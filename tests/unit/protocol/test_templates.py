@@ -265,3 +265,16 @@ def _framed() -> tuple[bytes, bytes]:
 
 def _without_memory(*_: object) -> None:
     raise MemoryError
+
+
+def test_what_has_no_end_is_refused_as_without_a_form() -> None:
+    """It is the codec that says where it is."""
+    cyclic: list[object] = []
+    cyclic.append(cyclic)
+    deep: object = 1
+    for _ in range(5000):
+        deep = (deep,)
+    with pytest.raises(LocalProtocolError, match="contains itself"):
+        m.pack(m.Value({"a": cyclic}))
+    with pytest.raises(LocalProtocolError, match="nested deeper"):
+        m.pack(m.Value({"a": deep}))

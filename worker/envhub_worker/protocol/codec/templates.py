@@ -238,7 +238,7 @@ def outline(values: list[Any]) -> tuple[Any, list[Array]] | None:
     arrays: list[Array] = []
     try:
         return tuple([_outlined(value, arrays) for value in values]), arrays
-    except _IrregularError:
+    except (_IrregularError, RecursionError):  # deep or cyclic: the codec says what is wrong
         return None
 
 
