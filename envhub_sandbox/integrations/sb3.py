@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from envhub_sandbox.api import make_env
 from envhub_sandbox.vector.infos import of_one
+from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _Indices = int | Iterable[int] | None
 
@@ -84,12 +85,14 @@ class SandboxVecEnv(VecEnv):
         self._reset_options()
         if all(one == options[0] for one in options):
             batch, infos = self.vector.reset(seed=seeds, options=options[0] or None)
-            self.reset_infos = self._infos(infos)
+            with UNTRUSTED:
+                self.reset_infos = self._infos(infos)
             return batch
         for index, own in enumerate(options):
             mask = np.arange(self.num_envs) == index
             batch, infos = self.vector.reset(seed=seeds, options={**own, "reset_mask": mask})
-            self.reset_infos[index] = of_one(infos, index, self.num_envs)
+            with UNTRUSTED:
+                self.reset_infos[index] = of_one(infos, index, self.num_envs)
         return batch
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -99,31 +102,40 @@ class SandboxVecEnv(VecEnv):
     def step_wait(self) -> Any:
         """Observations, rewards float32 ``(num_envs,)``, dones bool ``(num_envs,)``, infos."""
         batch, rewards, terminations, truncations, told = self.vector.step_wait()
-        dones = np.logical_or(terminations, truncations)
-        infos = self._infos(told)
-        for index, info in enumerate(infos):
-            info["TimeLimit.truncated"] = bool(truncations[index] and not terminations[index])
+        with UNTRUSTED:  # of a repository's own class, nobody has declared what its results are
+            dones = np.logical_or(terminations, truncations).reshape(self.num_envs)
+            infos = self._infos(told)
+            for index, info in enumerate(infos):
+                info["TimeLimit.truncated"] = bool(truncations[index] and not terminations[index])
+            rewards = np.asarray(rewards, np.float32)
         if dones.any():
             batch = self._begin_again(batch, dones, infos)
-        return batch, np.asarray(rewards, np.float32), dones, infos
+        return batch, rewards, dones, infos
 
     def _begin_again(self, batch: Any, dones: Any, infos: list[dict[str, Any]]) -> Any:
         """The observations with which those that have ended begin; ``infos`` gets their last."""
         ended = [index for index in range(self.num_envs) if dones[index]]
         if self._resets_in_the_same_step:
-            for index in ended:
-                begun = infos[index]
-                last = begun.pop("final_info", {})
-                last["terminal_observation"] = begun.pop("final_obs")
-                last["TimeLimit.truncated"] = begun.pop("TimeLimit.truncated")
-                infos[index], self.reset_infos[index] = last, begun
+            with UNTRUSTED:
+                self._begun(ended, infos)
             return batch
-        lasts = list(iterate(self.vector.observation_space, batch))
+        with UNTRUSTED:
+            lasts = list(iterate(self.vector.observation_space, batch))
         batch, told = self.vector.reset(options={"reset_mask": dones})
-        for index in ended:
-            infos[index]["terminal_observation"] = lasts[index]
-            self.reset_infos[index] = of_one(told, index, self.num_envs)
+        with UNTRUSTED:
+            for index in ended:
+                infos[index]["terminal_observation"] = lasts[index]
+                self.reset_infos[index] = of_one(told, index, self.num_envs)
         return batch
+
+    def _begun(self, ended: list[int], infos: list[dict[str, Any]]) -> None:
+        """Take apart what belongs to the end of an episode, and to the beginning of the next."""
+        for index in ended:
+            begun = infos[index]
+            last = begun.pop("final_info", {})
+            last["terminal_observation"] = begun.pop("final_obs")
+            last["TimeLimit.truncated"] = begun.pop("TimeLimit.truncated")
+            infos[index], self.reset_infos[index] = last, begun
 
     def close(self) -> None:
         """End their processes. Idempotent."""

@@ -7,15 +7,16 @@ from typing import Any
 import numpy as np
 
 
-def of_one(infos: dict[str, Any], index: int, num_envs: int) -> dict[str, Any]:
+def of_one(infos: dict[Any, Any], index: int, num_envs: int) -> dict[Any, Any]:
     """The info of sub-environment ``index``.
 
     The other way round from ``VectorEnv._add_info``: a key counts where its mask, ``"_" + key``,
-    bool ``(num_envs,)``, is set, and mappings are nested.
+    bool ``(num_envs,)``, is set, and mappings are nested. Keys may be numbers, as in Gymnasium.
     """
     info = {}
+    masks = {f"_{key}" for key in infos}
     for key, value in infos.items():
-        if key.startswith("_") and key[1:] in infos:
+        if key in masks:
             continue
         mask = infos.get(f"_{key}")
         if mask is None or np.asarray(mask).flat[index]:

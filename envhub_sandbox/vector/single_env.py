@@ -18,6 +18,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from envhub_sandbox.vector.infos import of_one
 from envhub_worker.protocol.names import is_servable
+from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _PLAIN = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
 
@@ -83,7 +84,8 @@ class SingleEnv(gym.Env[Any, Any]):
         if begun is not None and seed is None and not options:
             return begun
         batch, infos = self._vector.reset(seed=seed, options=options)
-        return self._first(batch), of_one(infos, 0, 1)
+        with UNTRUSTED:
+            return self._first(batch), of_one(infos, 0, 1)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """One step with ``action``, an element of ``action_space``.
@@ -98,7 +100,13 @@ class SingleEnv(gym.Env[Any, Any]):
         """
         self._begun = None
         result = self._vector.step(self._batch(action))
-        batch, rewards, terminations, truncations, infos = result
+        with UNTRUSTED:  # of a repository's own class, nobody has declared what its results are
+            return self._of_one(*result)
+
+    def _of_one(
+        self, batch: Any, rewards: Any, terminations: Any, truncations: Any, infos: Any
+    ) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """What a step of the only one returns."""
         observation, info = self._first(batch), of_one(infos, 0, 1)
         terminated, truncated = bool(terminations[0]), bool(truncations[0])
         if (terminated or truncated) and self._resets_in_the_same_step:
@@ -132,8 +140,9 @@ class SingleEnv(gym.Env[Any, Any]):
     @property
     def np_random_seed(self) -> int:
         """The seed of its generator, as Gymnasium has it: -1 if it is not known."""
-        found = self._vector.np_random_seed
-        return int(found[0] if isinstance(found, tuple) else found)  # type: ignore[arg-type]
+        found: Any = self._vector.np_random_seed
+        seed = found[0] if isinstance(found, tuple) else found
+        return -1 if seed is None else int(seed)
 
     def __getattr__(self, name: str) -> Any:
         """An attribute or a method of the environment, whichever of its wrappers has it."""

@@ -8,7 +8,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.vector import AutoresetMode, VectorEnv
 
+from envhub_sandbox.errors import RemoteProtocolError
 from tests.support.samples import make_env_of, sample
 
 torch = pytest.importorskip("torch")
@@ -67,6 +69,44 @@ def test_steps_are_those_of_its_own_vector_environment(counters: SandboxVecEnv) 
         ]
         ends += int(ours[2].sum())
     assert ends > 10
+
+
+class _Liar(VectorEnv[Any, Any, Any]):
+    """A repository's own class, of which a step returns whatever it is told to."""
+
+    num_envs = 2
+    observation_space = single_observation_space = gym.spaces.Box(-1, 1, (2,))
+    action_space = single_action_space = gym.spaces.Discrete(2)
+    render_mode = None
+
+    def __init__(self, terminations: Any, infos: Any) -> None:
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        self._said = terminations, infos
+
+    def step_async(self, actions: Any) -> None:
+        """Nothing is done."""
+
+    def step_wait(self) -> Any:
+        """What was told."""
+        terminations, infos = self._said
+        return np.zeros(2), np.zeros(2), terminations, np.zeros(2, bool), infos
+
+
+@pytest.mark.parametrize(
+    ("terminations", "infos"),
+    [
+        (np.ones(2, bool), {}),
+        (np.ones(2, bool), {"final_obs": np.ones(2), "final_info": np.ones(2)}),
+        (np.ones((2, 2), bool), {}),
+        (np.zeros(2, bool), {"a": np.ones(2), "_a": np.zeros(0, bool)}),
+    ],
+    ids=["no last", "no last infos", "of nobody", "no mask"],
+)
+def test_results_that_are_of_nobody_break_the_rules(terminations: Any, infos: Any) -> None:
+    """Whatever is wrong with them, it is an error of this project."""
+    env = SandboxVecEnv(_Liar(terminations, infos))
+    with pytest.raises(RemoteProtocolError):
+        env.step(np.zeros(2, int))
 
 
 def test_options_go_to_whom_they_are_for(counters: SandboxVecEnv) -> None:

@@ -8,8 +8,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
+from envhub_sandbox.errors import RemoteProtocolError
 from envhub_sandbox.vector.single_env import SingleEnv
 
 _SPACES = (
@@ -131,3 +132,70 @@ def test_several_are_refused() -> None:
     """It says how to make one."""
     with pytest.raises(ValueError, match="n_envs=1"):
         SingleEnv(SyncVectorEnv([_Story, _Story]))
+
+
+class _Numbered(_Story):
+    """Some of its infos have numbers for keys."""
+
+    def step(self, action: Any) -> Any:
+        *result, info = super().step(action)
+        return *result, {**info, 7: self.steps, (1, 2): {3: "deep"}}
+
+
+def test_infos_may_have_numbers_for_keys() -> None:
+    """As in Gymnasium, where a mask's name is a text in any case."""
+    env = SingleEnv(SyncVectorEnv([_Numbered]))
+    env.reset()
+    info = env.step(0)[4]
+    assert set(info) == {"step", "deep", 7, (1, 2)}
+    assert (info[7], info[1, 2]) == (1, {3: "deep"})
+
+
+class _Liar(VectorEnv[Any, Any, Any]):
+    """A repository's own class, which returns whatever it is told to."""
+
+    num_envs = 1
+    observation_space = single_observation_space = spaces.Discrete(2)
+    action_space = single_action_space = spaces.Discrete(2)
+
+    def __init__(self, **lies: Any) -> None:
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        self.said = {"observation": np.zeros(1), "rewards": np.zeros(1), "infos": {}}
+        self.said |= {"terminations": np.zeros(1, bool), "truncations": np.zeros(1, bool)} | lies
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return self.said["observation"], self.said["infos"]
+
+    def step(self, actions: Any) -> Any:
+        names = ("observation", "rewards", "terminations", "truncations", "infos")
+        return tuple(self.said[name] for name in names)
+
+
+@pytest.mark.parametrize(
+    "lies",
+    [
+        {"terminations": np.ones(1, bool)},
+        {"terminations": np.ones((1, 2), bool)},
+        {"rewards": np.ones((1, 2))},
+        {"infos": {"a": np.ones(1), "_a": np.zeros(0, bool)}},
+        {"infos": {"a": 1, "_a": np.ones((1, 2), object)}, "observation": ()},
+    ],
+    ids=str,
+)
+def test_results_that_are_of_nobody_break_the_rules(lies: Any) -> None:
+    """Whatever is wrong with them, it is an error of this project."""
+    env = SingleEnv(_Liar(**lies))
+    with pytest.raises(RemoteProtocolError):
+        env.step(1)
+    if "infos" in lies:
+        with pytest.raises(RemoteProtocolError):
+            env.reset()
+
+
+@pytest.mark.parametrize(("found", "seed"), [(None, -1), ((None,), -1), ((3,), 3), (3, 3)])
+def test_a_seed_that_nobody_knows_is_minus_one(
+    monkeypatch: pytest.MonkeyPatch, found: Any, seed: int
+) -> None:
+    """As ``gymnasium.Env`` has it."""
+    monkeypatch.setattr(_Liar, "np_random_seed", found)
+    assert SingleEnv(_Liar()).np_random_seed == seed
