@@ -548,6 +548,7 @@ class EnvSession:
                 return warming is not None
             with self._turn("make_env"):
                 self._warm = False
+                self.lifecycle.moved(Event.EXPIRY)  # first: an interrupt must not leave it READY
                 self.lease.close_politely()
                 self.lease.give_back()
                 self.lifecycle.moved(Event.FORGET)
@@ -577,6 +578,7 @@ class EnvSession:
         try:
             self.lease.look("make_env", Deadline(_LOOK_S))
         except EnvHubError:
+            self.lifecycle.moved(Event.EXPIRY)  # as in cool_down
             self._forget()
 
     def _start(self, deadline: StartupDeadline) -> None:

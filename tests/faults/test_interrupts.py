@@ -72,6 +72,29 @@ def test_a_second_ctrl_c_in_recovery_leaves_a_usable_environment(
         assert env.render() is not None
 
 
+@pytest.mark.parametrize("why", ["it has died", "there is no room"])
+def test_ctrl_c_while_what_was_started_ahead_is_given_up(
+    why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its jail has gone already: nobody takes it for ready."""
+    make_env(sample("counter"), n_envs=2).close()  # known from here on: it starts later
+    with make_env(sample("counter"), n_envs=2) as suites:
+        env = suites.env
+        remote = inside.session(env)
+        remote.warm_up()
+        give_back = remote.lease.give_back
+        with monkeypatch.context() as patch:
+            patch.setattr(remote.lease, "give_back", lambda: interrupted(give_back()))
+            if why == "it has died":
+                remote.lease.end()
+            with pytest.raises(KeyboardInterrupt):
+                env.reset() if why == "it has died" else remote.cool_down()
+        with pytest.raises(errors.WorkerDiedError, match="call reset"):
+            env.step([0, 0])
+        env.reset()
+        env.step([0, 0])
+
+
 @pytest.mark.parametrize("moment", ["amid the frames", "when all is sent"])
 def test_ctrl_c_in_sending_a_step_leaves_a_late_reply(
     moment: str, monkeypatch: pytest.MonkeyPatch
