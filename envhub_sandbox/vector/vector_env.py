@@ -112,8 +112,10 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             WorkerDiedError: The worker process ended.
             RemoteEnvError: The environment raised; it is still usable.
         """
-        self.reset_async(seed=seed, options=options)
-        return self.reset_wait()
+        # not by the two halves: an interrupt between them would leave a wait that nobody ends
+        self._refuse_if_busy("reset_async")
+        self._send_reset(seed, options)
+        return self._end_reset(self._timeouts.reset_s)
 
     def reset_async(
         self,
@@ -122,6 +124,10 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     ) -> None:
         """Send the reset; ``reset_wait`` returns its results."""
         self._refuse_if_busy("reset_async")
+        self._send_reset(seed, options)
+        self._waiting = "reset"
+
+    def _send_reset(self, seed: Any, options: dict[str, Any] | None) -> None:
         mask = None
         if options is not None and "reset_mask" in options:
             options = copy(options)  # the caller's own keep theirs
@@ -140,10 +146,12 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
         """The results of ``reset_async``; ``timeout`` in seconds, else ``Timeouts.reset_s``."""
-        replies = self._collect("reset", timeout, self._timeouts.reset_s, m.ResetDone)
-        return self._remote.finish_reset(
-            replies, self._timeouts.reset_s if timeout is None else timeout
-        )
+        self._end_wait("reset")
+        return self._end_reset(self._timeouts.reset_s if timeout is None else timeout)
+
+    def _end_reset(self, timeout_s: float | None) -> tuple[Any, dict[Any, Any]]:
+        replies = self._collect(timeout_s, m.ResetDone)
+        return self._remote.finish_reset(replies, timeout_s)
 
     def step(self, actions: Any) -> StepResult:
         """Step every sub-environment.
@@ -195,12 +203,17 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method, or read an attribute, of every sub-environment: a tuple of results."""
-        self.call_async(name, *args, **kwargs)
-        return self.call_wait()
+        self._refuse_if_busy("call_async")
+        self._send_call(name, args, kwargs)  # as reset
+        return self._end_call(self._timeouts.call_s)
 
     def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
         """Send the call; ``call_wait`` returns its results."""
         self._refuse_if_busy("call_async")
+        self._send_call(name, args, kwargs)
+        self._waiting = "call"
+
+    def _send_call(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         _check_name(name)
         if name in _NOT_CALLED and not self._manifest.sync:
             raise ValueError(
@@ -210,7 +223,11 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
     def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
         """The results of ``call_async``; ``timeout`` in seconds, else ``Timeouts.call_s``."""
-        replies = self._collect("call", timeout, self._timeouts.call_s, m.Value)
+        self._end_wait("call")
+        return self._end_call(self._timeouts.call_s if timeout is None else timeout)
+
+    def _end_call(self, timeout_s: float | None) -> tuple[Any, ...]:
+        replies = self._collect(timeout_s, m.Value)
         if not self._manifest.shardable:
             return cast("tuple[Any, ...]", replies[0].value)
         with self._remote.handling():
@@ -386,7 +403,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     def _ask(self, operation: str, message: Callable[[int, Bounds], m.Message]) -> list[m.Value]:
         self._refuse_if_busy(operation)
         self._submit(operation, message)
-        return self._collect(operation, None, self._timeouts.call_s, m.Value)
+        return self._collect(self._timeouts.call_s, m.Value)
 
     def _submit(self, operation: str, message: Callable[[int, Bounds], m.Message]) -> None:
         try:
@@ -394,14 +411,10 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         except WorkerDiedError:
             self._raise_if_closed()
             raise
-        self._waiting = operation
 
-    def _collect(
-        self, operation: str, timeout: float | None, default: float | None, kind: type[m.M]
-    ) -> list[m.M]:
-        self._end_wait(operation)
+    def _collect(self, timeout_s: float | None, kind: type[m.M]) -> list[m.M]:
         try:
-            replies = self._remote.collect(default if timeout is None else timeout)
+            replies = self._remote.collect(timeout_s)
         except WorkerDiedError:
             self._raise_if_closed()  # close() in another thread ended it under us
             raise

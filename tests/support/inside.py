@@ -29,6 +29,7 @@ from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RemoteJail
 from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
+from envhub_sandbox.transport.shared_memory.shard import LaneShard
 from envhub_worker.access.connection_limit import Doorman
 from envhub_worker.access.gate import RemoteGate
 from envhub_worker.cli import listen
@@ -127,6 +128,11 @@ def pids(env: Any) -> list[int]:
     assert isinstance(status, m.Status)
     jails = [one for one in status.jails if isinstance(one, dict)]
     return next(list(one["pids"]) for one in jails if one["jail"] == jail(env).number)
+
+
+def request_words(lane: LaneShard) -> Any:
+    """What a shard's runner reads before it does anything."""
+    return lane._asks
 
 
 def lane(env: Any) -> SharedMemoryLane | None:

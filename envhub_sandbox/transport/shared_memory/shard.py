@@ -29,10 +29,15 @@ from envhub_worker.protocol.untrusted import UNTRUSTED
 Outcome = tuple[int, m.Message | None]
 """``slabs.DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``, and what came encoded."""
 _OUTCOMES = frozenset({slabs.DONE, slabs.RAISED, slabs.FETCH, slabs.COLUMNS})
+_UNKNOWN = -1
 
 
 class LaneShard:
     """The slabs and doorbells of one shard.
+
+    An interrupt may fall between any two statements of a request. So what is remembered of the
+    slab is forgotten before it is written, and noted again afterwards: otherwise the next request
+    would leave out what the runner has never seen.
 
     Args:
         layout: Where everything lies.
@@ -58,8 +63,8 @@ class LaneShard:
         self._tells = slabs.words(self._reply)
         self._columns: list[tuple[Column, Any]] = []
         self._views: dict[tuple[int, Any], Any] = {}
-        self._codes = [-1] * len(layout.actions)
-        self._wishes = (0, 0, 0)
+        self._codes = [_UNKNOWN] * len(layout.actions)
+        self._wishes: tuple[int, int, int] | None = (0, 0, 0)
         self._told = False
         self.sequence = 0
 
@@ -84,8 +89,10 @@ class LaneShard:
                 found = self._view(index, leaf.dtype)
             code = found[0] + self._listed if listed else found[0]
             if self._codes[index] != code:
-                asks[slabs.DTYPES + index] = self._codes[index] = code
+                self._codes[index] = _UNKNOWN
+                asks[slabs.DTYPES + index] = code
                 asks[slabs.CHANGES] += 1
+                self._codes[index] = code
             found[1][...] = leaf
         wishes = (spin_ns, slot, cpu)
         if wishes != self._wishes:
@@ -96,8 +103,8 @@ class LaneShard:
         """Write a message and announce it."""
         start = self.layout.message
         self._request[start : start + len(packet)] = packet
-        self._asks[slabs.MESSAGE] = len(packet)
         self._told = True
+        self._asks[slabs.MESSAGE] = len(packet)
         wishes = (spin_ns, slot, cpu)
         if wishes != self._wishes:
             self._wish(*wishes)
@@ -111,11 +118,12 @@ class LaneShard:
 
     def _wish(self, spin_ns: int, slot: int, cpu: int) -> None:
         asks = self._asks
-        self._wishes = (spin_ns, slot, cpu)
+        self._wishes = None
         asks[slabs.SPIN] = spin_ns
         asks[slabs.SLOT] = slot
         asks[slabs.CPU] = cpu
         asks[slabs.CHANGES] += 1
+        self._wishes = (spin_ns, slot, cpu)
 
     def _view(self, index: int, dtype: Any) -> tuple[int, Any]:
         code = slabs.DTYPE_CODES[dtype]
