@@ -26,6 +26,9 @@ MessageFor = Callable[[int, "int | None"], m.Message]
 _OUTERMOST = 0
 _SEARCHED = -1
 """In place of a depth: whichever wrapper has it."""
+_MOST_WRAPPERS = 1000
+"""Around one environment: whoever looks for the innermost would never come to an end. As many as
+calls of Python in one another, which a step through them is."""
 _OURS = frozenset({"_vector", "_ask", "_index", "_depth"})
 
 
@@ -114,7 +117,10 @@ class SubEnvironment(gym.Env[Any, Any]):
 
         Raises:
             AttributeError: It is no wrapper.
+            RemoteProtocolError: There is no end to them.
         """
+        if self._depth is not None and self._depth >= _MOST_WRAPPERS:
+            raise RemoteProtocolError(f"the worker says that more than {_MOST_WRAPPERS} wrap one")
         found = self._get("env")
         if self._depth is None or not (callable(found) or isinstance(found, RemoteObject)):
             return found
@@ -170,7 +176,9 @@ class SubEnvironment(gym.Env[Any, Any]):
 
     def has_wrapper_attr(self, name: str) -> bool:
         """Whether it has an attribute, or a wrapper of it."""
-        return bool(self._call("has_wrapper_attr", (name,), {}))
+        found = self._call("has_wrapper_attr", (name,), {})
+        with UNTRUSTED:  # of an array, nobody can say
+            return bool(found)
 
     def get_wrapper_attr(self, name: str) -> Any:
         """An attribute of the outermost wrapper that has it."""
