@@ -13,6 +13,7 @@ import weakref
 from collections.abc import Iterator, Sequence
 from functools import partial
 
+from envhub_sandbox.log import WORKER
 from envhub_sandbox.session.env_session import EnvSession
 
 
@@ -59,11 +60,20 @@ class Prewarming:
             self._staff()
 
     def _staff(self) -> None:
-        """A thread for each that is to be given up or started. The lock is held."""
+        """A thread for each that is to be given up or started. The lock is held.
+
+        Where the system has no thread left, whoever has asked for another task does not hear of it.
+        """
         while (todo := self._next()) is not None:
-            threading.Thread(
+            thread = threading.Thread(
                 target=self._run, args=todo, name="envhub-prewarm", daemon=True
-            ).start()
+            )
+            try:
+                thread.start()
+            except RuntimeError as error:
+                WORKER.info("nothing is started ahead: %s", error)
+                self._giving_up -= not todo[1]
+                return
 
     def _stale(self) -> list[weakref.ref[EnvSession]]:
         return [one for one in self._ahead if one not in self._wanted]
