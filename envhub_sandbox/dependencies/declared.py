@@ -33,6 +33,7 @@ MAX_DOTS = 2000
 """In TOML: the time that its parser takes grows with the square of the parts of a key."""
 
 _HASH = re.compile(r"--hash[= ](sha256:[0-9a-f]{64}|sha384:[0-9a-f]{96}|sha512:[0-9a-f]{128})")
+_QUOTED = re.compile(r"'[^']*'|\"[^\"]*\"")
 _CLOSES = "# ///"
 _ADVICE = (
     "If you trust it, install the packages into an interpreter of your own and give that with "
@@ -107,6 +108,8 @@ def one(text: str, where: str) -> Wanted:
         requirement = Requirement(plain)
         if not all(found):
             raise InvalidRequirement("a hash that is none")
+        if not _is_literal(plain):
+            raise InvalidRequirement("a text that would be printed as something else")
     except (InvalidRequirement, RecursionError) as error:
         raise RequirementError(
             f"{where} is {text[:200]!r}. Only plain requirements such as 'numpy>=2' are taken, "
@@ -119,6 +122,20 @@ def one(text: str, where: str) -> Wanted:
             f"the index are installed. {_ADVICE}"
         )
     return Wanted(requirement, where, tuple(one[1] for one in found if one))
+
+
+def _is_literal(text: str) -> bool:
+    """Whether it means the same once it has been parsed and printed for uv.
+
+    Texts in markers are read with Python's escapes: one could end its line or its quotes, and what
+    comes then would be a line of its own, which uv obeys.
+    """
+    texts = [one[1:-1] for one in _QUOTED.findall(text.partition(";")[2])]
+    return (
+        "\\" not in text
+        and text.replace("\t", " ").isprintable()
+        and not any("'" in one or '"' in one for one in texts)
+    )
 
 
 def read(path: Path) -> list[Wanted]:

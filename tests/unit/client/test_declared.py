@@ -71,6 +71,10 @@ def test_hashes_stand_on_the_line_or_on_the_next(tmp_path: Path) -> None:
         *(f"numpy --hash={HASH} -e .", f"numpy --hash={HASH}; --no-binary x", "a" * 3000),
         *(f"-e . --hash={HASH}", f"./here --hash={HASH}", f"a @ file:///a --hash={HASH}"),
         *("numpy; (" + "(" * 900, f"{'a' * 3000} --hash={HASH}"),
+        # read with Python's escapes and printed without them, this is three lines to uv
+        *(rf"a; os_name == 'x{one}-e .{one}y'" for one in (r"\n", r"\x0a", r"\r", r"\u000a")),
+        r"a; os_name == 'x\" or os_name == \"x\"\n-i https://index.example\na; \"\" == \"'",
+        *("""a; os_name == 'x" or "y'""", '''a; os_name == "x' or 'y"''', "numpy>=2\x00"),
     ],
 )
 def test_whatever_could_run_code_does_not(tmp_path: Path, line: str) -> None:
