@@ -12,6 +12,7 @@ import subprocess
 import tempfile
 import threading
 from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache
 
 from envhub_sandbox.dependencies import index
 from envhub_sandbox.errors import (
@@ -23,6 +24,10 @@ from envhub_sandbox.errors import (
 from envhub_worker.protocol.text import printable
 
 NO_BUILDS = ("--no-config", "--no-build")
+OLDEST = (0, 11, 16)
+"""Before, a wheel's scripts went wherever the wheel said, and what is editable was built in spite
+of ``--no-build``. pyproject.toml asks for the same; but there may be another on PATH."""
+_VERSION_S = 60.0
 _SHOWN = 4000
 _KEPT_LINES = 400
 
@@ -163,12 +168,13 @@ def command() -> str:
     """uv's path.
 
     Raises:
-        DependencyError: It is not installed.
+        DependencyError: It is not installed, or too old.
     """
+    found: str | None
     try:
         from uv import find_uv_bin  # it knows where pip has put it, which need not be on PATH
 
-        return str(find_uv_bin())
+        found = str(find_uv_bin())
     except (ImportError, FileNotFoundError):
         found = shutil.which("uv")
     if found is None:
@@ -176,7 +182,25 @@ def command() -> str:
             "uv resolves and installs packages, and is not found: neither among this interpreter's "
             "packages nor on PATH. Run: pip install uv"
         )
+    _check_release(found)
     return found
+
+
+@lru_cache(maxsize=8)
+def _check_release(path: str) -> None:
+    try:
+        said = subprocess.run(
+            [path, "--version"], capture_output=True, timeout=_VERSION_S, check=True, text=True
+        ).stdout
+    except (OSError, ValueError, subprocess.SubprocessError) as error:
+        raise DependencyError(f"{path} does not say its version: {error}") from error
+    version = re.match(r"uv (\d+)\.(\d+)\.(\d+)", said)
+    if version is None or tuple(map(int, version.groups())) < OLDEST:
+        oldest = ".".join(map(str, OLDEST))
+        raise DependencyError(
+            f"{path} is {printable(said.strip(), 80)!r}: uv before {oldest} lets a package write "
+            f"outside of its folder. Run: pip install 'uv>={oldest}'"
+        )
 
 
 def _error(what: str, said: str) -> DependencyError:

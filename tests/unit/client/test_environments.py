@@ -304,3 +304,18 @@ def test_where_others_can_write_nothing_is_used(index: Index, tmp_path: Path) ->
     with pytest.raises(DependencyError, match="other users"):
         made(folder)
     environments.root().chmod(0o755)
+
+
+@pytest.mark.parametrize("name", ["../../escaped", "{outside}/escaped"])
+def test_a_script_lies_where_the_others_do(index: Index, tmp_path: Path, name: str) -> None:
+    """Whatever the wheel calls it: nothing is written elsewhere, and nothing is kept."""
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    script = name.format(outside=outside)
+    entry_points = f"[console_scripts]\n{script} = wanted:main\n"
+    files = {"wanted.py": "", "wanted-1.0.dist-info/entry_points.txt": entry_points}
+    make_wheel(index.folder, "wanted", files=files)
+    with pytest.raises(DependencyError, match="could not be installed"):
+        made(repository(tmp_path / "repo", "wanted"))
+    assert [*outside.iterdir(), *tmp_path.rglob("escaped")] == []
+    assert left_behind() == []

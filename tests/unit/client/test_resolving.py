@@ -154,6 +154,23 @@ def test_no_uv_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         uv.command()
 
 
+def test_an_old_uv_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """It would put a package's scripts wherever that says; pyproject.toml asks for no older."""
+    monkeypatch.setitem(sys.modules, "uv", None)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    found = tmp_path / "uv"
+    found.write_text("#!/bin/sh\necho 'uv 0.11.8 (x86_64-unknown-linux-gnu)'\n")
+    found.chmod(0o755)
+    with pytest.raises(DependencyError, match=r"uv before .* pip install"):
+        uv.command()
+
+
+def test_the_project_asks_for_the_oldest_uv_that_is_taken(project: dict[str, Any]) -> None:
+    """So that pip brings one that is."""
+    oldest = ".".join(map(str, uv.OLDEST))
+    assert f"uv>={oldest}" in project["project"]["dependencies"]
+
+
 NO_FILES = {"PIP_CONFIG_FILE": os.devnull}
 
 
