@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from packaging.utils import canonicalize_name
 
-from envhub_sandbox.dependencies import uv
+from envhub_sandbox.dependencies import interpreters, uv
 from envhub_sandbox.dependencies.declared import Wanted, one
 from envhub_sandbox.errors import PackageIntegrityError, ResolutionError
 
@@ -66,7 +66,10 @@ class Target:
         if self.python:
             return ("--python", self.python)
         platform = f"{self.machine}-manylinux_2_28"
-        return ("--python-version", self.version, "--python-platform", platform)
+        # uv asks some interpreter all the same, and a .venv beside or above its working directory,
+        # which is one for temporary files, is the first that it would run: named, it runs ours
+        ours = ("--python", interpreters.own().path)
+        return (*ours, "--python-version", self.version, "--python-platform", platform)
 
 
 def resolve(

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
+import subprocess
 import sys
 import tarfile
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from envhub_sandbox.dependencies import index as places
+from envhub_sandbox.dependencies import interpreters, uv
 from envhub_sandbox.dependencies import resolve as module
-from envhub_sandbox.dependencies import uv
 from envhub_sandbox.dependencies.declared import one
 from envhub_sandbox.dependencies.resolve import Lock, Target
 from envhub_sandbox.errors import (
@@ -57,6 +60,32 @@ def test_another_machines_interpreter_is_described(index: Index) -> None:
     )
     with pytest.raises(ResolutionError):
         resolve("wanted", target=Target(version="3.10", machine="x86_64"))
+
+
+def test_no_interpreter_of_somebody_elses_is_asked(
+    index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """uv runs the one of a .venv above its working directory: anybody can make one in /tmp."""
+    python = tmp_path / ".venv/bin/python"
+    python.parent.mkdir(parents=True)
+    (tmp_path / ".venv/pyvenv.cfg").write_text(f"home = {os.path.dirname(HERE.python)}\n")
+    python.write_text(f'#!/bin/sh\ntouch {tmp_path}/asked\nexec {HERE.python} "$@"\n')
+    python.chmod(0o755)
+    for name in ("python3", f"python{sys.version_info[0]}.{sys.version_info[1]}"):
+        (python.parent / name).symlink_to("python")
+    command = [uv.command(), "pip", "compile", "-", *uv.NO_BUILDS, "--python-version", "3.12"]
+    (tmp_path / "cwd").mkdir()
+    subprocess.run(
+        command, input=b"", capture_output=True, cwd=tmp_path / "cwd", env=places.environment()
+    )
+    assert (tmp_path / "asked").exists(), "the control asks nobody"
+    (tmp_path / "asked").unlink()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    for target in (HERE, Target(version="3.12", machine="x86_64")):
+        assert resolve("numpy", target=target).packages
+    with contextlib.suppress(DependencyError):
+        interpreters.find("3.9.1")
+    assert not (tmp_path / "asked").exists()
 
 
 def test_what_jails_import_is_what_the_image_installs(project: dict[str, Any]) -> None:
