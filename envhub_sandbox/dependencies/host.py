@@ -25,7 +25,8 @@ def lacks(declared: Declared) -> str | None:
     files the packages here were made of.
     """
     python = SpecifierSet(declared.python)
-    if not python.contains(platform.python_version(), prereleases=True):
+    # a Python that was built from a checkout has a plus at the end, which is no version
+    if not python.contains(platform.python_version().rstrip("+"), prereleases=True):
         return f"python{declared.python}"
     hashed = next((wanted for wanted in declared.wanted if wanted.hashes), None)
     if hashed is not None:
@@ -44,8 +45,11 @@ class _Installed:
         waiting = [(one, frozenset[str]()) for one in requirements]
         while waiting:
             wanted, extras = waiting.pop()
-            if not self._applies(wanted, extras):
-                continue
+            try:
+                if not self._applies(wanted, extras):
+                    continue
+            except (ValueError, LookupError):  # its marker compares what nobody can: let uv say so
+                return str(wanted)
             found = self._distribution(wanted.name)
             if found is None or not _is_among(found, wanted.specifier):
                 return str(wanted)

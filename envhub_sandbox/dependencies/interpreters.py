@@ -62,10 +62,15 @@ def own() -> Interpreter:
     return Interpreter(
         base,
         sys.implementation.name,
-        platform.python_version(),
+        release(platform.python_version()),
         os.uname().machine,
         platform.libc_ver()[1],
     )
+
+
+def release(version: str) -> str:
+    """A version of Python as one that can be compared: built from a checkout it ends in a plus."""
+    return version.rstrip("+")
 
 
 def find(asked: str, declared: str = "") -> Interpreter:
@@ -118,12 +123,13 @@ def _at(path: str) -> Interpreter:
         done = subprocess.run(
             [path, "-I", "-S", "-c", _ASK], capture_output=True, timeout=_ASK_S, check=True
         )
-        *facts, real = json.loads(done.stdout)
+        implementation, version, *facts, real = map(str, json.loads(done.stdout))
+        Version(release(version))
     except (OSError, ValueError, subprocess.SubprocessError) as error:
         raise InterpreterUnavailableError(
             f"{path} is no interpreter that answers: {error}"
         ) from error
-    return Interpreter(real, *map(str, facts))
+    return Interpreter(real, implementation, release(version), *facts)
 
 
 def _others(versions: SpecifierSet) -> list[Interpreter]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import json
 import platform
 import zipfile
 from importlib import metadata
@@ -103,6 +104,26 @@ def test_what_is_here_is_not_installed_again(lines: list[str]) -> None:
 def test_what_is_not_here_is_named(line: str) -> None:
     """Another version is not here; nor is one whose files nobody can compare."""
     assert host.lacks(declares("gymnasium", line)) == str(one(line, "").requirement)
+
+
+@pytest.mark.parametrize("marker", ["os_name ~= 'posix'", "python_version ~= '3'", "'a' ~= 'b'"])
+def test_a_marker_that_says_nothing_is_left_to_uv(marker: str) -> None:
+    """It compares what cannot be compared; that is no error of ours."""
+    assert str(host.lacks(declares(f"numpy; {marker}"))).startswith("numpy; ")
+
+
+def test_a_python_that_was_built_from_a_checkout(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It says a plus behind its version."""
+    monkeypatch.setattr(platform, "python_version", lambda: "3.12.1+")
+    assert host.lacks(declares(python=">=3.12,<3.13")) is None
+    assert interpreters.own().version == "3.12.1"
+    other = tmp_path / "python3"
+    facts = ["cpython", "3.12.2+", "x86_64", "2.36", str(other)]
+    other.write_text(f"#!/bin/sh\necho '{json.dumps(facts)}'\n")
+    other.chmod(0o755)
+    assert interpreters.find(str(other)).version == "3.12.2"
 
 
 def test_another_python_is_not_here() -> None:
