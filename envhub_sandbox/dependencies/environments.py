@@ -45,6 +45,7 @@ _WAIT_S = 2 * 3600.0
 _POLL_S = 0.1
 _COMPILE_S = 1800.0
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+_THERE = (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR)
 
 # Reads a stranger's source and runs none of it: -I -S, no package is on the path. Tests are left
 # out; nobody imports them. Bytecode is never held against its source again: both are read-only.
@@ -263,7 +264,16 @@ def _made(
 def _publish(building: Path, key: str, facts: dict[str, object]) -> None:
     (building / "environment.json").write_text(json.dumps(facts, indent=1))
     building.chmod(folders.SHARED_MODE)
-    os.rename(building, root() / key)
+    try:
+        os.rename(building, root() / key)
+    except OSError as error:
+        if error.errno not in _THERE:
+            raise
+        # what bears the name is none, or we would not be here: a disk that lost power, a hand
+        damaged = Path(tempfile.mkdtemp(prefix=f"{_BUILDING}{key}-", dir=root()))
+        os.rename(root() / key, damaged / "damaged")
+        os.rename(building, root() / key)
+        remove_tree(damaged)
 
 
 def _install(

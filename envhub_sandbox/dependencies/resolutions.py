@@ -44,7 +44,8 @@ def recall(key: str) -> Lock | None:
     try:
         if not folders.is_ours_alone(path.parent) or path.stat().st_size > _MAX_BYTES:
             return None
-        return Lock(path.read_text("utf-8"))
+        lock = Lock(path.read_text("utf-8"))
+        return lock if lock.packages else None  # what the worker needs is in each: it was lost
     except (OSError, ValueError):
         return None
 

@@ -104,6 +104,22 @@ def test_the_same_again_asks_nobody(index: Index, tmp_path: Path) -> None:
     assert len(index.asked) == asked
 
 
+@pytest.mark.parametrize("damage", ["environment.json", "resolutions"])
+def test_what_lost_its_content_is_made_again(index: Index, tmp_path: Path, damage: str) -> None:
+    """A machine that loses its power may leave empty files behind."""
+    folder = repository(tmp_path / "repo", "numpy")
+    env = made(folder)
+    if damage == "resolutions":
+        [path] = (environments.root().parent / damage).iterdir()
+        path.write_text("")
+    else:
+        (env.home / damage).write_text("")
+        assert environments.ready(env.key) is None
+    assert made(folder) == env
+    assert environments.ready(env.key) == env
+    assert left_behind() == []
+
+
 def test_two_repositories_that_need_the_same_share_it(index: Index, tmp_path: Path) -> None:
     """It is called by what is in it."""
     make_wheel(index.folder, "wanted")
