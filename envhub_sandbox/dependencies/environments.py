@@ -56,8 +56,8 @@ for limit, value in ((resource.RLIMIT_AS, 8 << 30), (resource.RLIMIT_CPU, 1800),
     hard = resource.getrlimit(limit)[1]
     value = value if hard == resource.RLIM_INFINITY else min(value, hard)
     resource.setrlimit(limit, (value, value))
-compileall.compile_dir(sys.argv[1], quiet=2, stripdir=sys.argv[1], rx=re.compile(r"/tests?/"),
-                       maxlevels=64,
+left_out = re.compile(re.escape(sys.argv[1]) + r"(/.*)?/tests?/", re.DOTALL)
+compileall.compile_dir(sys.argv[1], quiet=2, stripdir=sys.argv[1], rx=left_out, maxlevels=64,
                        invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH)
 """
 

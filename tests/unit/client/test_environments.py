@@ -88,6 +88,17 @@ def test_its_bytecode_is_made_with_it(index: Index, tmp_path: Path) -> None:
     assert compiled.is_file()
 
 
+def test_a_cache_below_a_folder_of_tests_has_bytecode(
+    index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only tests of the packages have none."""
+    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "tests/cache"))
+    make_wheel(index.folder, "wanted", files={"wanted/a.py": "", "wanted/tests/b.py": ""})
+    env = made(repository(tmp_path / "repo", "wanted"))
+    assert len([*env.packages.glob("wanted/__pycache__/a.*.pyc")]) == 1
+    assert [*env.packages.glob("wanted/tests/__pycache__/*.pyc")] == []
+
+
 def test_source_that_cannot_be_compiled_is_nobodys_error(index: Index, tmp_path: Path) -> None:
     """Packages hold templates and code of other Pythons."""
     make_wheel(index.folder, "wanted", files={"wanted.py": "print 'of another age'\n"})
