@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox import folders
-from envhub_sandbox.dependencies import uv
+from envhub_sandbox.dependencies import index, uv
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.resolve import Lock
 from envhub_sandbox.errors import DependencyError, PackageIntegrityError
@@ -289,7 +289,7 @@ def _install(
         [
             *("pip", "install", *uv.NO_BUILDS, "--require-hashes", "--no-deps"),
             *("--link-mode", "copy", "--python", interpreter.path, "--target", str(packages)),
-            *("-r", str(pins)),
+            *(*index.options(), "-r", str(pins)),
         ],
         what="the packages could not be installed",
         timeout_s=_INSTALL_S,

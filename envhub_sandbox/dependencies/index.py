@@ -28,6 +28,10 @@ _CHOOSE_AN_INDEX = (
     *("UV_DEFAULT_INDEX", "UV_INDEX", "UV_INDEX_URL", "UV_EXTRA_INDEX_URL", "UV_FIND_LINKS"),
     "UV_NO_INDEX",
 )
+_PATHS = (
+    *("UV_CACHE_DIR", "SSL_CERT_FILE", "SSL_CERT_DIR", "SSL_CLIENT_CERT", "REQUESTS_CA_BUNDLE"),
+    "NETRC",
+)
 _FIXED = {"UV_PYTHON_DOWNLOADS": "never", "UV_NO_PROGRESS": "1", "NO_COLOR": "1"}
 _YES = ("1", "true", "yes", "on")
 
@@ -42,7 +46,23 @@ def environment(variables: Mapping[str, str] | None = None) -> dict[str, str]:
     kept = {name: value for name, value in given.items() if value and _KEPT.fullmatch(name)}
     if not any(name in kept for name in _CHOOSE_AN_INDEX):
         kept |= _as_uv_says(pip_settings(given), kept)
-    return kept | _FIXED
+    return {name: _from_here(name, value) for name, value in kept.items()} | _FIXED
+
+
+def _from_here(name: str, value: str) -> str:
+    """A path as the user means it: uv runs in another folder."""
+    if name == "UV_FIND_LINKS":
+        return ",".join(map(_absolute, value.split(",")))
+    return _absolute(value) if name in _PATHS else value
+
+
+def _absolute(place: str) -> str:
+    return place if not place or "://" in place else os.path.abspath(os.path.expanduser(place))
+
+
+def options() -> tuple[str, ...]:
+    """What uv is told on its command line: it has no variable for that there is no index."""
+    return ("--no-index",) if environment().get("UV_NO_INDEX", "").lower() in _YES else ()
 
 
 def places(variables: Mapping[str, str] | None = None) -> list[str]:

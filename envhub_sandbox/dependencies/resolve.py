@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from packaging.utils import canonicalize_name
 
-from envhub_sandbox.dependencies import interpreters, uv
+from envhub_sandbox.dependencies import index, interpreters, uv
 from envhub_sandbox.dependencies.declared import Wanted, one
 from envhub_sandbox.errors import PackageIntegrityError, ResolutionError
 
@@ -99,7 +99,7 @@ def resolve(
         text = uv.run(
             [
                 *("pip", "compile", "-", *uv.NO_BUILDS, "--generate-hashes", "--no-header"),
-                *("--no-annotate", *target.options),
+                *("--no-annotate", *target.options, *index.options()),
                 *(() if exclude_newer is None else ("--exclude-newer", exclude_newer)),
                 *(("--refresh",) if refresh else ()),
             ],

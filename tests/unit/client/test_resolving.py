@@ -218,6 +218,29 @@ def test_a_mirror_that_pip_knows_is_used() -> None:
     assert found["SSL_CERT_FILE"] == "/ca.pem"
 
 
+def test_a_relative_path_is_relative_to_the_users_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """uv runs in another one."""
+    for name, version in WORKERS.items():
+        make_wheel(tmp_path, name, version)
+    monkeypatch.chdir(tmp_path.parent)
+    for name in [name for name in os.environ if name.startswith(("UV_", "PIP_"))]:
+        monkeypatch.delenv(name)
+    settings = {"NO_INDEX": "1", "FIND_LINKS": tmp_path.name, "CONFIG_FILE": os.devnull}
+    for name, value in settings.items():
+        monkeypatch.setenv(f"PIP_{name}", value)
+    monkeypatch.setenv("UV_CACHE_DIR", f"{tmp_path.name}/uv")
+    target = Target(version="3.12", machine="x86_64")
+    assert set(resolve("numpy", target=target).packages) == {
+        f"{name}=={version}" for name, version in WORKERS.items()
+    }
+    assert (tmp_path / "uv").is_dir()
+    given = {**NO_FILES, "UV_FIND_LINKS": "a,https://b.example/c,/d"}
+    here = tmp_path.parent
+    assert places.environment(given)["UV_FIND_LINKS"] == f"{here}/a,https://b.example/c,/d"
+
+
 def test_pips_files_are_read_in_pips_order(tmp_path: Path) -> None:
     """The user's wins over the machine's, and a variable over both."""
     config, home = tmp_path / "xdg", tmp_path / "home"
