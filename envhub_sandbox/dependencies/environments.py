@@ -152,7 +152,7 @@ def provide(
 
 def every() -> list[Environment]:
     """All of them, the latest used first."""
-    found = [_read(record.parent) for record in root().glob("*/environment.json")]
+    found = [_read(record.parent) for record in root().glob("[!.]*/environment.json")]
     return sorted((one for one in found if one is not None), key=lambda one: -one.used)
 
 

@@ -33,7 +33,8 @@ _KEPT_LINES = 400
 
 _NO_INDEX = (
     "The package index did not answer. Look at the network, or name a mirror that can be reached "
-    "in UV_INDEX_URL or in pip's settings; what was made here before works offline"
+    "in UV_INDEX_URL or in pip's settings; what was made here before works offline, and "
+    "dependencies='host' takes the packages of this interpreter as they are"
 )
 
 # What uv says, and what that means for the user; the first that is found counts.
@@ -180,7 +181,8 @@ def command() -> str:
     if found is None:
         raise DependencyError(
             "uv resolves and installs packages, and is not found: neither among this interpreter's "
-            "packages nor on PATH. Run: pip install uv"
+            "packages nor on PATH. Run: pip install uv. Or take the packages of this one as they "
+            "are, with dependencies='host'"
         )
     _check_release(found)
     return found

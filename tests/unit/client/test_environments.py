@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import importlib.util
 import os
+import shutil
 import stat
 import subprocess
 import sys
@@ -129,6 +130,15 @@ def test_what_lost_its_content_is_made_again(index: Index, tmp_path: Path, damag
     assert made(folder) == env
     assert environments.ready(env.key) == env
     assert left_behind() == []
+
+
+def test_what_is_still_being_made_is_not_listed(index: Index, tmp_path: Path) -> None:
+    """So that nobody removes it under its maker's hands."""
+    env = made(repository(tmp_path / "repo"))
+    draft = environments.root() / f".building-{env.key}-12345678"
+    (draft / "packages").mkdir(parents=True)
+    shutil.copy(env.home / "environment.json", draft)
+    assert environments.every() == [env]
 
 
 def test_two_repositories_that_need_the_same_share_it(index: Index, tmp_path: Path) -> None:
