@@ -28,6 +28,8 @@ OLDEST = (0, 11, 16)
 """Before, a wheel's scripts went wherever the wheel said, and what is editable was built in spite
 of ``--no-build``. pyproject.toml asks for the same; but there may be another on PATH."""
 _VERSION_S = 60.0
+_SECRET = re.compile(r"(?<=://)[^/?#\s]*(?=@)|(?<=\?)[^\s?=]+=[^\s'\"`)]+")
+"""What may be one in a URL; uv hides passwords, but for those in a query or in what is no URL."""
 _SHOWN = 4000
 _KEPT_LINES = 400
 
@@ -161,7 +163,7 @@ class _Listener:
         assert self._process.stderr is not None
         for line in self._process.stderr:
             del self._lines[:-_KEPT_LINES]
-            self._lines.append(printable(line.rstrip(), 500))
+            self._lines.append(printable(_SECRET.sub("****", line.rstrip()), 500))
             self._tell(self._lines[-1].strip())
 
 

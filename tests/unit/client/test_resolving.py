@@ -159,6 +159,20 @@ def test_no_index(index: Index) -> None:
         resolve("numpy")
 
 
+@pytest.mark.parametrize("wrong", ["http://u:hidden@[wrong", "{url}/no?token=hidden"])
+def test_no_password_of_an_index_is_in_an_error(
+    index: Index, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, wrong: str
+) -> None:
+    """Errors are logged, and shown to others."""
+    index.broken = 503
+    url = os.environ["UV_DEFAULT_INDEX"]
+    monkeypatch.setenv("UV_DEFAULT_INDEX", wrong.format(url=url))
+    monkeypatch.setenv("UV_EXTRA_INDEX_URL", url)
+    with pytest.raises(DependencyError) as caught:
+        resolve("numpy")
+    assert "hidden" not in f"{caught.value} {caplog.text}"
+
+
 def test_only_what_uploads_before_a_date(index: Index) -> None:
     """The index gives no times here, so that nothing is old enough."""
     with pytest.raises(DependencyError):
