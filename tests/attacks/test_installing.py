@@ -212,7 +212,15 @@ def relative(index: Index, folder: Path, traces: Path) -> tuple[str, Callable[[]
     return "./source", lambda: plain_uv("./source\n", folder)
 
 
-@pytest.mark.parametrize("kind", [only_source, editable, linked, relative])
+def smuggled(index: Index, folder: Path, traces: Path) -> tuple[str, Callable[[], object]]:
+    """An option in a marker's text, which is read with its escapes and was printed without them."""
+    made = source(folder / "source", "smuggled", traces)
+    text = f'numpy; os_name == "x" or os_name == "posix"\n-e {made}\nnumpy; os_name == "x"'
+    inside = text[len('numpy; os_name == "') : -1].replace("\n", r"\n").replace('"', r"\"")
+    return f"numpy; os_name == '{inside}'", lambda: plain_uv(f"{text}\n", folder)
+
+
+@pytest.mark.parametrize("kind", [only_source, editable, linked, relative, smuggled])
 def test_what_would_be_built_is_not(
     real_index: Index,
     tmp_path: Path,
