@@ -1,4 +1,4 @@
-"""A warm worker server, to spawn confined workers from. Looks into private parts."""
+"""A warm worker server, to spawn confined workers from."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The forms in which people write a repository: plain, ``hf://``, and pages of the Hub's site.
 
-Each reader returns ``Parts``, which ``reference_rules.check`` then judges, or raises ``Wrong``.
+Each reader returns ``Parts``, which ``grammar.check`` then judges, or raises ``Wrong``.
 """
 
 from __future__ import annotations

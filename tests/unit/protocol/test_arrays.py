@@ -196,7 +196,7 @@ F4, BOOL, TEXT_CODE, BYTES_CODE, TIME_CODE = 10, 0, 14, 15, 16
 
 
 def test_hand_made_descriptor_is_understood() -> None:
-    """The helper that the tests below spoil writes what the reader reads."""
+    """The descriptors that the tests below spoil are what the reader reads."""
     tail = np.arange(6, dtype="<f4").tobytes()
     assert_same(np.arange(6, dtype="f4").reshape(2, 3), read(descriptor(F4, 2, 3), tail))
 

@@ -69,7 +69,7 @@ def unshare_for_zygote(network: str) -> None:
 
 
 def unshare_for_jail(network: str) -> None:
-    """What each jail has for itself; its pid namespace was made by ``in_new_pid_namespace``."""
+    """What each jail has for itself; ``fork_in_new_pid_namespace`` made its pid namespace."""
     flags = CLONE_NEWNS | CLONE_NEWIPC | CLONE_NEWCGROUP
     _unshare(flags | (0 if network == "host" else CLONE_NEWNET))
 
