@@ -109,7 +109,8 @@ def make_env(
         SandboxUnavailableError: This host cannot enforce the policy.
         DependencyError: Its packages cannot be had, or it imports one that it does not declare.
         LoadError: The repository failed to load, or returned something unusable.
-        WorkerError: The worker did not come up, died, or took too long.
+        WorkerError: The worker did not come up, died, or took too long; or a server has no room
+            (``ServerBusyError``).
         RuntimeError: ``sandbox=None`` without ``trust_remote_code=True``.
     """
     reference, config = _reference(cfg)

@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from envhub_sandbox.dependencies.environments import Environment
 
 app = typer.Typer(
-    help="List and remove what was downloaded.", no_args_is_help=True, rich_markup_mode="rich"
+    help="List and remove what was downloaded, and made of it.",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
 )
 
 _DAY_S = 24 * 3600.0

@@ -29,7 +29,7 @@ Grant = Annotated[
     typer.Option(
         "--grant",
         help="Permit what the bundle asks for beyond an ordinary run: its network, readable paths, "
-        "variables, limits, interpreter, Hub. Only for bundles that you trust.",
+        "variables, limits, interpreter, packages, Hub. Only for bundles that you trust.",
     ),
 ]
 

@@ -49,30 +49,60 @@ class UsageError(Exception):
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``listen``."""
-    quotas = Quotas()
     parser.add_argument(
-        "--max-connections", type=_count, default=MAX_CONNECTIONS, help="of everybody together"
+        "--max-connections",
+        type=_count,
+        default=MAX_CONNECTIONS,
+        help=f"of everybody together, strangers included (default: {MAX_CONNECTIONS})",
     )
-    parser.add_argument("--bind", default=DEFAULT_BIND, metavar="tcp://HOST:PORT")
+    parser.add_argument(
+        "--bind",
+        default=DEFAULT_BIND,
+        metavar="tcp://HOST:PORT",
+        help=f"where to listen (default: {DEFAULT_BIND})",
+    )
     parser.add_argument("--key", type=Path, help="the server's secret key (see keygen)")
-    parser.add_argument("--authorized-clients", type=Path, metavar="FILE")
+    parser.add_argument(
+        "--authorized-clients",
+        type=Path,
+        metavar="FILE",
+        help="clients' public keys, one a line; without it one is made and printed",
+    )
     parser.add_argument("--insecure-loopback", action="store_true", help="no keys; loopback only")
     parser.add_argument("--state-dir", type=Path, help="keys and snapshots; private, writable")
-    parser.add_argument("--idle-s", type=int, default=_IDLE_S, help="end silent clients' jails")
-    parser.add_argument("--weakest-profile", choices=PROFILES, default=_weakest_profile())
+    parser.add_argument(
+        "--idle-s",
+        type=int,
+        default=_IDLE_S,
+        help=f"end jails of clients that are silent for so long; 0: never (default: {_IDLE_S})",
+    )
+    parser.add_argument(
+        "--weakest-profile",
+        choices=PROFILES,
+        default=_weakest_profile(),
+        help="that a policy may ask for (default here: %(default)s)",
+    )
     parser.add_argument("--allow-network", action="store_true", help="permit network='host'")
     parser.add_argument("--allow-gpu", action="store_true", help="permit gpu=True")
-    for names, default, unit in (
-        (("--max-jails",), quotas.jails, ""),
-        (("--max-runners", "--max-hosts"), quotas.runners, ""),
-        (("--max-sessions",), quotas.sessions, ""),
-        (("--max-upload-files",), quotas.upload_files, ""),
-        (("--max-memory",), quotas.memory_bytes // GIB, " GiB"),
-        (("--max-upload",), quotas.upload_bytes // MIB, " MiB"),
-        (("--max-inflight",), quotas.inflight_bytes // MIB, " MiB"),
+    _add_quotas(parser)
+
+
+def _add_quotas(parser: argparse.ArgumentParser) -> None:
+    quotas = Quotas()
+    for names, what, default, unit in (
+        (("--max-jails",), "open jails", quotas.jails, ""),
+        (("--max-runners", "--max-hosts"), "processes of environments", quotas.runners, ""),
+        (("--max-sessions",), "client processes", quotas.sessions, ""),
+        (("--max-upload-files",), "files of a snapshot", quotas.upload_files, ""),
+        (("--max-memory",), "memory limits of jails", quotas.memory_bytes // GIB, " GiB"),
+        (("--max-upload",), "snapshots", quotas.upload_bytes // MIB, " MiB"),
+        (("--max-inflight",), "unanswered requests", quotas.inflight_bytes // MIB, " MiB"),
     ):
         parser.add_argument(
-            *names, type=_count, default=default, help=f"of one key (default: {default}{unit})"
+            *names,
+            type=_count,
+            default=default,
+            help=f"of one key: {what} (default: {default}{unit})",
         )
 
 
