@@ -1,1 +1,1 @@
-"""The commands of ``envhub-worker``, one file each."""
+"""Commands of ``envhub-worker``, one file each; ``serve`` and ``keygen`` are in ``__main__``."""

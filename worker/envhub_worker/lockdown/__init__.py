@@ -1,1 +1,1 @@
-"""One file per mechanism that confines a jail. Own ctypes code: no system library is needed."""
+"""What confines a jail: the plan (pure), its stages and mechanisms, the report, and the probe."""

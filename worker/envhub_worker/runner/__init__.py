@@ -1,1 +1,1 @@
-"""Everything that shares a process with the stranger. Only a forked, confined child imports it."""
+"""Everything that shares a process with the stranger. Zygote and runners load it, by name."""
