@@ -94,7 +94,7 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
 
     @property
     def provenance(self) -> dict[str, Any]:
-        """What runs: repository, commit, file hashes, interpreter, packages, protocol, layers."""
+        """What runs: commit, file hashes, interpreter, packages, what was installed, layers."""
         return self._provenance()
 
     def close(self) -> None:
