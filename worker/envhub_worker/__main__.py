@@ -198,8 +198,10 @@ def _add_remote(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     status.add_arguments(asking)
     asking.set_defaults(run=_status)
     keygen = commands.add_parser("keygen", help="make a CURVE key pair")
-    keygen.add_argument("--out", type=Path, default=Path(), metavar="DIR")
-    keygen.add_argument("--name", default="client")
+    keygen.add_argument(
+        "--out", type=Path, default=Path(), metavar="DIR", help="where both lie (default: here)"
+    )
+    keygen.add_argument("--name", default="client", help="of NAME.key (secret) and NAME.pub")
     keygen.set_defaults(run=_keygen)
 
 
