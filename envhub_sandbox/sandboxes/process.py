@@ -50,8 +50,12 @@ class ProcessServer:
 
     @property
     def runs(self) -> bool:
-        """Whether it has not ended."""
-        return self.process.poll() is None
+        """Whether it has not ended.
+
+        One that was killed is a zombie before its threads are gone, and only then can it be waited
+        for: it takes no requests any more.
+        """
+        return self.process.poll() is None and not _is_zombie(self.process.pid)
 
     def stop(self) -> None:
         """End it and everything below it, in bounded time. A fork of its owner does nothing."""
@@ -159,3 +163,11 @@ def _wait_until_ready(ready: int, server: ProcessServer) -> None:
 
 
 PROCESS = ProcessSandbox()
+
+
+def _is_zombie(pid: int) -> bool:
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace")
+    except OSError:
+        return True
+    return stat.rpartition(")")[2].split()[0] in "ZX"

@@ -6,6 +6,7 @@ table; run it as root and as a plain user for all of them.
 
 from __future__ import annotations
 
+import fcntl
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -75,3 +76,11 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """Write the table, if asked to."""
     _TABLE.write(session)
+
+
+@pytest.fixture
+def broadcasting() -> Iterator[None]:
+    """What is sent to everybody is sent by one test at a time, whichever process runs it."""
+    with open(__file__) as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield

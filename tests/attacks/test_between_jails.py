@@ -43,7 +43,7 @@ class Neighbour:
     path: str
 
     def state(self) -> dict[str, Any]:
-        """``text``, what its memory holds now, and ``signals``, how many have come."""
+        """``text``, what its memory holds now, ``signals`` and ``broadcasts`` that have come."""
         run = Run(new_alias(), True)
         call(self.env, run, "be_victim", {"secret": None})
         return dict(run.value)
@@ -136,6 +136,7 @@ def test_signals_do_not_reach_another_jail(arena: Arena, way: str) -> None:
         )
 
 
+@pytest.mark.usefixtures("broadcasting")
 def test_everybody_is_not_another_jail(arena: Arena) -> None:
     """kill(-1) does not reach a neighbour either."""
     with victim(token()) as target, neighbour(arena, token()) as other:
@@ -143,10 +144,12 @@ def test_everybody_is_not_another_jail(arena: Arena) -> None:
 
         def came(run: Run) -> bool:
             of = other if run.inside else target
-            return eventually(lambda: of.state()["signals"] > seen[0], 0.5 if run.inside else 10.0)
+            return eventually(
+                lambda: of.state()["broadcasts"] > seen[0], 0.5 if run.inside else 10.0
+            )
 
         def begin() -> None:  # the control is the caller's own, and reaches all that is theirs
-            seen[0] = other.state()["signals"]
+            seen[0] = other.state()["broadcasts"]
 
         arena.attack("signal another jail: kill(-1)", "signal_all", came, before=begin)
 

@@ -39,7 +39,10 @@ class Victim:
     fd: int
 
     def state(self) -> dict[str, Any]:
-        """``text``, what its memory holds now, and ``signals``, how many have come."""
+        """``text``, what its memory holds now; ``signals`` and ``broadcasts``, how many have come.
+
+        What is sent to everybody is another signal: it reaches victims of other tests, too.
+        """
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         self.process.stdin.write("\n")
@@ -71,18 +74,19 @@ def main(secret: str) -> None:
     buffer = ctypes.create_string_buffer(secret.encode())
     file = os.memfd_create("secret")
     os.write(file, secret.encode())
-    count = 0
+    counts = {signal.SIGURG: 0, signal.SIGWINCH: 0}
 
-    def counted(*_: object) -> None:
-        nonlocal count
-        count += 1
+    def counted(number: int, _: object) -> None:
+        counts[signal.Signals(number)] += 1
 
-    signal.signal(signal.SIGURG, counted)
+    for number in counts:
+        signal.signal(number, counted)
     facts = {"pid": os.getpid(), "address": ctypes.addressof(buffer), "size": len(secret)}
     print(json.dumps({**facts, "fd": file}), flush=True)
     for _ in sys.stdin:
         text = buffer.raw.decode("ascii", "replace")
-        print(json.dumps({"text": text, "signals": count}), flush=True)
+        came = {"signals": counts[signal.SIGURG], "broadcasts": counts[signal.SIGWINCH]}
+        print(json.dumps({"text": text, **came}), flush=True)
 
 
 if __name__ == "__main__":

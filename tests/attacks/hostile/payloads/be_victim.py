@@ -5,14 +5,16 @@ import os
 import signal
 import tempfile
 
-kept = {"signals": 0}
+kept = {"signals": 0, "broadcasts": 0}
 
 
 def attack(secret):
     if secret is None:
-        return {"signals": kept["signals"], "text": kept["buffer"].raw.decode("ascii", "replace")}
+        came = {name: kept[name] for name in ("signals", "broadcasts")}
+        return {**came, "text": kept["buffer"].raw.decode("ascii", "replace")}
     ctypes.CDLL(None).prctl(0x59616D61, ctypes.c_ulong(-1), 0, 0, 0)  # PR_SET_PTRACER
     signal.signal(signal.SIGURG, _count)
+    signal.signal(signal.SIGWINCH, _count)  # what is sent to everybody
     os.environ["SECRET"] = secret
     kept["buffer"] = ctypes.create_string_buffer(secret.encode())
     folder = os.path.expanduser("~")
@@ -29,5 +31,5 @@ def attack(secret):
     }
 
 
-def _count(*_):
-    kept["signals"] += 1
+def _count(number, _):
+    kept["broadcasts" if number == signal.SIGWINCH else "signals"] += 1
