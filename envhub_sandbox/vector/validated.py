@@ -39,9 +39,9 @@ class ValidatedVectorEnv(SandboxVectorEnv):
         # not a method of ours: who holds himself is not closed when nobody else holds him
         self._read_actions = partial(_read_and_check, self._read_actions, *spaces_of_actions)
 
-    def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
-        """As ``SandboxVectorEnv.reset_wait``, checked."""
-        observations, infos = super().reset_wait(timeout)
+    def _end_reset(self, timeout_s: float | None) -> tuple[Any, dict[Any, Any]]:
+        """What both ``reset`` and ``reset_wait`` end with, checked."""
+        observations, infos = super()._end_reset(timeout_s)
         self._check_batch("reset", observations)
         return observations, infos
 

@@ -232,7 +232,8 @@ def test_proxy_that_nobody_holds_ends_its_processes(folder: Path) -> None:
         sys.stdin.readline()
         """,
     )
-    assert line(client) == "collected"
+    said = line(client)
+    assert said == "collected", said + finish(client)
     jails = 5  # the server, its zygote's two, and keeper's init and runner
     assert eventually(lambda: len(Traces.of(folder).processes) <= jails), left(folder)
     client.kill()
