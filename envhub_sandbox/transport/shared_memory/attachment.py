@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ from envhub_worker.protocol import messages as m
 
 _RECHECK_MS = 2
 _CONNECT_S = 5.0
+_TRIES = 3
 
 
 class Attachment:
@@ -103,13 +105,25 @@ def sleep_for(watch: Watch, shard: LaneShard, deadline: Deadline) -> bool:
 def deposit(path: str, session: bytes, jail: int, runner: int, fds: Sequence[int]) -> int:
     """Hand descriptors to the server for a runner; returns a pidfd of the jail, or of the runner.
 
+    The server waits a second for what a connection brings, and for nothing else meanwhile. If the
+    garbage collector closes another environment between our connecting and our sending, it waits
+    for that server in turn, and the connection is gone. So it is tried again: the same descriptors
+    for the same runner take the place of what was there.
+
     Raises:
         OSError: The server did not take them.
     """
+    [frame] = m.pack(m.Deposit(session, jail, runner), 0)
+    for _ in range(_TRIES - 1):
+        with contextlib.suppress(ConnectionError):
+            return _deposit(path, frame, fds)
+    return _deposit(path, frame, fds)
+
+
+def _deposit(path: str, frame: bytes | memoryview, fds: Sequence[int]) -> int:
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
         connection.settimeout(_CONNECT_S)
         connection.connect(path)
-        [frame] = m.pack(m.Deposit(session, jail, runner), 0)
         socket.send_fds(connection, [frame], list(fds))
         data, received, _, _ = socket.recv_fds(connection, 16, 1)
     if data != b"k" or len(received) != 1:
