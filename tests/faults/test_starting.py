@@ -57,7 +57,8 @@ def test_what_a_client_left_that_had_no_server_yet_goes_with_the_next(
         assert list(runtime_folder.stale_folders(folder)) == []
     client.kill()
     finish(client)
-    assert len(list(runtime_folder.stale_folders(folder))) == 1
+    age(folder)
+    assert eventually(lambda: len(list(runtime_folder.stale_folders(folder))) == 1)
     assert is_removed_by_the_next(folder), left(folder)
 
 

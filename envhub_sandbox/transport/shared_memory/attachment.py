@@ -115,7 +115,7 @@ def deposit(path: str, session: bytes, jail: int, runner: int, fds: Sequence[int
     """
     [frame] = m.pack(m.Deposit(session, jail, runner), 0)
     for _ in range(_TRIES - 1):
-        with contextlib.suppress(ConnectionError):
+        with contextlib.suppress(ConnectionError, TimeoutError):
             return _deposit(path, frame, fds)
     return _deposit(path, frame, fds)
 
