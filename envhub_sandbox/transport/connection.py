@@ -31,7 +31,8 @@ from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimit
 from envhub_worker.protocol.text import printable
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
-_MORE, _NOW = int(zmq.SNDMORE), int(zmq.NOBLOCK)
+_NOW = int(zmq.NOBLOCK)
+_MORE_NOW = int(zmq.SNDMORE) | _NOW
 _FAR_VERSION = 2
 _FIRST_OF_VERSION_2 = 17
 SESSION = secrets.token_bytes(16)
@@ -54,6 +55,8 @@ def _context() -> zmq.Context[zmq.Socket[bytes]]:
 
 _LOOK_MS = 500
 """One wait on a connection over a network: whether it is still there is asked in between."""
+_ROOM_S = 30.0
+"""How long a socket may be full, or without a connection, until what is sent counts as lost."""
 
 
 class WorkerClient:
@@ -191,10 +194,31 @@ class WorkerClient:
                 self._send(request_id, unanswered)
 
     def _put(self, frames: Sequence[Buffer], *, copy: bool) -> None:
-        # one by one: pyzmq's own loop costs more than the calls in it
-        for frame in frames[:-1]:
-            self._socket.send(frame, _MORE, copy)
-        self._socket.send(frames[-1], 0, copy)
+        deadline: Deadline | None = None
+        while True:
+            try:
+                # one by one: pyzmq's own loop costs more than the calls in it
+                for frame in frames[:-1]:
+                    self._socket.send(frame, _MORE_NOW, copy)
+                self._socket.send(frames[-1], _NOW, copy)
+            except zmq.Again:  # nothing of the message is left in the socket
+                deadline = deadline or Deadline(_ROOM_S)
+                self._wait_for_room(deadline)
+            else:
+                return
+
+    def _wait_for_room(self, deadline: Deadline) -> None:
+        """Until the socket takes a message. A refused handshake leaves it with nowhere to put one.
+
+        To send and wait for that, as libzmq does unasked, would be to wait for ever.
+        """
+        while not self._socket.poll(min(_LOOK_MS, deadline.left_ms() or 0), zmq.POLLOUT):
+            if self._process_fd in dict(self._poller.poll(0)):
+                raise WorkerDiedError("the worker server has ended", reason="server")
+            if self._link is not None:
+                self._link.check(self._link.next_number())
+            if deadline.passed:
+                raise WorkerTimeoutError(f"the worker took no request for {_ROOM_S:.0f} s")
 
     def _take(self) -> list[Buffer]:
         """The message that is there. What is large stays in ZeroMQ's memory until it is decoded."""

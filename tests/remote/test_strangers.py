@@ -20,6 +20,7 @@ import zmq
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerError
+from envhub_sandbox.transport.tcp import Link
 from envhub_worker.access import keys
 from envhub_worker.access.connection_limit import Doorman
 from envhub_worker.access.gate import Arrived, Asked, Greeting, RemoteGate, Rules
@@ -78,6 +79,22 @@ def test_another_clients_key_is_refused_at_once(server: Listening, repository: P
 
     # again and again: the log has a few lines a minute, and other tests have refused knocks too
     assert eventually(knocks)
+
+
+def test_a_refusal_between_looking_and_sending_is_no_wait(
+    server: Listening, repository: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The socket has nowhere to put the request then, and libzmq would wait for that for ever."""
+    whole = Link.next_number
+
+    def slowly(link: Link) -> int:
+        monkeypatch.setattr(Link, "next_number", whole)
+        assert eventually(lambda: not inside.can_send(link))
+        return 1  # as if it had looked just before
+
+    monkeypatch.setattr(Link, "next_number", slowly)
+    with pytest.raises(SandboxUnavailableError, match="does not know our key"):
+        make_env(repository, sandbox=server.sandbox(client_key=key_text(keys.generate().secret)))
 
 
 def test_another_servers_key_is_refused_at_once(server: Listening, repository: Path) -> None:

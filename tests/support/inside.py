@@ -180,6 +180,11 @@ def link_is_up(found: Any) -> bool:
     return bool(found._up)
 
 
+def can_send(found: Any) -> bool:
+    """Whether the socket of a link takes a message."""
+    return bool(found._socket.poll(0, zmq.POLLOUT))
+
+
 def link_losses(found: Any) -> int:
     """How often it was lost."""
     return int(found._lost)
