@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from envhub_sandbox.dependencies.prepare import provided
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.hub import store
 from envhub_sandbox.hub.snapshot import named
+from envhub_sandbox.locks import use as locks
 from envhub_sandbox.policy import Limits, Policy, Timeouts, policy_from, timeouts_from
 from envhub_sandbox.sandboxes import inprocess
 from envhub_sandbox.sandboxes.base import Sandbox
@@ -51,6 +52,7 @@ def make_env(
     endpoint: str | None = None,
     python: str | Path | None = None,
     dependencies: str | os.PathLike[str] | Mapping[str, Any] = "auto",
+    lock: str | os.PathLike[str] | None = None,
     num_workers: int | None = None,
     prewarm: int | None = None,
     lane: str = "auto",
@@ -84,6 +86,8 @@ def make_env(
             takes this interpreter as it is; a path that interpreter or virtual environment. A
             mapping always makes one: ``{"extra": ["scipy"], "python": "3.12", "exclude_newer":
             "2026-01-31"}``. See ``docs/dependencies.md``; for ``sandbox="process"``.
+        lock: A file that ``envhub lock`` wrote: its packages are used and no others, and whatever
+            differs from it (commit, files, Python, spaces) is refused. For ``sandbox="process"``.
         num_workers: Processes over which the sub-environments are spread; by default one, or with
             ``use_async_envs`` as many as are useful for the cores there are.
         prewarm: How many of a suite's next tasks are started in the background when a task is first
@@ -107,6 +111,7 @@ def make_env(
         SnapshotError: The files cannot be had, or are not what the commit says.
         PolicyError: An unknown or impossible policy, limit or timeout.
         SandboxUnavailableError: This host cannot enforce the policy.
+        LockError: The lock cannot be read; or something is not as it says (``LockDriftError``).
         DependencyError: Its packages cannot be had, or it imports one that it does not declare.
         LoadError: The repository failed to load, or returned something unusable.
         WorkerError: The worker did not come up, died, or took too long; or a server has no room
@@ -131,12 +136,14 @@ def make_env(
                 "limits": limits,
                 "python": python,
                 "dependencies": None if dependencies == "auto" else dependencies,
+                "lock": lock,
                 "num_workers": num_workers,
                 "prewarm": prewarm,
                 "validate": validate,
                 "server_key": server_key,
             }
         )
+    locked = None if lock is None else locks.opened(lock, sandbox, python, dependencies)
     choice, python = chosen(dependencies, python)
     if choice.where == "own" and sandbox not in ("process", None):
         raise PolicyError(
@@ -154,7 +161,11 @@ def make_env(
     if place is None:
         envs = inprocess.make(snapshot, n_envs, use_async_envs, config, further)
         return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))
-    environment = provided(snapshot, choice) if sandbox == "process" else None
+    environment = None
+    if locked is not None:
+        environment = locks.provided(snapshot, locked)
+    elif sandbox == "process":
+        environment = provided(snapshot, choice)
     if environment is not None:
         runs_on = Runtime(environment.python, str(environment.packages))
     repository = Repository(
@@ -190,6 +201,7 @@ def make_env(
             "endpoint": endpoint,
             "python": python,
             "dependencies": "auto" if python is not None else dependencies,
+            "lock": None if lock is None else os.path.abspath(lock),
             "num_workers": num_workers,
             "prewarm": prewarm,
             "lane": lane,
@@ -202,7 +214,8 @@ def make_env(
         prewarm = (
             0  # a container's memory is all its jails', a quota all a key's, a GPU everybody's
         )
-    return _Maker(repository, num_workers, prewarm, _face(validate)).make()
+    agrees = locks.checker(locked, snapshot.label, further, config)
+    return _Maker(repository, num_workers, prewarm, _face(validate), agrees).make()
 
 
 def _face(validate: bool) -> type[SandboxVectorEnv]:
@@ -225,8 +238,10 @@ class _Maker:
         num_workers: int | None,
         prewarm: int | None,
         face: type[SandboxVectorEnv],
+        agrees: Callable[[Manifest], None],
     ) -> None:
         self._face = face
+        self._agrees = agrees
         self._repository = repository
         self._num_workers = num_workers
         self._prewarm = prewarm
@@ -238,6 +253,7 @@ class _Maker:
         repository = self._repository
         manifest = self._cache.load(max_elements=repository.policy.limits.elements)
         if manifest is not None:
+            self._agrees(manifest)
             return self._suites(manifest, None)
         with repository.named():
             deadline = Deadline(repository.timeouts.startup_s)
@@ -245,6 +261,7 @@ class _Maker:
             loaded = wait_in_line(ask, repository.retry_s, deadline, repository.label)
         self._cache.save(loaded.value)
         try:
+            self._agrees(loaded.manifest)
             return self._suites(loaded.manifest, loaded)
         except BaseException:
             repository.close(loaded)

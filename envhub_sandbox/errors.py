@@ -10,6 +10,8 @@
         RepositoryUnavailableError
       PolicyError (ValueError)
       BundleError (ValueError)
+      LockError (ValueError)
+        LockDriftError
       ActionError (ValueError)
         ActionTypeError (TypeError)
       ObservationError (ValueError)
@@ -69,6 +71,8 @@ __all__ = [
     "InterpreterUnavailableError",
     "LoadError",
     "LocalProtocolError",
+    "LockDriftError",
+    "LockError",
     "MessageTooLargeError",
     "PackageIntegrityError",
     "PolicyError",
@@ -120,6 +124,22 @@ class PolicyError(EnvHubError, ValueError):
 
 class BundleError(EnvHubError, ValueError):
     """This is no crash bundle, or one that breaks a rule."""
+
+
+class LockError(EnvHubError, ValueError):
+    """A lock file cannot be read or written, or asks for what no lock of ours does."""
+
+
+class LockDriftError(LockError):
+    """Something is not as it was locked; nothing of it is used.
+
+    Attributes:
+        drifts: What, a line each.
+    """
+
+    def __init__(self, message: str, drifts: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.drifts = drifts
 
 
 class ActionError(EnvHubError, ValueError):

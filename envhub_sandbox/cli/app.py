@@ -6,7 +6,18 @@ from typing import Annotated
 
 import typer
 
-from envhub_sandbox.cli import cache, doctor, gc, image, inspect, prefetch, replay, run, version
+from envhub_sandbox.cli import (
+    cache,
+    doctor,
+    gc,
+    image,
+    inspect,
+    lock,
+    prefetch,
+    replay,
+    run,
+    version,
+)
 from envhub_sandbox.cli.shared.exits import EXIT_CODES
 
 app = typer.Typer(
@@ -46,6 +57,8 @@ def envhub(
 app.command("run", epilog=EXIT_CODES)(run.run)
 app.command("inspect", epilog=EXIT_CODES)(inspect.inspect)
 app.command("prefetch", epilog=EXIT_CODES)(prefetch.prefetch)
+app.command("lock", epilog=EXIT_CODES)(lock.lock)
+app.command("verify", epilog=EXIT_CODES)(lock.verify)
 app.command("replay", epilog=EXIT_CODES)(replay.replay)
 app.command("doctor")(doctor.doctor)
 app.add_typer(cache.app, name="cache")

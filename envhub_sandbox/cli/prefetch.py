@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 def prefetch(
     ref: opt.Ref,
     dependencies: opt.Dependencies = "auto",
+    lock: opt.Lock = None,
     upgrade: Annotated[
         bool, typer.Option("--upgrade", help="Choose versions again, the newest that fit.")
     ] = False,
@@ -38,7 +39,12 @@ def prefetch(
             from envhub_sandbox.hub.snapshot import named
 
             snapshot = named(ref, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
-            environment = _environment(snapshot, opt.read_dependencies(dependencies), upgrade)
+            given = opt.read_dependencies(dependencies)
+            environment = (
+                _environment(snapshot, given, upgrade)
+                if lock is None
+                else _of_lock(snapshot, lock, given)
+            )
         if json:
             print_json(_document(snapshot, environment))
         else:
@@ -51,6 +57,12 @@ def _environment(snapshot: Snapshot, given: Any, upgrade: bool) -> Environment |
 
     choice, _ = chosen(given, None)
     return provided(snapshot, choice, upgrade=upgrade)
+
+
+def _of_lock(snapshot: Snapshot, lock: str, given: Any) -> Environment:
+    from envhub_sandbox.locks import use
+
+    return use.provided(snapshot, use.opened(lock, "process", None, given))
 
 
 def _document(snapshot: Snapshot, environment: Environment | None) -> dict[str, Any]:

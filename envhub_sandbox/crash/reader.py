@@ -262,7 +262,7 @@ def _texts(mapping: dict[str, Any]) -> dict[str, str]:
 # --- what it asks of this machine --------------------------------------------------------------
 
 _GRANTED = ("profile", "network", "readable", "gpu", "environment")
-_CARRIED = ("hub_cache_dir", "endpoint", "python", "dependencies")
+_CARRIED = ("hub_cache_dir", "endpoint", "python", "dependencies", "lock")
 _USUAL = (None, "auto")
 
 

@@ -14,7 +14,7 @@ from envhub_sandbox.errors import PolicyError
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.declared import Wanted
 
-_DATE = re.compile(r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}:\d{2}(Z|[+-]\d{2}:\d{2}))?")
+DATE = re.compile(r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}:\d{2}(Z|[+-]\d{2}:\d{2}))?")
 _NAMES = ("extra", "python", "exclude_newer")
 
 
@@ -113,7 +113,7 @@ def _date(given: object) -> str | None:
     if given is None:
         return None
     text = given if isinstance(given, str) else getattr(given, "isoformat", lambda: "")()
-    if not _DATE.fullmatch(text):
+    if not DATE.fullmatch(text):
         raise PolicyError(
             f"exclude_newer in dependencies is {given!r}; it takes a date such as '2026-01-31'"
         )

@@ -73,13 +73,18 @@ def prepare(
 
     declares = needed.declared.python if needed.declared else ""
     interpreter = interpreters.find(needed.choice.python, declares)
-    lock = _lock(needed, interpreter, tell, upgrade)
+    lock = versions(needed, interpreter, tell, upgrade=upgrade)
     return environments.provide(lock, interpreter, tell)
 
 
-def _lock(
-    needed: Needs, interpreter: Interpreter, tell: Callable[[str], None], upgrade: bool
+def versions(
+    needed: Needs,
+    interpreter: Interpreter,
+    tell: Callable[[str], None] = lambda line: None,
+    *,
+    upgrade: bool = False,
 ) -> Lock:
+    """The pins of all packages that are needed, remembered or chosen; raises as ``prepare``."""
     from envhub_sandbox.dependencies import resolutions
     from envhub_sandbox.dependencies.resolve import Target, resolve
 

@@ -78,6 +78,14 @@ Dependencies = Annotated[
         rich_help_panel=_CODE,
     ),
 ]
+Lock = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE",
+        help="What 'envhub lock' wrote: its packages, and nothing that differs from it.",
+        rich_help_panel=_CODE,
+    ),
+]
 NumWorkers = Annotated[
     int | None,
     typer.Option(
@@ -226,6 +234,7 @@ class MakeOptions:
     endpoint: str | None
     hub_cache_dir: str | None
     server_key: str | None = None
+    lock: str | None = None
     output: str | None = None
     validate: bool = False
 
@@ -261,6 +270,7 @@ class MakeOptions:
             "endpoint": self.endpoint,
             "python": self.python,
             "dependencies": read_dependencies(self.dependencies),
+            "lock": self.lock,
             "num_workers": self.num_workers,
             "validate": self.validate,
         }

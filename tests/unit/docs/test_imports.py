@@ -50,10 +50,12 @@ MAY_IMPORT = {
     "envhub_sandbox": {"api", "gym", "hub", "policy", "sandboxes", "vector"},
     "envhub_sandbox.__main__": {"cli"},
     "envhub_sandbox.cli": {
-        *("", "api", "crash", "dependencies", "hub", "policy", "sandboxes", "session"),
+        *("", "api", "crash", "dependencies", "hub", "locks", "policy", "sandboxes"),
+        "session",
     },
     "envhub_sandbox.api": {
-        *("arguments", "config", "dependencies", "hub", "policy", "sandboxes", "session"),
+        *("arguments", "config", "dependencies", "hub", "locks", "policy", "sandboxes"),
+        "session",
         *("transport", "vector"),
     },
     "envhub_sandbox.gym": {"api", "vector"},
@@ -64,6 +66,7 @@ MAY_IMPORT = {
     "envhub_sandbox.crash": {"folders", "hub", "policy", "transport"},
     "envhub_sandbox.sandboxes": {"dependencies", "hub", "policy", "transport"},
     "envhub_sandbox.transport": set(),
+    "envhub_sandbox.locks": {"dependencies", "hub"},
     "envhub_sandbox.dependencies": {"folders", "hub"},
     "envhub_sandbox.hub": {"folders"},
     "envhub_sandbox.arguments": set(),

@@ -1,0 +1,239 @@
+"""``envhub lock`` and ``envhub verify``: what a repository was, and whether it still is."""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from envhub_sandbox.cli.shared import options as opt
+from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say
+from envhub_sandbox.cli.shared.exits import UsageError, reported
+from envhub_sandbox.cli.shared.progress import Bar
+
+if TYPE_CHECKING:
+    from envhub_sandbox.dependencies.choice import Choice
+    from envhub_sandbox.hub.snapshot import Snapshot
+    from envhub_sandbox.locks.lockfile import LockFile
+
+Output = Annotated[
+    Path | None,
+    typer.Option(
+        "--output",
+        "-o",
+        metavar="FILE",
+        help="The file; by default pylock.NAME.toml here, after the repository's name.",
+    ),
+]
+NoSpaces = Annotated[
+    bool,
+    typer.Option(
+        "--no-spaces",
+        help="Run nothing: the lock then says nothing of what the environments look like.",
+    ),
+]
+
+
+def lock(
+    ref: opt.Ref,
+    output: Output = None,
+    upgrade: Annotated[
+        bool,
+        typer.Option(
+            "--upgrade", help="Choose versions again, and show what differs from the file."
+        ),
+    ] = False,
+    dependencies: opt.Dependencies = "auto",
+    env_kwargs: opt.EnvKwargs = None,
+    no_spaces: NoSpaces = False,
+    json: opt.Json = False,
+    token: opt.Token = None,
+    endpoint: opt.Endpoint = None,
+    hub_cache_dir: opt.HubCacheDir = None,
+    debug: opt.Debug = False,
+) -> None:
+    """Write down commit, file hashes, packages, Python and spaces, for make_env(lock=FILE).
+
+    The packages are those of an environment of its own. To see its spaces the repository is loaded,
+    in the sandbox.
+    """
+    hub = {"token": token, "endpoint": endpoint, "hub_cache_dir": hub_cache_dir}
+    with reported(debug=debug):
+        with Bar(quiet=json) as bar:
+            bar.begin(f"locking {ref}")
+            from envhub_sandbox.hub.snapshot import named
+            from envhub_sandbox.locks import drift, lockfile, making
+
+            snapshot = named(ref, **hub)
+            path = _path(output, snapshot)
+            old = _old(path, upgrade)
+            choice = _choice(opt.read_dependencies(dependencies), old)
+            made = making.locked(snapshot, choice, upgrade=upgrade)
+            if not no_spaces:
+                kwargs = opt.read_env_kwargs(env_kwargs or ())
+                made = _with_spaces(made, snapshot, _kwargs(kwargs, old), hub)
+            changes = [] if old is None else drift.differences(old, made)
+            lockfile.write(made, path)
+        _print(path, made, changes, old is not None, as_json=json)
+
+
+def verify(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="What 'envhub lock' wrote.")],
+    ref: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[REF]",
+            help="What is held against it; by default the commit that was locked. A branch says "
+            "whether that has moved on. A folder has to be named.",
+        ),
+    ] = None,
+    no_spaces: NoSpaces = False,
+    no_index: Annotated[
+        bool, typer.Option("--no-index", help="Do not ask whether the index still has the files.")
+    ] = False,
+    json: opt.Json = False,
+    token: opt.Token = None,
+    endpoint: opt.Endpoint = None,
+    hub_cache_dir: opt.HubCacheDir = None,
+    debug: opt.Debug = False,
+) -> None:
+    """Say whether a repository is still as it was locked, and if not, what differs (exit code 7).
+
+    Files, the packages on the index, Python, and, unless told otherwise, its spaces.
+    """
+    hub = {"token": token, "endpoint": endpoint, "hub_cache_dir": hub_cache_dir}
+    with reported(debug=debug):
+        with Bar(quiet=json) as bar:
+            bar.begin(f"verifying {file}")
+            from envhub_sandbox.hub.snapshot import named
+            from envhub_sandbox.locks import drift, lockfile
+
+            locked = lockfile.read(file)
+            snapshot = named(_reference(ref, locked, file), **hub)
+            now = _now(locked, snapshot, no_index=no_index)
+            if not no_spaces and not drift.differences(locked, now):
+                now = _spaces_again(now, locked, snapshot, hub)
+            found = drift.differences(locked, now)
+        if json:
+            print_json({"lock": str(file), "reference": snapshot.label, "drift": found})
+        drift.refuse(found, snapshot.label)
+        if not json:
+            say(f"{snapshot.label} is as it was locked in {file}.")
+
+
+def _path(output: Path | None, snapshot: Snapshot) -> Path:
+    if output is None:
+        name = re.sub(r"[^A-Za-z0-9_-]+", "-", Path(snapshot.repo_id).name).strip("-") or "env"
+        output = Path(f"pylock.{name}.toml")
+    path = Path(os.path.abspath(output))
+    inside = Path(snapshot.repo_id).resolve() in path.parent.resolve().joinpath("x").parents
+    if snapshot.repo_type == "local" and inside:
+        raise UsageError(
+            f"{path} would be one of the files that it locks; name another folder: --output FILE"
+        )
+    return path
+
+
+def _old(path: Path, upgrade: bool) -> LockFile | None:
+    if not path.exists():
+        return None
+    if not upgrade:
+        raise UsageError(
+            f"there is {path} already. 'envhub lock --upgrade' chooses again and shows what "
+            "differs, 'envhub verify' says whether it still holds"
+        )
+    from envhub_sandbox.locks import lockfile
+
+    return lockfile.read(path)
+
+
+def _choice(given: Any, old: LockFile | None) -> Choice:
+    from envhub_sandbox.dependencies.choice import chosen
+    from envhub_sandbox.locks import making
+
+    if given == "auto":
+        return chosen({}, None)[0] if old is None else making.again(old)
+    if not isinstance(given, dict):
+        raise UsageError(
+            "a lock is of an environment of its own; --dependencies takes auto or a JSON object"
+        )
+    return chosen(given, None)[0]
+
+
+def _kwargs(given: dict[str, Any], old: LockFile | None) -> dict[str, Any]:
+    """Those of the old lock where none are given."""
+    if given or old is None or old.spaces is None:
+        return given
+    return opt.read_env_kwargs([old.spaces.arguments])
+
+
+def _with_spaces(
+    made: LockFile, snapshot: Snapshot, env_kwargs: dict[str, Any], hub: dict[str, Any]
+) -> LockFile:
+    """The lock with what its repository returns, in the sandbox and in its own environment."""
+    from envhub_sandbox.api import make_env
+    from envhub_sandbox.locks import lockfile, making
+    from envhub_sandbox.session.recipe import pinned
+
+    with tempfile.TemporaryDirectory(prefix="envhub-lock-") as folder:
+        path = Path(folder, "pylock.toml")
+        lockfile.write(replace(made, spaces=None), path)
+        with make_env(pinned(snapshot), env_kwargs=env_kwargs, lock=path, **hub) as suites:
+            return making.with_spaces(made, env_kwargs, suites)
+
+
+def _reference(ref: str | None, locked: LockFile, file: Path) -> str:
+    from envhub_sandbox.locks import lockfile
+
+    found = ref or lockfile.reference_of(locked)
+    if found is None:
+        raise UsageError(f"{file} is of a folder; say which: envhub verify {file} ./FOLDER")
+    return found
+
+
+def _now(locked: LockFile, snapshot: Snapshot, *, no_index: bool) -> LockFile:
+    from envhub_sandbox.locks import lockfile, making
+    from envhub_sandbox.locks.drift import with_files
+
+    here = lockfile.Runner.of(lockfile.runner_here(locked))
+    now = replace(with_files(locked, snapshot), runner=here)
+    return now if no_index else replace(now, packages=making.relisted(locked).packages)
+
+
+def _spaces_again(
+    now: LockFile, locked: LockFile, snapshot: Snapshot, hub: dict[str, Any]
+) -> LockFile:
+    if locked.spaces is None:
+        return now
+    return _with_spaces(locked, snapshot, opt.read_env_kwargs([locked.spaces.arguments]), hub)
+
+
+def _print(
+    path: Path, made: LockFile, changes: list[str], was_there: bool, *, as_json: bool
+) -> None:
+    from envhub_sandbox.locks import lockfile
+
+    if as_json:
+        packages = [f"{one.name}=={one.version}" for one in made.packages]
+        reference = lockfile.reference_of(made)
+        print_json(
+            {
+                "lock": str(path),
+                "reference": reference,
+                "commit": made.commit,
+                "python": str(made.runner),
+                "packages": packages,
+                "changes": changes,
+            }
+        )
+        return
+    for line in changes:
+        console().print(safe_line(line, 500), soft_wrap=True)
+    if was_there and not changes:
+        say("Nothing has changed.")
+    say(f"{len(made.packages)} packages for {made.runner}, {len(made.files)} files, in {path}")

@@ -1,0 +1,153 @@
+"""What is no longer as it was locked, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+from envhub_sandbox.errors import LockDriftError
+from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.locks.fingerprint import Task
+from envhub_sandbox.locks.lockfile import LOCAL, LockFile, Runner, repository_of
+from envhub_sandbox.locks.pylock import Package
+from envhub_worker.protocol.text import printable
+
+_SHOWN = 30
+
+
+def differences(then: LockFile, now: LockFile) -> list[str]:
+    """Whatever differs, a line each."""
+    return [
+        *_of_files(then, now),
+        *_of_runner(then.runner, now.runner),
+        *_of_packages(then.packages, now.packages),
+        *_of_spaces(then, now),
+    ]
+
+
+def refuse(found: Sequence[str], label: str) -> None:
+    """Raise what has drifted, if anything has.
+
+    Raises:
+        LockDriftError: Something has.
+    """
+    if not found:
+        return
+    more = [f"and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else []
+    lines = "\n".join(f"  {line}" for line in [*found[:_SHOWN], *more])
+    raise LockDriftError(
+        f"{label}: not as it was locked:\n{lines}\nTake what was locked, or lock what is there "
+        "now: envhub lock --upgrade",
+        tuple(found),
+    )
+
+
+def files_and_commit(lock: LockFile, snapshot: Snapshot) -> list[str]:
+    """What differs in a repository's files."""
+    return list(_of_files(lock, with_files(lock, snapshot)))
+
+
+def with_files(lock: LockFile, snapshot: Snapshot) -> LockFile:
+    """The same with the files of a snapshot."""
+    return replace(
+        lock,
+        repository=repository_of(snapshot),
+        commit=snapshot.commit,
+        entry=snapshot.path,
+        files={record.path: record.digest for record in snapshot.files},
+    )
+
+
+def _of_files(then: LockFile, now: LockFile) -> Iterator[str]:
+    if then.repository != now.repository:
+        names = ["a local folder" if one == LOCAL else one for one in _two(then, now)]
+        yield f"repository: {names[0]} was locked, this is {names[1]}"
+    if then.commit != now.commit:
+        yield f"commit: {then.commit[:18]} was locked, this is {now.commit[:18]}"
+    if then.entry != now.entry:
+        yield f"entry file: {then.entry} was locked, this is {now.entry}"
+    yield from _of_digests(then.files, now.files)
+
+
+def _two(then: LockFile, now: LockFile) -> tuple[str, str]:
+    return then.repository, now.repository
+
+
+def _of_digests(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[str]:
+    for name in sorted({*then, *now}):
+        shown = printable(name, 200)
+        if name not in now:
+            yield f"file {shown}: gone"
+        elif name not in then:
+            yield f"file {shown}: new"
+        elif then[name] != now[name]:
+            yield f"file {shown}: other content"
+
+
+def _of_runner(then: Runner, now: Runner) -> Iterator[str]:
+    if then != now:
+        yield f"Python: {then} was locked, this is {now}"
+
+
+def runner(lock: LockFile, now: Runner) -> list[str]:
+    """What differs in the interpreter."""
+    return list(_of_runner(lock.runner, now))
+
+
+def _of_packages(then: Sequence[Package], now: Sequence[Package]) -> Iterator[str]:
+    before, after = ({one.name: one for one in packages} for packages in (then, now))
+    for name in sorted({*before, *after}):
+        old, new = before.get(name), after.get(name)
+        if old is None and new is not None:
+            yield f"package {name}: new, {new.version}"
+        elif new is None and old is not None:
+            yield f"package {name}: gone, {old.version} was locked"
+        elif old is not None and new is not None:
+            yield from _of_package(old, new)
+
+
+def _of_package(then: Package, now: Package) -> Iterator[str]:
+    if then.version != now.version:
+        yield f"package {then.name}: {then.version} was locked, this is {now.version}"
+        return
+    there = {wheel.sha256 for wheel in now.wheels}
+    for wheel in then.wheels:
+        if wheel.sha256 not in there:
+            others = ", ".join(sorted(one[:12] for one in there)) or "none"
+            yield (
+                f"package {then.name}=={then.version}: the file with SHA-256 "
+                f"{wheel.sha256[:12]}... was locked, there is {others}"
+            )
+
+
+def _of_spaces(then: LockFile, now: LockFile) -> Iterator[str]:
+    if then.spaces is None or now.spaces is None:
+        return
+    if then.spaces.arguments == now.spaces.arguments:
+        yield from of_tasks(then.spaces.tasks, now.spaces.tasks)
+
+
+def of_tasks(then: Sequence[Task], now: Sequence[Task]) -> Iterator[str]:
+    """What differs in environments."""
+    before, after = ({task.name: task for task in tasks} for tasks in (then, now))
+    for name in sorted({*before, *after}):
+        old, new, shown = before.get(name), after.get(name), printable(name, 200)
+        if old is None or new is None:
+            yield f"environment {shown}: {'new' if old is None else 'gone'}"
+            continue
+        if old.mode != new.mode:
+            yield f"environment {shown}: autoreset mode {old.mode or 'none'}, now {new.mode}"
+        if old.spaces != new.spaces:
+            yield f"environment {shown}: {_of_texts(old, new)}"
+
+
+def _of_texts(old: Task, new: Task) -> str:
+    told = [
+        f"{what} were {before}, now {after}"
+        for what, before, after in (
+            ("observations", old.observations, new.observations),
+            ("actions", old.actions, new.actions),
+        )
+        if before != after
+    ]
+    return "; ".join(told) or "other bounds or types in its spaces, which read the same"

@@ -1,0 +1,88 @@
+"""What is there now, as a lock file says it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from envhub_sandbox.dependencies import interpreters, prepare
+from envhub_sandbox.dependencies.choice import Choice
+from envhub_sandbox.dependencies.declared import one
+from envhub_sandbox.errors import LockError
+from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.locks import lockfile, pylock
+from envhub_sandbox.locks.drift import with_files
+from envhub_sandbox.locks.fingerprint import task_of
+from envhub_sandbox.locks.lockfile import LockFile, Runner, Spaces
+
+
+def locked(
+    snapshot: Snapshot,
+    choice: Choice,
+    tell: Callable[[str], None] = lambda line: None,
+    *,
+    upgrade: bool = False,
+) -> LockFile:
+    """A lock of a repository with the packages of a choice; nothing of either runs.
+
+    Raises:
+        DependencyError: Versions cannot be chosen.
+    """
+    needed = prepare.needs(snapshot, replace(choice, where="own"))
+    assert needed is not None  # which only another choice gives
+    declares = needed.declared.python if needed.declared else ""
+    interpreter = interpreters.find(choice.python, declares)
+    versions = prepare.versions(needed, interpreter, tell, upgrade=upgrade)
+    empty = LockFile(
+        *("", "", "", {}, Runner.of(interpreter)),
+        packages=pylock.described(versions, interpreter.path),
+        extra=tuple(map(str, choice.extra)),
+        exclude_newer=choice.exclude_newer,
+    )
+    return with_files(empty, snapshot)
+
+
+def again(lock: LockFile) -> Choice:
+    """The choice that led to a lock."""
+    extra = tuple(one(text, f"{text[:80]!r} in the lock") for text in lock.extra)
+    return Choice("own", extra, lock.runner.python, lock.exclude_newer)
+
+
+def relisted(lock: LockFile) -> LockFile:
+    """The same with the files that the index has of its packages now.
+
+    Raises:
+        DependencyError: The index does not answer, or lacks one.
+    """
+    pins = [f"{package.name}=={package.version}" for package in lock.packages]
+    interpreter = lockfile.runner_here(lock)
+    return replace(lock, packages=pylock.listed(pins, interpreter.path, refresh=True))
+
+
+def with_spaces(
+    lock: LockFile, env_kwargs: Mapping[str, Any], suites: Mapping[str, Mapping[Any, Any]]
+) -> LockFile:
+    """The same with what a repository's ``make_env`` returned for these arguments.
+
+    Raises:
+        LockError: The arguments have no form that can be compared.
+    """
+    arguments = lockfile.arguments_text(env_kwargs)
+    if arguments is None:
+        raise LockError("env_kwargs have no plain form that a lock could hold")
+    tasks = [
+        task_of(
+            *(suite, task, _mode(env)),
+            *(env.single_observation_space, env.single_action_space),
+        )
+        for suite, tasks in suites.items()
+        for task, env in tasks.items()
+    ]
+    return replace(lock, spaces=Spaces(arguments, tuple(tasks)))
+
+
+def _mode(env: Any) -> str | None:
+    mode = env.metadata.get("autoreset_mode")
+    found: str | None = getattr(mode, "value", mode)
+    return found

@@ -1,0 +1,85 @@
+"""A lock file as ``make_env`` uses it: its packages and no others, and nothing that has drifted."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from envhub_sandbox.errors import DependencyError, LockError, PolicyError, name_source
+from envhub_sandbox.hub.snapshot import Snapshot
+
+if TYPE_CHECKING:  # they cost time, and mostly there is no lock
+    from envhub_sandbox.dependencies.environments import Environment
+    from envhub_sandbox.locks.lockfile import LockFile
+    from envhub_worker.protocol.manifest import Manifest
+
+
+def opened(
+    path: str | os.PathLike[str], sandbox: object, python: object, dependencies: object
+) -> LockFile:
+    """The lock of these arguments of ``make_env``.
+
+    Raises:
+        LockError: It cannot be read.
+        PolicyError: The other arguments say something else.
+    """
+    if python is not None or dependencies != "auto":
+        raise PolicyError("lock says which packages there are; leave out python and dependencies")
+    if sandbox != "process":
+        raise PolicyError(
+            "lock is for sandbox='process'; an image is locked by its digest, and on another host "
+            "whoever runs the server chooses its packages"
+        )
+    from envhub_sandbox.locks import lockfile
+
+    return lockfile.read(path)
+
+
+def provided(snapshot: Snapshot, lock: LockFile) -> Environment:
+    """The environment of its packages; made if there is none.
+
+    Raises:
+        LockDriftError: The files or the interpreter are others.
+        DependencyError: It cannot be made; a package that was replaced is one of these.
+    """
+    from envhub_sandbox.dependencies import environments, progress
+    from envhub_sandbox.locks import drift, lockfile, pylock
+
+    drift.refuse(drift.files_and_commit(lock, snapshot), snapshot.label)
+    try:
+        interpreter = lockfile.runner_here(lock)
+        drift.refuse(drift.runner(lock, lockfile.Runner.of(interpreter)), snapshot.label)
+        with progress.shown("packages") as tell:
+            return environments.provide(pylock.pins(lock.packages), interpreter, tell)
+    except (DependencyError, LockError) as error:
+        name_source(error, snapshot.label)
+        raise
+
+
+def checker(
+    lock: LockFile | None, label: str, env_kwargs: Mapping[str, Any], config: object
+) -> Callable[[Manifest], None]:
+    """What holds a manifest against the lock.
+
+    With other arguments than those that were locked a repository may well make other environments:
+    then there is nothing to hold it against.
+    """
+
+    def check(manifest: Manifest) -> None:
+        if lock is None or lock.spaces is None or config is not None:
+            return
+        from envhub_sandbox.locks import drift, lockfile
+        from envhub_sandbox.locks.fingerprint import task_of
+
+        if lockfile.arguments_text(env_kwargs) == lock.spaces.arguments:
+            now = [
+                task_of(
+                    *(env.suite, env.task, env.autoreset_mode),
+                    *(env.single_observation_space, env.single_action_space),
+                )
+                for env in manifest.envs
+            ]
+            drift.refuse(list(drift.of_tasks(lock.spaces.tasks, now)), label)
+
+    return check

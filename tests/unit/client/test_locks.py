@@ -1,0 +1,324 @@
+"""Lock files: written and read again, held against what is there, and never believed."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from envhub_sandbox.dependencies import uv
+from envhub_sandbox.dependencies.choice import chosen
+from envhub_sandbox.errors import EnvHubError, LockDriftError, LockError, PackageIntegrityError
+from envhub_sandbox.hub.snapshot import local
+from envhub_sandbox.locks import drift, lockfile, making, pylock, toml
+from envhub_sandbox.locks.fingerprint import spaces_of, task_of
+from envhub_sandbox.locks.lockfile import LockFile, Runner, Spaces
+from envhub_sandbox.locks.pylock import Package, Wheel
+from tests.support.wheels import WORKERS, Index, make_wheel, served
+
+A, B = "a" * 64, "b" * 64
+BOX = gym.spaces.Box(-1, 1, (3,), np.float32)
+TASK = task_of("suite", 0, "NextStep", BOX, gym.spaces.Discrete(2))
+LOCK = LockFile(
+    "org/repo",
+    "0" * 40,
+    "env.py",
+    {"env.py": f"sha256:{A}", 'a "b".py': f"git-sha1:{'1' * 40}"},
+    Runner("cpython", "3.11", "x86_64"),
+    (Package("one", "1.0", (Wheel(A, "https://index/one-1.0.whl", 7), Wheel(B))),),
+    ("scipy>=1.11",),
+    "2026-01-31",
+    Spaces('{"size": 8}', (TASK,)),
+)
+
+
+def changed(**fields: Any) -> LockFile:
+    """The lock with other fields."""
+    return dataclasses.replace(LOCK, **fields)
+
+
+def test_what_is_written_is_read_again(tmp_path: Path) -> None:
+    """Every field, with quotes in names; under the mode of any other new file."""
+    path = tmp_path / "pylock.repo.toml"
+    lockfile.write(LOCK, path)
+    assert lockfile.read(path) == LOCK
+    plain = changed(spaces=None, exclude_newer=None, extra=())
+    lockfile.write(plain, path)
+    assert lockfile.read(path) == plain
+    (tmp_path / "other").write_text("")
+    assert path.stat().st_mode == (tmp_path / "other").stat().st_mode
+    assert [file.name for file in tmp_path.iterdir() if file.name.startswith(".")] == []
+
+
+def test_a_lock_that_cannot_be_written_says_so(tmp_path: Path) -> None:
+    """And leaves nothing."""
+    with pytest.raises(LockError, match="cannot be written"):
+        lockfile.write(LOCK, tmp_path / "none" / "pylock.repo.toml")
+    with pytest.raises(LockError, match="cannot be written"):
+        lockfile.write(changed(entry="\udc80.py"), tmp_path / "pylock.repo.toml")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_it_is_a_lock_of_the_standard(index: Index, tmp_path: Path) -> None:
+    """uv itself installs from it."""
+    make_wheel(index.folder, "wanted")
+    lock = made(tmp_path / "repo", "wanted")
+    path = tmp_path / "pylock.repo.toml"
+    lockfile.write(lock, path)
+    target = tmp_path / "target"
+    uv.run(
+        [
+            *("pip", "install", "--no-config", "--no-build", "--python", chosen_python()),
+            *("--target", str(target), "-r", str(path)),
+        ],
+        what="the lock is none",
+        timeout_s=300,
+    )
+    assert (target / "wanted/__init__.py").is_file()
+
+
+def chosen_python() -> str:
+    """The interpreter that locks are made for here."""
+    from envhub_sandbox.dependencies import interpreters
+
+    return interpreters.own().path
+
+
+def made(folder: Path, *lines: str, **options: Any) -> LockFile:
+    """The lock of a repository that needs these packages."""
+    folder.mkdir(exist_ok=True)
+    (folder / "env.py").write_text("")
+    (folder / "requirements.txt").write_text("".join(f"{line}\n" for line in lines))
+    return making.locked(local(folder), chosen({}, None)[0], **options)
+
+
+def test_a_lock_has_every_package_with_its_files(index: Index, tmp_path: Path) -> None:
+    """What the repository needs and what the worker imports; nothing is installed."""
+    make_wheel(index.folder, "wanted")
+    lock = made(tmp_path / "repo", "wanted")
+    pins = {package.name: package.version for package in lock.packages}
+    assert pins == {**WORKERS, "wanted": "1.0"}
+    assert lock.repository == lockfile.LOCAL
+    assert set(lock.files) == {"env.py", "requirements.txt"}
+    assert drift.differences(lock, making.relisted(lock)) == []
+
+
+def test_hashes_of_the_repository_hold_in_its_lock(index: Index, tmp_path: Path) -> None:
+    """Of two files that fit, only the permitted one is locked."""
+    wheel = make_wheel(index.folder, "wanted")
+    make_wheel(index.folder, "wanted", files={"wanted/other.py": ""}, tag="py2.py3-none-any")
+    digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
+    lock = made(tmp_path / "repo", f"wanted==1.0 --hash=sha256:{digest}")
+    [wanted] = [package for package in lock.packages if package.name == "wanted"]
+    assert [one.sha256 for one in wanted.wheels] == [digest]
+
+
+def test_a_file_that_was_replaced_on_the_index_is_told(index: Index, tmp_path: Path) -> None:
+    """By package, version and hash; a further file for the same version is no drift."""
+    make_wheel(index.folder, "wanted")
+    lock = made(tmp_path / "repo", "wanted")
+    make_wheel(index.folder, "wanted", tag="py2.py3-none-any")
+    assert drift.differences(lock, making.relisted(lock)) == []
+    make_wheel(index.folder, "wanted", files={"wanted/__init__.py": "evil = 1\n"})
+    [said] = drift.differences(lock, making.relisted(lock))
+    assert said.startswith("package wanted==1.0: the file with SHA-256 ")
+
+
+def test_upgrading_shows_what_differs(index: Index, tmp_path: Path) -> None:
+    """Versions stay as they were chosen until somebody asks for others."""
+    make_wheel(index.folder, "wanted", "1.0")
+    before = made(tmp_path / "repo", "wanted")
+    make_wheel(index.folder, "wanted", "2.0", requires=["its-own"])
+    make_wheel(index.folder, "its-own")
+    assert made(tmp_path / "repo", "wanted") == before
+    after = made(tmp_path / "repo", "wanted", upgrade=True)
+    assert drift.differences(before, after) == [
+        "package its-own: new, 1.0",
+        "package wanted: 1.0 was locked, this is 2.0",
+    ]
+
+
+OTHER_BOX = gym.spaces.Box(-1, 2, (3,), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("now", "said"),
+    [
+        (changed(repository="org/other"), "repository: org/repo was locked, this is org/other"),
+        (changed(commit="1" * 40), f"commit: {'0' * 18} was locked, this is {'1' * 18}"),
+        (changed(entry="other.py"), "entry file: env.py was locked, this is other.py"),
+        (changed(files={**LOCK.files, "env.py": f"sha256:{B}"}), "file env.py: other content"),
+        (changed(files={**LOCK.files, "x\x1b.py": f"sha256:{B}"}), "file x\\x1b.py: new"),
+        (changed(files={"env.py": f"sha256:{A}"}), 'file a "b".py: gone'),
+        (
+            changed(runner=Runner("cpython", "3.12", "x86_64")),
+            "Python: cpython 3.11 on x86_64 was locked, this is cpython 3.12 on x86_64",
+        ),
+        (
+            changed(packages=(Package("one", "1.1", LOCK.packages[0].wheels),)),
+            "package one: 1.0 was locked, this is 1.1",
+        ),
+        (
+            changed(packages=(Package("one", "1.0", (Wheel(A),)),)),
+            f"package one==1.0: the file with SHA-256 {B[:12]}... was locked, there is {A[:12]}",
+        ),
+        (changed(packages=()), "package one: gone, 1.0 was locked"),
+        (
+            changed(spaces=Spaces('{"size": 8}', (dataclasses.replace(TASK, task=1),))),
+            "environment suite/0: gone",
+        ),
+        (
+            changed(
+                spaces=Spaces(
+                    '{"size": 8}',
+                    (task_of("suite", 0, "NextStep", OTHER_BOX, gym.spaces.Discrete(2)),),
+                )
+            ),
+            "environment suite/0: observations were Box(-1.0, 1.0, (3,), float32), now "
+            "Box(-1.0, 2.0, (3,), float32)",
+        ),
+        (
+            changed(spaces=Spaces('{"size": 8}', (dataclasses.replace(TASK, mode="SameStep"),))),
+            "environment suite/0: autoreset mode NextStep, now SameStep",
+        ),
+    ],
+)
+def test_what_differs_is_said(now: LockFile, said: str) -> None:
+    """Commit, file, package, Python, spaces; a line each, fit for a terminal."""
+    assert drift.differences(LOCK, LOCK) == []
+    found = drift.differences(LOCK, now)
+    assert said in found
+    with pytest.raises(LockDriftError) as caught:
+        drift.refuse(found, "org/repo")
+    assert caught.value.drifts == tuple(found)
+    assert said in str(caught.value)
+
+
+def test_other_arguments_make_other_environments() -> None:
+    """Spaces of other arguments are not held against those that were locked."""
+    other = task_of("suite", 0, None, OTHER_BOX, gym.spaces.Discrete(2))
+    assert drift.differences(LOCK, changed(spaces=Spaces("{}", (other,)))) == []
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        gym.spaces.Box(-1, 1, (3,), np.float64),
+        gym.spaces.Box(-1, 1, (1, 3), np.float32),
+        gym.spaces.Box(np.array([-1, -1, -1]), np.array([1, 1, np.inf]), dtype=np.float32),
+        gym.spaces.Dict(a=BOX),
+        gym.spaces.Tuple([BOX]),
+        gym.spaces.Discrete(3),
+    ],
+)
+def test_no_two_spaces_look_alike(other: gym.Space[Any]) -> None:
+    """Kind, shape, dtype and every bound count; what was drawn from one does not."""
+    same = gym.spaces.Box(-1, 1, (3,), np.float32, seed=7)
+    same.sample()
+    assert spaces_of(same) == spaces_of(BOX)
+    assert spaces_of(other) != spaces_of(BOX)
+    assert spaces_of(BOX, other) != spaces_of(other, BOX)
+
+
+def spoiled(tmp_path: Path, change: Callable[[str], str]) -> Path:
+    """The lock with its text changed."""
+    text = lockfile.written(LOCK)
+    assert change(text) != text
+    path = tmp_path / "pylock.repo.toml"
+    path.write_text(change(text))
+    return path
+
+
+def put(old: str, new: str) -> Callable[[str], str]:
+    """A change of text."""
+    return lambda text: text.replace(old, new, 1)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (put('name = "one"', 'name = "one\\n--index-url http://evil"'), "no normalized name"),
+        (put('name = "one"', 'name = "--index-url"'), "no normalized name"),
+        (put('\nversion = "1.0"', '\nversion = "1.0 \\\\\\n--pre"'), "no version"),
+        (put('\nversion = "1.0"', '\nversion = "1.0\\n-e ./evil"'), "no version"),
+        (put(A, "a" * 63 + "\\n"), "no SHA-256"),
+        (put("wheels = [", "wheelz = ["), "no list of 1 to"),
+        (put("wheels = [", "vcs = { type = 'git' }\nwheels = ["), "only wheels of an index"),
+        (put("wheels = [", "marker = 'x'\nwheels = ["), "only wheels of an index"),
+        (
+            put('\nversion = "1.0"\n', '\nversion = "1.0"\ndirectory = { path = "." }\n'),
+            "directory",
+        ),
+        (put('extra = ["scipy>=1.11"]', 'extra = ["-r other.txt"]'), "-r other.txt"),
+        (put("scipy>=1.11", "x; python_version > '\\\\n-e .'"), "Only plain requirements"),
+        (put("2026-01-31", "2026-01-31 --pre"), "exclude-newer"),
+        (put('python = "3.11"', 'python = "/tmp/evil/python"'), "python"),
+        (put('commit = "0', 'commit = "../'), "commit"),
+        (put("format = 1", "format = 2"), "another release"),
+        (put("[tool.envhub]\n", "[tool.other]\n"), "another program"),
+        (put('lock-version = "1.0"', 'lock-version = "9"'), "no lock file"),
+        (put("task = 0", "task = 0.5"), "tasks"),
+        (put("[[packages]]", f"[[packages]]\n{'.'.join('a' * 3000)} = 1"), "dots"),
+        (put('"env.py"', '"""env.py"""'), "several lines"),
+        (lambda text: text + "[" * 5000, "no TOML"),
+        (lambda text: "", "no lock file"),
+    ],
+)
+def test_what_is_no_lock_of_ours_is_refused(
+    tmp_path: Path, change: Callable[[str], str], said: str
+) -> None:
+    """By what is wrong with it; nothing of it becomes an option, a path or a line for uv."""
+    with pytest.raises(LockError, match=said):
+        lockfile.read(spoiled(tmp_path, change))
+
+
+def test_dots_cannot_be_hidden_from_the_count() -> None:
+    """A parser takes long for a key of many parts, wherever it stands on the line."""
+    key = ".".join("a" * 3000)
+    for text in (f"'\"'.{key}.'\"' = 1", f'"\\"".{key}."x" = 1', f"a = 1 # '\n{key} = 1 # '"):
+        with pytest.raises(LockError, match="dots"):
+            toml.loads(text, "it")
+    assert toml.loads(f"a = '{key}'", "it") == {"a": key}
+
+
+def test_a_name_with_a_line_end_would_be_obeyed(index: Index, tmp_path: Path) -> None:
+    """The control of what is refused: uv takes the second line for an option."""
+    folder = tmp_path / "evil"
+    folder.mkdir()
+    make_wheel(folder, "one")
+    with served(folder) as evil:
+        name = f"--extra-index-url {evil.url}\none"
+        lock = changed(packages=(Package(name, "1.0", (Wheel(A),)),))
+        pins = pylock.pins(lock.packages).text.replace(f" \\\n    --hash=sha256:{A}", "")
+        command = ["pip", "compile", "-", *uv.NO_BUILDS, "--python", chosen_python()]
+        uv.run(command, what="the control", given=pins, timeout_s=300)
+        assert evil.asked
+        evil.asked.clear()
+        lockfile.write(lock, tmp_path / "pylock.toml")
+        with pytest.raises(LockError, match="normalized"):
+            lockfile.read(tmp_path / "pylock.toml")
+        assert evil.asked == []
+
+
+def test_an_index_that_has_another_file_gets_no_lock(
+    index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was chosen is what is locked."""
+    make_wheel(index.folder, "wanted")
+    made(tmp_path / "repo", "wanted")
+    make_wheel(index.folder, "wanted", files={"wanted/__init__.py": "evil = 1\n"})
+    monkeypatch.setenv("UV_CACHE_DIR", str(tmp_path / "another"))
+    with pytest.raises(PackageIntegrityError, match=r"wanted==1\.0"):
+        made(tmp_path / "repo", "wanted")
+
+
+def test_a_lock_error_is_one_of_ours() -> None:
+    """And a ValueError."""
+    assert issubclass(LockDriftError, EnvHubError)
+    assert issubclass(LockDriftError, ValueError)
