@@ -63,9 +63,10 @@ def make_env(
     """Make the vector environments of a repository, without its code entering this process.
 
     Args:
-        cfg: A hub reference (``"org/repo@commit:path"``), a local folder (``"./my-env"``), or a
-            ``HubEnvConfig``-like object with ``hub_path``, whose ``vars()`` and public properties
-            the repository's ``make_env`` gets as ``cfg``.
+        cfg: A hub reference (``"org/repo@commit:path"``), a local folder (``"./my-env"``), a
+            ``.py`` file that is here (``"env.py"``), or a ``HubEnvConfig``-like object with
+            ``hub_path``, whose ``vars()`` and public properties the repository's ``make_env``
+            gets as ``cfg``.
         n_envs: Number of sub-environments, passed to the repository's ``make_env``.
         use_async_envs: Passed on likewise; sub-environments may then run in several processes.
         hub_cache_dir: huggingface_hub's ``cache_dir``.

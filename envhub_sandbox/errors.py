@@ -7,7 +7,7 @@
       SnapshotError
         SnapshotTooLargeError
         SnapshotIntegrityError
-        RepositoryUnavailableError
+        RepositoryUnavailableError (OSError)
       PolicyError (ValueError)
       BundleError (ValueError)
       LockError (ValueError)
@@ -22,6 +22,7 @@
         IndexUnavailableError
         PackageIntegrityError
         InterpreterUnavailableError
+        MissingModuleError (ModuleNotFoundError)
       LoadError
         LoadAttributeError (AttributeError), LoadValueError (ValueError), ...
       WorkerError
@@ -74,6 +75,7 @@ __all__ = [
     "LockDriftError",
     "LockError",
     "MessageTooLargeError",
+    "MissingModuleError",
     "PackageIntegrityError",
     "PolicyError",
     "ProtocolError",
@@ -93,6 +95,7 @@ __all__ = [
     "WorkerStartupError",
     "WorkerTimeoutError",
     "name_bundle",
+    "name_line",
     "name_source",
     "remote_error",
 ]
@@ -114,8 +117,10 @@ class SnapshotIntegrityError(SnapshotError):
     """A file is not what the pinned commit says it is."""
 
 
-class RepositoryUnavailableError(SnapshotError):
+class RepositoryUnavailableError(SnapshotError, OSError):
     """The Hub did not give the repository, revision or file; ``__cause__`` says why."""
+
+    __str__ = Exception.__str__
 
 
 class PolicyError(EnvHubError, ValueError):
@@ -194,8 +199,18 @@ class InterpreterUnavailableError(DependencyError):
     """No interpreter of this machine is one that the repository asks for."""
 
 
+class MissingModuleError(DependencyError, ModuleNotFoundError):
+    """It imports a module that its interpreter does not have."""
+
+    __str__ = Exception.__str__
+
+
 class LoadError(EnvHubError):
-    """The repository's entry point cannot be imported, or returned something unusable."""
+    """The repository's entry point cannot be imported, or returned something unusable.
+
+    Also the builtin that LeRobot's loader would raise: ``AttributeError`` where there is no
+    ``make_env``, ``ValueError`` where it returned no environment, and else what the repository did.
+    """
 
 
 class WorkerError(EnvHubError):
@@ -299,7 +314,9 @@ class RemoteEnvError(EnvHubError):
     Attributes:
         type_name: The class, as the worker named it (``"mypkg.Oops"``).
         message: ``str()`` of the exception.
-        traceback: The formatted traceback.
+        traceback: The formatted traceback, which files of the repository have their names in.
+        where: The last line of the repository's own in it, as its author knows the file; may be
+            empty. It is at the end of ``str()`` too.
     """
 
     def __init__(self, type_name: str, message: str, traceback: str = "") -> None:
@@ -307,12 +324,13 @@ class RemoteEnvError(EnvHubError):
         self.type_name = type_name
         self.message = message
         self.traceback = traceback
+        self.where = ""
 
     def __reduce__(self) -> tuple[object, ...]:
         return (
             remote_error,
             (_builtin_of(type(self)), self.type_name, self.message, self.traceback),
-            {"args": self.args},  # with where it came from
+            {**vars(self), "args": self.args},  # with where it came from
         )
 
 
@@ -398,6 +416,19 @@ def name_source(error: EnvHubError, label: str) -> None:
         error.args = (f"{label}: {text}", *error.args[1:])
     if isinstance(error, (WorkerDiedError, WorkerTimeoutError)):
         error.repository = label
+
+
+def name_line(error: EnvHubError, where: str) -> None:
+    """Put the repository's own line at the end of an error's text, and the traceback below it."""
+    remote = error if isinstance(error, RemoteEnvError) else error.__cause__
+    assert isinstance(remote, RemoteEnvError)
+    remote.where = where
+    if where:
+        error.args = (f"{error.args[0]}\n{where}", *error.args[1:])
+    if remote.traceback:
+        note = f"In the environment:\n{remote.traceback.rstrip()}"
+        # before Python 3.11 only some shells and test runners show it
+        vars(error)["__notes__"] = [*getattr(error, "__notes__", ()), note]
 
 
 def name_bundle(error: WorkerDiedError | WorkerTimeoutError, bundle: str) -> None:

@@ -85,7 +85,8 @@ class Policy:
         restart_backoff_s: Seconds to wait before a restart that follows another within a minute;
             they double with each, up to half a minute.
         output: What becomes of what the worker prints: ``"tail"`` keeps the last lines for error
-            messages; a path writes it to that file as well, a further file for each further jail.
+            messages; a path writes it to that file as well, a further file for each further jail;
+            ``"stderr"`` or ``"-"`` to this program's stderr.
         crash_history: How many requests since the last seeded reset are kept for a crash bundle
             (``docs/crashes.md``), within 8 MiB; 0 keeps none and writes no bundles.
         crash_folder: Where crash bundles are written; ``crashes`` in the cache by default.

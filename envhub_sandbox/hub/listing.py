@@ -6,6 +6,7 @@ so both are judged before anything is downloaded.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -58,10 +59,23 @@ class Snapshot:
     @property
     def label(self) -> str:
         """Repository, commit and entry file, for errors."""
+        return f"{self._source}:{self.path}"
+
+    def known_as(self, path: str) -> str | None:
+        """A file as its author knows it, for tracebacks; None if there is none of that name."""
+        found = bisect_left(self.files, path, key=lambda file: file.path)
+        if found == len(self.files) or self.files[found].path != path:
+            return None
         if self.repo_type == "local":
-            return f"{self.repo_id}:{self.path}"
+            return f'"{self.repo_id.rstrip("/")}/{path}"'
+        return f'"{path}" of {self._source}'
+
+    @property
+    def _source(self) -> str:
+        if self.repo_type == "local":
+            return self.repo_id
         prefix = "" if self.repo_type == "model" else f"{self.repo_type}s/"
-        return f"{prefix}{self.repo_id}@{self.commit[:12]}:{self.path}"
+        return f"{prefix}{self.repo_id}@{self.commit[:12]}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -43,9 +43,10 @@ def named(
 ) -> Snapshot:
     """The snapshot of a hub reference or of a local folder; raises as ``fetch`` and ``local`` do.
 
-    A reference that is also a folder here gets a hint.
+    The path of a ``.py`` file that is here means that file. A reference that is also a folder here
+    gets a hint.
     """
-    if is_local(reference):
+    if is_local(reference) or (reference.endswith(".py") and os.path.isfile(reference)):
         return local(reference)
     try:
         ref = HubRef.parse(reference)

@@ -95,6 +95,7 @@ class EnvSession:
         self._warm = False  # started ahead, and not used yet
         self._warming: StartupDeadline | None = None
         self._first_use: Callable[[], None] | None = None
+        self._interruption: str | None = None  # the request that is late for that reason
         labels = Labels(self.repository.label, manifest.suite, str(manifest.task))
         LEDGER.add(self, labels, self._restarts)
         _living.add(self)
@@ -244,7 +245,10 @@ class EnvSession:
     def _make_ready(self, operation: str) -> None:
         if self.lifecycle.state is State.READY:
             return
-        refused = refusal(self.lifecycle.state, operation, self.repository.policy.restart)
+        state, restart = self.lifecycle.state, self.repository.policy.restart
+        # a request that is still pending here was interrupted before anybody waited
+        interrupted = self.lifecycle.request if state is State.PENDING else self._interruption
+        refused = refusal(state, operation, restart, interrupted)
         if refused is not None:
             self._refuse_others(operation)
             raise refused
@@ -311,6 +315,7 @@ class EnvSession:
         failures, operation = self._failures, self.lifecycle.request or "a request"
         if isinstance(error, WorkerTimeoutError):
             self.counters.timeouts += 1
+            self._interruption = None
             self.lifecycle.moved(Event.TIMEOUT)
             raise failures.late(operation, deadline) from error
         if isinstance(error, WorkerDiedError) and error.reason == "idle":
@@ -329,6 +334,7 @@ class EnvSession:
         """
         if self.closed and isinstance(error, Exception):
             raise self._failures.dead(WorkerDiedError("")) from error
+        self._interruption = self.lifecycle.request or "request"
         self.lifecycle.moved(Event.INTERRUPT)
 
     def _infos_apart(self, deadline: Deadline) -> dict[Any, Any]:
@@ -435,6 +441,7 @@ class EnvSession:
             if self.closed:
                 raise self._failures.dead(error) from error
             self.lifecycle.request = None  # nobody knows how far it came: a reset starts afresh
+            self._interruption = None
             self.lifecycle.moved(Event.TIMEOUT)
             raise
         except EnvHubError as error:
@@ -464,6 +471,7 @@ class EnvSession:
                 self._look_whether_warm_lives()
             self._refuse_others("reset")
             if self.lifecycle.state is State.PENDING:
+                self._interruption = self.lifecycle.request
                 self.lifecycle.on(Event.INTERRUPT)
             if self.lifecycle.state is State.READY and self.repository.timeouts.idle_s is not None:
                 self._see_whether_it_expired()

@@ -99,16 +99,25 @@ def expiry(operation: str, why: str) -> WorkerDiedError:
     return WorkerDiedError(text, reason="idle", request=operation, detail=why)
 
 
-def refusal(state: State, operation: str, restart: str) -> EnvHubError | None:
+def refusal(
+    state: State, operation: str, restart: str, interrupted: str | None = None
+) -> EnvHubError | None:
     """Why an environment takes no request now; None if it takes one.
 
     Args:
         state: Where it is in its life.
         operation: What is asked.
         restart: What the policy says of an environment that has died.
+        interrupted: The request whose reply nobody waited for any more.
     """
     if state in (State.IDLE, State.READY):
         return None
+    if state in (State.LATE, State.PENDING) and interrupted is not None:
+        text = (
+            f"cannot {operation}: the last {interrupted} was interrupted, by Ctrl-C or a stopped "
+            "cell, and where the environment is now is not known; call reset() first"
+        )
+        return WorkerTimeoutError(text, request=operation)
     if state in (State.LATE, State.PENDING):
         text = f"cannot {operation}: the reply to the last request is late; call reset() first"
         return WorkerTimeoutError(text, request=operation)

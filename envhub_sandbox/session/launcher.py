@@ -34,6 +34,7 @@ from envhub_sandbox.sandboxes.base import (
     Sandbox,
     WorkerServer,
 )
+from envhub_sandbox.session.author_lines import point_out
 from envhub_sandbox.session.provenance import provenance_of
 from envhub_sandbox.session.recipe import Recipe
 from envhub_sandbox.session.server_hold import ServerHold
@@ -43,9 +44,11 @@ from envhub_sandbox.transport.generators import generator
 from envhub_sandbox.transport.jail import RemoteJail, open_jail, typed
 from envhub_sandbox.transport.output import OutputFollower, Wanted
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.confinement import LACKS_PACKAGES
 from envhub_worker.protocol.limits import WireLimits
 from envhub_worker.protocol.manifest import EnvManifest, Manifest, decode_manifest
 from envhub_worker.protocol.runtime import Runtime
+from envhub_worker.protocol.text import printable
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _CLOSE_S = 5.0
@@ -183,6 +186,7 @@ class Repository:
             if isinstance(error, DependencyError) and not str(error).startswith(self.label):
                 error.args = (f"{error}. {self.cure()}",)
             name_source(error, self.label)
+            point_out(error, self.snapshot)
             raise
 
     @contextmanager
@@ -191,6 +195,9 @@ class Repository:
         try:
             yield
         except WorkerDiedError as error:
+            if error.reason == "zygote" and error.exit_code == LACKS_PACKAGES:
+                what = error.detail.strip().removeprefix("ModuleNotFoundError: ")
+                raise DependencyError(f"{self.label}: {printable(what)}") from error
             if not deadline.unasked:
                 self.keep_crash(error)
             raise
@@ -353,6 +360,8 @@ class Repository:
     def _wanted_output(self) -> Wanted:
         """Where the next jail's output goes: each has a file of its own."""
         output = self.policy.output
+        if output in ("stderr", "-"):
+            return Wanted(self.label, None, stderr=True)
         path = None if output == "tail" else Path(output)
         number = next(self._jail_numbers)
         if path is not None and number > 1:

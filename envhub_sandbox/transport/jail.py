@@ -9,9 +9,8 @@ from itertools import islice
 from typing import Any
 
 from envhub_sandbox.errors import (
-    DependencyError,
     EnvHubError,
-    LoadError,
+    MissingModuleError,
     RemoteProtocolError,
     WorkerDiedError,
     WorkerError,
@@ -324,6 +323,8 @@ _LOADING = {
     "make_env": "its make_env failed",
     "return": "its make_env returned something unusable",
 }
+_LOADERS_OWN = (".EntryError", ".ArgumentsError")
+"""What our own loader raises, which has a traceback of nobody's interest."""
 
 
 def raised(reply: m.Raised) -> EnvHubError:
@@ -333,15 +334,14 @@ def raised(reply: m.Raised) -> EnvHubError:
         return remote_error(reply.builtin, reply.type_name, reply.message, reply.traceback)
     what = _LOADING[reply.stage]
     if reply.stage == "return":
-        return LoadError(reply.message)
+        return load_error("ValueError", reply.message)
     cause: Any = remote_error(reply.builtin, reply.type_name, reply.message, reply.traceback)
     if reply.builtin == "ModuleNotFoundError":
-        error: EnvHubError = DependencyError(f"{what}: {reply.message}")
-    elif reply.type_name.endswith(".EntryError"):
-        return LoadError(reply.message)
+        error: EnvHubError = MissingModuleError(f"{what}: {reply.message}")
+    elif reply.type_name.endswith(_LOADERS_OWN):
+        return load_error(reply.builtin, reply.message)
     else:
-        trace = f"\nRemote traceback:\n{reply.traceback.rstrip()}" if reply.traceback else ""
-        error = load_error(reply.builtin, f"{what}: {reply.type_name}: {reply.message}{trace}")
+        error = load_error(reply.builtin, f"{what}: {reply.type_name}: {reply.message}")
     error.__cause__ = cause
     return error
 

@@ -7,8 +7,10 @@ notice. Only where somebody wants it: ``Policy(output=...)``, or DEBUG on
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import re
+import sys
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -29,7 +31,7 @@ _LINE_CHARS = 4096
 _LINE_BYTES = 4 * _LINE_CHARS
 _ENDS = re.compile(rb"\r\n|\n|\r")
 
-Sink = Callable[[str], None]
+Sink = Callable[[str], object]
 
 
 class Lines:
@@ -66,12 +68,17 @@ class Lines:
             sink(text)
 
 
-class OutputFile:
-    """A file that takes lines, up to ``FILE_BYTES``."""
+class Bounded:
+    """Takes lines, up to a number of bytes.
 
-    def __init__(self, path: Path) -> None:
-        self._file: TextIO = open(path, "a", encoding="utf-8", buffering=1)  # noqa: SIM115
-        self._left = FILE_BYTES - self._file.tell()
+    Args:
+        write: Where the text goes.
+        left: How many bytes.
+    """
+
+    def __init__(self, write: Sink, left: int) -> None:
+        self._write = write
+        self._left = left
 
     def __call__(self, line: str) -> None:
         """Write a line, or say once that there is no room for more."""
@@ -79,7 +86,15 @@ class OutputFile:
             return
         size = len(line.encode("utf-8", "backslashreplace")) + 1
         self._left -= size
-        self._file.write(f"{line}\n" if self._left > 0 else "[the rest is left out]\n")
+        self._write(f"{line}\n" if self._left > 0 else "[the rest is left out]\n")
+
+
+class OutputFile(Bounded):
+    """A file that takes lines, up to ``FILE_BYTES``."""
+
+    def __init__(self, path: Path) -> None:
+        self._file: TextIO = open(path, "a", encoding="utf-8", buffering=1)  # noqa: SIM115
+        super().__init__(self._file.write, FILE_BYTES - self._file.tell())
 
     def close(self) -> None:
         """Close it."""
@@ -137,18 +152,19 @@ class OutputFollower:
 
 
 class Wanted:
-    """Where a jail's lines are to go: a log, a file, both or nowhere.
+    """Where a jail's lines are to go: a log, a file, stderr, several of these or nowhere.
 
     Args:
         label: What the log calls the jail.
         path: The file, or None.
+        stderr: Whether this program's stderr gets them, ``FILE_BYTES`` of them.
 
     Raises:
         PolicyError: The file cannot be written.
     """
 
-    def __init__(self, label: str, path: Path | None) -> None:
-        self.sinks: list[Sink] = []
+    def __init__(self, label: str, path: Path | None, *, stderr: bool = False) -> None:
+        self.sinks: list[Sink] = [Bounded(_write_to_stderr, FILE_BYTES)] if stderr else []
         self._file: OutputFile | None = None
         if path is not None:
             try:
@@ -163,3 +179,10 @@ class Wanted:
         """Close the file."""
         if self._file is not None:
             self._file.close()
+
+
+def _write_to_stderr(text: str) -> None:
+    """Whichever it is now: a notebook's, for instance. One that takes nothing is nobody's fault."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        sys.stderr.write(text)
+        sys.stderr.flush()

@@ -9,6 +9,7 @@ from typing import Any
 from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.session.recipe import Recipe
+from envhub_sandbox.vector.shown import suites_html
 from envhub_sandbox.vector.single_env import SingleEnv
 
 Envs = Mapping[str, Mapping[int | str, VectorEnv[Any, Any, Any]]]
@@ -96,6 +97,9 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
     def provenance(self) -> dict[str, Any]:
         """What runs: commit, file hashes, interpreter, packages, what was installed, layers."""
         return self._provenance()
+
+    def _repr_html_(self) -> str:
+        return suites_html(self)
 
     def close(self) -> None:
         """Close every environment and end its processes. Idempotent."""

@@ -6,7 +6,6 @@ the results.
 
 from __future__ import annotations
 
-import html
 import warnings
 import weakref
 from collections.abc import Callable, Sequence
@@ -28,6 +27,7 @@ from envhub_sandbox.transport import generators
 from envhub_sandbox.transport.jail import typed
 from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.vector import from_manifest
+from envhub_sandbox.vector.shown import environment_html
 from envhub_sandbox.vector.sub_environment import MessageFor as OneMessageFor
 from envhub_sandbox.vector.sub_environment import SubEnvironment
 from envhub_worker.protocol import messages as m
@@ -359,7 +359,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         return f"SandboxVectorEnv({self._remote.repository.label}, num_envs={self.num_envs})"
 
     def _repr_html_(self) -> str:
-        return f"<code>{html.escape(repr(self))}</code>"
+        return environment_html(self, self.sandbox_report)
 
     __html__ = _repr_html_
 

@@ -230,10 +230,11 @@ def test_notebooks_show_the_clients_own_text(
 
 
 def test_suites_show_the_clients_own_text(liar: LyingServer, folder: str) -> None:
-    """The mapping is a dict; its names are escaped where they are shown as HTML."""
+    """Its names are escaped where they are shown as HTML, and nobody is asked for them."""
     with greedy(liar, folder, suite=SCRIPT) as suites:
-        assert SCRIPT not in templated(suites)
-        assert "text/html" not in displayed(suites)
+        shown = "".join(displayed(suites).values()).replace(repr(dict(suites)), "")
+        assert SCRIPT not in templated(suites) + displayed(suites)["text/html"]
+        assert html.escape(SCRIPT) in shown, "the control shows no suite"
         assert not asked_for(liar)
 
 

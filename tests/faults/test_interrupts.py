@@ -112,7 +112,7 @@ def test_ctrl_c_in_sending_a_step_leaves_a_late_reply(
                 patch.setattr(jail, "relay", lambda *all_of_it: interrupted(relay(*all_of_it)))
             with pytest.raises(KeyboardInterrupt):
                 env.step([0, 0])
-        with pytest.raises(errors.WorkerTimeoutError, match="call reset"):
+        with pytest.raises(errors.WorkerTimeoutError, match=r"step was interrupted.*call reset"):
             env.step([0, 0])
         env.reset()
         env.step([0, 0])
@@ -333,3 +333,23 @@ def test_closed_in_the_midst_says_closed(lane: str, before: bool, operation: str
             ask(env)
         assert loaded.closed
         assert (inside.loaded(env), inside.lane(env)) == (None, None)
+
+
+@lanes
+def test_what_was_interrupted_is_said(lane: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a notebook the next cell tells what the stopped one did; a late reply is told as such."""
+    with made(lane) as suites:
+        env = suites.env
+        lane_in_use = inside.session(env).lease.lane
+        with monkeypatch.context() as patch:
+            patch.setattr(lane_in_use, "wait", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                env.step([0, 0])
+        with pytest.raises(errors.WorkerTimeoutError, match="the last step was interrupted"):
+            env.render()
+        env.reset()
+        env.step_async([0, 1])
+        with pytest.raises(errors.WorkerTimeoutError, match="has not finished"):
+            env.step_wait(timeout=0.05)
+        with pytest.raises(errors.WorkerTimeoutError, match="is late"):
+            env.step([0, 0])

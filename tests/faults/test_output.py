@@ -174,3 +174,14 @@ def test_nobody_is_followed_without_need() -> None:
     with made(None, "exit") as suites:
         suites.env.reset()
         assert followers() == []
+
+
+@pytest.mark.parametrize("output", ["stderr", "-"])
+def test_prints_reach_stderr(output: str, capfd: pytest.CaptureFixture[str]) -> None:
+    """From Python, without a log or a file; from the import of the entry file to the end."""
+    with made(None, "exit", output=output) as suites:
+        suites.env.reset()
+        with pytest.raises(errors.WorkerDiedError):
+            suites.env.step([0, 1])
+    assert capfd.readouterr() == ("", "about to exit\n")
+    assert not Path(output).exists()

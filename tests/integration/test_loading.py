@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import venv
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +14,14 @@ import pytest
 from gymnasium.vector import VectorEnv
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import DependencyError, EnvHubError, LoadError, WorkerDiedError
+from envhub_sandbox.cli.shared.exits import Exit, code_for
+from envhub_sandbox.errors import (
+    DependencyError,
+    EnvHubError,
+    HubReferenceError,
+    LoadError,
+    WorkerDiedError,
+)
 from tests.support.compare import assert_same
 from tests.support.repositories import CARTPOLES, write_repository
 from tests.support.samples import make_env_of, reference, sample
@@ -319,11 +327,27 @@ class TestWhatGoesWrong:
         assert "broken" in str(caught.value)
 
     def test_remote_traceback_is_text(self, tmp_path: Path) -> None:
-        """What the repository raised comes with its traceback, as text."""
+        """What the repository raised comes with its line and its traceback, as text."""
         body = "def make_env(**k):\n    return deep()\ndef deep():\n    raise KeyError('oh')\n"
-        with pytest.raises(LoadError, match=r"(?s)Remote traceback.*in deep.*KeyError") as caught:
+        with pytest.raises(LoadError, match=r"(?s)KeyError.*line 4, in deep\n.*oh") as caught:
             make_env(write_repository(tmp_path / "repo", body))
         assert isinstance(caught.value.__cause__, KeyError)
+        assert "line 2, in make_env" in vars(caught.value)["__notes__"][0]
+
+    def test_an_interpreter_without_our_packages_is_a_missing_dependency(
+        self, tmp_path: Path
+    ) -> None:
+        """The text says what to install there, and nothing crashed: there is no bundle."""
+        crashes = tmp_path / "crashes"
+        venv.create(tmp_path / "bare", with_pip=False)
+        python = str(tmp_path / "bare" / "bin" / "python")
+        options = {"python": python, "policy": {"crash_folder": str(crashes)}}
+        with pytest.raises(DependencyError, match="which the worker needs; install") as caught:
+            make_env(sample("cartpole"), **options)
+        assert str(caught.value).count(f"{python} has no ") == 1
+        assert str(sample("cartpole")) in str(caught.value)
+        assert code_for(caught.value) == Exit.LOAD
+        assert not crashes.exists()
 
     def test_unknown_env_kwargs_are_refused(self) -> None:
         """Arguments that ``make_env`` does not take are an error, not dropped."""
@@ -496,3 +520,29 @@ def test_a_result_that_stays_is_not(tmp_path: Path) -> None:
     folder = write_repository(tmp_path / "changing", CHANGING)
     with make_env(folder, 2, env_kwargs={"what": "nothing"}) as suites:
         suites["suite"]["task"].reset(seed=0)
+
+
+class TestAFile:
+    """``make_env("env.py")``, as whoever stands in the folder would write it."""
+
+    @pytest.mark.parametrize("name", ["env.py", "nets/env.py", "./env.py"])
+    def test_a_file_that_is_here_is_taken(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+    ) -> None:
+        """Even where the Hub could have a repository of that name."""
+        body = CARTPOLES + "def make_env(n_envs=1, use_async_envs=False):\n    return cartpoles(1)"
+        write_repository((tmp_path / name).parent, body)
+        monkeypatch.chdir(tmp_path)
+        with make_env(name) as suites:
+            assert suites.provenance["repository"] == str((tmp_path / name).parent)
+            assert suites.provenance["path"] == "env.py"
+
+    @pytest.mark.parametrize("name", ["env.py", "env.txt"])
+    def test_what_is_no_python_file_here_is_a_hub_reference(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+    ) -> None:
+        """A name alone is none."""
+        (tmp_path / "env.txt").write_text("")
+        monkeypatch.chdir(tmp_path)
+        with pytest.raises(HubReferenceError, match="owner is missing"):
+            make_env(name)

@@ -81,7 +81,7 @@ def main(argv: Sequence[str]) -> int:
             f"ModuleNotFoundError: {sys.executable} has no {_NEEDED[error.name]}, which the worker "
             f"needs; install all of it there: {sys.executable} -m pip install {needed}\n"
         )
-        return 1
+        return int(importlib.import_module("envhub_worker.protocol.confinement").LACKS_PACKAGES)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ from envhub_sandbox.cli.shared.console import safe_text, say
 from envhub_sandbox.errors import EnvHubError
 
 _TAIL_LINES = 10
-_TRACE_MARK = "\nRemote traceback:\n"
 
 
 class Exit(IntEnum):
@@ -93,7 +92,7 @@ def describe(error: BaseException) -> str:
     if found:
         kept = tail.rstrip().splitlines()[-_TAIL_LINES:]
         text = before + "\n".join(f"  {line}" for line in kept) + after
-    return safe_text(text.partition(_TRACE_MARK)[0])
+    return safe_text(text)
 
 
 def _has_traceback(error: BaseException) -> bool:

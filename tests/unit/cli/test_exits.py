@@ -74,9 +74,10 @@ def test_every_code_is_in_the_documentation(checkout: Path) -> None:
 
 
 def test_a_message_carries_no_traceback_and_no_escape_sequence() -> None:
-    """The worker's traceback is for --debug."""
-    error = errors.LoadError("repo: bad \x1b[31mred\nRemote traceback:\nFile x, line 1")
-    assert describe(error) == "repo: bad \\x1b[31mred"
+    """The worker's traceback is for --debug; the line that it ends in is in the text."""
+    error = errors.LoadError("repo: bad \x1b[31mred\n  File x, line 1")
+    vars(error)["__notes__"] = ["Traceback ..."]
+    assert describe(error) == "repo: bad \\x1b[31mred\n  File x, line 1"
 
 
 def test_the_end_of_the_output_is_kept_short() -> None:

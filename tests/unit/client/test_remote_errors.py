@@ -121,13 +121,50 @@ def test_failures_to_load_are_the_builtin_that_they_were(name: str) -> None:
     error = raised(a_raised(stage="make_env", builtin=name))
     assert isinstance(error, errors.LoadError)
     assert isinstance(error, getattr(builtins, name))
-    assert str(error).endswith("mypkg.Oops: no\nRemote traceback:\nTraceback ...")
+    assert str(error).endswith("mypkg.Oops: no")
+    assert isinstance(error.__cause__, getattr(builtins, name))
     assert type(pickle.loads(pickle.dumps(error))) is type(error)
 
 
 def test_a_missing_package_is_an_import_error() -> None:
-    """As it would be in this process."""
+    """As it would be in this process, and of the very class where a module is missing."""
     assert issubclass(errors.DependencyError, ImportError)
+    error = raised(a_raised(stage="import", builtin="ModuleNotFoundError"))
+    assert isinstance(error, errors.DependencyError)
+    assert isinstance(error, ModuleNotFoundError)
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+
+LOADER = "envhub_worker.runner.loader"
+
+
+@pytest.mark.parametrize(
+    ("stage", "kind", "builtin", "expected"),
+    [
+        ("import", f"{LOADER}.EntryError", "AttributeError", AttributeError),
+        ("make_env", f"{LOADER}.ArgumentsError", "TypeError", TypeError),
+        ("return", f"{LOADER}.ResultError", "Exception", ValueError),
+        ("import", f"{LOADER}.EntryError", "SystemExit", errors.LoadError),  # of an older worker
+    ],
+)
+def test_what_the_loader_refuses_is_what_lerobot_raises(
+    stage: str, kind: str, builtin: str, expected: type[Exception]
+) -> None:
+    """``except AttributeError`` around LeRobot's ``make_env`` goes on working; our table has it."""
+    error = raised(a_raised(stage=stage, type_name=kind, builtin=builtin))
+    assert isinstance(error, errors.LoadError)
+    assert isinstance(error, expected)
+    assert not isinstance(error, SystemExit)
+    assert str(error) == "no"
+
+
+def test_a_repository_that_cannot_be_had_is_an_os_error() -> None:
+    """As huggingface_hub's errors are; its text is ours."""
+    error = errors.RepositoryUnavailableError("org/repo: there is none")
+    assert isinstance(error, OSError)
+    error.args = ("here: org/repo: there is none",)
+    assert str(error) == "here: org/repo: there is none"
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
 def test_gymnasiums_own_errors_are_themselves() -> None:

@@ -99,3 +99,29 @@ def test_a_follower_gets_every_byte_that_is_kept(
     assert tail.ended
     tail.read()  # after its end: nothing happens
     tail.close()
+
+
+def test_stderr_gets_lines_as_it_is_now(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A notebook puts another in its place; what takes nothing hurts nobody."""
+    [sink] = Wanted("repo", None, stderr=True).sinks
+    sink("hello")
+    assert capsys.readouterr() == ("", "hello\n")
+    with open(os.devnull) as unwritable:
+        for broken in (None, unwritable):
+            with monkeypatch.context() as patch:
+                patch.setattr("sys.stderr", broken)
+                sink("lost")
+    assert capsys.readouterr() == ("", "")
+
+
+def test_stderr_takes_no_more_than_a_file(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker may print for ever, and somebody keeps what our program prints."""
+    monkeypatch.setattr(output, "FILE_BYTES", 20)
+    [sink] = Wanted("repo", None, stderr=True).sinks
+    for _ in range(5):
+        sink("12345678")
+    assert capsys.readouterr().err == "12345678\n12345678\n[the rest is left out]\n"

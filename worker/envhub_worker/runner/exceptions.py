@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import builtins
+import os
 import traceback
+from collections.abc import Iterator
 
 from envhub_worker.protocol.messages import Raised
 from envhub_worker.protocol.text import printable
@@ -12,11 +14,18 @@ from envhub_worker.unreadable import why_hidden
 _MAX_MESSAGE = 8_192
 _MAX_TRACEBACK = 32_768
 _GYMNASIUM = "gymnasium.error"
-_OURS = f"{__name__.rpartition('.')[0]}."
+_OURS = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
+_IMPORTING = ("<frozen importlib.", f"{os.path.dirname(os.__file__)}{os.sep}importlib{os.sep}")
 
 
-def raised(error: BaseException, stage: str) -> Raised:
-    """The message for an exception: its nearest builtin ancestor, its text, its traceback."""
+def raised(error: BaseException, stage: str, root: str = "") -> Raised:
+    """The message for an exception: its nearest builtin ancestor, its text, its traceback.
+
+    Args:
+        error: What the repository raised.
+        stage: What it was doing.
+        root: The repository's folder: its files are told by their names in it.
+    """
     # a package that may not be read is imported all the same, as one without a file of its own
     nowhere = isinstance(error, ImportError) and error.path is None
     hidden = why_hidden(str(getattr(error, "name", ""))) if nowhere else ""
@@ -31,7 +40,7 @@ def raised(error: BaseException, stage: str) -> Raised:
         builtin=_builtin(kind),
         type_name=printable(name, 512),
         message=printable(_text(error), _MAX_MESSAGE),
-        traceback=printable(_traceback(error), _MAX_TRACEBACK),
+        traceback=printable(_traceback(error, root), _MAX_TRACEBACK),
         stage=stage,
     )
 
@@ -52,14 +61,40 @@ def _text(error: BaseException) -> str:
         return "(its text could not be read)"
 
 
-def _traceback(error: BaseException) -> str:
+def _traceback(error: BaseException, root: str) -> str:
     """The traceback, without the frames of this package that called into the repository."""
-    frames = error.__traceback__
-    while frames and frames.tb_frame.f_globals.get("__name__", "").startswith(_OURS):
-        frames = frames.tb_next
     try:
-        return "".join(
-            traceback.format_exception(type(error), error, frames or error.__traceback__)
-        )
+        whole = traceback.TracebackException.from_exception(error, compact=True)
+        for one in _chain(whole):
+            _tell(one, root)
+        return "".join(whole.format())
     except Exception:
         return ""
+
+
+def _chain(whole: traceback.TracebackException) -> Iterator[traceback.TracebackException]:
+    """An exception, and all that are told with it."""
+    waiting, seen = [whole], set()
+    while waiting:
+        one = waiting.pop()
+        if id(one) in seen:
+            continue
+        seen.add(id(one))
+        yield one
+        group = getattr(one, "exceptions", None) or ()
+        waiting += [two for two in (one.__cause__, one.__context__, *group) if two is not None]
+
+
+def _tell(one: traceback.TracebackException, root: str) -> None:
+    """Leave out whose line helps nobody, and name the repository's files as it does."""
+    theirs = [frame for frame in one.stack if not frame.filename.startswith((_OURS, *_IMPORTING))]
+    if theirs:
+        one.stack[:] = theirs
+    for frame in one.stack:
+        frame.filename = _in_repository(frame.filename, root)
+    if getattr(one, "filename", None):  # of a SyntaxError
+        one.filename = _in_repository(str(one.filename), root)
+
+
+def _in_repository(name: str, root: str) -> str:
+    return name.removeprefix(f"{root.rstrip(os.sep)}{os.sep}") if root else name

@@ -20,7 +20,6 @@ import numpy as np
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.stream import Packet, pack_packet, read_packet
-from envhub_worker.runner.exceptions import raised
 from envhub_worker.runner.infos import InfoWriter, Pairs, join
 from envhub_worker.runner.sync_envs import SubEnvs
 
@@ -39,6 +38,7 @@ class Lane:
             now on.
         answer: Gives the frames of the answer to a message.
         pack: Gives the frames of a message.
+        raised: Makes a message of an exception.
 
     Attributes:
         number: The environment's.
@@ -52,10 +52,12 @@ class Lane:
         fds: list[int],
         answer: Callable[[Packet], list[Any]],
         pack: Callable[[m.Message, int], list[Any]],
+        raised: Callable[[BaseException, str], m.Raised],
     ) -> None:
         self.number = attach.env
         self.unsent: list[Any] = []
         self._answer = answer
+        self._raised = raised
         layout = slabs.layout_of(env.single_action_space, env.num_envs)
         observed = slabs.observation_layout(
             env.single_observation_space, attach.count, attach.slots
@@ -163,7 +165,7 @@ class Lane:
             pairs = self._pairs = self._env.run_step(actions)
             return self._writer.write(pairs) if pairs else (slabs.DONE, 0)
         except BaseException as error:
-            return slabs.RAISED, self._writer.put(_raised_frame(error))
+            return slabs.RAISED, self._writer.put(_raised_frame(self._raised(error, "step")))
 
     def _run_message(self, length: int) -> tuple[int, int]:
         start = self._layout.message
@@ -212,9 +214,8 @@ class Lane:
         return join(self._pairs, self._layout.count, sliced=self._env.sliced)
 
 
-def _raised_frame(error: BaseException) -> Any:
+def _raised_frame(message: m.Raised) -> Any:
     """The encoded exception; without its traceback where that does not fit."""
-    message = raised(error, "step")
     [frame] = m.pack(message, 0)
     if len(frame) > slabs.INFO_BYTES:
         [frame] = m.pack(m.replace(message, traceback=""), 0)

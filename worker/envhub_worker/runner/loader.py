@@ -22,8 +22,12 @@ from envhub_worker.protocol.messages import Load, LoadTask
 PACKAGE = "hub_env"
 
 
-class EntryError(Exception):
+class EntryError(AttributeError):
     """The entry file has no usable ``make_env``."""
+
+
+class ArgumentsError(TypeError):
+    """``make_env`` takes other arguments."""
 
 
 def import_entry(snapshot: str, entry: str, scratch: str) -> Callable[..., Any]:
@@ -60,7 +64,7 @@ def call_make_env(make_env: Callable[..., Any], request: Load | LoadTask) -> Any
     """Call ``make_env`` with those of our arguments that it takes.
 
     Raises:
-        EntryError: It needs others, or does not take the caller's ``env_kwargs``.
+        ArgumentsError: It needs others, or does not take the caller's ``env_kwargs``.
     """
     offered: dict[str, Any] = {
         "n_envs": request.n_envs,
@@ -139,7 +143,7 @@ def _check_arguments(
 ) -> None:
     unknown = [name for name in given if not _takes(parameters, name)]
     if unknown:
-        raise EntryError(
+        raise ArgumentsError(
             f"make_env takes no {', '.join(unknown)}; it takes {', '.join(parameters) or 'nothing'}"
         )
     missing = [
@@ -151,7 +155,7 @@ def _check_arguments(
         and name not in given
     ]
     if missing:
-        raise EntryError(
+        raise ArgumentsError(
             f"make_env needs {', '.join(missing)}; pass "
             "env_kwargs={...}, or a config object where it is cfg"
         )

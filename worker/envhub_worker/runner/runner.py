@@ -122,9 +122,9 @@ class Runner:
                 reply = m.Value(reply.info)  # the observation lies in the slab already
             return self._pack(reply, request_id)
         except ResultError as error:
-            return m.pack(raised(error, "return"), request_id)
+            return m.pack(raised(error, "return", self._snapshot), request_id)
         except BaseException as error:
-            return m.pack(raised(error, self._stage), request_id)
+            return m.pack(raised(error, self._stage, self._snapshot), request_id)
 
     def load(self, request: m.Load) -> m.Message:
         """Import the repository, call ``make_env``, describe what came back."""
@@ -206,7 +206,8 @@ class Runner:
         if not isinstance(env, SubEnvs) or env.reward_shape:
             return m.Value(False)
         answer = partial(self.answer, by_lane=True)
-        self.lane = Lane(env, request, self.descriptors, answer, self._pack)
+        fail = partial(raised, root=self._snapshot)
+        self.lane = Lane(env, request, self.descriptors, answer, self._pack, fail)
         return m.Value(True)
 
     def fetch_infos(self, request: m.FetchInfos) -> m.Message:

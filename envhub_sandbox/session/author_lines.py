@@ -1,0 +1,58 @@
+"""Leads whoever wrote an environment to his line: a worker's traceback, with the names he knows.
+
+A worker tells the files of its repository by their names in it. They get the place here that their
+author knows: the path in his folder, or the name in his repository at that commit; never the copy
+in the store. Which names these are, the verified snapshot says and no worker.
+"""
+
+from __future__ import annotations
+
+import re
+
+from envhub_sandbox.errors import EnvHubError, RemoteEnvError, name_line
+from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_worker.protocol.codec.inert import one_line
+from envhub_worker.protocol.text import printable
+
+_FRAME = re.compile(
+    r'^(?P<margin>[ |+-]*)File "(?P<file>[^"\n]{1,4096})", line (?P<line>[0-9]{1,9})'
+    r"(?:, in (?P<function>[^\n]*))?(?P<source>\n[ |]{4}[^\n]*)?",
+    re.MULTILINE,
+)
+_TRACEBACK_CHARS = 32_768
+_FUNCTION_CHARS, _SOURCE_CHARS = 100, 200
+
+
+def point_out(error: EnvHubError, snapshot: Snapshot) -> None:
+    """Add the repository's own line to what it raised, once. Trust: text from the worker.
+
+    Args:
+        error: What failed; one that no code of the repository raised stays as it is.
+        snapshot: Its files.
+    """
+    remote = error if isinstance(error, RemoteEnvError) else error.__cause__
+    if not isinstance(remote, RemoteEnvError) or "__notes__" in vars(error):
+        return
+    frames = [found for found in _FRAME.finditer(remote.traceback) if _place(found, snapshot)]
+    where = _line(frames[-1], snapshot) if frames else ""
+    named = _FRAME.sub(lambda found: _named(found, snapshot), remote.traceback)
+    remote.traceback = printable(named, _TRACEBACK_CHARS)
+    name_line(error, where)
+
+
+def _place(found: re.Match[str], snapshot: Snapshot) -> str | None:
+    name = found["file"].removeprefix(f"{snapshot.root}/")  # older workers tell the whole path
+    return snapshot.known_as(name)
+
+
+def _named(found: re.Match[str], snapshot: Snapshot) -> str:
+    place, rest = _place(found, snapshot), found[0].partition('"')[2].partition('"')[2]
+    return found[0] if place is None else f"{found['margin']}File {place}{rest}"
+
+
+def _line(found: re.Match[str], snapshot: Snapshot) -> str:
+    place = printable(str(_place(found, snapshot)))
+    function = found["function"]
+    inside = f", in {one_line(function, _FUNCTION_CHARS)}" if function else ""
+    source = one_line((found["source"] or "").strip(" |\n"), _SOURCE_CHARS)
+    return f"  File {place}, line {found['line']}{inside}" + (f"\n    {source}" if source else "")

@@ -1,0 +1,185 @@
+"""Errors lead whoever wrote an environment to his line, whatever text a worker sends."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import sys
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox import errors
+from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.hub.listing import FileRecord, Snapshot
+from envhub_sandbox.session.author_lines import point_out
+from envhub_sandbox.transport.jail import raised
+from envhub_worker.protocol import messages as m
+from envhub_worker.runner.exceptions import raised as described
+
+ROOT = "/store/tree"
+FILES = tuple(FileRecord(path, 1, "sha256:0") for path in ("env.py", "lib/a.py", "lib/b.py"))
+LOCAL = Snapshot("/home/me/my-env", "local", "local-1", "env.py", Path(ROOT), FILES)
+HUB = Snapshot(
+    "org/repo", "space", "0123456789abcdef" * 2 + "00000000", "env.py", Path(ROOT), FILES
+)
+TRACE = """Traceback (most recent call last):
+  File "env.py", line 12, in step
+    helper(0)
+  File "lib/a.py", line 2, in helper
+    return np.linalg.inv(x)
+           ~~~~~~~~~~~~~^~~
+  File "/usr/lib/python3/numpy/linalg.py", line 561, in inv
+    raise LinAlgError("no")
+ValueError: no
+"""
+
+
+def told(traceback: str, snapshot: Snapshot = LOCAL, stage: str = "step") -> EnvHubError:
+    """The error that is raised for this traceback."""
+    error = raised(m.Raised("ValueError", "ValueError", "no", traceback, stage))
+    point_out(error, snapshot)
+    return error
+
+
+def notes(error: EnvHubError) -> str:
+    """What Python prints below the error."""
+    return "\n".join(vars(error).get("__notes__", ()))
+
+
+@pytest.mark.parametrize(
+    ("snapshot", "place"),
+    [(LOCAL, '"/home/me/my-env/{}"'), (HUB, '"{}" of spaces/org/repo@0123456789ab')],
+)
+@pytest.mark.parametrize("stage", ["step", "make_env"])
+def test_the_authors_last_line_is_in_the_text(snapshot: Snapshot, place: str, stage: str) -> None:
+    """By the name that he knows, and the whole traceback is in the notes, by these names too."""
+    error = told(TRACE, snapshot, stage)
+    last = f"  File {place.format('lib/a.py')}, line 2, in helper\n    return np.linalg.inv(x)"
+    assert str(error).endswith(f"ValueError: no\n{last}")
+    assert f"File {place.format('env.py')}, line 12, in step\n    helper(0)\n" in notes(error)
+    assert 'File "/usr/lib/python3/numpy/linalg.py", line 561' in notes(error)
+    remote = error if stage == "step" else error.__cause__
+    assert isinstance(remote, errors.RemoteEnvError)
+    assert remote.where == last
+    assert remote.traceback.rstrip() in notes(error)
+
+
+def test_a_path_in_the_store_is_taken_for_the_authors_too() -> None:
+    """As workers of before tell it."""
+    error = told(TRACE.replace('"env.py"', f'"{ROOT}/env.py"').replace('"lib/a.py"', '"x.py"'))
+    assert str(error).endswith('  File "/home/me/my-env/env.py", line 12, in step\n    helper(0)')
+    assert ROOT not in notes(error)
+
+
+@pytest.mark.parametrize(
+    "name", ["train.py", "../env.py", "lib", "lib/", "", "env.pyc", "/home/me/my-env/env.py", "env"]
+)
+def test_only_files_of_the_snapshot_are_pointed_at(name: str) -> None:
+    """A worker fills in which of them; it cannot send the reader anywhere else."""
+    error = told(f'Traceback:\n  File "{name}", line 3, in x\n    y\nValueError: no\n')
+    assert str(error) == "ValueError: no"
+
+
+def test_it_is_told_once() -> None:
+    """However many layers of ours the error goes through."""
+    error = told(TRACE)
+    before = str(error), notes(error)
+    point_out(error, LOCAL)
+    assert (str(error), notes(error)) == before
+
+
+def test_copies_and_pickles_keep_the_line() -> None:
+    """As those of a pool's worker do."""
+    for stage in ("step", "make_env"):
+        error = told(TRACE, stage=stage)
+        for made in (copy.copy(error), pickle.loads(pickle.dumps(error))):
+            assert (str(made), notes(made)) == (str(error), notes(error))
+
+
+HOSTILE = "\x1b]0;owned\x07\x1b[2J\r\u202e"
+
+
+@pytest.mark.parametrize(
+    "trace",
+    [
+        f'  File "env.py", line 1, in {HOSTILE}\n    {HOSTILE}\n',
+        f'  File "{HOSTILE}env.py", line 1, in x\n    y\n',
+        '  File "env.py", line 1, in ' + "x" * 100_000,
+        '  File "env.py", line 1, in x\n    ' + "y" * 100_000,
+        '  File "env.py", line 1, in x\n    y\n' * 20_000,
+        '  File "' + "e" * 100_000 + '", line 1\n',
+        '  File "env.py", line ' + "9" * 10_000 + "\n",
+        "  " * 50_000 + 'File "env.py", line 1\n',
+        "| + - " * 20_000,
+    ],
+    ids=range(9),
+)
+@pytest.mark.parametrize("stage", ["step", "import"])
+def test_hostile_tracebacks_stay_bounded_and_printable(trace: str, stage: str) -> None:
+    """Nothing that a terminal obeys, and no more than a screen in the text itself."""
+    error = told(trace, stage=stage)
+    for text in (str(error), notes(error)):
+        assert all(char in "\n\t" or char.isprintable() for char in text)
+        assert len(text) < 40_000
+    assert len(str(error)) < 2_000
+
+
+def test_names_of_the_machine_that_a_terminal_would_obey_are_escaped() -> None:
+    """A folder may have any name."""
+    folder = Snapshot(f"/home/{HOSTILE}", "local", "local-1", "env.py", Path(ROOT), FILES)
+    error = told(TRACE, folder)
+    assert "\\x1b" in str(error)
+    for text in (str(error), notes(error)):
+        assert all(char in "\n\t" or char.isprintable() for char in text)
+
+
+# --- in the worker --------------------------------------------------------------------------
+
+
+def a_failure(folder: Path, source: str) -> m.Raised:
+    """What a runner tells of a file that raises when it is run."""
+    path = folder / "env.py"
+    path.write_text(source)
+    try:
+        exec(compile(source, str(path), "exec"), {"__name__": "hub_env.env"})
+    except Exception as error:
+        return described(error, "step", str(folder))
+    raise AssertionError("nothing was raised")
+
+
+def test_files_of_the_repository_have_their_names_in_it(tmp_path: Path) -> None:
+    """Causes included; the line of the source is found all the same."""
+    source = "try:\n    1 / 0\nexcept ArithmeticError as error:\n    raise KeyError from error\n"
+    told = a_failure(tmp_path, source)
+    assert told.traceback.count('File "env.py", line') == 2
+    assert "    1 / 0\n" in told.traceback
+    assert str(tmp_path) not in told.traceback
+
+
+def test_a_syntax_error_has_its_line(tmp_path: Path) -> None:
+    """It has no frame in the repository."""
+    told = a_failure(tmp_path, "def make_env(:\n")
+    assert '  File "env.py", line 1\n    def make_env(:\n' in told.traceback
+
+
+def test_our_own_frames_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever they stand; so are those of the import of the entry file."""
+    source = (
+        "import importlib, sys\n"
+        "from envhub_worker.runner.loader import import_entry\n"
+        f"import_entry({str(tmp_path)!r}, 'other.py', {str(tmp_path)!r})\n"
+    )
+    (tmp_path / "other.py").write_text("1 / 0\n")
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    try:
+        told = a_failure(tmp_path, source).traceback
+    finally:
+        for name in [name for name in sys.modules if name.split(".")[0] == "hub_env"]:
+            del sys.modules[name]
+    _, *lines = [line.strip() for line in told.splitlines() if "File" in line]  # the first is here
+    assert lines == [
+        'File "env.py", line 3, in <module>',
+        'File "other.py", line 1, in <module>',
+    ]

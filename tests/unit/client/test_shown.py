@@ -1,0 +1,78 @@
+"""What a notebook shows is escaped and bounded, whatever names a worker gives."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from envhub_sandbox.vector.shown import environment_html, suites_html
+
+SCRIPT = "<script>steal()</script><img src=x onerror=steal()>\x1b[2J"
+OURS = {"table", "tr", "th", "td", "code", "p"}
+
+
+class Tags(HTMLParser):
+    """Notes which elements there are, and that none has attributes."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.found: set[str] = set()
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[Any]) -> None:
+        """Ours have none."""
+        assert not attrs
+        self.found.add(tag)
+
+    def handle_data(self, data: str) -> None:
+        """What a reader sees."""
+        self.text += f"{data} "
+
+
+def an_env(name: str = "arm", **fields: Any) -> Any:
+    """What is shown of an environment."""
+    space = gym.spaces.Dict({name: gym.spaces.Box(0, 1, (2,), np.float32)})
+    kept = {"num_envs": 3, "single_observation_space": space, "closed": False}
+    return SimpleNamespace(**{**kept, "single_action_space": gym.spaces.Discrete(4), **fields})
+
+
+def test_spaces_and_layers_are_shown() -> None:
+    """Of the layers those that hold."""
+    layers = [{"layer": "seccomp", "enforced": True}, {"layer": "cgroup", "enforced": False}]
+    text = Tags(environment_html(an_env(), layers)).text
+    for word in ("3", "'arm': Box", "Discrete(4)", "seccomp", "open"):
+        assert word in text
+    assert "cgroup" not in text
+    assert "does not run" in Tags(environment_html(an_env(), [])).text
+
+
+def test_each_task_has_its_line() -> None:
+    """By suite and task id, as they are asked for."""
+    shown = Tags(suites_html({"kitchen": {0: an_env(), "lift": an_env("leg")}}))
+    for word in ("kitchen", "0 ", "'lift'", "'leg': Box"):
+        assert word in shown.text
+
+
+def test_names_are_text_and_no_markup() -> None:
+    """Of suites, tasks, keys and layers; nor do they paint."""
+    env = an_env(SCRIPT)
+    layers = [{"layer": SCRIPT, "enforced": True}]
+    for shown in (environment_html(env, layers), suites_html({SCRIPT: {SCRIPT: env}})):
+        assert Tags(shown).found <= OURS
+        assert "steal()" in Tags(shown).text
+        assert "\x1b" not in shown
+
+
+def test_what_is_shown_is_bounded() -> None:
+    """A suite of thousands with names of megabytes is one screen."""
+    env = an_env("x" * 100_000)
+    tasks = dict.fromkeys(range(5000), env)
+    shown = suites_html({"y" * 100_000: tasks})
+    assert len(shown) < 100_000
+    assert "4950 more" in shown
+    assert len(environment_html(env, [{"layer": "z" * 100_000, "enforced": True}])) < 5_000
