@@ -20,7 +20,7 @@ from envhub_sandbox import RemoteSandbox, make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
 from envhub_worker.access import keys
 from envhub_worker.access.keys import AuthorizedClients
-from envhub_worker.access.rate_limited_log import LINES, Log
+from envhub_worker.access.rate_limited_log import CLIENT_LINES, LINES, Log
 from envhub_worker.cli import listen
 from envhub_worker.protocol.keys import key_text, parse_key
 from tests.remote.listening import WORKER, Listening, listening
@@ -232,7 +232,7 @@ def test_health_asks_the_server_and_not_only_its_port(tmp_path: Path) -> None:
         command = [*WORKER, "health", "--state-dir", str(server.state)]
         assert subprocess.run(command, timeout=60, check=False).returncode == 0
         assert "refused" not in server.said()
-        assert "unknown key" not in server.said()
+        assert "unknown_key" not in server.said()
         server.process.send_signal(signal.SIGSTOP)
         assert subprocess.run(command, timeout=60, check=False).returncode == 1
         server.process.send_signal(signal.SIGCONT)
@@ -251,12 +251,27 @@ def test_a_log_cannot_be_filled_by_strangers() -> None:
     now, lines = [0.0], list[str]()
     log = Log(lines.append, lambda: now[0])
     for _ in range(1000):
-        log.say("refused", "noise")
-    log.say("ended", "something else")
+        log.say("unknown_key", why="noise")
+    log.say("stopped", why="something else")
     assert len(lines) == LINES + 1
     now[0] = 61
     log.tick()
-    assert lines[-1].endswith(f"and {1000 - LINES} more in a minute")
+    assert lines[-1].endswith(f"left_out of=unknown_key lines={1000 - LINES}")
+
+
+def test_a_log_cannot_be_filled_by_a_client_and_is_not_by_its_work() -> None:
+    """Many lines of its own; what it wastes is neither another's nor a stranger's."""
+    now, lines = [0.0], list[str]()
+    log = Log(lines.append, lambda: now[0])
+    for _ in range(CLIENT_LINES + 5):
+        log.say("refused", whose="a" * 64, client="mallory")
+    assert len(lines) == CLIENT_LINES
+    log.say("refused", whose="b" * 64, client="alice")
+    log.say("refused", why="a stranger")
+    assert len(lines) == CLIENT_LINES + 2
+    now[0] = 61
+    log.tick()
+    assert lines[-1].endswith(f"left_out of=refused lines=5 key={'a' * 16}")
 
 
 def test_a_log_that_nobody_reads_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -265,10 +280,10 @@ def test_a_log_that_nobody_reads_ends_nothing(monkeypatch: pytest.MonkeyPatch) -
     os.close(read)
     broken = open(write, "w", buffering=1)  # noqa: SIM115
     monkeypatch.setattr("sys.stderr", broken)
-    Log().say("refused", "to a pipe without a reader")
+    Log().say("refused", why="to a pipe without a reader")
     with contextlib.suppress(BrokenPipeError):
         broken.close()
-    Log().say("refused", "to a closed stream")
+    Log().say("refused", why="to a closed stream")
 
 
 def test_a_state_folder_of_somebody_else_is_not_used(

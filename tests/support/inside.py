@@ -32,6 +32,7 @@ from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
 from envhub_sandbox.transport.shared_memory.shard import LaneShard
 from envhub_worker.access.connection_limit import Doorman
 from envhub_worker.access.gate import RemoteGate
+from envhub_worker.access.rate_limited_log import Log
 from envhub_worker.cli import listen
 from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.protocol import messages as m
@@ -305,7 +306,7 @@ def step_aside(group: str) -> None:
 
 def gate_of(options: Any, folder: Path, identity: listen.Identity) -> Any:
     """The gate that ``envhub-worker listen`` puts before a server."""
-    return listen._gate(options, folder, identity)
+    return listen._gate(options, folder, identity, Log())
 
 
 def public_key(gate: RemoteGate) -> bytes:

@@ -62,7 +62,10 @@ class Server:
         self._router = self._listen(endpoint)
         self._loop.watch(self._router, self._serve_clients)
         fd_path = fd_path or runtime_dir / "fds"
-        self._jails = Jails(self._loop, self, runtime_dir, readable_roots, limits, fd_path, ahead)
+        witness = self._gate.witness
+        self._jails = Jails(
+            self._loop, self, runtime_dir, readable_roots, limits, fd_path, ahead, witness
+        )
         self._loop.tick(self._tick)
         if client_pidfd is not None:
             self._loop.watch(client_pidfd, self.stop)
@@ -191,6 +194,7 @@ class Server:
         """Answer that it is not done."""
         # what the client has sent may be quoted in it, at any length
         self.reply(asker, m.Refused(error, message[:_MAX_SAID], layer, fix))
+        self._gate.refused(asker, error, message[:_MAX_SAID], layer, fix)
 
     def _hello(self, asker: Asker, request: m.Hello, arrived: Arrived) -> None:
         version = min(m.VERSION, request.newest)

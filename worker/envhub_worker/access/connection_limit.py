@@ -68,7 +68,7 @@ class Doorman:
             self._open -= 1
             self._wires.pop(value, None)
         else:
-            self._log.say("refused", "a handshake failed: no key, another server's, or noise")
+            self._log.say("handshake_failed", why="no key, another server's, or noise")
 
     def wire(self, fd: int) -> int:
         """The number of the connection that a message has just come from; 0 if that is not known.
@@ -96,10 +96,10 @@ class Doorman:
         except OSError as error:
             if door is not None:
                 door.close()
-            self._log.say("refused", f"there are {self._open} connections, and no end: {error}")
+            self._log.say("connections_full", connections=self._open, why=f"and no end: {error}")
             return
         self._shut_door = door
-        self._log.say("refused", f"there are {self._open} connections: no more for the moment")
+        self._log.say("connections_full", connections=self._open, why="no more for the moment")
 
     def tick(self) -> None:
         """Let others in once there is room."""

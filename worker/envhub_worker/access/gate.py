@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Protocol
 import zmq
 
 from envhub_worker.access.connection_limit import MAX_CONNECTIONS, Doorman
+from envhub_worker.access.events import Events
 from envhub_worker.access.keys import AuthorizedClients, KeyPair
 from envhub_worker.access.line import RETRY_S, Line
 from envhub_worker.access.quotas import (
@@ -28,8 +29,8 @@ from envhub_worker.access.quotas import (
     check_policy,
 )
 from envhub_worker.access.rate_limited_log import Log
-from envhub_worker.access.sessions import Session, Sessions
-from envhub_worker.access.uploads import Uploads, wrong_with_path
+from envhub_worker.access.sessions import WATCHER, Session, Sessions
+from envhub_worker.access.uploads import PREFIX, Uploads, wrong_with_path
 from envhub_worker.access.zap import DOMAIN, Zap
 from envhub_worker.lockdown.spec import confinement_from_wire
 from envhub_worker.loop import Loop
@@ -39,7 +40,8 @@ from envhub_worker.protocol.busy import Busy
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.keys import KEY_BYTES, key_text
 from envhub_worker.supervisor.jails import Jails
-from envhub_worker.supervisor.records import Asker, JailEntry
+from envhub_worker.supervisor.records import Asker
+from envhub_worker.supervisor.witness import Nobody, Witness
 
 _HANDSHAKE_MS = 5_000
 _HEARTBEAT_MS = 15_000
@@ -49,8 +51,6 @@ _SNDHWM = 32
 _FORGOTTEN_S = 3600.0
 """Where silent clients keep their jails, those without any are forgotten after so long."""
 _PLACE_NEEDED = "its client has gone, and its key needed the place"
-WATCHER = b"status"
-"""The session of whoever only looks: the same each time, and not counted."""
 ANYBODY = bytes(KEY_BYTES)
 """The key of clients that have none, behind ``--insecure-loopback``."""
 
@@ -101,11 +101,13 @@ class Gate(Protocol):
         handlers: The requests that only this gate knows.
         compresses: Whether frames are worth compressing.
         idle_s: How long the jails of a client that says nothing live on; 0 for ever.
+        witness: Is told what becomes of jails.
     """
 
     handlers: Mapping[type[m.Message], Handler]
     compresses: bool
     idle_s: int
+    witness: Witness
 
     def secure(self, router: zmq.Socket[bytes], loop: Loop) -> None:
         """Set what must be set before the socket is bound."""
@@ -122,6 +124,9 @@ class Gate(Protocol):
     def answered(self, asker: Asker) -> None:
         """A request was answered."""
 
+    def refused(self, asker: Asker, error: str, message: str, layer: str, fix: str) -> None:
+        """A request was answered so."""
+
     def tick(self, sessions: Sessions, jails: Jails) -> None:
         """Time has passed."""
 
@@ -135,6 +140,7 @@ class LocalGate:
     handlers: Mapping[type[m.Message], Handler] = MappingProxyType({})
     compresses = False
     idle_s = 0
+    witness: Witness = Nobody()
 
     def secure(self, router: zmq.Socket[bytes], loop: Loop) -> None:
         """Nothing: the folder is of mode 0700."""
@@ -155,6 +161,9 @@ class LocalGate:
 
     def answered(self, asker: Asker) -> None:
         """Nothing is counted."""
+
+    def refused(self, asker: Asker, error: str, message: str, layer: str, fix: str) -> None:
+        """Its client says so."""
 
     def tick(self, sessions: Sessions, jails: Jails) -> None:
         """The server ends with its client."""
@@ -196,6 +205,8 @@ class RemoteGate:
         self._rules = rules
         self._uploads = uploads
         self._log = log
+        self._events = Events(log, self._name_of)
+        self.witness: Witness = self._events
         self._in_flight = InFlight()
         self._lines = {"sessions": Line(), "jails": Line()}
         self._closers: list[Callable[[], None]] = []
@@ -234,7 +245,7 @@ class RemoteGate:
         if self._rules.authorized.name_of(key) is not None or key in self._rules.operators:
             return True
         # a kind of its own: noise at the port must not count away the line that an operator needs
-        self._log.say("unknown key", f"{key_text(key)} at {address} is not authorised")
+        self._log.say("unknown_key", key=key_text(key), address=address)
         return False
 
     def receive(self, router: zmq.Socket[bytes]) -> Arrived:
@@ -278,7 +289,10 @@ class RemoteGate:
             self._refuse_behind("sessions", key, name, len(others), quota)
         self._lines["sessions"].leave(key, name)
         wire = 0 if self._doorman is None else self._doorman.wire(fd)
-        sessions.connect(identity, key, name, wire)
+        known = {one.name for one in sessions.of_key(key)}
+        session = sessions.connect(identity, key, name, wire)
+        if name not in known:
+            self._events.came(session)
 
     def authorize(self, asked: Asked) -> m.Message:
         """Hold a request against keys and quotas."""
@@ -292,6 +306,10 @@ class RemoteGate:
             size = sum(map(len, asked.payload))
             self._in_flight.add(asker.key, asker, size, self._rules.quotas.inflight_bytes)
         return request
+
+    def _name_of(self, key: bytes) -> str | None:
+        name = self._rules.authorized.name_of(key)
+        return name if name or key not in self._rules.operators else "operator"
 
     def _is_known(self, key: bytes) -> bool:
         rules = self._rules
@@ -355,7 +373,13 @@ class RemoteGate:
         asker, request = asked.asker, asked.request
         assert isinstance(request, m.OfferSnapshot)
         in_use = {entry.jail.spec.snapshot for entry in asked.jails.open_ones()}
-        return self._uploads.offer(asker.session, asker.key, request, in_use)
+        wanted = self._uploads.offer(asker.session, asker.key, request, in_use)
+        if wanted.hashes:
+            sizes = {file[2]: file[1] for file in request.files if isinstance(file, tuple)}
+            size = sum(sizes[sha256] for sha256 in wanted.hashes)
+            digest = wanted.snapshot.removeprefix(PREFIX)
+            self._events.uploads(asker.session, digest, len(wanted.hashes), size)
+        return wanted
 
     def _put(self, asked: Asked) -> m.Message:
         asker, request = asked.asker, asked.request
@@ -380,6 +404,10 @@ class RemoteGate:
         """Its bytes are no longer in flight."""
         self._in_flight.answered(asker)
 
+    def refused(self, asker: Asker, error: str, message: str, layer: str, fix: str) -> None:
+        """The operator is told, too."""
+        self._events.refused(asker, error, message, layer, fix)
+
     def _sessions_of(self, key: bytes, sessions: Sessions, jails: Jails) -> list[dict[str, Any]]:
         rules = self._rules
         self._end_deserted(sessions, jails)
@@ -387,7 +415,7 @@ class RemoteGate:
         used = {key: self._uploads.used_bytes(key) for key in {one.key for one in seen}}
         return [
             {
-                "client": rules.authorized.name_of(one.key) or "operator",
+                "client": self._name_of(one.key) or "operator",
                 "key": key_text(one.key),
                 "session": one.name.hex()[:8],
                 "heard_s": sessions.age_s(one),
@@ -408,7 +436,7 @@ class RemoteGate:
         try:
             self._rules.authorized.refresh()
         except (OSError, ValueError) as error:
-            self._log.say("authorised clients", f"kept as they were: {error}")
+            self._log.say("clients_kept_as_they_were", why=str(error))
         for session in sessions.all():
             if not self._is_known(session.key):
                 self._end(session, sessions, jails, "its key is not authorised any more")
@@ -418,8 +446,7 @@ class RemoteGate:
                 why = f"nothing was heard of its client for {self.idle_s} s"
                 self._end(session, sessions, jails, why)
             elif not jails.open_ones(session.owner):
-                self._uploads.forget(session.owner)
-                sessions.drop(session)
+                self._drop(session, sessions, "nothing was heard of it for long")
         if self.idle_s:
             self._end_unheld(sessions, jails)
 
@@ -432,8 +459,7 @@ class RemoteGate:
         self._disconnect(sessions)
         for session in sessions.all():
             if not session.connections and not jails.open_ones(session.owner):
-                self._uploads.forget(session.owner)
-                sessions.drop(session)
+                self._drop(session, sessions, "its connections have ended")
 
     def _disconnect(self, sessions: Sessions) -> None:
         if self._doorman is not None:
@@ -443,17 +469,17 @@ class RemoteGate:
         for session in sessions.all():
             for entry in jails.open_ones(session.owner):
                 if sessions.unheld(session, entry.number, self.idle_s):
-                    self._reap(entry, jails, "its client gave it up")
+                    jails.end(entry, "its client gave it up")
 
     def _end(self, session: Session, sessions: Sessions, jails: Jails, why: str) -> None:
         for entry in jails.open_ones(session.owner):
-            self._reap(entry, jails, why)
+            jails.end(entry, why)
+        self._drop(session, sessions, why)
+
+    def _drop(self, session: Session, sessions: Sessions, why: str) -> None:
         self._uploads.forget(session.owner)
         sessions.drop(session)
-
-    def _reap(self, entry: JailEntry, jails: Jails, why: str) -> None:
-        self._log.say("ended", f"the jail of {entry.name[:200]!r}: {why}")
-        jails.end(entry, why)
+        self._events.left(session, why)
 
     def close(self) -> None:
         """Close the sockets of the handshakes."""

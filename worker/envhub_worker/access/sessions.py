@@ -9,6 +9,9 @@ from dataclasses import dataclass, field
 
 from envhub_worker.protocol.messages import OLDEST_VERSION
 
+WATCHER = b"status"
+"""The session of whoever only looks: the same each time, and not counted."""
+
 MAX_CONNECTIONS = 4096
 """Of one session; the longest unused is dropped."""
 
@@ -37,6 +40,7 @@ class Session:
         key: The client's public key, as ZAP gave it; empty where there is none.
         name: The client's own random bytes.
         heard: When it last said anything.
+        since: When it said Hello for the first time.
         held: The jails that it last said it holds, and when; None before it said so.
         version: The version of the protocol that it last agreed to.
     """
@@ -47,6 +51,7 @@ class Session:
     held: dict[int, float] | None = None
     version: int = OLDEST_VERSION
     connections: OrderedDict[tuple[bytes, bytes], Connection] = field(default_factory=OrderedDict)
+    since: float = field(default_factory=time.monotonic)
 
     @property
     def owner(self) -> bytes:

@@ -16,6 +16,7 @@ import signal
 import stat
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -26,6 +27,7 @@ from envhub_worker.access import keys
 from envhub_worker.access.connection_limit import MAX_CONNECTIONS
 from envhub_worker.access.gate import RemoteGate, Rules
 from envhub_worker.access.keys import AuthorizedClients, KeyPair
+from envhub_worker.access.log_lines import FORMS, LEVELS
 from envhub_worker.access.quotas import Permissions, Quotas
 from envhub_worker.access.rate_limited_log import Log
 from envhub_worker.access.uploads import Uploads
@@ -84,6 +86,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--allow-network", action="store_true", help="permit network='host'")
     parser.add_argument("--allow-gpu", action="store_true", help="permit gpu=True")
+    parser.add_argument(
+        "--log-format",
+        choices=tuple(FORMS),
+        default="text",
+        help="of the log, which goes to stderr, a line an event (default: text)",
+    )
+    parser.add_argument(
+        "--log-level",
+        choices=LEVELS,
+        default="info",
+        help="what is less important is left out (default: info)",
+    )
     _add_quotas(parser)
 
 
@@ -136,13 +150,16 @@ def _listen(arguments: argparse.Namespace, state: Path) -> int:
     check_bind(arguments.bind, arguments.insecure_loopback)
     strongest = surroundings.profiles(probe.probe()["layers"], landlock.version())
     identity = replace(_identity(arguments, state), profile=(*strongest, "strict")[0])
-    sys.stderr.write(unusable(identity.profile, arguments.weakest_profile))
+    log = Log(form=FORMS[arguments.log_format], level=arguments.log_level)
+    why = unusable(identity.profile, arguments.weakest_profile)
+    if why:
+        log.say("no_jail_possible", "error", why=why)
     _raise_file_limit()
     place = locked_folder.place_for_sockets()
     locked_folder.remove_deserted(place)
     runtime = LockedFolder("envhub-", place)
     try:
-        gate = _gate(arguments, state, identity)
+        gate = _gate(arguments, state, identity, log)
         store = state / "store"
         server = Server(arguments.bind, runtime.path, [str(store)], gate=gate)
     except BaseException:
@@ -152,13 +169,23 @@ def _listen(arguments: argparse.Namespace, state: Path) -> int:
     note = state / "endpoint"
     key_file = (arguments.key or state / "server.key").absolute()
     note.write_text(f"{server.endpoint} {identity.public} {key_file}\n")
-    print(announcement(server.endpoint, identity), flush=True)
+    if arguments.log_format == "text" or identity.authorized is None:  # a client needs to read it
+        print(announcement(server.endpoint, identity), flush=True)
+    _log_start(log, server.endpoint, identity, arguments.weakest_profile)
+    began = time.monotonic()
     try:
         server.run()
     finally:
+        log.say("stopped", "info", seconds=time.monotonic() - began)
         note.unlink(missing_ok=True)
         runtime.remove()
     return 0
+
+
+def _log_start(log: Log, endpoint: str, identity: Identity, weakest: str) -> None:
+    told = {"version": __version__, "endpoint": endpoint, "server_key": identity.public}
+    profiles = {"strongest_profile": identity.profile, "weakest_profile": weakest}
+    log.say("listening", "info", **told, **profiles, pid=os.getpid())
 
 
 def _raise_file_limit() -> None:
@@ -294,8 +321,8 @@ def unusable(strongest: str, weakest: str) -> str:
     if PROFILES.index(strongest) <= PROFILES.index(weakest):
         return ""
     return (
-        f"envhub-worker listen: no jail can be opened here: the strongest profile to be had is "
-        f"{strongest!r}, and --weakest-profile permits nothing weaker than {weakest!r}\n"
+        f"no jail can be opened here: the strongest profile to be had is {strongest!r}, and "
+        f"--weakest-profile permits nothing weaker than {weakest!r}"
     )
 
 
@@ -305,7 +332,7 @@ def reachable(endpoint: str) -> str:
     return f"tcp://127.0.0.1:{port}" if host in _ANY_HOST else endpoint
 
 
-def _gate(arguments: argparse.Namespace, state: Path, identity: Identity) -> RemoteGate:
+def _gate(arguments: argparse.Namespace, state: Path, identity: Identity, log: Log) -> RemoteGate:
     known = {} if identity.client is None else {identity.client.public: "the one client"}
     pair = identity.keys
     operators = frozenset[bytes]() if pair is None else frozenset({pair.public})
@@ -331,7 +358,7 @@ def _gate(arguments: argparse.Namespace, state: Path, identity: Identity) -> Rem
         idle_s=max(0, arguments.idle_s),
         max_connections=most_connections(arguments.max_connections),
     )
-    return RemoteGate(rules, Uploads(state / "store", quotas), Log())
+    return RemoteGate(rules, Uploads(state / "store", quotas), log)
 
 
 def _most_clients(arguments: argparse.Namespace) -> int | None:

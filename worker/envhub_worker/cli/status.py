@@ -11,7 +11,7 @@ from typing import Any
 import zmq
 
 from envhub_worker.access import keys
-from envhub_worker.access.gate import WATCHER
+from envhub_worker.access.sessions import WATCHER
 from envhub_worker.cli.listen import reachable, state_dir
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import ProtocolError

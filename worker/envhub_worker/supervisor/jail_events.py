@@ -7,8 +7,8 @@ and one that breaks the rules loses its jail.
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Callable
+from time import monotonic
 
 from envhub_worker.channel import close_fds
 from envhub_worker.loop import Loop
@@ -32,6 +32,7 @@ from envhub_worker.supervisor.records import (
     whole_jail,
 )
 from envhub_worker.supervisor.runner_stream import RunnerLink
+from envhub_worker.supervisor.witness import Witness
 
 MAX_DEAD = 256
 """Jails that have ended and are not closed, whose deaths are remembered."""
@@ -45,15 +46,22 @@ class JailEvents:
         answers: Takes the replies.
         jails: All jails of the server; what has ended long ago is taken out.
         deposits: Descriptors that wait for runners.
+        witness: Is told what becomes of each.
     """
 
     def __init__(
-        self, loop: Loop, answers: Answers, jails: dict[int, JailEntry], deposits: Deposits
+        self,
+        loop: Loop,
+        answers: Answers,
+        jails: dict[int, JailEntry],
+        deposits: Deposits,
+        witness: Witness,
     ) -> None:
         self._loop = loop
         self._answers = answers
         self._jails = jails
         self._deposits = deposits
+        self._witness = witness
 
     def follow(self, entry: JailEntry) -> None:
         """Hear of a new jail from now on."""
@@ -71,7 +79,7 @@ class JailEvents:
             try:
                 callback()
             except Exception as error:
-                traceback.print_exc()
+                self._witness.failed(error)
                 what = f"an error of the worker server: {type(error).__name__}: {error}"
                 self.end(entry, whole_jail("killed", detail=what))
 
@@ -138,6 +146,9 @@ class JailEvents:
                 entry.opening.remove(opening)
                 opened = m.JailOpened(entry.number, opening.runners, entry.report)
                 self._answers.reply(opening.asker, opened)
+                took = monotonic() - opening.since
+                self._witness.opened(entry, len(opening.runners), took)
+                entry.opened = True
 
     def _failed(self, entry: JailEntry, event: Failed) -> None:
         for opening in entry.opening:
@@ -176,7 +187,7 @@ class JailEvents:
         close_fds(self._deposits.take(entry.number, death.runner))
         if entry.idle is not None:
             entry.idle.forget(death.runner)
-        link = entry.links.pop(death.runner)
+        link = entry.drop(death.runner)
         self._loop.unwatch(link.fileno())
         for pending, index in link.pending.values():
             pending.lost(index, death)
@@ -185,6 +196,7 @@ class JailEvents:
         for opening in [one for one in entry.opening if death.runner in one.waiting]:
             entry.opening.remove(opening)
             self._answers.reply(opening.asker, for_operation(death, "start"))
+        self._witness.lost(entry, death)
 
     def end(self, entry: JailEntry, death: m.Died) -> None:
         """Write the jail's death down, tell everybody who waits, and make it true."""
@@ -197,6 +209,7 @@ class JailEvents:
         for opening in entry.opening:
             self._answers.reply(opening.asker, for_operation(death, "start"))
         entry.opening.clear()
+        self._witness.died(entry)
         self.kill(entry)
 
     def kill(self, entry: JailEntry) -> None:
@@ -224,6 +237,8 @@ class JailEvents:
         self._release(entry)
         for asker in entry.closing:
             self._answers.reply(asker, m.Done())
+        if entry.death is None:
+            self._witness.closed(entry)
 
     def _release(self, entry: JailEntry) -> None:
         entry.released = True

@@ -33,6 +33,7 @@ from envhub_worker.supervisor.records import (
     whole_jail,
 )
 from envhub_worker.supervisor.runner_stream import MAX_PENDING, RunnerLink
+from envhub_worker.supervisor.witness import Nobody, Witness
 from envhub_worker.supervisor.zygotes import Zygotes
 
 MAX_RUNNERS = 64
@@ -54,6 +55,7 @@ class Jails:
         limits: Bounds on what a runner may say.
         fd_path: The socket that takes descriptors.
         ahead: A process for the first zygote.
+        witness: Is told what becomes of each.
     """
 
     def __init__(
@@ -65,6 +67,7 @@ class Jails:
         limits: WireLimits,
         fd_path: Path,
         ahead: ZygoteProcess | None = None,
+        witness: Witness | None = None,
     ) -> None:
         self._answers = answers
         self._limits = limits
@@ -72,7 +75,7 @@ class Jails:
         self._packet_ids = itertools.count(1)
         self._deposits = Deposits(str(fd_path), self._pidfd_for)
         loop.watch(self._deposits.fileno(), self._deposits.accept)
-        self._events = JailEvents(loop, answers, self._jails, self._deposits)
+        self._events = JailEvents(loop, answers, self._jails, self._deposits, witness or Nobody())
         self._zygotes = Zygotes(loop, runtime_dir, readable_roots, self._jails, self._events, ahead)
 
     def close(self) -> None:

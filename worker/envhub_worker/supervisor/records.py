@@ -39,6 +39,7 @@ class Opening:
     asker: Asker
     waiting: set[int]
     runners: tuple[int, ...]
+    since: float = field(default_factory=monotonic)
 
 
 @dataclass(slots=True)
@@ -59,7 +60,13 @@ class Pending:
 
 @dataclass
 class JailEntry:
-    """A jail and everything that waits for it."""
+    """A jail and everything that waits for it.
+
+    Attributes:
+        opened: Whether it has come up.
+        since: When it was asked for.
+        moved: Bytes to and from runners that it has lost.
+    """
 
     number: int
     name: str
@@ -77,10 +84,25 @@ class JailEntry:
     lost: dict[int, m.Died] = field(default_factory=dict)
     death: m.Died | None = None
     released: bool = False
+    opened: bool = False
+    since: float = field(default_factory=monotonic)
+    moved: tuple[int, int] = (0, 0)
 
     def __post_init__(self) -> None:
         # kept, because closing a descriptor makes it forget its number
         self.control = self.jail.fileno()
+
+    def bytes_moved(self) -> tuple[int, int]:
+        """To its runners, and from them."""
+        sent, received = self.moved
+        links = self.links.values()
+        return sent + sum(one.sent for one in links), received + sum(one.received for one in links)
+
+    def drop(self, runner: int) -> RunnerLink:
+        """Its link to a runner, which it has no more."""
+        link = self.links[runner]
+        self.moved = self.moved[0] + link.sent, self.moved[1] + link.received
+        return self.links.pop(runner)
 
 
 class Answers(Protocol):

@@ -32,6 +32,8 @@ class RunnerLink:
     limits: WireLimits
     pending: collections.OrderedDict[int, Any] = field(default_factory=collections.OrderedDict)
     watched: bool = False
+    sent: int = 0
+    received: int = 0
     _unsent: collections.deque[memoryview] = field(default_factory=collections.deque)
 
     def __post_init__(self) -> None:
@@ -57,7 +59,9 @@ class RunnerLink:
             return
         self.pending[request_id] = owner
         buffers = pack_packet(request_id, frames)
-        if sum(map(len, buffers)) < LARGE_BYTES:
+        size = sum(map(len, buffers))
+        self.sent += size
+        if size < LARGE_BYTES:
             buffers = [b"".join(buffers)]
         self._unsent += [memoryview(buffer).cast("B") for buffer in buffers if buffer]
         self.flush()
@@ -105,6 +109,7 @@ class RunnerLink:
             return None
         if not data:
             return None
+        self.received += len(data)
         answers = []
         try:
             for packet in self._reader.feed(data):
