@@ -11,9 +11,11 @@ from envhub_sandbox.cli import (
     doctor,
     gc,
     image,
+    init,
     inspect,
     lock,
     prefetch,
+    push,
     replay,
     run,
     version,
@@ -26,7 +28,6 @@ app = typer.Typer(
     "into your process.",
     epilog=EXIT_CODES,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -59,6 +60,8 @@ app.command("inspect", epilog=EXIT_CODES)(inspect.inspect)
 app.command("prefetch", epilog=EXIT_CODES)(prefetch.prefetch)
 app.command("lock", epilog=EXIT_CODES)(lock.lock)
 app.command("verify", epilog=EXIT_CODES)(lock.verify)
+app.command("init")(init.init)
+app.command("push", epilog=EXIT_CODES)(push.push)
 app.command("replay", epilog=EXIT_CODES)(replay.replay)
 app.command("doctor")(doctor.doctor)
 app.add_typer(cache.app, name="cache")

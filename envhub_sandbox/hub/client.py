@@ -154,6 +154,28 @@ class HubClient:
         with self._explained(repo, commit):
             return self._download(repo, commit, path, force_download=True)
 
+    def publish(
+        self, repo: Repository, folder: Path, revision: str | None, message: str, *, private: bool
+    ) -> str:
+        """Upload a folder as one commit; a repository that is not there is made.
+
+        Returns:
+            The full commit.
+        """
+        client: Any = import_module("huggingface_hub")
+        with self._explained(repo, revision):
+            login = self._login()
+            token = False if login else self.token
+            hub = client.HfApi(self.public_endpoint, token=token, headers=login, **_LIBRARY)
+            sdk = {"space_sdk": "static"} if repo.repo_type == "space" else {}
+            hub.create_repo(**repo._asdict(), private=private or None, exist_ok=True, **sdk)
+            done = hub.upload_folder(
+                **repo._asdict(), folder_path=folder, revision=revision, commit_message=message
+            )
+            if not (isinstance(done.oid, str) and is_commit(done.oid)):
+                raise ValueError("the answer has no full commit")
+        return done.oid
+
     def _download(self, repo: Repository, commit: str, path: str, **more: Any) -> Path:
         from huggingface_hub import hf_hub_download
 

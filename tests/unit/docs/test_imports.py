@@ -40,6 +40,7 @@ OPTIONAL = {
     "envhub_sandbox.metrics": {"prometheus_client"},
     "envhub_sandbox.transport.tensors": {"torch"},
     "envhub_sandbox.cli.rollout.video": {"imageio_ffmpeg"},
+    "envhub_sandbox.pytest_plugin": {"pytest"},
 }
 DESERIALISERS = {"_pickle", "copyreg", "dill", "joblib", "marshal", "pickle", "shelve"}
 
@@ -59,6 +60,7 @@ MAY_IMPORT = {
         *("transport", "vector"),
     },
     "envhub_sandbox.gym": {"api", "vector"},
+    "envhub_sandbox.pytest_plugin": {"api", "hub"},
     "envhub_sandbox.integrations": {"api", "vector"},
     "envhub_sandbox.vector": {"session", "transport"},
     "envhub_sandbox.metrics": {"session"},
@@ -298,6 +300,7 @@ def test_only_faces_and_the_command_line_import_make_env() -> None:
         "envhub_sandbox",
         "envhub_sandbox.gym",
         "envhub_sandbox.integrations.sb3",
+        "envhub_sandbox.pytest_plugin",
     }
 
 
@@ -458,6 +461,20 @@ def test_the_package_imports_nothing_heavy() -> None:
     """Names are looked up when they are used."""
     heavy = CLIENTS_OWN - {"envhub_sandbox"} | {"torch"}
     assert not loaded_by("import envhub_sandbox") & heavy
+
+
+def test_the_pytest_plugin_costs_nothing_until_it_is_used() -> None:
+    """Every run of pytest on the machine imports it."""
+    loaded = loaded_by("import envhub_sandbox.pytest_plugin")
+    assert "pytest" in loaded
+    assert not loaded & (CLIENTS_OWN - {"envhub_sandbox"} | {"torch"}) - loaded_by("import pytest")
+
+
+def test_the_pytest_plugin_is_declared(checkout: Path) -> None:
+    """Under the name by which it can be left out."""
+    declared = (checkout / "pyproject.toml").read_text()
+    table = declared.partition("[project.entry-points.pytest11]\n")[2].partition("\n[")[0]
+    assert table.strip() == 'envhub = "envhub_sandbox.pytest_plugin"'
 
 
 def test_every_public_name_is_there() -> None:

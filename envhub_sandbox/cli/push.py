@@ -1,0 +1,149 @@
+"""``envhub push``: publish a folder on the Hub, if it loads and steps in a sandbox."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from envhub_sandbox.cli.shared import options as opt
+from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say
+from envhub_sandbox.cli.shared.exits import UsageError, reported
+from envhub_sandbox.cli.shared.progress import Bar
+
+if TYPE_CHECKING:
+    from envhub_sandbox.hub.reference import HubRef
+    from envhub_sandbox.hub.snapshot import Snapshot
+
+_STEPS = 10
+_SECRETS = frozenset(
+    {".env", ".git-credentials", ".netrc", ".pypirc", "id_ed25519", "id_rsa", "credentials.json"}
+)
+_SECRET_SUFFIXES = (".pem", ".key")
+
+
+def push(
+    folder: Annotated[str, typer.Argument(metavar="FOLDER", help="The folder, as in './my-env'.")],
+    ref: Annotated[
+        str,
+        typer.Argument(
+            metavar="REPO",
+            help="Where to: 'owner/name', 'spaces/owner/name', 'owner/name@branch'.",
+        ),
+    ],
+    message: Annotated[
+        str, typer.Option("--message", "-m", help="The commit's message.")
+    ] = "Publish the environment with envhub",
+    private: Annotated[
+        bool, typer.Option("--private", help="A repository that is made is private.")
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Check, say what would be uploaded, and stop.")
+    ] = False,
+    env_kwargs: opt.EnvKwargs = None,
+    dependencies: opt.Dependencies = "auto",
+    json: opt.Json = False,
+    token: opt.Token = None,
+    endpoint: opt.Endpoint = None,
+    debug: opt.Debug = False,
+) -> None:
+    """Publish a folder on the Hub as one commit, and print the pinned reference.
+
+    First it is loaded, reset and stepped in a sandbox, every value held against its space. What
+    fails there is not uploaded; what is uploaded is the very copy that was checked. Files of the
+    repository that the folder lacks stay as they are.
+    """
+    with reported(debug=debug):
+        from envhub_sandbox.hub.reference import HubRef
+        from envhub_sandbox.hub.snapshot import local
+
+        target = HubRef.parse(ref)
+        with Bar(quiet=json) as bar:
+            bar.begin(f"reading {folder}")
+            snapshot = local(folder)
+            _refuse_secrets(snapshot)
+            bar.begin("checking it in a sandbox")
+            _check(folder, snapshot, env_kwargs or [], dependencies)
+            if not dry_run:
+                bar.begin(f"uploading to {ref}")
+                target = _publish(snapshot, target, token, endpoint, message, private)
+        _tell(snapshot, target, dry_run, as_json=json)
+
+
+def _refuse_secrets(snapshot: Snapshot) -> None:
+    for file in snapshot.files:
+        name = file.path.rpartition("/")[2]
+        if name in _SECRETS or name.endswith(_SECRET_SUFFIXES):
+            raise UsageError(
+                f"{snapshot.repo_id} holds {file.path!r}, which looks like a secret, and what is "
+                "once on the Hub stays in its history; put it elsewhere"
+            )
+
+
+def _check(folder: str, snapshot: Snapshot, env_kwargs: list[str], dependencies: str) -> None:
+    """Load it and step it.
+
+    Raises:
+        EnvHubError: It does not load, or breaks a rule.
+        UsageError: The folder was changed meanwhile.
+    """
+    from envhub_sandbox.api import make_env
+
+    made = make_env(
+        folder,
+        n_envs=2,
+        env_kwargs=opt.read_env_kwargs(env_kwargs),
+        dependencies=opt.read_dependencies(dependencies),
+        validate=True,
+    )
+    with made as suites:
+        for env in suites.envs():
+            env.reset(seed=0)
+            env.action_space.seed(0)
+            for _ in range(_STEPS):
+                env.step(env.action_space.sample())
+            env.close()
+        commit = suites.provenance["commit"]
+    if commit != snapshot.commit:
+        raise UsageError(f"{folder} was changed while it was checked; try again")
+
+
+def _publish(
+    snapshot: Snapshot,
+    target: HubRef,
+    token: str | None,
+    endpoint: str | None,
+    message: str,
+    private: bool,
+) -> HubRef:
+    """Upload the copy in the store; gives the pinned reference."""
+    from dataclasses import replace
+
+    from envhub_sandbox.errors import RepositoryUnavailableError
+    from envhub_sandbox.hub.client import HubClient, Repository, checked_endpoint, checked_token
+    from envhub_sandbox.hub.failures import HubFailure
+
+    hub = HubClient(checked_endpoint(endpoint), checked_token(token))
+    repo = Repository(target.repo_type or "model", target.repo_id)
+    try:
+        commit = hub.publish(repo, snapshot.root, target.revision, message, private=private)
+    except HubFailure as failure:
+        raise RepositoryUnavailableError(
+            f"{target} on {hub.public_endpoint}: nothing was published: {failure.what}. "
+            f"{failure.advice}. To publish takes a token that may write."
+        ) from failure.__cause__
+    return replace(target, revision=commit, path=snapshot.path)
+
+
+def _tell(snapshot: Snapshot, target: HubRef, dry_run: bool, *, as_json: bool) -> None:
+    files = [file.path for file in snapshot.files]
+    if as_json:
+        told: dict[str, Any] = {"reference": str(target), "published": not dry_run, "files": files}
+        print_json(told)
+        return
+    if dry_run:
+        console().print("\n".join(map(safe_line, files)), soft_wrap=True)
+        say("It loads and steps. Nothing was uploaded.")
+        return
+    console().print(safe_line(str(target), 300), soft_wrap=True)
+    say(f"{len(files)} files. Use it: envhub run {safe_line(str(target), 300)}")

@@ -1,0 +1,61 @@
+"""A pytest plugin for authors: ``pytest --envhub-ref .``, and the fixture ``envhub_env``.
+
+pytest imports it in every run on a machine that has this package, so it imports nothing but pytest
+before a test asks for the fixture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+_MARK = "envhub"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """``--envhub-ref``."""
+    group = parser.getgroup("envhub", "environments of the Hugging Face Hub, in a sandbox")
+    group.addoption(
+        "--envhub-ref",
+        metavar="REF",
+        help="What the fixture envhub_env makes: a hub reference, or a folder, './my-env'.",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """The marker that has the fixture's options."""
+    config.addinivalue_line(
+        "markers",
+        f"{_MARK}(suite=, task=, **options): which environment envhub_env is, and further "
+        "arguments of make_env for it, such as n_envs=2.",
+    )
+
+
+@pytest.fixture
+def envhub_env(request: pytest.FixtureRequest) -> Iterator[Any]:
+    """The vector environment of ``--envhub-ref``, in a sandbox, made for this test alone.
+
+    Every action and observation is held against its space (``validate=True``).
+    """
+    ref = request.config.getoption("--envhub-ref")
+    if ref is None:
+        pytest.fail("the fixture envhub_env needs --envhub-ref REF, as in --envhub-ref .")
+    from envhub_sandbox.api import make_env
+
+    marks = request.node.iter_markers(_MARK)
+    options: dict[str, Any] = {}
+    for mark in reversed(list(marks)):  # the nearest last, which wins
+        options |= mark.kwargs
+    chosen = options.pop("suite", None), options.pop("task", None)
+    with make_env(_from_where_pytest_began(ref, request), **{"validate": True, **options}) as made:
+        yield made.choose(*chosen)
+
+
+def _from_where_pytest_began(ref: str, request: pytest.FixtureRequest) -> str:
+    """A folder's own path: a test may have gone elsewhere."""
+    from envhub_sandbox.hub.reference import is_local
+
+    began = request.config.invocation_params.dir
+    return str(began / ref) if is_local(ref) and not ref.startswith("~") else ref

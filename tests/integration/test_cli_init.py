@@ -1,0 +1,108 @@
+"""``envhub init``: what it writes passes its own check, by the plugin that it is written for."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox.cli.shared.starter import starter
+
+ENVHUB = [sys.executable, "-I", "-m", "envhub_sandbox"]
+PLUGIN = "envhub_sandbox.pytest_plugin"
+
+
+def run(folder: Path, *command: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run a command there to its end."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    return subprocess.run(
+        command,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        env={**kept, **variables},
+        timeout=240,
+        check=False,
+    )
+
+
+def pytest_run(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    """What an author would run, without what our own tests need."""
+    installed = {found.value for found in entry_points(group="pytest11")}
+    ours = () if PLUGIN in installed else ("-p", PLUGIN)  # a checkout of before may be installed
+    without = ("no:cacheprovider", "no:xdist", "no:hypothesispytest", "no:timeout")
+    plugins = [part for name in without for part in ("-p", name)]
+    return run(folder, sys.executable, "-m", "pytest", "-q", *ours, *plugins, *options)
+
+
+def test_a_new_repository_passes_its_own_tests(tmp_path: Path) -> None:
+    """In a sandbox, values held against spaces; so do its further options."""
+    made = run(tmp_path, *ENVHUB, "init", "my-env")
+    assert (made.returncode, made.stdout) == (0, "./my-env\n")
+    folder = tmp_path / "my-env"
+    found = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+    assert found == set(starter("my-env", 2026))
+    (folder / "test_more.py").write_text(_MORE)
+    done = pytest_run(folder, "--strict-markers", "--envhub-ref", ".")
+    assert done.returncode == 0, done.stdout
+    assert "3 passed" in done.stdout
+
+
+_MORE = """
+import os, sys
+import pytest
+
+pytestmark = pytest.mark.envhub(n_envs=2, use_async_envs=True)
+
+def test_options_of_the_module(envhub_env):
+    assert envhub_env.num_envs == 2
+    assert "hub_env" not in sys.modules
+
+@pytest.mark.envhub(n_envs=3, suite="hub_env", task=0)
+def test_those_of_the_test_win(tmp_path, monkeypatch, request):
+    monkeypatch.chdir(tmp_path)
+    assert request.getfixturevalue("envhub_env").num_envs == 3
+"""
+
+
+def test_a_fixture_without_a_reference_says_what_is_missing(tmp_path: Path) -> None:
+    """And nothing is made."""
+    (tmp_path / "test_it.py").write_text("def test_it(envhub_env):\n    pass\n")
+    done = pytest_run(tmp_path)
+    assert done.returncode == 1
+    assert "needs --envhub-ref REF" in done.stdout
+
+
+@pytest.mark.parametrize("name", ["-x", "a--b", "a b", "a..b", "x.git", "é", ".env", "."])
+def test_names_that_the_hub_would_not_take_are_refused(tmp_path: Path, name: str) -> None:
+    """Before anything is written."""
+    from envhub_sandbox.cli.init import repository_name
+    from envhub_sandbox.cli.shared.exits import UsageError
+
+    folder = tmp_path / "a b" if name == "." else tmp_path / name
+    with pytest.raises(UsageError, match="cannot be a name on the Hub"):
+        repository_name(folder)
+
+
+def test_what_is_there_already_stays(tmp_path: Path) -> None:
+    """A folder with anything in it is not touched."""
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "env.py").write_text("precious")
+    done = run(tmp_path, *ENVHUB, "init", "mine")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "is there already" in done.stderr
+    assert [path.read_text() for path in (tmp_path / "mine").iterdir()] == ["precious"]
+
+
+def test_the_shell_completes_commands_and_options(tmp_path: Path) -> None:
+    """By the script that ``--show-completion`` prints, which asks the program."""
+    words = {"COMP_WORDS": "envhub pu", "COMP_CWORD": "1", "_ENVHUB_COMPLETE": "complete_bash"}
+    assert run(tmp_path, *ENVHUB, **words).stdout.split() == ["push"]
+    words |= {"COMP_WORDS": "envhub run --vid", "COMP_CWORD": "2"}
+    assert run(tmp_path, *ENVHUB, **words).stdout.split() == ["--video"]
+    shown = {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
+    assert "complete_bash" in run(tmp_path, *ENVHUB, "--show-completion", "bash", **shown).stdout

@@ -1,0 +1,114 @@
+"""``envhub push``: what loads and steps is published as it was checked, and nothing else is."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.cli.shared.starter import starter
+from tests.hub.stub_hub import StubHub
+
+TOKEN = "hf_of_the_author"
+COMMAND = [sys.executable, "-I", "-m", "envhub_sandbox", "push"]
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    """A folder as ``envhub init`` writes it."""
+    folder = tmp_path / "my-env"
+    for path, text in starter("my-env", 2026).items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text(text)
+    return folder
+
+
+def push(
+    hub: StubHub, folder: Path, *options: str, token: str = TOKEN
+) -> subprocess.CompletedProcess[str]:
+    """Run the command to its end."""
+    home = {"HF_HOME": str(folder.parent / "hf"), "HF_TOKEN": token}
+    return subprocess.run(
+        [*COMMAND, str(folder), "org/my-env", "--endpoint", hub.endpoint, *options],
+        capture_output=True,
+        text=True,
+        env={**os.environ, **home},
+        timeout=240,
+        check=False,
+    )
+
+
+def writes(hub: StubHub) -> list[str]:
+    """What was asked of the Hub that changes it."""
+    return [request for request in hub.requests if request.startswith("POST")]
+
+
+def test_what_was_checked_is_published_and_runs(
+    stub_hub: StubHub, mine: Path, hub_cache: Path
+) -> None:
+    """Every file, as it is, and none that no repository has; then by the pin that was printed."""
+    (mine / ".git").mkdir()
+    (mine / ".git" / "config").write_text("secret")
+    done = push(stub_hub, mine, "--private", "--json")
+    assert done.returncode == 0, done.stderr
+    [made] = stub_hub.created
+    assert made["name"] == "my-env"
+    assert made.get("private") or made.get("visibility") == "private"
+    repository = stub_hub.repositories["model", "org/my-env"]
+    texts = {path: content.decode() for path, content in repository.files.items()}
+    assert texts == starter("my-env", 2026)
+    told = json.loads(done.stdout)
+    assert told["reference"] == f"org/my-env@{repository.commit}"
+    assert TOKEN not in done.stdout + done.stderr
+    options = {"endpoint": stub_hub.endpoint, "hub_cache_dir": hub_cache}
+    with make_env(told["reference"], **options) as suites:
+        suites.env.reset(seed=0)
+
+
+LIES = "return np.array([self.puck, 7], np.float32)"
+
+
+@pytest.mark.parametrize(
+    ("path", "change", "code", "said"),
+    [
+        ("env.py", ("import numpy as np", "import numpy as np\n1 / 0"), 4, "ZeroDivisionError"),
+        ("env.py", ("return np.array([self.puck, self.goal], np.float32)", LIES), 1, "obs"),
+        (".env", ("", "HF_TOKEN=x"), 2, "looks like a secret"),
+    ],
+)
+def test_what_fails_is_not_published(
+    stub_hub: StubHub, mine: Path, path: str, change: tuple[str, str], code: int, said: str
+) -> None:
+    """The Hub is not even asked; the text leads to the author's own line."""
+    text = (mine / path).read_text() if (mine / path).exists() else ""
+    (mine / path).write_text(text.replace(*change))
+    done = push(stub_hub, mine)
+    assert (done.returncode, done.stdout) == (code, "")
+    assert said in done.stderr
+    assert code != 4 or f'File "{mine}/env.py", line' in done.stderr
+    assert stub_hub.requests == []
+
+
+def test_a_hub_that_refuses_is_a_message(stub_hub: StubHub, mine: Path) -> None:
+    """With what to do, and without the token, which a careless server echoes."""
+    stub_hub.fail("POST /api/repos", 403, headers={"X-Error-Message": f"no rights for {TOKEN}"})
+    done = push(stub_hub, mine)
+    assert (done.returncode, done.stdout) == (3, "")
+    for text in ("org/my-env", "nothing was published", "takes a token that may write"):
+        assert text in done.stderr
+    assert TOKEN not in done.stderr
+    assert "Traceback" not in done.stderr
+    assert len(writes(stub_hub)) == 1
+
+
+def test_a_dry_run_uploads_nothing(stub_hub: StubHub, mine: Path) -> None:
+    """It is checked all the same, and says what it would upload."""
+    done = push(stub_hub, mine, "--dry-run")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == sorted(starter("my-env", 2026))
+    assert stub_hub.requests == []
