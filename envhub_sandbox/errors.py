@@ -21,6 +21,7 @@
         ResolutionError
         IndexUnavailableError
         PackageIntegrityError
+        PackagesTooLargeError
         InterpreterUnavailableError
         MissingModuleError (ModuleNotFoundError)
       LoadError
@@ -77,6 +78,7 @@ __all__ = [
     "MessageTooLargeError",
     "MissingModuleError",
     "PackageIntegrityError",
+    "PackagesTooLargeError",
     "PolicyError",
     "ProtocolError",
     "RemoteEnvError",
@@ -193,6 +195,10 @@ class IndexUnavailableError(DependencyError):
 
 class PackageIntegrityError(DependencyError):
     """A package is not the one whose hash is known. Nothing of it was kept."""
+
+
+class PackagesTooLargeError(DependencyError):
+    """Packages have more bytes or files than this machine's user permits. None was made."""
 
 
 class InterpreterUnavailableError(DependencyError):

@@ -33,9 +33,10 @@ from typing import Any
 
 from envhub_sandbox import folders
 from envhub_sandbox.dependencies import index, uv
+from envhub_sandbox.dependencies.bounds import Bounds, Watch, checked, walk
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.resolve import Lock
-from envhub_sandbox.errors import DependencyError, PackageIntegrityError
+from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.hub.store import CACHE_VARIABLE, cache_root, remove_tree
 
 _FORMAT = 1
@@ -133,6 +134,7 @@ def provide(
 
     Raises:
         IndexUnavailableError, PackageIntegrityError: As with uv.
+        PackagesTooLargeError: It is over the bounds of this machine.
         DependencyError: It cannot be made, or others can write where it lies.
     """
     key = key_of(lock, interpreter)
@@ -240,8 +242,9 @@ def _made(
     building = Path(tempfile.mkdtemp(prefix=f"{_BUILDING}{key}-", dir=root()))
     try:
         packages = building / "packages"
-        _install(lock, interpreter, building, held, tell)
-        size = _size(packages)
+        watch = Watch(Bounds.set(), building, [index.uv_cache()])
+        _install(lock, interpreter, building, held, watch, tell)
+        size = _size(packages, watch.bounds)
         tell(f"compiling {size / 2**20:.0f} MiB")
         _compile(interpreter, packages, held)
         _close(packages)
@@ -277,12 +280,23 @@ def _publish(building: Path, key: str, facts: dict[str, object]) -> None:
 
 
 def _install(
-    lock: Lock, interpreter: Interpreter, building: Path, held: int, tell: Callable[[str], None]
+    lock: Lock,
+    interpreter: Interpreter,
+    building: Path,
+    held: int,
+    watch: Watch,
+    tell: Callable[[str], None],
 ) -> None:
     pins = building / "lock.txt"
     pins.write_text(lock.text)
     packages = building / "packages"
     packages.mkdir()
+    watch.look()
+
+    def hear(line: str) -> None:
+        watch.hear(line)
+        tell(line)
+
     # uv keeps our lock for as long as it lives: if we are killed, nobody removes what it still
     # writes to. Copies, since a file that is shared with uv's cache is another's to change.
     uv.run(
@@ -293,22 +307,18 @@ def _install(
         ],
         what="the packages could not be installed",
         timeout_s=_INSTALL_S,
-        tell=tell,
+        tell=hear,
         keep=[held],
+        watch=watch.look,
+        file_bytes=watch.bounds.bytes,
     )
     (packages / ".lock").unlink(missing_ok=True)  # uv's own
 
 
-def _size(packages: Path) -> int:
-    """Bytes of all files. A wheel that brought anything but files and folders is refused."""
-    size = 0
-    for path in _walk(packages):
-        status = path.lstat()
-        if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
-            raise PackageIntegrityError(
-                f"a package brought {str(path.relative_to(packages))!r}, which is no file"
-            )
-        size += status.st_size
+def _size(packages: Path, bounds: Bounds) -> int:
+    """Bytes of all files; what is over the bounds, or no file, is refused."""
+    size, count = checked(packages)
+    bounds.check(size, count, "its packages have")
     return size
 
 
@@ -329,15 +339,10 @@ def _compile(interpreter: Interpreter, packages: Path, held: int) -> None:
 
 def _close(packages: Path) -> None:
     """Let everybody read, and nobody write."""
-    for path in [*_walk(packages), packages]:
+    for path in [*walk(packages), packages]:
         mode = path.lstat().st_mode
         runs = stat.S_ISDIR(mode) or mode & stat.S_IXUSR
         path.chmod(0o555 if runs else 0o444)
-
-
-def _walk(folder: Path) -> Iterator[Path]:
-    for above, below, files in os.walk(folder):
-        yield from (Path(above, name) for name in [*below, *files])
 
 
 def _refuse_shared(place: Path) -> None:

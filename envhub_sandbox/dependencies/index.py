@@ -60,6 +60,13 @@ def _absolute(place: str) -> str:
     return place if not place or "://" in place else os.path.abspath(os.path.expanduser(place))
 
 
+def uv_cache() -> Path:
+    """Where uv keeps what it downloads and unpacks."""
+    found = environment()
+    home = found.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(found.get("UV_CACHE_DIR") or os.path.join(home, "uv"))
+
+
 def options() -> tuple[str, ...]:
     """What uv is told on its command line: it has no variable for that there is no index."""
     return ("--no-index",) if environment().get("UV_NO_INDEX", "").lower() in _YES else ()

@@ -7,10 +7,13 @@ interpreter. What it prints is the user's to read, but quotes a stranger's names
 from __future__ import annotations
 
 import re
+import resource
 import shutil
+import signal
 import subprocess
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 
@@ -19,6 +22,7 @@ from envhub_sandbox.errors import (
     DependencyError,
     IndexUnavailableError,
     PackageIntegrityError,
+    PackagesTooLargeError,
     ResolutionError,
 )
 from envhub_worker.protocol.text import printable
@@ -30,6 +34,7 @@ of ``--no-build``. pyproject.toml asks for the same; but there may be another on
 _VERSION_S = 60.0
 _SECRET = re.compile(r"(?<=://)[^/?#\s]*(?=@)|(?<=\?)[^\s?=]+=[^\s'\"`)]+")
 """What may be one in a URL; uv hides passwords, but for those in a query or in what is no URL."""
+_WATCH_S = 1.0
 _SHOWN = 4000
 _KEPT_LINES = 400
 
@@ -79,6 +84,8 @@ def run(
     timeout_s: float,
     tell: Callable[[str], None] = lambda line: None,
     keep: Iterable[int] = (),
+    watch: Callable[[], None] = lambda: None,
+    file_bytes: int | None = None,
 ) -> str:
     """Run uv to its end, and return what it printed.
 
@@ -89,6 +96,8 @@ def run(
         timeout_s: For how long at most.
         tell: Gets each line of its progress as it comes.
         keep: Descriptors that it keeps open for as long as it lives.
+        watch: Called now and then; what it raises ends it.
+        file_bytes: The largest file that it may write.
 
     Raises:
         DependencyError: It failed, or there is none.
@@ -107,17 +116,34 @@ def run(
             errors="replace",
         )
         with process:
+            if file_bytes is not None:
+                _limit_files(process, file_bytes)
             said = _Listener(process, tell)
             try:
-                printed = said.exchange(given, timeout_s)
+                printed = said.exchange(given, timeout_s, watch)
             except subprocess.TimeoutExpired:
                 text = f"{what}: uv was not done after {timeout_s:.0f} s"
                 raise IndexUnavailableError(text) from None
             finally:
                 process.kill()
+    if process.returncode == -signal.SIGXFSZ:
+        raise PackagesTooLargeError(
+            f"{what}: a file was about to have more than {file_bytes} bytes. 'uv cache prune' "
+            "removes what uv keeps of it"
+        )
     if process.returncode != 0:
         raise _error(what, said.text)
     return printed
+
+
+def _limit_files(process: subprocess.Popen[str], largest: int) -> None:
+    if process.poll() is not None:
+        return
+    hard = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)[1]
+    limit = largest if hard == resource.RLIM_INFINITY else min(largest, hard)
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (limit, limit))
+    # no core of it either: the signal would leave one
+    resource.prlimit(process.pid, resource.RLIMIT_CORE, (0, 0))
 
 
 class _Listener:
@@ -134,7 +160,7 @@ class _Listener:
         """The last lines that it wrote on stderr."""
         return "\n".join(self._lines)
 
-    def exchange(self, given: str, timeout_s: float) -> str:
+    def exchange(self, given: str, timeout_s: float, watch: Callable[[], None]) -> str:
         """Write to it, read until it ends, and return what it printed."""
         threads = [threading.Thread(target=work) for work in (self._read, self._listen)]
         for thread in threads:
@@ -146,7 +172,7 @@ class _Listener:
                 self._process.stdin.close()
             except BrokenPipeError:
                 pass  # it says on stderr why it has gone
-            self._process.wait(timeout_s)
+            self._wait(timeout_s, watch)
         except BaseException:
             self._process.kill()
             raise
@@ -154,6 +180,17 @@ class _Listener:
             for thread in threads:
                 thread.join()
         return self._printed
+
+    def _wait(self, timeout_s: float, watch: Callable[[], None]) -> None:
+        until = time.monotonic() + timeout_s
+        while True:
+            try:
+                self._process.wait(min(_WATCH_S, max(until - time.monotonic(), 0)))
+                return
+            except subprocess.TimeoutExpired:
+                if time.monotonic() >= until:
+                    raise
+                watch()
 
     def _read(self) -> None:
         assert self._process.stdout is not None

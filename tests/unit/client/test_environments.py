@@ -15,10 +15,15 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.dependencies import environments, prepare
+from envhub_sandbox.dependencies import bounds, environments, prepare
 from envhub_sandbox.dependencies.choice import chosen
 from envhub_sandbox.dependencies.environments import Environment
-from envhub_sandbox.errors import DependencyError, IndexUnavailableError, PackageIntegrityError
+from envhub_sandbox.errors import (
+    DependencyError,
+    IndexUnavailableError,
+    PackageIntegrityError,
+    PackagesTooLargeError,
+)
 from envhub_sandbox.hub.snapshot import local
 from tests.support import inside
 from tests.support.processes import eventually
@@ -330,6 +335,73 @@ def test_a_full_disk_is_said(index: Index, tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(DependencyError, match="envhub cache remove"):
         made(repository(tmp_path / "repo", "wanted"))
     assert environments.every() == [kept]
+    assert left_behind() == []
+
+
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        ({"wanted/one.bin": b"0" * 2**21}, "a file was about to have more than 1048576 bytes"),
+        ({f"wanted/{n}.bin": b"0" * 2**18 for n in range(6)}, "at most 1 MiB are installed"),
+        ({f"wanted/{n}.py": "" for n in range(100)}, "at most 60 are installed"),
+    ],
+    ids=["a large file", "many large files", "many files"],
+)
+def test_what_is_too_large_is_not_made(
+    index: Index,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    files: dict[str, str | bytes],
+    said: str,
+) -> None:
+    """And does not have to be unpacked to its end; who wants it can have it."""
+    make_wheel(index.folder, "wanted", files=files)
+    folder = repository(tmp_path / "repo", "wanted")
+    with monkeypatch.context() as patch:
+        patch.setenv(bounds.BYTES_VARIABLE, str(2**20))
+        patch.setenv(bounds.FILES_VARIABLE, "60")
+        with pytest.raises(PackagesTooLargeError, match=said):
+            made(folder)
+        assert environments.every() == []
+        assert left_behind() == []
+        patch.setenv(bounds.BYTES_VARIABLE, "much")
+        with pytest.raises(DependencyError, match=r"ENVHUB_ENVIRONMENT_BYTES is 'much'"):
+            made(folder)
+    assert (made(folder).packages / "wanted").is_dir()
+
+
+def test_what_is_announced_counts_before_it_is_there(tmp_path: Path) -> None:
+    """uv says what it downloads; a package is no smaller once it is unpacked."""
+    watch = bounds.Watch(bounds.Bounds(2**30, 1000), tmp_path, [tmp_path / "none/yet"])
+    for line in ("Downloading scipy (33.7MiB)", "Prepared 3 packages in 4s", "Downloading 9GiB"):
+        watch.hear(line)
+    watch.look()
+    watch.hear("Downloading torch (1.5GiB)")
+    with pytest.raises(PackagesTooLargeError, match="downloads of 1,570 MiB; at most 1,024 MiB"):
+        watch.look()
+
+
+def test_a_disk_that_fills_up_ends_it(
+    index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While packages come, and before they do: somebody else needs what is left."""
+    make_wheel(index.folder, "wanted")
+    folder = repository(tmp_path / "repo", "wanted")
+    environments.remove(made(folder))  # so that versions are known, and packages are not
+    subprocess.run(["rm", "-r", str(tmp_path / "uv")], check=True)
+    index.hold("/files/wanted")
+    with ThreadPoolExecutor(1) as pool:
+        making = pool.submit(made, folder)
+        try:
+            assert eventually(lambda: index.held() or making.done())
+            monkeypatch.setattr(bounds, "LEFT_FREE", 2**62)
+            with pytest.raises(DependencyError, match="envhub cache remove"):
+                making.result(timeout=120)
+        finally:
+            index.let_go()
+    with pytest.raises(DependencyError, match="is full"):
+        made(folder)
+    assert environments.every() == []
     assert left_behind() == []
 
 

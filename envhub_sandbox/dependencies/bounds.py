@@ -1,0 +1,154 @@
+"""How large an environment may become, and how much of the disk it has to leave free.
+
+A small file on an index can be unpacked to a disk's worth. So uv is watched: by what it says that
+it downloads, by what lies in the folder, and by what is left of the disks that it writes to; and
+the kernel ends it at a single file over the bound.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from envhub_sandbox.errors import DependencyError, PackageIntegrityError, PackagesTooLargeError
+
+BYTES_VARIABLE = "ENVHUB_ENVIRONMENT_BYTES"
+FILES_VARIABLE = "ENVHUB_ENVIRONMENT_FILES"
+MAX_BYTES = 16 * 2**30
+MAX_FILES = 400_000
+LEFT_FREE = 64 * 2**20
+"""Bytes of a disk that are left to everybody else."""
+_ANNOUNCED = re.compile(r"Downloading (\S{1,200}) \((\d{1,9}(?:\.\d{1,9})?)([KMGT]iB)\)")
+_UNITS = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40}
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What one environment may have.
+
+    Attributes:
+        bytes: All files together, before their bytecode is made.
+        files: Their number, folders included.
+    """
+
+    bytes: int
+    files: int
+
+    @classmethod
+    def set(cls) -> Bounds:
+        """Those of this machine's user.
+
+        Raises:
+            DependencyError: A variable holds no number.
+        """
+        return cls(_number(BYTES_VARIABLE, MAX_BYTES), _number(FILES_VARIABLE, MAX_FILES))
+
+    def check(self, size: int, files: int, what: str) -> None:
+        """Refuse what is more.
+
+        Raises:
+            PackagesTooLargeError: It is.
+        """
+        if size > self.bytes:
+            told = f"{size / 2**20:,.0f} MiB; at most {self.bytes / 2**20:,.0f} MiB"
+            raise PackagesTooLargeError(
+                f"{what} {told} are installed. No environment was made. If you want it, set "
+                f"{BYTES_VARIABLE} to more bytes"
+            )
+        if files > self.files:
+            raise PackagesTooLargeError(
+                f"{what} {files} files; at most {self.files} are installed. No environment was "
+                f"made. If you want it, set {FILES_VARIABLE} to more"
+            )
+
+
+def _number(variable: str, usual: int) -> int:
+    text = os.environ.get(variable) or str(usual)
+    if not re.fullmatch(r"[1-9]\d{0,17}", text):
+        raise DependencyError(f"{variable} is {text[:80]!r}; it takes a number")
+    return int(text)
+
+
+class Watch:
+    """Looks at an installation while it goes on.
+
+    Args:
+        bounds: What is permitted.
+        folder: What is being filled.
+        places: Further folders that are written to; they need not be there yet.
+    """
+
+    def __init__(self, bounds: Bounds, folder: Path, places: Sequence[Path]) -> None:
+        self.bounds = bounds
+        self._folder = folder
+        self._places = [_existing(place) for place in (folder, *places)]
+        self._announced = 0
+
+    def hear(self, line: str) -> None:
+        """Note what uv says that it downloads: a package is no smaller once it is unpacked."""
+        if found := _ANNOUNCED.fullmatch(line):
+            self._announced += int(float(found[2]) * _UNITS[found[3]])
+
+    def look(self) -> None:
+        """Refuse to go on.
+
+        Raises:
+            PackagesTooLargeError: It is over a bound, or will be.
+            DependencyError: A disk is as good as full.
+        """
+        self.bounds.check(self._announced, 0, "its packages are downloads of")
+        self.bounds.check(*measured(self._folder), "its packages have")
+        for place in self._places:
+            free = _free(place)
+            if free < LEFT_FREE:
+                raise DependencyError(
+                    f"the disk of {place} is full: {free // 2**20} MiB are left, and nothing is "
+                    f"installed below {LEFT_FREE // 2**20}. 'envhub cache remove --unused-for 30' "
+                    "frees what nobody used for long, and 'uv cache prune' what uv keeps"
+                )
+
+
+def measured(folder: Path) -> tuple[int, int]:
+    """Bytes and number of all that is below a folder; what vanishes meanwhile counts nothing."""
+    size = count = 0
+    for path in walk(folder):
+        try:
+            size += path.lstat().st_size
+            count += 1
+        except FileNotFoundError:
+            continue
+    return size, count
+
+
+def checked(folder: Path) -> tuple[int, int]:
+    """The same for a folder that nobody changes.
+
+    Raises:
+        PackageIntegrityError: A wheel brought anything but files and folders.
+    """
+    for path in walk(folder):
+        mode = path.lstat().st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise PackageIntegrityError(
+                f"a package brought {str(path.relative_to(folder))!r}, which is no file"
+            )
+    return measured(folder)
+
+
+def walk(folder: Path) -> Iterator[Path]:
+    """All that is below a folder, links not followed."""
+    for above, below, files in os.walk(folder):
+        yield from (Path(above, name) for name in [*below, *files])
+
+
+def _existing(place: Path) -> Path:
+    return next(path for path in (place, *place.parents) if path.exists())
+
+
+def _free(place: Path) -> int:
+    found = os.statvfs(place)
+    return found.f_bavail * found.f_frsize
