@@ -8,6 +8,7 @@ import typer
 
 from envhub_sandbox.cli import (
     cache,
+    check,
     doctor,
     gc,
     image,
@@ -57,6 +58,7 @@ def envhub(
 
 app.command("run", epilog=EXIT_CODES)(run.run)
 app.command("inspect", epilog=EXIT_CODES)(inspect.inspect)
+app.command("check", epilog=EXIT_CODES)(check.check)
 app.command("prefetch", epilog=EXIT_CODES)(prefetch.prefetch)
 app.command("lock", epilog=EXIT_CODES)(lock.lock)
 app.command("verify", epilog=EXIT_CODES)(lock.verify)

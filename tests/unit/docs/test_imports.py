@@ -51,14 +51,15 @@ MAY_IMPORT = {
     "envhub_sandbox": {"api", "gym", "hub", "policy", "sandboxes", "vector"},
     "envhub_sandbox.__main__": {"cli"},
     "envhub_sandbox.cli": {
-        *("", "api", "crash", "dependencies", "hub", "locks", "policy", "sandboxes"),
-        "session",
+        *("", "api", "check", "crash", "dependencies", "hub", "locks", "policy"),
+        *("sandboxes", "session"),
     },
     "envhub_sandbox.api": {
         *("arguments", "config", "dependencies", "hub", "locks", "policy", "sandboxes"),
         "session",
         *("transport", "vector"),
     },
+    "envhub_sandbox.check": {"api", "dependencies", "hub", "session", "vector"},
     "envhub_sandbox.gym": {"api", "vector"},
     "envhub_sandbox.pytest_plugin": {"api", "hub"},
     "envhub_sandbox.integrations": {"api", "vector"},
@@ -298,6 +299,7 @@ def test_only_faces_and_the_command_line_import_make_env() -> None:
     importers = {name for name, target in arrows("envhub_sandbox") if target.endswith(".api")}
     assert {name for name in importers if not below(name, "envhub_sandbox.cli")} <= {
         "envhub_sandbox",
+        "envhub_sandbox.check.judge",
         "envhub_sandbox.gym",
         "envhub_sandbox.integrations.sb3",
         "envhub_sandbox.pytest_plugin",

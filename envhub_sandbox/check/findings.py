@@ -1,0 +1,84 @@
+"""What was found, and what follows from it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from typing import Any
+
+from envhub_sandbox.check.table import CHECKS, Check, Severity
+from envhub_worker.protocol.text import printable
+
+_LONGEST = 1_000
+_MOST = 500
+"""Findings: a repository of ten thousand files is no reason for as many lines."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One check that does not hold.
+
+    Attributes:
+        id: The check's.
+        message: What was seen, printable and of bounded length.
+        task: ``"suite / task"``; empty where it is about the whole repository.
+        file, line: Where it stands in the repository; empty and 0 where it stands nowhere.
+    """
+
+    id: str
+    message: str
+    task: str = ""
+    file: str = ""
+    line: int = 0
+
+    @property
+    def check(self) -> Check:
+        """What did not hold."""
+        return CHECKS[self.id]
+
+
+@dataclass
+class Report:
+    """A judgement.
+
+    Attributes:
+        reference: What was judged, pinned.
+        findings: In the order in which they were found.
+        passed: Checks that were made, by id and task, and found nothing.
+        figures: Of each task that was played: plain numbers.
+        provenance: What ran, if anything did.
+        left_out: How many findings are not in ``findings``.
+    """
+
+    reference: str
+    findings: list[Finding] = field(default_factory=list)
+    passed: list[tuple[str, str]] = field(default_factory=list)
+    figures: dict[str, dict[str, float]] = field(default_factory=dict)
+    provenance: dict[str, Any] | None = None
+    left_out: int = 0
+
+    def judged(self, check: str, found: Collection[str], task: str = "") -> None:
+        """A check was made: it found this, or nothing. Trust: texts from the worker."""
+        for message in found:
+            self.add(Finding(check, message, task))
+        if not found:
+            self.passed.append((check, task))
+
+    def add(self, finding: Finding) -> None:
+        """Add what was found, made printable."""
+        if len(self.findings) >= _MOST:
+            self.left_out += 1
+            return
+        kept = Finding(
+            finding.id,
+            printable(finding.message, _LONGEST),
+            printable(finding.task, 200),
+            printable(finding.file, 500),
+            finding.line,
+        )
+        self.findings.append(kept)
+
+    def failures(self, fail_on: Severity, allowed: Collection[str] = ()) -> list[Finding]:
+        """The findings that weigh enough, without those that are allowed."""
+        found = (one for one in self.findings if one.id not in allowed)
+        return [one for one in found if one.check.severity.reaches(fail_on)]

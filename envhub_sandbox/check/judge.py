@@ -1,0 +1,265 @@
+"""Asks a repository every question of the table, and runs it in the sandbox for that.
+
+What it answers is hostile: a report says what was seen from outside, and a check passes because
+our own comparison found nothing, never because the repository says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from envhub_sandbox.api import make_env
+from envhub_sandbox.check import source, traces
+from envhub_sandbox.check.findings import Report
+from envhub_sandbox.check.traces import Trace
+from envhub_sandbox.dependencies.choice import chosen
+from envhub_sandbox.dependencies.declared import declared
+from envhub_sandbox.dependencies.prepare import provided
+from envhub_sandbox.errors import (
+    DependencyError,
+    LoadError,
+    ObservationError,
+    PackageIntegrityError,
+    RemoteEnvError,
+    RequirementError,
+    ResolutionError,
+    WorkerDiedError,
+    WorkerTimeoutError,
+)
+from envhub_sandbox.hub.snapshot import Snapshot, named
+from envhub_sandbox.session.recipe import pinned
+from envhub_sandbox.vector.suites import EnvSuites
+
+_MODES = ("NextStep", "SameStep", "Disabled")
+
+
+class _StoppedError(Exception):
+    """Nothing more can be asked of this task, or of the repository."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Asked:
+    """What is judged, and how.
+
+    Attributes:
+        reference: The repository.
+        arguments: Of ``make_env``, beyond the reference.
+        seed, steps: Of each play.
+        tasks: Chooses ``(suite, task)`` pairs of the environments.
+        tell: Is told what is done next.
+    """
+
+    reference: str
+    arguments: Mapping[str, Any]
+    seed: int = 0
+    steps: int = 200
+    tasks: Callable[[EnvSuites], list[tuple[str, Any]]] = field(
+        default=lambda suites: [(suite, task) for suite in suites for task in suites[suite]]
+    )
+    tell: Callable[[str], None] = lambda what: None
+
+
+def judge(asked: Asked) -> Report:
+    """Judge a repository.
+
+    Raises:
+        EnvHubError: It could not be judged: it could not be had, this host cannot confine it, or
+            a server is full. What the repository itself does wrong is a finding.
+    """
+    asked.tell(f"reading {asked.reference}")
+    where = {name: asked.arguments.get(name) for name in ("hub_cache_dir", "token", "endpoint")}
+    snapshot = named(asked.reference, **where)
+    report = Report(pinned(snapshot))
+    _Judge(asked, snapshot, report).ask()
+    return report
+
+
+class _Judge:
+    def __init__(self, asked: Asked, snapshot: Snapshot, report: Report) -> None:
+        self._asked, self._snapshot, self._report = asked, snapshot, report
+
+    def ask(self) -> None:
+        self._read()
+        try:
+            self._resolve()
+            self._load()
+        except _StoppedError:
+            return
+
+    def _read(self) -> None:
+        is_moving = self._snapshot.repo_type != "local" and (
+            self._snapshot.commit not in self._asked.reference
+        )
+        moving = [f"{self._asked.reference} may mean another commit tomorrow"] if is_moving else []
+        self._report.judged("pinned", moving)
+        found = source.look(self._snapshot)
+        for finding in found:
+            self._report.add(finding)
+        read = ("licence", "card", *(f"source-{of}" for of in _SOURCES))
+        for check in set(read) - {one.id for one in found}:
+            self._report.judged(check, [])
+
+    def _resolve(self) -> None:
+        self._asked.tell("reading and installing what it declares")
+        packages, wanted = None, {}
+        try:
+            choice, _ = chosen(self._asked.arguments.get("dependencies", "auto"), None)
+            says = declared(self._snapshot.root, self._snapshot.path)
+            wanted = (
+                {}
+                if says is None
+                else {one.requirement.name: one.requirement for one in says.wanted}
+            )
+            if self._asked.arguments.get("python") is None and self._is_here:
+                made = provided(self._snapshot, choice)
+                packages = None if made is None else made.packages
+        except (RequirementError, ResolutionError, PackageIntegrityError) as error:
+            self._report.judged("requirements", [str(error)])
+            raise _StoppedError from error
+        self._report.judged("requirements", [])
+        found = source.undeclared(source.imports(self._snapshot), wanted, packages)
+        for finding in found:
+            self._report.add(finding)
+        if not found:
+            self._report.judged("imports", [])
+
+    @property
+    def _is_here(self) -> bool:
+        return bool(self._asked.arguments.get("sandbox", "process") == "process")
+
+    def _make(self, **changes: Any) -> EnvSuites:
+        return make_env(**{**self._asked.arguments, "cfg": self._report.reference, **changes})
+
+    def _load(self) -> None:
+        self._asked.tell("loading it")
+        try:
+            suites = self._make(num_workers=1, validate=True)
+        except LoadError as error:
+            self._report.judged("loads", [str(error)])
+            raise _StoppedError from error
+        except DependencyError as error:
+            if not self._found("imports"):  # where it stands has been said already
+                self._report.judged("imports", [str(error)])
+            raise _StoppedError from error
+        except (WorkerDiedError, WorkerTimeoutError) as error:
+            self._report.judged("survives", [f"while it loaded: {error}"])
+            raise _StoppedError from error
+        with suites:
+            self._report.judged("loads", [])
+            for suite, task in self._asked.tasks(suites):
+                self._asked.tell(f"{suite} / {task}")
+                with self._stopping(f"{suite} / {task}"):
+                    _Task(self, suites, suite, task).ask()
+                suites[suite][task].close()
+            self._report.provenance = suites.provenance
+
+    @contextmanager
+    def _stopping(self, task: str) -> Iterator[None]:
+        try:
+            yield
+        except ObservationError as error:
+            self._report.judged("observation-space", [str(error)], task)
+        except RemoteEnvError as error:
+            self._report.judged("runs", [f"{error.type_name}: {error.message}"], task)
+        except (WorkerDiedError, WorkerTimeoutError) as error:
+            self._report.judged("survives", [str(error)], task)
+        else:
+            for check in ("observation-space", "runs", "survives"):
+                self._report.judged(check, [], task)
+
+    def _found(self, check: str) -> bool:
+        return any(finding.id == check for finding in self._report.findings)
+
+
+_SOURCES = ("network", "process", "dynamic", "pickle", "native")
+
+
+class _Task:
+    """The questions to one environment."""
+
+    def __init__(self, judge: _Judge, suites: EnvSuites, suite: str, task: Any) -> None:
+        self._judge, self._report = judge, judge._report
+        self._asked = judge._asked
+        self._env = suites[suite][task]
+        self._suite, self._task = suite, task
+        self._name = f"{suite} / {task}"
+
+    def ask(self) -> None:
+        mode = getattr(self._env.metadata.get("autoreset_mode"), "value", None)
+        stated = mode in _MODES
+        self._say("autoreset-stated", [] if stated else ["the metadata does not say"])
+        first = traces.play(self._env, mode, seed=self._asked.seed, steps=self._asked.steps)
+        self._say("rewards", first.bad_rewards)
+        if stated:
+            self._say("autoreset", first.autoreset)
+        self._say("render", list(self._frames()))
+        self._say("observation-dtype", list(self._uncast()))
+        self._compare(first, mode)
+
+    def _say(self, check: str, found: list[str]) -> None:
+        self._report.judged(check, found, self._name)
+
+    def _again(self, mode: str | None, **changes: Any) -> Trace:
+        """The same play in fresh processes."""
+        with self._judge._make(**changes) as suites:
+            env = suites[self._suite][self._task]
+            return traces.play(env, mode, seed=self._asked.seed, steps=self._asked.steps)
+
+    def _compare(self, first: Trace, mode: str | None) -> None:
+        second = self._again(mode, num_workers=1)
+        self._report.figures[self._name] = {
+            "steps": len(second.steps) - 1,
+            "episodes": second.episodes,
+            "step_mean_s": second.mean_s,
+            "step_slowest_s": second.slowest_s,
+        }
+        at = first.differs_from(second)
+        self._say("seeding", [] if at is None else [_first_difference(at, "in two processes")])
+        if at is None and self._env.num_envs > 1:
+            spread = first.differs_from(self._again(mode, num_workers=2))
+            here = _first_difference(spread or 0, "with one worker and with two")
+            self._say("workers", [] if spread is None else [here])
+
+    def _frames(self) -> Iterator[str]:
+        if self._env.render_mode != "rgb_array":
+            return
+        frames = self._env.render()
+        if not isinstance(frames, (tuple, list)) or len(frames) != self._env.num_envs:
+            yield f"render() gave {type(frames).__name__}, not a frame for each sub-environment"
+            return
+        for index, frame in enumerate(frames):
+            if not _is_frame(frame):
+                yield f"sub-environment {index} gave {_kind(frame)}"
+                return
+
+    def _uncast(self) -> Iterator[str]:
+        """What one sub-environment gives before Gymnasium writes it into a batch."""
+        handles = getattr(self._env, "envs", None)
+        if not handles:
+            return
+        space = self._env.single_observation_space
+        try:
+            observation = handles[0].reset(seed=self._asked.seed)[0]
+        except (AttributeError, TypeError, ValueError, NotImplementedError):
+            return  # it has no sub-environments of its own that can be reset
+        if not space.contains(observation):
+            yield f"sub-environment 0 gave {_kind(observation)}, which is not in {space}"
+
+
+def _is_frame(frame: Any) -> bool:
+    if not isinstance(frame, np.ndarray) or frame.dtype != np.uint8:
+        return False
+    return frame.ndim == 3 and frame.shape[2] == 3 and frame.size > 0
+
+
+def _kind(value: Any) -> str:
+    return f"{getattr(value, 'dtype', type(value).__name__)} {getattr(value, 'shape', '')}".strip()
+
+
+def _first_difference(at: int, where: str) -> str:
+    return f"{'the reset' if at == 0 else f'step {at}'} differs {where}"

@@ -1,0 +1,165 @@
+"""A report in the forms that others read: JSON, JUnit's XML, SARIF, and GitHub's annotations.
+
+Its texts are partly a stranger's: they are printable and bounded when they get here, and each form
+escapes what means something in it.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from envhub_sandbox.check.findings import Finding, Report
+from envhub_sandbox.check.table import CHECKS, Severity
+
+_SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
+_GITHUB = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.NOTE: "notice"}
+# what XML 1.0 has no way to write at all
+_NO_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def document(report: Report, failures: Sequence[Finding]) -> dict[str, Any]:
+    """Everything, as plain data."""
+    return {
+        "reference": report.reference,
+        "passed": not failures,
+        "findings": [_finding(one, failures) for one in report.findings],
+        "left_out": report.left_out,
+        "held": [{"check": check, "task": task} for check, task in report.passed],
+        "figures": report.figures,
+        "provenance": report.provenance,
+    }
+
+
+def _finding(one: Finding, failures: Sequence[Finding]) -> dict[str, Any]:
+    return {
+        "check": one.id,
+        "severity": one.check.severity.value,
+        "message": one.message,
+        "cure": one.check.cure,
+        "task": one.task or None,
+        "file": one.file or None,
+        "line": one.line or None,
+        "fails": one in failures,
+    }
+
+
+def junit(report: Report, failures: Sequence[Finding]) -> str:
+    """One test case for each check of each task; what does not fail the whole is its output."""
+    asked = dict.fromkeys([*((one.id, one.task) for one in report.findings), *report.passed])
+    failed = dict.fromkeys((one.id, one.task) for one in failures)
+    suite = ElementTree.Element(
+        "testsuite",
+        name=_xml(report.reference),
+        tests=str(len(asked)),
+        failures=str(len(failed)),
+        errors="0",
+        skipped="0",
+    )
+    for check, task in asked:
+        case = ElementTree.SubElement(
+            suite, "testcase", classname=_xml(task or "repository"), name=check
+        )
+        found = [one for one in report.findings if (one.id, one.task) == (check, task)]
+        text = "\n".join(_line(one) for one in found)
+        if (check, task) in failed:
+            words = _xml(CHECKS[check].sentence)
+            ElementTree.SubElement(case, "failure", message=words).text = _xml(text)
+        elif found:
+            ElementTree.SubElement(case, "system-out").text = _xml(text)
+    ElementTree.indent(suite)
+    return ElementTree.tostring(suite, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _xml(text: str) -> str:
+    return _NO_XML.sub("?", text)
+
+
+def _line(one: Finding) -> str:
+    place = f"{one.file}:{one.line}: " if one.line else f"{one.file}: " if one.file else ""
+    return f"{place}{one.message}"
+
+
+def sarif(report: Report, failures: Sequence[Finding]) -> str:
+    """SARIF 2.1.0. What stands in no file is said of the entry file's folder."""
+    rules = [
+        {
+            "id": check.id,
+            "shortDescription": {"text": check.sentence},
+            "help": {"text": check.cure},
+            "defaultConfiguration": {"level": check.severity.value},
+        }
+        for check in CHECKS.values()
+    ]
+    run = {
+        "tool": {"driver": {"name": "envhub check", "rules": rules}},
+        "results": [_result(one, failures) for one in report.findings],
+        "columnKind": "unicodeCodePoints",
+    }
+    return json.dumps({"$schema": _SCHEMA, "version": "2.1.0", "runs": [run]}, indent=2) + "\n"
+
+
+def _result(one: Finding, failures: Sequence[Finding]) -> dict[str, Any]:
+    where = f"{one.task}: " if one.task else ""
+    place: dict[str, Any] = {"artifactLocation": {"uri": _uri(one.file or "env.py")}}
+    if one.line:
+        place["region"] = {"startLine": one.line}
+    return {
+        "ruleId": one.id,
+        "level": one.check.severity.value,
+        "message": {"text": f"{where}{one.message}"},
+        "locations": [{"physicalLocation": place}],
+        "properties": {"fails": one in failures},
+    }
+
+
+def _uri(path: str) -> str:
+    from urllib.parse import quote
+
+    return quote(path)
+
+
+def workflow_commands(report: Report) -> Iterator[str]:
+    """GitHub's workflow commands, one a line: a stranger's text cannot begin another."""
+    for one in report.findings:
+        place = f"file={_property(one.file)}," if one.file else ""
+        place += f"line={one.line}," if one.line else ""
+        title = f"envhub check: {one.id}" + (f" ({one.task})" if one.task else "")
+        yield (
+            f"::{_GITHUB[one.check.severity]} {place}title={_property(title)}::"
+            f"{_data(one.message)}%0A{_data(one.check.cure)}"
+        )
+
+
+def _data(text: str) -> str:
+    return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
+
+
+def _property(text: str) -> str:
+    return _data(text).replace(":", "%3A").replace(",", "%2C")
+
+
+def summary(report: Report, failures: Collection[Finding]) -> str:
+    """A table for GitHub's step summary; a stranger's text is no markup there."""
+    verdict = f"{len(failures)} findings fail" if failures else "passed"
+    lines = [f"### envhub check: {verdict}", "", _cell(report.reference), ""]
+    if report.findings:
+        lines += ["| | check | task | finding |", "| --- | --- | --- | --- |"]
+    for one in report.findings:
+        mark = "**fails**" if one in failures else one.check.severity.value
+        lines.append(f"| {mark} | {one.id} | {_cell(one.task)} | {_cell(_line(one))} |")
+    return "\n".join(lines) + "\n"
+
+
+def _cell(text: str) -> str:
+    # every character that Markdown or HTML gives a meaning to, by its number
+    return re.sub(r"[^\w .,;=/-]", lambda found: f"&#{ord(found[0])};", text.replace("\n", " "))
+
+
+def write(path: Path, text: str) -> None:
+    """Write a report, in UTF-8 whatever the locale."""
+    path.write_text(text, encoding="utf-8")

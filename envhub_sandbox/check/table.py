@@ -1,0 +1,171 @@
+"""What is judged: each check once, what it means, and what cures it.
+
+The checks, their reports and ``docs/checks.md`` are all of this table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+
+class Severity(str, Enum):
+    """How much a finding weighs, worst first; the words are SARIF's."""
+
+    ERROR = "error"
+    WARNING = "warning"
+    NOTE = "note"
+
+    def reaches(self, other: Severity) -> bool:
+        """Whether it weighs at least as much."""
+        order = list(Severity)
+        return order.index(self) <= order.index(other)
+
+
+@dataclass(frozen=True)
+class Check:
+    """One question that is asked of a repository.
+
+    Attributes:
+        id: Its name, in reports and for ``--allow``.
+        severity: Of its findings.
+        sentence: What holds where it passes.
+        cure: What an author changes where it does not.
+    """
+
+    id: str
+    severity: Severity
+    sentence: str
+    cure: str
+
+
+_E, _W, _N = Severity.ERROR, Severity.WARNING, Severity.NOTE
+
+CHECKS: dict[str, Check] = {
+    check.id: check
+    for check in (
+        Check(
+            "requirements",
+            _E,
+            "What the repository declares can be read, resolved and installed.",
+            "Write plain requirements that do not contradict each other: names, versions, markers.",
+        ),
+        Check(
+            "imports",
+            _E,
+            "Every package that its code imports is declared.",
+            "Add the package to requirements.txt, or import it within try and except ImportError.",
+        ),
+        Check(
+            "loads",
+            _E,
+            "The entry file can be imported, and its make_env returns vector environments.",
+            "Define make_env(n_envs, use_async_envs) and return a gymnasium.vector.VectorEnv, or "
+            "{suite: {task: VectorEnv}}.",
+        ),
+        Check(
+            "runs",
+            _E,
+            "reset and step raise nothing, for actions sampled from the action space.",
+            "Take every member of the action space in every state, or make the space smaller.",
+        ),
+        Check(
+            "survives",
+            _E,
+            "No process of it dies, and each answer comes within its timeout.",
+            "Keep to the limits of memory, processes and time, or say which ones it needs.",
+        ),
+        Check(
+            "observation-space",
+            _E,
+            "Every observation is a member of the observation space.",
+            "Clip the observations, or widen the space.",
+        ),
+        Check(
+            "observation-dtype",
+            _E,
+            "Each sub-environment gives observations of the dtype and shape that its space says; "
+            "Gymnasium casts what it puts into a batch, and so hides it.",
+            "Return what observation_space says: for a float32 Box, np.asarray(..., np.float32).",
+        ),
+        Check(
+            "rewards",
+            _W,
+            "Rewards are finite numbers.",
+            "Bound what the reward is computed from.",
+        ),
+        Check(
+            "seeding",
+            _E,
+            "The same seed and the same actions give the same results in another process.",
+            "Draw from self.np_random alone, after super().reset(seed=seed).",
+        ),
+        Check(
+            "workers",
+            _E,
+            "The results do not depend on the number of processes.",
+            "Share nothing among sub-environments: no module-level state, no common generator.",
+        ),
+        Check(
+            "autoreset",
+            _E,
+            "It resets itself as metadata['autoreset_mode'] says.",
+            "Let Gymnasium's vector environments do it, or follow the mode that is stated.",
+        ),
+        Check(
+            "autoreset-stated",
+            _N,
+            "metadata['autoreset_mode'] says how it resets itself.",
+            "Set metadata['autoreset_mode'] to a member of gymnasium.vector.AutoresetMode.",
+        ),
+        Check(
+            "render",
+            _E,
+            "With render_mode='rgb_array' it renders frames: uint8, (height, width, 3).",
+            "Return such an array from render(), or declare no rgb_array.",
+        ),
+        Check(
+            "pinned",
+            _N,
+            "The reference names a commit, so that what was judged is what will run.",
+            "Write org/repo@COMMIT; the report says which one was judged.",
+        ),
+        Check(
+            "licence",
+            _N,
+            "A file says what one may do with it.",
+            "Add a LICENSE file, or 'license:' at the head of README.md.",
+        ),
+        Check("card", _N, "There is a README.md.", "Say what the environment is, and how it ends."),
+        Check(
+            "source-network",
+            _N,
+            "Its code opens no connections.",
+            "Bring data along in the repository: a sandbox has no network.",
+        ),
+        Check(
+            "source-process",
+            _N,
+            "Its code starts no programs.",
+            "Do in Python what the program does, or say in the card which program it needs.",
+        ),
+        Check(
+            "source-dynamic",
+            _N,
+            "Its code is what is written: no eval, exec or compile of texts.",
+            "Write the code out.",
+        ),
+        Check(
+            "source-pickle",
+            _N,
+            "Its code loads no pickles, which are programs.",
+            "Keep weights and data as safetensors, npz without objects, or JSON.",
+        ),
+        Check(
+            "source-native",
+            _N,
+            "It brings no machine code and calls none by address.",
+            "Depend on a package that brings the library along.",
+        ),
+    )
+}

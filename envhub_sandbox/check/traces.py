@@ -1,0 +1,115 @@
+"""One play of an environment, as something that can be compared: a digest for each step."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import VectorEnv
+
+Env = VectorEnv[Any, Any, Any]
+
+
+@dataclass
+class Trace:
+    """What a play gave.
+
+    Attributes:
+        steps: A digest of the reset, and of every step.
+        bad_rewards: Steps with a reward that is no finite number, the first few.
+        autoreset: What the autoreset mode would not permit, the first few.
+        episodes: How many ended.
+        slowest_s: The longest step, and ``mean_s`` all of them.
+    """
+
+    steps: list[str] = field(default_factory=list)
+    bad_rewards: list[str] = field(default_factory=list)
+    autoreset: list[str] = field(default_factory=list)
+    episodes: int = 0
+    slowest_s: float = 0.0
+    mean_s: float = 0.0
+
+    def differs_from(self, other: Trace) -> int | None:
+        """The first step that differs, 0 for the reset; None if none does."""
+        pairs = enumerate(zip(self.steps, other.steps, strict=True))
+        return next((number for number, (one, two) in pairs if one != two), None)
+
+
+def play(env: Env, mode: str | None, *, seed: int, steps: int) -> Trace:
+    """Reset and step with seeded random actions.
+
+    Args:
+        env: Is left open.
+        mode: Its autoreset mode, as its metadata says.
+        seed: Of the environment and of the actions.
+        steps: Vector steps.
+    """
+    trace, ended = Trace(), np.zeros(env.num_envs, np.bool_)
+    env.action_space.seed(seed)
+    trace.steps.append(digest(env.reset(seed=seed)[0]))
+    spent = []
+    for number in range(1, steps + 1):
+        if mode == "Disabled" and ended.any():
+            trace.steps[-1] += digest(env.reset(options={"reset_mask": ended})[0])
+        actions = env.action_space.sample()
+        begun = time.perf_counter()
+        result = env.step(actions)
+        spent.append(time.perf_counter() - begun)
+        trace.steps.append(digest(result[:4]))  # infos may hold times
+        ended = _judge(trace, result, ended, mode, number)
+    trace.slowest_s, trace.mean_s = max(spent, default=0.0), sum(spent) / max(len(spent), 1)
+    return trace
+
+
+def _judge(trace: Trace, result: tuple[Any, ...], ended: Any, mode: str | None, number: int) -> Any:
+    _, rewards, terminations, truncations, infos = result
+    done = np.logical_or(np.asarray(terminations, bool), np.asarray(truncations, bool))
+    trace.episodes += int(done.sum())
+    if not np.isfinite(np.asarray(rewards, np.float64)).all():
+        _note(trace.bad_rewards, f"step {number}: {np.asarray(rewards).tolist()}")
+    if mode == "NextStep":
+        for index in np.flatnonzero(ended):
+            if done[index] or np.any(np.asarray(rewards)[index]):
+                _note(
+                    trace.autoreset,
+                    f"step {number}: sub-environment {index} had ended, and the step that resets "
+                    "it has a reward or ends it again (NEXT_STEP)",
+                )
+    if mode == "SameStep" and done.any() and "final_obs" not in infos:
+        _note(trace.autoreset, f"step {number}: an episode ended without 'final_obs' (SAME_STEP)")
+    return done
+
+
+def _note(notes: list[str], text: str) -> None:
+    if len(notes) < 3:
+        notes.append(text)
+
+
+def digest(value: Any) -> str:
+    """Equal for what is equal bit for bit: arrays, numbers, texts, and what holds them."""
+    hashed = hashlib.sha256()
+    _feed(hashed, value)
+    return hashed.hexdigest()
+
+
+def _feed(hashed: Any, value: Any) -> None:
+    if isinstance(value, np.ndarray) and value.dtype != object:
+        hashed.update(f"array {value.dtype.str} {value.shape}".encode())
+        hashed.update(np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, Mapping):
+        hashed.update(f"mapping {len(value)}".encode())
+        for key in sorted(value, key=repr):
+            _feed(hashed, key)
+            _feed(hashed, value[key])
+    elif isinstance(value, (list, tuple, np.ndarray)):
+        hashed.update(f"items {len(value)}".encode())
+        for one in value:
+            _feed(hashed, one)
+    elif hasattr(value, "tolist") and hasattr(value, "cpu"):  # a tensor
+        _feed(hashed, value.cpu().numpy())
+    else:
+        hashed.update(f"{type(value).__name__} {value!r}".encode("utf-8", "replace"))

@@ -1,0 +1,220 @@
+"""``envhub check``: judge a repository that nobody trusts yet, for people and for CI."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from envhub_sandbox.cli.shared import options as opt
+from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say
+from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
+from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.select import select
+
+if TYPE_CHECKING:
+    from envhub_sandbox.check.findings import Finding, Report
+    from envhub_sandbox.check.table import Severity
+
+_PANEL = "What it says"
+_FILE = "FILE"
+_STYLES = {"error": "red", "warning": "yellow", "note": "dim"}
+
+
+def check(
+    ref: opt.Ref,
+    steps: Annotated[
+        int, typer.Option(min=1, help="Vector steps of each play; there are up to three.")
+    ] = 200,
+    seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="Of each play.")] = 0,
+    fail_on: Annotated[
+        str,
+        typer.Option(metavar="error|warning|note", help="The least finding that fails it."),
+    ] = "error",
+    allow: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--allow", metavar="ID", help="A check whose findings fail nothing (repeatable)."
+        ),
+    ] = None,
+    json: opt.Json = False,
+    junit: Annotated[
+        Path | None, typer.Option(metavar=_FILE, help="JUnit's XML.", rich_help_panel=_PANEL)
+    ] = None,
+    sarif: Annotated[
+        Path | None, typer.Option(metavar=_FILE, help="SARIF 2.1.0.", rich_help_panel=_PANEL)
+    ] = None,
+    github: Annotated[
+        bool,
+        typer.Option(
+            "--github",
+            help="Annotations for a GitHub workflow, and its step summary.",
+            rich_help_panel=_PANEL,
+        ),
+    ] = False,
+    suite: opt.Suite = None,
+    task: opt.Task = None,
+    n_envs: opt.NEnvs = 2,
+    use_async: opt.UseAsync = False,
+    env_kwargs: opt.EnvKwargs = None,
+    python: opt.Python = None,
+    dependencies: opt.Dependencies = "auto",
+    sandbox: opt.SandboxName = "process",
+    server_key: opt.ServerKey = None,
+    profile: opt.Profile = None,
+    memory: opt.Memory = None,
+    disk: opt.Disk = None,
+    processes: opt.Processes = None,
+    cpu_time: opt.CpuTime = None,
+    timeout: opt.Timeout = None,
+    token: opt.Token = None,
+    endpoint: opt.Endpoint = None,
+    hub_cache_dir: opt.HubCacheDir = None,
+    debug: opt.Debug = False,
+) -> None:
+    """Run a repository in a sandbox and say what is wrong with it.
+
+    Its files are read, its packages installed, and each task is played up to three times, in
+    processes of its own each time. docs/checks.md has every check. Exit code 0: nothing fails; 1:
+    something does; others: it could not be judged.
+
+    [bold]envhub check org/repo@<commit> --junit report.xml[/bold]
+    """
+    with reported(debug=debug):
+        make = opt.MakeOptions(
+            ref=ref,
+            n_envs=n_envs,
+            use_async=use_async,
+            env_kwargs=env_kwargs,
+            python=python,
+            dependencies=dependencies,
+            num_workers=None,
+            sandbox=sandbox,
+            server_key=server_key,
+            trust=False,
+            profile=profile,
+            network=None,
+            gpu=False,
+            readable=None,
+            variables=None,
+            memory=memory,
+            disk=disk,
+            processes=processes,
+            cpu_time=cpu_time,
+            timeout=timeout,
+            token=token,
+            endpoint=endpoint,
+            hub_cache_dir=hub_cache_dir,
+        )
+        least, allowed = _level(fail_on), _known(allow or ())
+        report = _judge(make, seed, steps, suite, task, quiet=json or github)
+        failures = report.failures(least, allowed)
+        _write(report, failures, junit=junit, sarif=sarif)
+        if github:
+            _annotate(report, failures)
+        if json:
+            from envhub_sandbox.check.reports import document
+
+            print_json(document(report, failures))
+        elif not github:
+            _print(report, failures)
+        if failures:
+            raise typer.Exit(Exit.ENVIRONMENT)
+
+
+def _level(name: str) -> Severity:
+    from envhub_sandbox.check.table import Severity
+
+    if name not in {one.value for one in Severity}:
+        raise UsageError(f"--fail-on is {name!r}; it takes error, warning or note")
+    return Severity(name)
+
+
+def _known(names: Sequence[str]) -> Sequence[str]:
+    from envhub_sandbox.check.table import CHECKS
+
+    for name in names:
+        if name not in CHECKS:
+            raise UsageError(f"--allow names no check: {name!r}; there are {', '.join(CHECKS)}")
+    return names
+
+
+def _judge(
+    make: opt.MakeOptions,
+    seed: int,
+    steps: int,
+    suites: list[str] | None,
+    tasks: list[str] | None,
+    *,
+    quiet: bool,
+) -> Report:
+    arguments = make.arguments()
+    del arguments["cfg"], arguments["validate"], arguments["num_workers"]
+    from envhub_sandbox.check.judge import Asked, judge
+
+    def chosen(envs: Any) -> list[tuple[str, Any]]:
+        return [(suite, task) for suite, task, _ in select(envs, suites, tasks)]
+
+    with Bar(quiet=quiet) as bar:
+        tell: Callable[[str], None] = bar.begin
+        asked = Asked(
+            reference=make.ref, arguments=arguments, seed=seed, steps=steps, tasks=chosen, tell=tell
+        )
+        return judge(asked)
+
+
+def _write(
+    report: Report, failures: list[Finding], *, junit: Path | None, sarif: Path | None
+) -> None:
+    from envhub_sandbox.check import reports
+
+    for path, form in ((junit, reports.junit), (sarif, reports.sarif)):
+        if path is None:
+            continue
+        try:
+            reports.write(path, form(report, failures))
+        except OSError as error:
+            raise UsageError(f"the report cannot be written: {error}") from error
+
+
+def _annotate(report: Report, failures: list[Finding]) -> None:
+    from envhub_sandbox.check import reports
+
+    for line in reports.workflow_commands(report):
+        typer.echo(line)
+    if path := os.environ.get("GITHUB_STEP_SUMMARY"):
+        with Path(path).open("a", encoding="utf-8") as file:
+            file.write(reports.summary(report, failures))
+
+
+def _print(report: Report, failures: list[Finding]) -> None:
+    from rich.table import Table
+
+    out = console()
+    out.print(safe_line(report.reference, 300), style="bold", soft_wrap=True)
+    grid = Table.grid(padding=(0, 2))
+    grid.add_column(no_wrap=True)
+    grid.add_column(no_wrap=True)
+    grid.add_column(overflow="fold")
+    for one in report.findings:
+        severity = one.check.severity.value
+        place = f"{one.file}:{one.line}: " if one.line else f"{one.file}: " if one.file else ""
+        where = f"{one.task}: " if one.task else ""
+        text = safe_line(f"{where}{place}{one.message}", 500)
+        grid.add_row(severity, one.id, text, style=_STYLES[severity])
+        if one in failures:
+            grid.add_row("", "", one.check.cure, style="dim")
+    if report.findings:
+        out.print(grid)
+    for task, figures in report.figures.items():
+        out.print(
+            f"{safe_line(task)}: {figures['steps']:.0f} steps, {figures['episodes']:.0f} episodes, "
+            f"a step takes {1e3 * figures['step_mean_s']:.2f} ms, the slowest "
+            f"{1e3 * figures['step_slowest_s']:.1f} ms",
+            style="dim",
+        )
+    held = f"{len(report.passed)} checks hold, {len(report.findings)} findings"
+    say(f"{held}, of which {len(failures)} fail it." if failures else f"{held}: passed.")

@@ -1,0 +1,180 @@
+"""``envhub check``: an honest repository passes, and each fault is told by its check alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox.check.findings import Report
+from envhub_sandbox.check.judge import Asked, judge
+from envhub_sandbox.check.table import CHECKS, Severity
+from tests.integration.test_cli_run import envhub
+from tests.support import checks
+from tests.support.repositories import write_repository
+from tests.support.samples import EXAMPLES
+
+_HONEST = """
+import gymnasium as gym
+import numpy as np
+
+class Walk(gym.Env):
+    metadata = {"render_modes": ["rgb_array"]}
+    render_mode = "rgb_array"
+    observation_space = gym.spaces.Box(-100, 100, (2,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+    count = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.at = self.np_random.random()
+        self.count = 0
+        return self.observation(), {}
+
+    def observation(self):
+        return np.array([self.at, self.count], np.float32)
+
+    def step(self, action):
+        self.at += self.np_random.random() * (1 if action else -1)
+        self.count += 1
+        return self.observation(), 1.0, self.count >= 10, False, {}
+
+    def render(self):
+        return np.zeros((4, 6, 3), np.uint8)
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([Walk] * n_envs)
+"""
+_TWO_RESETS = """
+class Twice(gym.vector.SyncVectorEnv):
+    def step(self, actions):
+        observations, rewards, *rest = super().step(actions)
+        return observations, rewards + 1.0, *rest
+
+def make_env(n_envs=1, use_async_envs=False):
+    return Twice([Walk] * n_envs)
+"""
+_FAULTS = {
+    "observation-dtype": ("self.count], np.float32)", "self.count], np.float64)"),
+    "observation-space": ("self.count], np.float32)", "self.count * 30], np.float32)"),
+    "seeding": ("self.at = self.np_random.random()", "self.at = np.random.default_rng().random()"),
+    "workers": ("[self.at, self.count]", "[len(gym.shared), self.count]"),
+    "autoreset": ("def make_env", _TWO_RESETS + "\ndef first_make_env"),
+    "rewards": ("1.0, self.count >= 10", "float('nan'), self.count >= 10"),
+    "render": ("(4, 6, 3), np.uint8", "(4, 6, 3), np.float32"),
+    "runs": ("self.count += 1", "raise RuntimeError('it broke')"),
+    "survives": ("self.count += 1", "import os; os._exit(3)"),
+    "loads": ("return gym.vector.SyncVectorEnv([Walk] * n_envs)", "return 3"),
+    "imports": ("import numpy as np", "import numpy as np\nimport not_to_be_had"),
+    "source-dynamic": ("self.count += 1", "self.count = eval('self.count + 1')"),
+    "source-process": ("import numpy as np", "import numpy as np\nimport subprocess"),
+    "source-network": ("import numpy as np", "import numpy as np\nfrom urllib import request"),
+    "source-pickle": ("import numpy as np", "import numpy as np\nimport pickle"),
+    "source-native": ("import numpy as np", "import numpy as np\nimport ctypes"),
+}
+_COUNTS = """
+    def __init__(self):
+        gym.shared.append(self)
+"""
+
+
+def repository(folder: Path, text: str = _HONEST, **files: str) -> Path:
+    """A repository with its papers."""
+    papers = {"README__md": "# Walk", "LICENSE": "MIT", **files}
+    return write_repository(folder, text, **papers)
+
+
+def judged(folder: Path, steps: int = 25) -> Report:
+    """What is found in it."""
+    asked = Asked(reference=str(folder), arguments={"n_envs": 2}, steps=steps)
+    return judge(asked)
+
+
+def test_the_page_is_the_table() -> None:
+    """To write it again: ``python -m tests.support.checks``."""
+    assert checks.DOCUMENT.read_text() == checks.document()
+
+
+def test_an_honest_repository_passes(tmp_path: Path) -> None:
+    """Every check that can be made of it holds, and the figures are of what was played."""
+    report = judged(repository(tmp_path / "walk"))
+    assert report.findings == []
+    unasked = set(CHECKS) - {check for check, _ in report.passed}
+    assert unasked == set(), "every check is made"
+    assert report.figures["hub_env / 0"]["steps"] == 25
+    assert report.figures["hub_env / 0"]["episodes"] == 4
+    assert report.provenance is not None
+    assert report.provenance["layers"], "it ran confined"
+
+
+@pytest.mark.parametrize("check", _FAULTS)
+def test_a_fault_is_told_by_its_check_alone(check: str, tmp_path: Path) -> None:
+    """The honest one, changed in one place."""
+    old, new = _FAULTS[check]
+    assert _HONEST.count(old) == 1
+    text = _HONEST.replace(old, new)
+    if check == "workers":  # how many there are in this process
+        text = text.replace("    count = 0\n", "    count = 0\n" + _COUNTS, 1)
+        text = text.replace("class Walk", "gym.shared = []\n\nclass Walk", 1)
+    report = judged(repository(tmp_path / "walk", text))
+    assert {one.id for one in report.findings} == {check}
+
+
+def test_what_cannot_be_installed_is_told(tmp_path: Path) -> None:
+    """Nothing is run of it, nor fetched: a link is no requirement."""
+    folder = repository(tmp_path / "walk", requirements__txt="x @ https://example.com/x.whl")
+    report = judged(folder)
+    assert {one.id for one in report.findings} == {"requirements"}
+    assert "requirements.txt" in report.findings[0].message
+
+
+def test_missing_papers_are_told(tmp_path: Path) -> None:
+    """Notes, which fail nothing unless one asks for it; the head of a card may name a licence."""
+    report = judged(write_repository(tmp_path / "bare", _HONEST))
+    assert {one.id for one in report.findings} == {"licence", "card"}
+    assert report.failures(Severity.ERROR) == []
+    assert len(report.failures(Severity.NOTE)) == 2
+    assert [one.id for one in report.failures(Severity.NOTE, ["card"])] == ["licence"]
+    card = "---\nlicense: mit\n---\n# Walk"
+    report = judged(write_repository(tmp_path / "card", _HONEST, README__md=card))
+    assert report.findings == []
+
+
+def test_the_command_line_judges(tmp_path: Path) -> None:
+    """Exit codes, and the reports that were asked for."""
+    good = envhub("check", EXAMPLES / "cartpole", "--steps", "20", "--json")
+    assert good.returncode == 0, good.stderr
+    assert json.loads(good.stdout)["passed"] is True
+    folder = repository(
+        tmp_path / "walk", _HONEST.replace("1.0, self.count", "1.0, 1 / 0, self.count")
+    )
+    files = [f"--{kind}={tmp_path / kind}" for kind in ("junit", "sarif")]
+    bad = envhub("check", folder, "--steps", "5", *files)
+    assert bad.returncode == 1, bad.stderr
+    assert "ZeroDivisionError" in bad.stdout
+    assert 'failures="1"' in (tmp_path / "junit").read_text()
+    [result] = json.loads((tmp_path / "sarif").read_text())["runs"][0]["results"]
+    assert result["ruleId"] == "runs"
+    allowed = envhub("check", folder, "--steps", "5", "--allow", "runs", "--github")
+    assert allowed.returncode == 0, allowed.stderr
+    assert allowed.stdout.startswith("::error title=envhub check%3A runs")
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "says"),
+    [
+        (["--allow", "nothing"], 2, "there are requirements, imports"),
+        (["--fail-on", "never"], 2, "error, warning or note"),
+    ],
+)
+def test_wrong_options_say_what_there_is(options: list[str], code: int, says: str) -> None:
+    """Before anything is run."""
+    done = envhub("check", EXAMPLES / "cartpole", *options)
+    assert (done.returncode, says in " ".join(done.stderr.split())) == (code, True), done.stderr
+
+
+def test_what_cannot_be_had_is_not_judged(tmp_path: Path) -> None:
+    """Another exit code than a judgement."""
+    done = envhub("check", tmp_path / "nowhere")
+    assert done.returncode == 3, done.stderr

@@ -1,0 +1,47 @@
+"""``docs/checks.md``, written from the table of checks.
+
+Write it again with ``python -m tests.support.checks``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from envhub_sandbox.check.table import CHECKS
+
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "checks.md"
+_HEAD = """# Checks
+
+What `envhub check` asks of a repository, written from `envhub_sandbox/check/table.py`. Its files
+are read as data, its packages installed without running any of them, and each task is played up to
+three times with seeded random actions, in the sandbox, each time in fresh processes: with every
+observation held against its space, once more, and spread over two processes.
+
+Exit code 0: nothing fails. 1: a finding weighs as much as `--fail-on` says (`error` by default),
+and `--allow ID` does not permit it. 2: a wrong option. Others (see `envhub check --help`): it could
+not be judged, because it could not be had, a server was full, or this host cannot confine it.
+
+A check passes because a comparison of ours found nothing, never because the repository says so.
+What is found in source is a hint for a person: who wants to hide a call can, and the walls are the
+sandbox's. Not asked yet: what the layers denied, what remains of threads and memory after many
+episodes, and how long a step may take.
+
+`--json` prints everything; `--junit FILE` has one test case for each check of each task, `--sarif
+FILE` is SARIF 2.1.0, and `--github` prints annotations and appends to `$GITHUB_STEP_SUMMARY`.
+
+| Check | Severity | What holds where it passes | What cures it |
+| --- | --- | --- | --- |
+"""
+
+
+def document() -> str:
+    """What the file has to hold."""
+    rows = [
+        f"| `{check.id}` | {check.severity.value} | {check.sentence} | {check.cure} |"
+        for check in CHECKS.values()
+    ]
+    return _HEAD + "\n".join(rows) + "\n"
+
+
+if __name__ == "__main__":
+    DOCUMENT.write_text(document())

@@ -1,0 +1,92 @@
+"""Reports of ``envhub check``: what a repository writes into them stays text in each form."""
+
+from __future__ import annotations
+
+import json
+from xml.etree import ElementTree
+
+import pytest
+
+from envhub_sandbox.check import reports
+from envhub_sandbox.check.findings import Finding, Report
+from envhub_sandbox.check.table import CHECKS, Severity
+
+_HOSTILE = (
+    "x\n::error::forged",
+    "x\r\n::add-mask::forged",
+    "<script>alert(1)</script> | [a](javascript:b) ![i](http://example.com/x) `c`",
+    "]]></failure></testcase><testcase name='forged'/>",
+    "\x1b[2J\x00\ufffe\ud800 %0A::error::forged",
+)
+
+
+def report(text: str) -> Report:
+    """One in which a repository chose every word that it can."""
+    made = Report("./walk:env.py")
+    made.add(Finding("runs", text, task=text, file=text, line=3))
+    made.judged("loads", [])
+    return made
+
+
+@pytest.mark.parametrize("text", _HOSTILE)
+def test_a_workflow_command_is_one_line(text: str) -> None:
+    """And begins where it begins; the control is the text itself, which has a line of its own."""
+    [line] = reports.workflow_commands(report(text))
+    assert len(line.splitlines()) == 1
+    assert line.startswith("::error file=")
+    assert line.count("::") == 2 + text.replace("\r", "").count("::")
+    head = line.split("title=")[0]
+    assert "\n" not in head
+    assert head.count("::") == 1
+
+
+@pytest.mark.parametrize("text", _HOSTILE)
+def test_a_summary_has_no_strangers_markup(text: str) -> None:
+    """One row of four cells, in which nothing is a tag, a link or an image."""
+    made = report(text)
+    table = reports.summary(made, made.findings).splitlines()
+    [row] = [line for line in table if line.startswith("| **fails**")]
+    assert row.count("|") == 5
+    assert not set("<>[]!`") & set(row)
+
+
+@pytest.mark.parametrize("text", _HOSTILE)
+def test_junit_is_well_formed(text: str) -> None:
+    """Two cases, whatever the text."""
+    made = report(text)
+    suite = ElementTree.fromstring(reports.junit(made, made.findings))
+    assert suite.attrib["tests"] == "2"
+    assert suite.attrib["failures"] == "1"
+    assert [case.attrib["name"] for case in suite] == ["runs", "loads"]
+    [failure] = suite.findall("testcase/failure")
+    assert failure.text
+
+
+@pytest.mark.parametrize("text", _HOSTILE)
+def test_sarif_is_data(text: str) -> None:
+    """A result of a rule that is there, at a place that is a URI."""
+    made = report(text)
+    [run] = json.loads(reports.sarif(made, made.findings))["runs"]
+    assert [rule["id"] for rule in run["tool"]["driver"]["rules"]] == list(CHECKS)
+    [result] = run["results"]
+    place = result["locations"][0]["physicalLocation"]
+    assert place["artifactLocation"]["uri"].isascii()
+    assert not set(" <>\n") & set(place["artifactLocation"]["uri"])
+    assert place["region"] == {"startLine": 3}
+
+
+def test_findings_are_bounded() -> None:
+    """Neither their number nor their length is a repository's choice."""
+    made = Report("./walk:env.py")
+    for number in range(600):
+        made.add(Finding("runs", "x" * 100_000, task="t" * 10_000, file="f" * 10_000, line=number))
+    assert len(made.findings) == 500
+    assert made.left_out == 100
+    assert max(len(one.message) + len(one.task) + len(one.file) for one in made.findings) < 2_000
+
+
+def test_severities_are_ordered() -> None:
+    """A note fails nothing but where notes are asked for."""
+    assert Severity.ERROR.reaches(Severity.WARNING)
+    assert not Severity.NOTE.reaches(Severity.WARNING)
+    assert Severity.NOTE.reaches(Severity.NOTE)
