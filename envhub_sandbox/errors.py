@@ -234,7 +234,7 @@ class ServerBusyError(WorkerError):
 
     Attributes:
         quota: Which: ``"sessions"``, ``"jails"``, ``"runners"``, ``"memory"`` or ``"inflight"``
-            (bytes both); empty if the server did not say.
+            (bytes both); ``"draining"`` for a server that is about to end; empty if it did not say.
         used: How much of it the same key's processes have.
         limit: How much they may have.
         retry_s: After how many seconds it is worth asking again.

@@ -17,17 +17,20 @@ from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerDiedError,
 from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.jail_sources import JailSource, SharedJail
 from envhub_sandbox.session.launcher import LoadedJail, Repository
-from envhub_sandbox.session.line import wait_in_line
+from envhub_sandbox.session.line import of_a_lost_server, of_a_server_that_ends, wait_in_line
 from envhub_sandbox.session.placement import Builder, Place
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.shared_memory.sharding import PaceBook
+from envhub_sandbox.transport.tcp import UnreachableError
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Lifecycle, State
 
 _WITHOUT_A_JAIL = frozenset({State.EXPIRED, State.DEAD, State.FOREIGN, State.CLOSED})
 """It may not have been given back yet."""
+_SUCCESSOR_S = 60.0
+"""For how long a restart waits for the server that comes in the place of one that ends."""
 
 
 class Lease:
@@ -70,6 +73,7 @@ class Lease:
         self._builder = Builder(jails, results)
         self._ending = threading.RLock()  # nothing is given back that another thread is ending
         self._owner = os.getpid()
+        self._was_loaded = False
         self._startup: StartupDeadline | None = None
         self._release_server: Callable[[], None] = _nothing
         self._departs = weakref.finalize(self, jails.repository.stay())
@@ -140,20 +144,31 @@ class Lease:
     def _take(self, deadline: Deadline) -> LoadedJail:
         try:
             return self._jails.take(deadline)
-        except WorkerError as error:
+        except (WorkerError, UnreachableError) as error:
             # or of this very type: an older server's refusal, which may be for want of room
             full = isinstance(error, ServerBusyError) or type(error) is WorkerError
-            if not full or deadline.unasked:
+            retry_s = self._patience_s(error)
+            if deadline.unasked or not (full or retry_s):
                 raise
-            room = self.repository.settle() | self.make_room()
-            if not room and not self.repository.retry_s:
+            room = full and self.repository.settle() | self.make_room()
+            if not room and not retry_s:
                 raise
+            told = error
         ask = partial(self._jails.take, deadline)
-        return wait_in_line(ask, self.repository.retry_s, deadline, self.repository.label)
+        return wait_in_line(ask, retry_s, deadline, self.repository.label, told)
+
+    def _patience_s(self, error: EnvHubError) -> float:
+        """How long to wait: after a server that ended, where restarts are wanted, for another."""
+        full = type(error) is WorkerError or isinstance(error, ServerBusyError)
+        retry_s = self.repository.retry_s if full else 0.0
+        if self.repository.policy.restart == "never":
+            return retry_s
+        lost = self._was_loaded and of_a_lost_server(error)
+        return max(retry_s, _SUCCESSOR_S) if lost or of_a_server_that_ends(error) else retry_s
 
     def _move(self, deadline: Deadline) -> None:
         self.leave()
-        self._build(self._jails.take(deadline), deadline)
+        self._build(self._take(deadline), deadline)
 
     def _build(self, loaded: LoadedJail, deadline: Deadline) -> None:
         try:
@@ -167,6 +182,7 @@ class Lease:
 
     def _settle(self, place: Place) -> None:
         self.loaded, self.lane = place.loaded, place.lane
+        self._was_loaded = True
         self._counters.connected(place.lane)
 
     # --- moving out ----------------------------------------------------------------------------

@@ -6,16 +6,25 @@ from collections.abc import Callable
 from time import monotonic, sleep
 from typing import TypeVar
 
-from envhub_sandbox.errors import ServerBusyError
+from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerDiedError
 from envhub_sandbox.log import WORKER
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.tcp import UnreachableError
+from envhub_worker.protocol.busy import DRAINING
 
 _SOON_S = 0.1
 _SLICE_S = 0.1
+_AGAIN_S = 1.0
 T = TypeVar("T")
 
 
-def wait_in_line(ask: Callable[[], T], retry_s: float, deadline: Deadline, label: str) -> T:
+def wait_in_line(
+    ask: Callable[[], T],
+    retry_s: float,
+    deadline: Deadline,
+    label: str,
+    told: EnvHubError | None = None,
+) -> T:
     """Ask, and ask again while the answer is that there is no room.
 
     The server keeps the order of those who go on asking: so the second time is soon, and takes the
@@ -26,22 +35,38 @@ def wait_in_line(ask: Callable[[], T], retry_s: float, deadline: Deadline, label
         retry_s: For how long.
         deadline: For all else; whoever gives it up is waited for no more.
         label: For whom, in the log.
+        told: What the answer was before.
 
     Raises:
         ServerBusyError: There was no room in all that time.
     """
     until, pause_s = monotonic() + retry_s, _SOON_S
+    ends = told is not None and (of_a_server_that_ends(told) or of_a_lost_server(told))
     while True:
         try:
             return ask()
-        except ServerBusyError as busy:
+        except (ServerBusyError, WorkerDiedError, UnreachableError) as error:
             left_s = until - monotonic()
-            if left_s <= 0 or deadline.unasked:
+            ends = ends or of_a_server_that_ends(error)
+            worth_it = isinstance(error, ServerBusyError) or (ends and of_a_lost_server(error))
+            if left_s <= 0 or deadline.unasked or not worth_it:
                 raise
             if pause_s == _SOON_S:
-                WORKER.warning("%s: %s; waiting for up to %.0f s", label, busy, left_s)
+                WORKER.warning("%s: %s; waiting for up to %.0f s", label, error, left_s)
             _pause(min(pause_s, left_s), deadline)
-            pause_s = max(busy.retry_s, _SLICE_S * 2)
+            pause_s = max(getattr(error, "retry_s", _AGAIN_S), _SLICE_S * 2)
+
+
+def of_a_server_that_ends(error: EnvHubError) -> bool:
+    """Whether another in its place is worth waiting for."""
+    return isinstance(error, ServerBusyError) and error.quota == DRAINING
+
+
+def of_a_lost_server(error: EnvHubError) -> bool:
+    """Whether there was no answer, so that it may have been between two servers."""
+    if isinstance(error, WorkerDiedError):
+        return error.reason == "connection"
+    return isinstance(error, UnreachableError)
 
 
 def _pause(pause_s: float, deadline: Deadline) -> None:

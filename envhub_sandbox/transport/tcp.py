@@ -28,6 +28,10 @@ _EVENTS = (
 )
 
 
+class UnreachableError(SandboxUnavailableError):
+    """There is no server, or it goes just now: as far as one can tell, for it has said nothing."""
+
+
 @dataclass(frozen=True)
 class Far:
     """A server on another host, as its clients know it.
@@ -117,9 +121,9 @@ class Link:
                 "are both of us with keys, or both without (insecure_loopback)?"
             )
         elif self._number == 0:
-            raise self._refused(
-                "it ended the handshake, as a server does whose public key is another than the "
-                "server_key that was given"
+            raise UnreachableError(
+                f"{self._endpoint}: it ended the handshake, as a server does whose public key is "
+                "another than the server_key that was given"
             )
 
     def _is_plain_and_refused(self) -> bool:
@@ -153,7 +157,7 @@ class Link:
                 f"{CONNECT_S:.0f} s",
                 reason="connection",
             )
-        raise SandboxUnavailableError(
+        raise UnreachableError(
             f"nothing answers at {self._endpoint} after {CONNECT_S:.0f} s; is 'envhub-worker "
             "listen' running there, and does a firewall let us through?"
         )

@@ -100,7 +100,8 @@ class Listening:
             check=True,
             timeout=60,
         )
-        return [one for one in json.loads(done.stdout) if one["client"] != "operator"]
+        told = json.loads(done.stdout)["sessions"]
+        return [one for one in told if one["client"] != "operator"]
 
     def jails(self) -> int:
         """How many are open, of whomever."""

@@ -23,7 +23,8 @@
 ``envhub-worker listen [--bind tcp://127.0.0.1:5555] [--key FILE] [--authorized-clients FILE]
 [--insecure-loopback] [--state-dir D] [quotas]`` serves clients on other hosts. It keeps keys and
 snapshots in ``D``, by default below ``$XDG_STATE_HOME``. ``envhub-worker keygen [--out DIR]``
-makes a key pair, ``envhub-worker status`` says who uses a listening server.
+makes a key pair, ``envhub-worker status`` says who uses a listening server, ``envhub-worker drain``
+ends it gently.
 
 ``envhub-worker health [--port 5555] [--state-dir D]`` exits with 0 if a server of this container
 answers, else 1.
@@ -139,6 +140,13 @@ def _status(arguments: argparse.Namespace) -> int:
     return status.run(arguments)
 
 
+def _drain(arguments: argparse.Namespace) -> int:
+    """Tell the server that listens here to end, gently."""
+    from envhub_worker.cli import drain
+
+    return drain.run(arguments)
+
+
 def _keygen(arguments: argparse.Namespace) -> int:
     """Make a key pair, and say its public key."""
     from envhub_worker.access import keys
@@ -189,7 +197,7 @@ def _parser(*, remote: bool) -> argparse.ArgumentParser:
 
 
 def _add_remote(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    from envhub_worker.cli import listen, status
+    from envhub_worker.cli import drain, listen, status
 
     listening = commands.add_parser("listen", help="serve clients on other hosts, with keys")
     listen.add_arguments(listening)
@@ -197,6 +205,9 @@ def _add_remote(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     asking = commands.add_parser("status", help="who uses a listening server")
     status.add_arguments(asking)
     asking.set_defaults(run=_status)
+    draining = commands.add_parser("drain", help="end the server that listens here, gently")
+    drain.add_arguments(draining)
+    draining.set_defaults(run=_drain)
     keygen = commands.add_parser("keygen", help="make a CURVE key pair")
     keygen.add_argument(
         "--out", type=Path, default=Path(), metavar="DIR", help="where both lie (default: here)"

@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 import signal
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from time import monotonic
 from typing import Any
 
 import zmq
 
 _POLL_MS = 1000
+_SIGNALS = 64
+"""Read at once."""
 _MAX_FAILURES = 100
 """Callbacks that fail one after the other."""
 
@@ -44,13 +46,19 @@ class Loop:
         if self._callbacks.pop(source, None) is not None:
             self._poller.unregister(source)
 
-    def stop_on(self, *signals: int) -> None:
-        """End the loop at these signals; to be called on the main thread."""
+    def call_on(self, signals: Mapping[int, Callable[[], None]]) -> None:
+        """Call back at these signals, between two rounds; to be called on the main thread."""
         woken, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-        signal.set_wakeup_fd(wakes)
+        signal.set_wakeup_fd(wakes)  # it is told the signals' numbers, a byte each
         for number in signals:
-            signal.signal(number, lambda *_: self.stop())
-        self.watch(woken, self.stop)
+            signal.signal(number, lambda *_: None)
+
+        def signalled() -> None:
+            for number in os.read(woken, _SIGNALS):
+                if number in signals:
+                    signals[number]()
+
+        self.watch(woken, signalled)
 
     def stop(self) -> None:
         """End the loop after the current round."""

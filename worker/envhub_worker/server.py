@@ -32,6 +32,8 @@ from envhub_worker.supervisor.records import Asker
 _RCVHWM = 64
 _ROUND = 64
 """Messages that are served before the jails have their turn."""
+_LAST_WORDS_MS = 500
+"""For how long what was said last is sent on after a drain."""
 _MAX_SAID = 4096
 """Characters of a refusal."""
 
@@ -78,10 +80,22 @@ class Server:
     def _tick(self) -> None:
         self._jails.look()
         self._gate.tick(self._sessions, self._jails)
+        if self._gate.drained(self._jails):
+            self.stop()
 
-    def stop_on(self, *signals: int) -> None:
-        """End the loop at these signals; to be called on the main thread."""
-        self._loop.stop_on(*signals)
+    def stop_on(self, *signals: int, gently: Sequence[int] = ()) -> None:
+        """End the loop at these signals; to be called on the main thread.
+
+        At those of ``gently`` nothing new is taken, and a second one ends it; the first does, where
+        the gate does not wait for what runs.
+        """
+        self._loop.call_on(
+            {**dict.fromkeys(signals, self.stop), **dict.fromkeys(gently, self._drain)}
+        )
+
+    def _drain(self) -> None:
+        if not self._gate.drain():
+            self.stop()
 
     def stop(self) -> None:
         """End the loop after the current round."""
@@ -106,6 +120,8 @@ class Server:
             self._shut_down()
 
     def _shut_down(self) -> None:
+        if self._gate.drained(self._jails):  # those who were refused last shall hear it
+            self._router.setsockopt(zmq.LINGER, _LAST_WORDS_MS)
         self._jails.close()
         self._gate.close()
         self._router.close()

@@ -38,6 +38,7 @@ OPTIONAL = {
     "envhub_sandbox.integrations.sb3": {"stable_baselines3"},
     "envhub_worker.protocol.messages.base": {"typing_extensions"},  # for type checkers alone
     "envhub_sandbox.metrics": {"prometheus_client"},
+    "envhub_worker.cli.metrics": {"prometheus_client"},
     "envhub_sandbox.transport.tensors": {"torch"},
     "envhub_sandbox.cli.rollout.video": {"imageio_ffmpeg"},
     "envhub_sandbox.pytest_plugin": {"pytest"},
@@ -81,7 +82,7 @@ MAY_IMPORT = {
     "envhub_worker.__main__": {"access", "cli", "lockdown", "server", "spawn"},
     "envhub_worker.cli": {"", "access", "lockdown", "server"},
     "envhub_worker.server": {"", "access", "lockdown", "loop", "multipart", "spawn", "supervisor"},
-    "envhub_worker.access": {"lockdown", "loop", "multipart", "supervisor"},
+    "envhub_worker.access": {"", "lockdown", "loop", "multipart", "supervisor"},
     "envhub_worker.supervisor": {"channel", "lockdown", "loop", "spawn"},
     "envhub_worker.spawn": {"bootstrap", "channel", "lockdown"},
     "envhub_worker.lockdown": {"", "channel"},

@@ -15,7 +15,9 @@ from typing import Any, NamedTuple, Protocol
 import zmq
 
 from envhub_worker.access.connection_limit import MAX_CONNECTIONS, Doorman
+from envhub_worker.access.drain import Drain
 from envhub_worker.access.events import Events
+from envhub_worker.access.figures import Clients, Facts, Tally, client_name
 from envhub_worker.access.keys import AuthorizedClients, KeyPair
 from envhub_worker.access.line import RETRY_S, Line
 from envhub_worker.access.quotas import (
@@ -31,6 +33,7 @@ from envhub_worker.access.quotas import (
 from envhub_worker.access.rate_limited_log import Log
 from envhub_worker.access.sessions import WATCHER, Session, Sessions
 from envhub_worker.access.uploads import PREFIX, Uploads, wrong_with_path
+from envhub_worker.access.usage import Usage
 from envhub_worker.access.zap import DOMAIN, Zap
 from envhub_worker.lockdown.spec import confinement_from_wire
 from envhub_worker.loop import Loop
@@ -40,7 +43,7 @@ from envhub_worker.protocol.busy import Busy
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.keys import KEY_BYTES, key_text
 from envhub_worker.supervisor.jails import Jails
-from envhub_worker.supervisor.records import Asker
+from envhub_worker.supervisor.records import Asker, JailEntry
 from envhub_worker.supervisor.witness import Nobody, Witness
 
 _HANDSHAKE_MS = 5_000
@@ -130,6 +133,12 @@ class Gate(Protocol):
     def tick(self, sessions: Sessions, jails: Jails) -> None:
         """Time has passed."""
 
+    def drain(self) -> bool:
+        """Let nothing new in from now on; False if nothing that runs is waited for."""
+
+    def drained(self, jails: Jails) -> bool:
+        """Whether that has been said, and nothing runs any more."""
+
     def close(self) -> None:
         """Close what ``secure`` opened."""
 
@@ -168,6 +177,14 @@ class LocalGate:
     def tick(self, sessions: Sessions, jails: Jails) -> None:
         """The server ends with its client."""
 
+    def drain(self) -> bool:
+        """There is one client, and it would wait for itself."""
+        return False
+
+    def drained(self, jails: Jails) -> bool:
+        """Never."""
+        return False
+
     def close(self) -> None:
         """There is nothing to close."""
 
@@ -184,6 +201,8 @@ class Rules:
         permissions: What a policy may ask for.
         idle_s: How long the jails of a client that says nothing live on.
         max_connections: Of everybody together, strangers included.
+        drain_s: How long what runs may go on once nothing new is let in.
+        profile: The strongest that jails can have here.
     """
 
     keys: KeyPair | None
@@ -193,6 +212,8 @@ class Rules:
     permissions: Permissions
     idle_s: int
     max_connections: int = MAX_CONNECTIONS
+    drain_s: int = 0
+    profile: str = "strict"
 
 
 class RemoteGate:
@@ -200,7 +221,13 @@ class RemoteGate:
 
     compresses = True
 
-    def __init__(self, rules: Rules, uploads: Uploads, log: Log) -> None:
+    def __init__(
+        self,
+        rules: Rules,
+        uploads: Uploads,
+        log: Log,
+        publish: Callable[[Mapping[str, Any]], None] | None = None,
+    ) -> None:
         self.idle_s = rules.idle_s
         self._rules = rules
         self._uploads = uploads
@@ -209,6 +236,16 @@ class RemoteGate:
         self.witness: Witness = self._events
         self._in_flight = InFlight()
         self._lines = {"sessions": Line(), "jails": Line()}
+        self._drain = Drain(rules.drain_s)
+        self._publish = publish
+        self._tally, self._usage = Tally(), Usage()
+        self._facts = Facts(
+            profile=rules.profile,
+            permissions=rules.permissions,
+            quotas=rules.quotas,
+            state=str(uploads.folder),
+            max_connections=rules.max_connections,
+        )
         self._closers: list[Callable[[], None]] = []
         self._doorman: Doorman | None = None
         self.handlers: Mapping[type[m.Message], Handler] = {
@@ -274,6 +311,8 @@ class RemoteGate:
         if len(name) > 64:
             raise RefusedError("LocalProtocolError", "the name of a session is too long")
         self._end_deserted(sessions, jails)
+        if name != WATCHER and name not in {one.name for one in sessions.of_key(key)}:
+            self._drain.refuse_new()
         others = [one for one in sessions.of_key(key) if one.name not in (name, WATCHER)]
         quota = self._rules.quotas.sessions
         if name != WATCHER and len(others) >= quota:
@@ -298,11 +337,14 @@ class RemoteGate:
         """Hold a request against keys and quotas."""
         asker, request = asked.asker, asked.request
         self._refuse_unless_authorized(asker.key)
+        if isinstance(request, (m.OpenJail, m.OfferSnapshot)):
+            self._drain.refuse_new()
         if isinstance(request, m.OpenJail):
             return self._authorize_open(asked, request)
         if isinstance(request, m.StartRunners):
             self._find_place(asked, Use(0, request.runners))
         elif isinstance(request, m.Relay):
+            self._tally.asked(self._label_of(asker.key), request.operation)
             size = sum(map(len, asked.payload))
             self._in_flight.add(asker.key, asker, size, self._rules.quotas.inflight_bytes)
         return request
@@ -365,6 +407,7 @@ class RemoteGate:
             raise RefusedError("PolicyError", f"the entry file {wrong}")
         self._find_place(asked, Use(confinement.limits.memory_bytes, request.runners))
         tree = self._uploads.tree(asked.asker.key, request.snapshot)
+        self._tally.open(self._label_of(asked.asker.key))
         return m.OpenJail(
             request.name[:512], "", tree, request.entry, request.confinement, request.runners
         )
@@ -398,15 +441,49 @@ class RemoteGate:
         return m.Done()
 
     def _tell_sessions(self, asked: Asked) -> m.Message:
-        return m.Sessions(tuple(self._sessions_of(asked.asker.key, asked.sessions, asked.jails)))
+        asker = asked.asker
+        told = self._sessions_of(asker.key, asked.sessions, asked.jails)
+        if asker.version >= m.FIRST_WITH_FIGURES_VERSION:
+            told.append({"server": self.figures(asked.sessions, asked.jails, asker.key)})
+        return m.Sessions(tuple(told))
 
     def answered(self, asker: Asker) -> None:
         """Its bytes are no longer in flight."""
         self._in_flight.answered(asker)
 
     def refused(self, asker: Asker, error: str, message: str, layer: str, fix: str) -> None:
-        """The operator is told, too."""
+        """The operator is told, and it is counted."""
+        self._tally.refused(error, layer)
         self._events.refused(asker, error, message, layer, fix)
+
+    def _label_of(self, key: bytes) -> str:
+        return client_name(self._rules.authorized.name_of(key), self._rules.keys is None)
+
+    def figures(self, sessions: Sessions, jails: Jails, key: bytes | None = None) -> dict[str, Any]:
+        """What there is to tell: all to the operator, and to any other key what concerns it."""
+        clients = Clients()
+        for one in sessions.all():
+            if one.name != WATCHER:
+                clients.of(self._label_of(one.key)).add_session(one)
+        for entry in jails.open_ones():
+            clients.of(self._label_of(_key_of(entry))).add_jail(entry)
+        for known in {one.key for one in sessions.all() if one.name != WATCHER}:
+            share = clients.of(self._label_of(known))
+            share.upload_bytes += self._uploads.used_bytes(known)
+            share.inflight_bytes += self._in_flight.of(known)
+        clients.add_past(self._tally, self._usage)
+        told = {**self._facts.for_clients(), "draining_s": self._drain.left_s}
+        if key is not None and key not in self._rules.operators:
+            return {**told, "clients": clients.told(self._label_of(key))}
+        return {
+            **told,
+            **self._facts.for_operators(),
+            "connections": 0 if self._doorman is None else len(self._doorman.open_wires()),
+            "waiting": {quota: line.waiting for quota, line in self._lines.items()},
+            "refusals": dict(self._tally.refusals),
+            "deaths": dict(jails.deaths),
+            "clients": clients.told(),
+        }
 
     def _sessions_of(self, key: bytes, sessions: Sessions, jails: Jails) -> list[dict[str, Any]]:
         rules = self._rules
@@ -418,6 +495,7 @@ class RemoteGate:
                 "client": self._name_of(one.key) or "operator",
                 "key": key_text(one.key),
                 "session": one.name.hex()[:8],
+                "protocol": one.version,
                 "heard_s": sessions.age_s(one),
                 "connections": len(one.connections),
                 "upload_bytes": used[one.key],
@@ -449,6 +527,26 @@ class RemoteGate:
                 self._drop(session, sessions, "nothing was heard of it for long")
         if self.idle_s:
             self._end_unheld(sessions, jails)
+        if self._publish is not None:
+            self._publish(self.figures(sessions, jails))
+        self._usage.watch(
+            {
+                pid: self._label_of(_key_of(entry))
+                for entry in jails.open_ones()
+                if (pid := entry.jail.pid) > 0
+            }
+        )
+        if self._drain.over:
+            for entry in jails.open_ones():
+                jails.end(entry, f"the server ends, {self._rules.drain_s} s after it was told to")
+
+    def drain(self) -> bool:
+        """Refuse new sessions and jails; those that run have ``drain_s``."""
+        return self._drain.begin(self._log)
+
+    def drained(self, jails: Jails) -> bool:
+        """Whether it may end: no jail is left, and everybody had a moment to hear so."""
+        return self._drain.begun and self._drain.quiet(bool(jails.open_ones()))
 
     def _end_deserted(self, sessions: Sessions, jails: Jails) -> None:
         """Forget the connections that have gone, and the sessions that have nothing else.
@@ -483,6 +581,7 @@ class RemoteGate:
 
     def close(self) -> None:
         """Close the sockets of the handshakes."""
+        self._usage.close()
         for close in self._closers:
             close()
 
@@ -498,6 +597,11 @@ def _descriptor_of(frame: zmq.Frame) -> int:
         return int(frame.get(zmq.SRCFD))
     except (zmq.ZMQError, ValueError):
         return -1
+
+
+def _key_of(entry: JailEntry) -> bytes:
+    """Whose a jail is: what it is marked with begins with the key, see ``Session.owner``."""
+    return entry.session[:KEY_BYTES]
 
 
 def _uses(jails: Jails, key: bytes) -> list[Use]:

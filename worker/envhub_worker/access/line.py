@@ -29,6 +29,16 @@ class Line:
         self._clock = clock
         self._waiting: dict[bytes, OrderedDict[bytes, _Waiting]] = {}
 
+    @property
+    def waiting(self) -> int:
+        """How many mean to wait: they have asked more than once, and not long ago."""
+        now = self._clock()
+        return sum(
+            one.times > 1 and now - one.asked <= _PATIENCE_S
+            for waiting in self._waiting.values()
+            for one in waiting.values()
+        )
+
     def ahead(self, key: bytes, owner: bytes) -> int:
         """How many wait that have come before."""
         waiting, now = self._of(key), self._clock()

@@ -146,6 +146,10 @@ class InFlight:
     _of: dict[bytes, int] = field(default_factory=dict)
     _requests: dict[tuple[bytes, int], tuple[Asker, bytes, int]] = field(default_factory=dict)
 
+    def of(self, key: bytes) -> int:
+        """How many there are of a key."""
+        return self._of.get(key, 0)
+
     def add(self, key: bytes, asker: Asker, size: int, quota: int) -> None:
         """Count a request until it is answered.
 

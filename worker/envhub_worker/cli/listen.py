@@ -17,10 +17,11 @@ import stat
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from envhub_worker import __version__
 from envhub_worker.access import keys
@@ -43,6 +44,9 @@ _IDLE_S = 120
 _MAX_OPEN_FILES = 65_536
 _ANY_HOST = frozenset({"0.0.0.0", "*", "[::]"})
 _CONTAINER_MARKS = ("/.dockerenv", "/run/.containerenv")
+
+
+Publish = Callable[[Mapping[str, Any]], None]
 
 
 class UsageError(Exception):
@@ -77,6 +81,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=_IDLE_S,
         help=f"end jails of clients that are silent for so long; 0: never (default: {_IDLE_S})",
+    )
+    parser.add_argument(
+        "--metrics",
+        metavar="[ADDRESS:]PORT",
+        help="answer GET /metrics, /healthz and /readyz there, over plain HTTP and without keys; "
+        "on 127.0.0.1, unless another address is given",
+    )
+    parser.add_argument(
+        "--drain-s",
+        type=_seconds,
+        default=0,
+        help="after SIGTERM let nothing new in, and give open jails so long; a second SIGTERM ends "
+        "at once (default: 0, the first one does)",
     )
     parser.add_argument(
         "--weakest-profile",
@@ -127,6 +144,13 @@ def _count(text: str) -> int:
     return value
 
 
+def _seconds(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise ValueError
+    return value
+
+
 def _weakest_profile() -> str:
     """In a container the container is the outer layer, and the others are often not to be had.
 
@@ -155,17 +179,28 @@ def _listen(arguments: argparse.Namespace, state: Path) -> int:
     if why:
         log.say("no_jail_possible", "error", why=why)
     _raise_file_limit()
+    with _watched(arguments.metrics, log, usable=not why) as publish:
+        return _serve(arguments, state, identity, log, publish)
+
+
+def _serve(
+    arguments: argparse.Namespace,
+    state: Path,
+    identity: Identity,
+    log: Log,
+    publish: Publish | None,
+) -> int:
     place = locked_folder.place_for_sockets()
     locked_folder.remove_deserted(place)
     runtime = LockedFolder("envhub-", place)
     try:
-        gate = _gate(arguments, state, identity, log)
+        gate = _gate(arguments, state, identity, log, publish)
         store = state / "store"
         server = Server(arguments.bind, runtime.path, [str(store)], gate=gate)
     except BaseException:
         runtime.remove()
         raise
-    server.stop_on(signal.SIGTERM, signal.SIGINT)
+    server.stop_on(signal.SIGINT, gently=(signal.SIGTERM,))
     note = state / "endpoint"
     key_file = (arguments.key or state / "server.key").absolute()
     note.write_text(f"{server.endpoint} {identity.public} {key_file}\n")
@@ -186,6 +221,41 @@ def _log_start(log: Log, endpoint: str, identity: Identity, weakest: str) -> Non
     told = {"version": __version__, "endpoint": endpoint, "server_key": identity.public}
     profiles = {"strongest_profile": identity.profile, "weakest_profile": weakest}
     log.say("listening", "info", **told, **profiles, pid=os.getpid())
+
+
+@contextmanager
+def _watched(metrics: str | None, log: Log, *, usable: bool) -> Iterator[Publish | None]:
+    """The port for whoever watches, if one is wanted: gives what is to be called with figures.
+
+    Raises:
+        UsageError: It cannot be had; the text says why.
+    """
+    if metrics is None:
+        yield None
+        return
+    from envhub_worker.cli.http_port import HttpPort, parse_address
+    from envhub_worker.cli.metrics import Page, exposition
+
+    host, number = parse_address(metrics)
+    try:
+        page = Page(usable, exposition())
+    except ImportError as error:
+        raise UsageError(str(error)) from None
+
+    def failed(why: str) -> None:
+        log.say("metrics_failed", "error", traceback=why)
+
+    try:
+        port = HttpPort(host, number, page.answer, failed)
+    except OSError as error:
+        raise UsageError(f"--metrics {metrics}: {error}") from None
+    if not _is_loopback(host):
+        log.say("metrics_are_open", why="whoever reaches them reads the clients' names: no keys")
+    log.say("metrics", "info", url=f"http://{port.address}/metrics")
+    try:
+        yield page.publish
+    finally:
+        port.close()
 
 
 def _raise_file_limit() -> None:
@@ -332,7 +402,13 @@ def reachable(endpoint: str) -> str:
     return f"tcp://127.0.0.1:{port}" if host in _ANY_HOST else endpoint
 
 
-def _gate(arguments: argparse.Namespace, state: Path, identity: Identity, log: Log) -> RemoteGate:
+def _gate(
+    arguments: argparse.Namespace,
+    state: Path,
+    identity: Identity,
+    log: Log,
+    publish: Publish | None = None,
+) -> RemoteGate:
     known = {} if identity.client is None else {identity.client.public: "the one client"}
     pair = identity.keys
     operators = frozenset[bytes]() if pair is None else frozenset({pair.public})
@@ -357,8 +433,10 @@ def _gate(arguments: argparse.Namespace, state: Path, identity: Identity, log: L
         ),
         idle_s=max(0, arguments.idle_s),
         max_connections=most_connections(arguments.max_connections),
+        drain_s=arguments.drain_s,
+        profile=identity.profile,
     )
-    return RemoteGate(rules, Uploads(state / "store", quotas), log)
+    return RemoteGate(rules, Uploads(state / "store", quotas), log, publish)
 
 
 def _most_clients(arguments: argparse.Namespace) -> int | None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from envhub_worker.access import keys
 from envhub_worker.access.sessions import WATCHER
 from envhub_worker.cli.listen import reachable, state_dir
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.confinement import MIB
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.keys import parse_key
 from envhub_worker.protocol.text import printable
@@ -35,13 +38,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print who uses the server, and what their jails do."""
+    """Print who uses the server, what their jails do, and how the server is."""
     try:
-        sessions = _ask(*_address(arguments))
+        told = _ask(*_address(arguments))
     except (OSError, ValueError, ProtocolError, UnreachableError) as error:
         sys.stderr.write(f"envhub-worker status: {error}\n")
         return 1
-    print(json.dumps(sessions, indent=2) if arguments.json else table(sessions))
+    server = next((one["server"] for one in told if "server" in one), None)
+    sessions = [one for one in told if "session" in one]
+    if arguments.json:
+        print(json.dumps({"server": server, "sessions": sessions}, indent=2))
+    else:
+        print(table(sessions) if server is None else f"{head(server)}\n{table(sessions)}")
     return 0
 
 
@@ -51,7 +59,16 @@ def _address(arguments: argparse.Namespace) -> tuple[str, bytes | None, keys.Key
         if not arguments.server_key or not arguments.key:
             raise ValueError("--endpoint needs --server-key and --key")
         return arguments.endpoint, parse_key(arguments.server_key), keys.load(arguments.key)
-    noted = _noted(arguments.state_dir)
+    return address_here(arguments.state_dir)
+
+
+def address_here(chosen: Path | None) -> tuple[str, bytes | None, keys.KeyPair]:
+    """The same, of the server that runs here on that state folder.
+
+    Raises:
+        UnreachableError: There is none.
+    """
+    noted = _noted(chosen)
     if noted is None:
         raise UnreachableError("no 'envhub-worker listen' of this user is running here")
     return noted
@@ -83,17 +100,33 @@ def is_healthy(chosen: Path | None) -> bool | None:
 
 
 def _ask(endpoint: str, server_key: bytes | None, pair: keys.KeyPair) -> list[dict[str, Any]]:
+    with _greeted(endpoint, server_key, pair) as (socket, _):
+        reply = _request(socket, m.GetSessions(), 2, m.Sessions)
+        assert isinstance(reply, m.Sessions)
+        return [dict(one) for one in reply.sessions if isinstance(one, dict)]
+
+
+def pid_of(endpoint: str, server_key: bytes | None, pair: keys.KeyPair) -> int:
+    """The number of the server's process, as it says itself."""
+    with _greeted(endpoint, server_key, pair) as (_, welcome):
+        return welcome.pid
+
+
+@contextmanager
+def _greeted(
+    endpoint: str, server_key: bytes | None, pair: keys.KeyPair
+) -> Iterator[tuple[zmq.Socket[bytes], m.Welcome]]:
     with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
         socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.IPV6, "[" in endpoint)
         if server_key is not None:
             socket.setsockopt(zmq.CURVE_SERVERKEY, server_key)
             socket.setsockopt(zmq.CURVE_PUBLICKEY, pair.public)
             socket.setsockopt(zmq.CURVE_SECRETKEY, pair.secret)
         socket.connect(endpoint)
-        _request(socket, m.Hello(2, m.VERSION, WATCHER), 1, m.Welcome)
-        reply = _request(socket, m.GetSessions(), 2, m.Sessions)
-        assert isinstance(reply, m.Sessions)
-        return [dict(one) for one in reply.sessions if isinstance(one, dict)]
+        welcome = _request(socket, m.Hello(2, m.VERSION, WATCHER), 1, m.Welcome)
+        assert isinstance(welcome, m.Welcome)
+        yield socket, welcome
 
 
 def _request(
@@ -108,6 +141,22 @@ def _request(
     if not isinstance(reply, kind):
         raise UnreachableError(f"the server answered with {type(reply).__name__}")
     return reply
+
+
+def head(server: dict[str, Any]) -> str:
+    """The server itself, in a line or two."""
+    lines = [
+        f"envhub-worker {server['version']}, protocol {server['protocol']}, profile "
+        f"{server['profile']} at most"
+    ]
+    if "disk" in server:
+        free = server["disk"]["free_bytes"] // MIB
+        lines[0] += f", {server['connections']} connections, {free} MiB of disk free"
+        refusals, deaths = sum(server["refusals"].values()), sum(server["deaths"].values())
+        lines.append(f"since its start: {refusals} refusals, {deaths} deaths")
+    if server["draining_s"] is not None:
+        lines.append(f"draining: open jails have {server['draining_s']:.0f} s left")
+    return printable("\n".join(lines))
 
 
 def table(sessions: list[dict[str, Any]]) -> str:

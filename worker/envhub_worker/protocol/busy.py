@@ -10,6 +10,8 @@ import re
 from dataclasses import dataclass
 
 ERROR = "ServerBusyError"
+DRAINING = "draining"
+"""In the place of a quota: the server is about to end."""
 LONGEST_S = 60.0
 _NUMBERS = re.compile(r"(\d{1,18}) (\d{1,18}) (\d{1,4}(?:\.\d{1,3})?)")
 _NAME = re.compile(r"[a-z_]{1,32}")

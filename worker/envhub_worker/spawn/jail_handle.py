@@ -312,6 +312,14 @@ class Jail:
         """A pidfd of the jail's init, or -1 before it is known and after it has gone."""
         return self._pidfd
 
+    @property
+    def pid(self) -> int:
+        """The number of the jail's init, as seen from here; below 1 before and after its life."""
+        try:
+            return process.pid_of(self._pidfd)
+        except OSError:
+            return -1
+
     def runner_pidfd(self, runner_id: int) -> int:
         """A pidfd of a runner, or -1 before it has started and after it has gone."""
         return self._runner_pidfds.get(runner_id, -1)

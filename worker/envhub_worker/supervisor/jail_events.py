@@ -7,6 +7,7 @@ and one that breaks the rules loses its jail.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from time import monotonic
 
@@ -47,6 +48,9 @@ class JailEvents:
         jails: All jails of the server; what has ended long ago is taken out.
         deposits: Descriptors that wait for runners.
         witness: Is told what becomes of each.
+
+    Attributes:
+        deaths: How many jails, and runners of kept jails, have ended unasked, by reason.
     """
 
     def __init__(
@@ -62,6 +66,7 @@ class JailEvents:
         self._jails = jails
         self._deposits = deposits
         self._witness = witness
+        self.deaths: Counter[str] = Counter()
 
     def follow(self, entry: JailEntry) -> None:
         """Hear of a new jail from now on."""
@@ -177,6 +182,7 @@ class JailEvents:
 
     def _lose(self, entry: JailEntry, death: m.Died) -> None:
         """Go on without a runner: whoever waits for it hears how it died, and nobody else."""
+        self.deaths[death.reason] += 1
         entry.output.read()
         death = m.replace(death, tail=entry.output.text())
         # the last lines of earlier deaths have been told: many of them would be much
@@ -202,6 +208,7 @@ class JailEvents:
         """Write the jail's death down, tell everybody who waits, and make it true."""
         if entry.death is not None:
             return
+        self.deaths[death.reason] += 1
         entry.output.read()
         entry.death = death = m.replace(death, tail=entry.output.text())
         for pending in waiting(entry):

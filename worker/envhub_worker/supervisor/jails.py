@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import os
 import secrets
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from envhub_worker.channel import close_fds
@@ -266,6 +266,11 @@ class Jails:
     def statuses(self, owner: bytes) -> list[dict[str, object]]:
         """What the jails of a session are doing."""
         return [status_of(entry) for entry in self.open_ones(owner)]
+
+    @property
+    def deaths(self) -> Mapping[str, int]:
+        """How many have ended unasked since the start, by reason."""
+        return self._events.deaths
 
     def end(self, entry: JailEntry, why: str) -> None:
         """End a jail that nobody closes; its client is told why if it comes back."""

@@ -235,7 +235,10 @@ class GetSessions(Message, kind=26):
 
 
 class Sessions(Message, kind=27):
-    """One mapping a session: ``client``, ``session``, ``heard_s``, ``connections``, ``jails``."""
+    """One mapping a session: ``client``, ``session``, ``heard_s``, ``connections``, ``jails``.
+
+    To whoever speaks version 9, one more with the key ``server``: figures of the server itself.
+    """
 
     sessions: tuple[object, ...]
 

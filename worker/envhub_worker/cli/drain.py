@@ -1,0 +1,55 @@
+"""``envhub-worker drain``: tell the ``listen`` of this state folder to end, and wait until it has.
+
+It is told by SIGTERM: for how long open jails go on is its own ``--drain-s``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import select
+import signal
+import sys
+from pathlib import Path
+
+from envhub_worker.cli import status
+from envhub_worker.protocol.errors import ProtocolError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``drain``."""
+    parser.add_argument("--state-dir", type=Path, help="as for listen")
+    parser.add_argument("--no-wait", action="store_true", help="do not wait until it has ended")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Send the signal; 0 once the server has ended, or been told."""
+    try:
+        pidfd = _server(arguments.state_dir)
+    except (OSError, ValueError, ProtocolError, status.UnreachableError) as error:
+        sys.stderr.write(f"envhub-worker drain: {error}\n")
+        return 1
+    signal.pidfd_send_signal(pidfd, signal.SIGTERM)
+    if not arguments.no_wait:
+        select.select([pidfd], [], [])
+    os.close(pidfd)
+    return 0
+
+
+def _server(chosen: Path | None) -> int:
+    """A pidfd of the server that listens. It is asked for its number over its key."""
+    address = status.address_here(chosen)
+    if address[1] is None:
+        raise status.UnreachableError(
+            "a server without keys cannot prove that it is ours: send it SIGTERM yourself"
+        )
+    pid = status.pid_of(*address)
+    pidfd = os.pidfd_open(pid)
+    try:
+        # a number may be given out anew; who says again that it is his has had it meanwhile
+        if status.pid_of(*address) != pid:
+            raise status.UnreachableError("the server has just been replaced: try again")
+    except BaseException:
+        os.close(pidfd)
+        raise
+    return pidfd
