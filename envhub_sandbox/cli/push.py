@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
     from envhub_sandbox.hub.snapshot import Snapshot
 
 _STEPS = 10
+_SHOWN = 5
 _SECRETS = frozenset(
     {".env", ".git-credentials", ".netrc", ".pypirc", "id_ed25519", "id_rsa", "credentials.json"}
 )
@@ -116,23 +119,47 @@ def _publish(
     message: str,
     private: bool,
 ) -> HubRef:
-    """Upload the copy in the store; gives the pinned reference."""
+    """Upload the copy in the store, and see that it has arrived; gives the pinned reference.
+
+    Raises:
+        RepositoryUnavailableError: The Hub refused.
+        SnapshotIntegrityError: It has other files now.
+    """
     from dataclasses import replace
 
-    from envhub_sandbox.errors import RepositoryUnavailableError
+    from envhub_sandbox.errors import SnapshotIntegrityError
     from envhub_sandbox.hub.client import HubClient, Repository, checked_endpoint, checked_token
-    from envhub_sandbox.hub.failures import HubFailure
+    from envhub_sandbox.hub.hashing import differing
+    from envhub_sandbox.hub.listing import DEFAULT_LIMITS, within_limits
 
     hub = HubClient(checked_endpoint(endpoint), checked_token(token))
     repo = Repository(target.repo_type or "model", target.repo_id)
-    try:
-        commit = hub.publish(repo, snapshot.root, target.revision, message, private=private)
-    except HubFailure as failure:
-        raise RepositoryUnavailableError(
-            f"{target} on {hub.public_endpoint}: nothing was published: {failure.what}. "
-            f"{failure.advice}. To publish takes a token that may write."
-        ) from failure.__cause__
+    where = f"{target} on {hub.public_endpoint}"
+    to_write = ". To publish takes a token that may write"
+    with _explained(f"{where}: nothing was published", to_write):
+        hub.publish(repo, snapshot.root, target.revision, message, private=private)
+    with _explained(f"{where}: it was published, and cannot be read back"):
+        commit = hub.resolve(repo, target.revision)
+        found = within_limits(hub.listing(repo, commit), DEFAULT_LIMITS, where)
+    missing = differing(snapshot.root, snapshot.files, found)
+    if missing:
+        raise SnapshotIntegrityError(
+            f"{where}: commit {commit} does not have {', '.join(missing[:_SHOWN])} as the folder "
+            "has it, so it is not what was checked; does a .gitignore leave that out?"
+        )
     return replace(target, revision=commit, path=snapshot.path)
+
+
+@contextlib.contextmanager
+def _explained(what: str, also: str = "") -> Iterator[None]:
+    from envhub_sandbox.errors import RepositoryUnavailableError
+    from envhub_sandbox.hub.failures import HubFailure
+
+    try:
+        yield
+    except HubFailure as failure:
+        text = f"{what}: {failure.what}. {failure.advice}{also}."
+        raise RepositoryUnavailableError(text) from failure.__cause__
 
 
 def _tell(snapshot: Snapshot, target: HubRef, dry_run: bool, *, as_json: bool) -> None:

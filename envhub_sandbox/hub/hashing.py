@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, Protocol
@@ -73,6 +73,18 @@ def copy_verified(source: Path, target: Path, record: FileRecord) -> None:
     found = f"{record.digest.partition(':')[0]}:{running.hexdigest()}"
     if written != record.size or found != record.digest:
         raise Mismatch(f"{written} bytes with {found}")
+
+
+def differing(root: Path, mine: Iterable[FileRecord], theirs: Iterable[FileRecord]) -> list[str]:
+    """The files below ``root`` that another listing has with other bytes, or not at all."""
+    listed = {record.path: record for record in theirs}
+    return [
+        file.path
+        for file in mine
+        if (there := listed.get(file.path)) is None
+        or there.size != file.size
+        or digest_of(root / file.path, there.digest.partition(":")[0], file.size) != there.digest
+    ]
 
 
 @contextmanager

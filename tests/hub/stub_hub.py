@@ -93,6 +93,7 @@ class StubHub:
         self.page_size: int | None = None
         self.sent = 0
         self.created: list[dict[str, Any]] = []
+        self.ignored: set[str] = set()
         self.stopped = threading.Event()
         hub = self
 
@@ -251,8 +252,11 @@ class _Handler(BaseHTTPRequestHandler):
             self._absent("RepoNotFound")
         elif steps[3] == "preupload":
             files = [file["path"] for file in json.loads(self._body)["files"]]
-            mode = {"uploadMode": "regular", "shouldIgnore": False}
-            self._send_json({"files": [{"path": path, **mode} for path in files]})
+            answers = [
+                {"path": path, "uploadMode": "regular", "shouldIgnore": path in self.stub.ignored}
+                for path in files
+            ]
+            self._send_json({"files": answers})
         else:
             self._commit(repository, "/".join(steps[1:3]))
 

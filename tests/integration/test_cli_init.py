@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
 
+from envhub_sandbox.cli.app import app
+from envhub_sandbox.cli.init import repository_name
+from envhub_sandbox.cli.shared.exits import UsageError
 from envhub_sandbox.cli.shared.starter import starter
 
 ENVHUB = [sys.executable, "-I", "-m", "envhub_sandbox"]
@@ -32,11 +34,10 @@ def run(folder: Path, *command: str, **variables: str) -> subprocess.CompletedPr
 
 def pytest_run(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
     """What an author would run, without what our own tests need."""
-    installed = {found.value for found in entry_points(group="pytest11")}
-    ours = () if PLUGIN in installed else ("-p", PLUGIN)  # a checkout of before may be installed
-    without = ("no:cacheprovider", "no:xdist", "no:hypothesispytest", "no:timeout")
-    plugins = [part for name in without for part in ("-p", name)]
-    return run(folder, sys.executable, "-m", "pytest", "-q", *ours, *plugins, *options)
+    # by its module: what is installed beside a checkout may be of before there was a plugin
+    plugins = ("no:envhub", PLUGIN, "no:cacheprovider", "no:xdist", "no:hypothesispytest")
+    chosen = [part for name in plugins for part in ("-p", name)]
+    return run(folder, sys.executable, "-m", "pytest", "-q", *chosen, *options)
 
 
 def test_a_new_repository_passes_its_own_tests(tmp_path: Path) -> None:
@@ -80,29 +81,26 @@ def test_a_fixture_without_a_reference_says_what_is_missing(tmp_path: Path) -> N
 @pytest.mark.parametrize("name", ["-x", "a--b", "a b", "a..b", "x.git", "é", ".env", "."])
 def test_names_that_the_hub_would_not_take_are_refused(tmp_path: Path, name: str) -> None:
     """Before anything is written."""
-    from envhub_sandbox.cli.init import repository_name
-    from envhub_sandbox.cli.shared.exits import UsageError
-
     folder = tmp_path / "a b" if name == "." else tmp_path / name
     with pytest.raises(UsageError, match="cannot be a name on the Hub"):
         repository_name(folder)
 
 
-def test_what_is_there_already_stays(tmp_path: Path) -> None:
+def test_what_is_there_already_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A folder with anything in it is not touched."""
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "env.py").write_text("precious")
-    done = run(tmp_path, *ENVHUB, "init", "mine")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert "is there already" in done.stderr
+    with pytest.raises(SystemExit) as ended:
+        app(["init", str(tmp_path / "mine")], prog_name="envhub")
+    assert ended.value.code == 2
+    assert "is there already" in capsys.readouterr().err
     assert [path.read_text() for path in (tmp_path / "mine").iterdir()] == ["precious"]
 
 
 def test_the_shell_completes_commands_and_options(tmp_path: Path) -> None:
     """By the script that ``--show-completion`` prints, which asks the program."""
-    words = {"COMP_WORDS": "envhub pu", "COMP_CWORD": "1", "_ENVHUB_COMPLETE": "complete_bash"}
-    assert run(tmp_path, *ENVHUB, **words).stdout.split() == ["push"]
-    words |= {"COMP_WORDS": "envhub run --vid", "COMP_CWORD": "2"}
+    words = {"COMP_WORDS": "envhub run --vid", "COMP_CWORD": "2"}
+    words |= {"_ENVHUB_COMPLETE": "complete_bash"}
     assert run(tmp_path, *ENVHUB, **words).stdout.split() == ["--video"]
     shown = {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
     assert "complete_bash" in run(tmp_path, *ENVHUB, "--show-completion", "bash", **shown).stdout

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
 from envhub_sandbox import make_env
+from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.shared.starter import starter
 from tests.hub.stub_hub import StubHub
 
 TOKEN = "hf_of_the_author"
-COMMAND = [sys.executable, "-I", "-m", "envhub_sandbox", "push"]
 
 
 @pytest.fixture
@@ -28,19 +27,36 @@ def mine(tmp_path: Path) -> Path:
     return folder
 
 
+class Done(NamedTuple):
+    """How the command ended."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
 def push(
-    hub: StubHub, folder: Path, *options: str, token: str = TOKEN
-) -> subprocess.CompletedProcess[str]:
-    """Run the command to its end."""
-    home = {"HF_HOME": str(folder.parent / "hf"), "HF_TOKEN": token}
-    return subprocess.run(
-        [*COMMAND, str(folder), "org/my-env", "--endpoint", hub.endpoint, *options],
-        capture_output=True,
-        text=True,
-        env={**os.environ, **home},
-        timeout=240,
-        check=False,
-    )
+    snapshot_store: Path,
+    stub_hub: StubHub,
+    mine: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> Callable[..., Done]:
+    """Run the command here, to its end."""
+    monkeypatch.setenv("HF_TOKEN", TOKEN)
+
+    def run(*options: str) -> Done:
+        arguments = ["push", str(mine), "org/my-env", "--endpoint", stub_hub.endpoint, *options]
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            app(arguments, prog_name="envhub")
+        return Done(int(ended.value.code or 0), *capsys.readouterr())
+
+    return run
+
+
+Push = Callable[..., Done]
 
 
 def writes(hub: StubHub) -> list[str]:
@@ -49,12 +65,12 @@ def writes(hub: StubHub) -> list[str]:
 
 
 def test_what_was_checked_is_published_and_runs(
-    stub_hub: StubHub, mine: Path, hub_cache: Path
+    push: Push, stub_hub: StubHub, mine: Path, hub_cache: Path
 ) -> None:
     """Every file, as it is, and none that no repository has; then by the pin that was printed."""
     (mine / ".git").mkdir()
     (mine / ".git" / "config").write_text("secret")
-    done = push(stub_hub, mine, "--private", "--json")
+    done = push("--private", "--json")
     assert done.returncode == 0, done.stderr
     [made] = stub_hub.created
     assert made["name"] == "my-env"
@@ -82,22 +98,28 @@ LIES = "return np.array([self.puck, 7], np.float32)"
     ],
 )
 def test_what_fails_is_not_published(
-    stub_hub: StubHub, mine: Path, path: str, change: tuple[str, str], code: int, said: str
+    push: Push,
+    stub_hub: StubHub,
+    mine: Path,
+    path: str,
+    change: tuple[str, str],
+    code: int,
+    said: str,
 ) -> None:
     """The Hub is not even asked; the text leads to the author's own line."""
     text = (mine / path).read_text() if (mine / path).exists() else ""
     (mine / path).write_text(text.replace(*change))
-    done = push(stub_hub, mine)
+    done = push()
     assert (done.returncode, done.stdout) == (code, "")
     assert said in done.stderr
     assert code != 4 or f'File "{mine}/env.py", line' in done.stderr
     assert stub_hub.requests == []
 
 
-def test_a_hub_that_refuses_is_a_message(stub_hub: StubHub, mine: Path) -> None:
+def test_a_hub_that_refuses_is_a_message(push: Push, stub_hub: StubHub) -> None:
     """With what to do, and without the token, which a careless server echoes."""
     stub_hub.fail("POST /api/repos", 403, headers={"X-Error-Message": f"no rights for {TOKEN}"})
-    done = push(stub_hub, mine)
+    done = push()
     assert (done.returncode, done.stdout) == (3, "")
     for text in ("org/my-env", "nothing was published", "takes a token that may write"):
         assert text in done.stderr
@@ -106,9 +128,17 @@ def test_a_hub_that_refuses_is_a_message(stub_hub: StubHub, mine: Path) -> None:
     assert len(writes(stub_hub)) == 1
 
 
-def test_a_dry_run_uploads_nothing(stub_hub: StubHub, mine: Path) -> None:
+def test_what_has_not_arrived_is_said(push: Push, stub_hub: StubHub) -> None:
+    """No reference is printed for a commit that is not what was checked."""
+    stub_hub.ignored = {"requirements.txt"}
+    done = push()
+    assert (done.returncode, done.stdout) == (3, "")
+    assert "does not have requirements.txt as the folder has it" in done.stderr
+
+
+def test_a_dry_run_uploads_nothing(push: Push, stub_hub: StubHub) -> None:
     """It is checked all the same, and says what it would upload."""
-    done = push(stub_hub, mine, "--dry-run")
+    done = push("--dry-run")
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == sorted(starter("my-env", 2026))
     assert stub_hub.requests == []
