@@ -34,6 +34,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import gc
 import os
 import select
 import signal
@@ -76,8 +77,11 @@ def _client_has_gone(arguments: argparse.Namespace) -> bool:
 
 def _serve_in(arguments: argparse.Namespace) -> int:
     ahead = _ahead(arguments)  # before anything heavy is imported: both are at it at once
+    gc.disable()  # as in the zygote: what is imported stays
     from envhub_worker.server import Server
 
+    gc.freeze()
+    gc.enable()
     announced = _announced() if arguments.announce else None
     server = Server(
         arguments.endpoint,

@@ -8,12 +8,12 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
 
 from envhub_worker.access.quotas import RefusedError
 from envhub_worker.lockdown.mechanisms.scratch import remove_tree
+from envhub_worker.protocol.records import dataclass
 
 BLOCK_BYTES = 4096
 """What the smallest file and each entry of a tree are charged: they take disk, too."""

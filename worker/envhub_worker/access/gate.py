@@ -8,7 +8,6 @@ have proved a key, and still may neither name a path of this machine nor take it
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
@@ -42,6 +41,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.busy import Busy
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.keys import KEY_BYTES, key_text
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.supervisor.jails import Jails
 from envhub_worker.supervisor.records import Asker, JailEntry
 from envhub_worker.supervisor.witness import Nobody, Witness

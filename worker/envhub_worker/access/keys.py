@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 import zmq
 from zmq.utils import z85
 
 from envhub_worker.protocol.keys import key_text, parse_key
+from envhub_worker.protocol.records import dataclass
 
 _SECRET_MODE = 0o600
 _MAX_FILE_BYTES = 1 << 20

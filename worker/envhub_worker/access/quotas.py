@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass as mutable_dataclass
+from dataclasses import field
 
 from envhub_worker.access.line import RETRY_S
 from envhub_worker.protocol import busy as busy_words
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.busy import Busy
 from envhub_worker.protocol.confinement import GIB, MIB, PROFILES, Confinement
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.supervisor.records import Asker
 
 
@@ -139,7 +141,7 @@ def check_jail(open_jails: Iterable[Use], more: Use, quotas: Quotas) -> None:
             raise BusyError(Busy(name, used[name], quota, RETRY_S), text)
 
 
-@dataclass
+@mutable_dataclass
 class InFlight:
     """Bytes that clients have sent and nobody has answered yet."""
 

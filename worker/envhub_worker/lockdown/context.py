@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from envhub_worker.lockdown.mechanisms.scratch import Scratch
 from envhub_worker.lockdown.plan import Plan
 from envhub_worker.lockdown.spec import JailSpec
+from envhub_worker.protocol.records import dataclass
 
 
 @dataclass(frozen=True, kw_only=True)

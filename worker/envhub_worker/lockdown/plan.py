@@ -6,11 +6,10 @@ a weaker profile goes without are listed too, with what stays possible.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from envhub_worker.lockdown.report import Layer, LayerUnavailableError
 from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
 from envhub_worker.protocol.confinement import LEAST_LANDLOCK, MIB, NETWORKS, PROFILES, Confinement
+from envhub_worker.protocol.records import dataclass
 
 #: What the kernel counts per user and nobody can bound per jail.
 SHARED_QUOTAS = "pages of pipes, descriptors under way in sockets, epoll watches"

@@ -8,9 +8,9 @@ from __future__ import annotations
 import os
 import posixpath
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 
 from envhub_worker.lockdown.mechanisms.namespaces import INSIDE_UID
+from envhub_worker.protocol.records import dataclass
 
 HOME = "/sandbox/home"
 WORK = "/sandbox/work"

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from typing import Any
 
 from envhub_worker.protocol.confinement import NETWORKS, PROFILES, Confinement, Limits
 from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.records import dataclass
 
 _MAX_LIMIT = 1 << 62
 _MAX_OUTPUT_BYTES = 64 << 20

@@ -7,7 +7,8 @@ name, ``fix`` three numbers. A client that knows nothing of it has a ``WorkerErr
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+
+from envhub_worker.protocol.records import dataclass
 
 ERROR = "ServerBusyError"
 DRAINING = "draining"

@@ -3,8 +3,10 @@ it may end."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Literal, get_args
+
+from envhub_worker.protocol.records import dataclass
 
 MIB = 1024 * 1024
 GIB = 1024 * MIB

@@ -7,7 +7,7 @@ are bounded, names are strings of bounded length, spaces are checked before they
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import gymnasium as gym
@@ -23,6 +23,7 @@ from envhub_worker.protocol.names import (
     optional_name,
     string_keys,
 )
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.spaces.reader import GeneratorMaker, SpaceReader
 from envhub_worker.protocol.spaces.spaces import encode_space
 from envhub_worker.protocol.untrusted import UNTRUSTED

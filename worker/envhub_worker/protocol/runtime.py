@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 
-@dataclass(frozen=True)
-class Runtime:
+class Runtime(NamedTuple):
     """An interpreter and a folder of packages.
+
+    No dataclass, for a server needs one before it starts its zygote: these import ``inspect``.
 
     Attributes:
         python: Absolute path of the interpreter. It belongs to the machine and is trusted; empty

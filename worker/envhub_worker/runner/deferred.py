@@ -16,13 +16,13 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import gymnasium as gym
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
 
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.runner import gymnasium_compat as compat
 
 _KEY = "_envhub_recording"

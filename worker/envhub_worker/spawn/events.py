@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 from envhub_worker.protocol.confinement import Reason
+from envhub_worker.protocol.records import dataclass
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import select
 import signal
 import socket
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from envhub_worker.lockdown.mechanisms.scratch import Scratch, remove_tree
 from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.confinement import Confinement
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import OWN, Runtime
 from envhub_worker.spawn.events import (
     Failed,

@@ -15,7 +15,6 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NoReturn
 
 from envhub_worker.channel import Channel
@@ -26,6 +25,7 @@ from envhub_worker.lockdown.mechanisms.environment import jail_environment
 from envhub_worker.lockdown.report import Layer, LayerUnavailableError
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.lockdown.stages import runner
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.spawn import blas, packages
 
 _SELF_TEST = Layer("self-test", True, "the denials above were tried and held")

@@ -11,11 +11,11 @@ import os
 import stat
 import struct
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 from envhub_worker.lockdown.mechanisms.kernel import syscall
 from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp.syscalls import number
+from envhub_worker.protocol.records import dataclass
 
 _VERSION = 1
 _RULE_PATH_BENEATH = 1

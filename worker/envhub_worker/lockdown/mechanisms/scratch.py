@@ -6,9 +6,9 @@ import contextlib
 import os
 import secrets
 import stat
-from dataclasses import dataclass
 
 from envhub_worker.lockdown.root_plan import HOME, SHARED_MEMORY, TEMPORARY, WORK
+from envhub_worker.protocol.records import dataclass
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ EPERM; one that they do not name answers ENOSYS, so that programs fall back.
 from __future__ import annotations
 
 import errno
-from dataclasses import dataclass
+
+from envhub_worker.protocol.records import dataclass
 
 _ERRNO = 0x00050000
 ALLOW = 0x7FFF0000

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import field
 from enum import Enum
 from typing import NoReturn
 
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.text import printable
 
 _ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")

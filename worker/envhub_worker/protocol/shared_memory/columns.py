@@ -8,11 +8,11 @@ offset and no schema ever comes from the jail.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.shared_memory.slabs import INFO_BYTES, LINE
 
 MAX_COLUMNS = 256

@@ -21,7 +21,6 @@ from __future__ import annotations
 import math
 import mmap
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -29,6 +28,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.shared_memory.words import SEQUENCE as SEQUENCE
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
 

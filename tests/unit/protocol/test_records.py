@@ -1,0 +1,144 @@
+"""Records are what the standard library makes of the same fields, but for how they are made."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import pickle
+import subprocess
+import sys
+from dataclasses import field
+from typing import Any
+
+import pytest
+
+from envhub_worker.protocol import records
+
+
+@records.dataclass(frozen=True)
+class Ours:
+    """Defaults of both kinds, and a field that is neither compared nor shown."""
+
+    first: int
+    second: str = "b"
+    third: list[int] = field(default_factory=list)
+    last: object = field(default=None, compare=False, repr=False)
+
+
+@dataclasses.dataclass(frozen=True)
+class Theirs:
+    """The same of the standard library."""
+
+    first: int
+    second: str = "b"
+    third: list[int] = field(default_factory=list)
+    last: object = field(default=None, compare=False, repr=False)
+
+
+@records.dataclass(frozen=True, kw_only=True)
+class Named:
+    """Nothing may be given in order."""
+
+    only: int
+
+
+@records.dataclass(frozen=True, repr=False)
+class Below(Ours):
+    """A field more, and the parent's ``repr``."""
+
+    more: tuple[int, ...] = ()
+
+
+CALLS: list[tuple[tuple[Any, ...], dict[str, Any]]] = [
+    ((1,), {}),
+    ((1, "x"), {"last": 4}),
+    ((), {"first": 1, "third": [3]}),
+    ((1, "x", [2], None), {}),
+]
+WRONG: list[tuple[tuple[Any, ...], dict[str, Any]]] = [
+    ((), {}),
+    ((1, "x", [2], None, 5), {}),
+    ((1,), {"first": 2}),
+    ((1,), {"other": 2}),
+]
+
+
+@pytest.mark.parametrize(("values", "named"), CALLS)
+def test_fields_are_those_of_the_standard_library(
+    values: tuple[Any, ...], named: dict[str, Any]
+) -> None:
+    """Values, text, and what the functions of ``dataclasses`` make of them."""
+    ours, theirs = Ours(*values, **named), Theirs(*values, **named)
+    assert dataclasses.asdict(ours) == dataclasses.asdict(theirs)
+    assert repr(ours) == repr(theirs).replace("Theirs", "Ours")
+    changed = dataclasses.replace(ours, second="c")
+    assert (changed.first, changed.second, changed.third) == (ours.first, "c", ours.third)
+
+
+@pytest.mark.parametrize(("values", "named"), WRONG)
+def test_wrong_arguments_are_refused_where_the_standard_library_does(
+    values: tuple[Any, ...], named: dict[str, Any]
+) -> None:
+    """Too few, too many, twice, unknown."""
+    for kind in (Theirs, Ours):
+        with pytest.raises(TypeError):
+            kind(*values, **named)
+
+
+def test_fields_by_name_are_not_taken_in_order() -> None:
+    """``kw_only`` holds."""
+    assert Named(only=1).only == 1
+    with pytest.raises(TypeError, match="Named takes only"):
+        Named(1)  # type: ignore[misc]
+
+
+def test_records_do_not_change() -> None:
+    """Neither assignment nor deletion, of fields and of others."""
+    record: Any = Ours(1)
+    for name in ("first", "other"):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(record, name, 2)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        del record.first
+    assert record.first == 1
+
+
+def test_equality_and_hash_go_by_compared_fields_of_one_class() -> None:
+    """A default is not shared, a field that is not compared does not count, a class does."""
+    assert Named(only=1) == Named(only=1)
+    assert hash(Named(only=1)) == hash(Named(only=1))
+    assert Named(only=1) != Named(only=2)
+    assert Ours(1, last=2) == Ours(1, last=3)
+    assert Ours(1).third is not Ours(1).third
+    assert Ours(1) != Below(1)
+    assert Named(only=1) != 1
+
+
+def test_subclasses_add_fields() -> None:
+    """Those of the parent come first."""
+    below = Below(1, more=(2,))
+    assert [one.name for one in dataclasses.fields(below)][-1] == "more"
+    assert repr(below) == "Below(first=1, second='b', third=[])"
+    assert below == Below(1, more=(2,)) != Below(1)
+
+
+def test_copies_are_equal() -> None:
+    """By ``copy`` and by ``pickle``."""
+    record = Ours(1, third=[1, 2])
+    assert copy.deepcopy(record) == pickle.loads(pickle.dumps(record)) == record
+
+
+def test_zygote_is_started_before_inspect_is_imported() -> None:
+    """What stands before it in a server's start takes time that nothing else does."""
+    program = (
+        "import sys, envhub_worker.__main__, envhub_worker.spawn.zygote_process;"
+        "print('inspect' in sys.modules, 'argparse' in sys.modules)"
+    )
+    found = subprocess.run(
+        [sys.executable, "-S", "-c", program],
+        env={"PYTHONPATH": records.__file__.rsplit("/envhub_worker/", 1)[0]},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert found.stdout.split() == ["False", "True"]
