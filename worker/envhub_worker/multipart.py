@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import zmq
 
-from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.codec.kinds import Buffer
 
 # plain numbers: as members of an enumeration they cost more than the calls that take them
 _MORE = int(zmq.SNDMORE)

@@ -22,7 +22,7 @@ from envhub_worker.lockdown.mechanisms.scratch import remove_tree
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import compression
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimits
 from envhub_worker.spawn.zygote_process import ZygoteProcess

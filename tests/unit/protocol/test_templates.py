@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec import templates
+from envhub_worker.protocol.codec.arrays import ArrayReader
 from envhub_worker.protocol.codec.codec import decode, encode
 from envhub_worker.protocol.errors import (
     LocalProtocolError,
@@ -250,7 +251,7 @@ def test_an_id_that_nobody_can_answer_under_is_refused(number: int) -> None:
 def test_memory_that_is_not_there_is_the_peers_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     """As without a form."""
     header, large = _framed()
-    monkeypatch.setattr(templates.ArrayReader, "take", _without_memory)
+    monkeypatch.setattr(ArrayReader, "take", _without_memory)
     with pytest.raises(MessageTooLargeError):
         m.unpack([header, large])
 

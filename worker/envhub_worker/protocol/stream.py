@@ -10,9 +10,7 @@ import struct
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-import numpy as np
-
-from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 
@@ -113,6 +111,15 @@ def _check_lengths(lengths: tuple[int, ...], limits: WireLimits) -> None:
         )
 
 
+def _space(size: int) -> memoryview:
+    """Memory for a body. A length that is declared and never sent costs next to none."""
+    if size <= _SMALL_CHUNK:
+        return memoryview(bytearray(size))
+    import numpy as np  # which maps large blocks lazily, and which a server may never need
+
+    return np.empty(size, np.uint8).data
+
+
 class PacketReader:
     """Cuts a byte stream into packets.
 
@@ -169,8 +176,7 @@ class PacketReader:
     def _begin_body(self) -> None:
         self._head = _read_head(self._pending, len(self._pending), self._limits, self._check)
         self._pending.clear()
-        # numpy maps large blocks lazily: a length that is declared and never sent costs no memory
-        self._body = np.empty(sum(self._head[1]), np.uint8).data
+        self._body = _space(sum(self._head[1]))
         self._filled = 0
 
     def _fill_body(self, data: memoryview) -> memoryview:

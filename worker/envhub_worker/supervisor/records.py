@@ -9,7 +9,7 @@ from time import monotonic
 from typing import Any, NamedTuple, Protocol
 
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.confinement import Reason
 from envhub_worker.spawn.jail_handle import Jail
 from envhub_worker.supervisor.idle_timer import Idleness

@@ -11,18 +11,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from envhub_worker.protocol.codec import structure
-from envhub_worker.protocol.codec.arrays import ArrayReader, Buffer
+from envhub_worker.protocol.codec.arrays import ArrayReader
 from envhub_worker.protocol.codec.decoder import Decoder, TensorMaker, ThingReader, Unpickler
 from envhub_worker.protocol.codec.encoder import Describer, Encoder
 from envhub_worker.protocol.codec.exact import Pickler
 from envhub_worker.protocol.codec.explain import explain
+from envhub_worker.protocol.codec.frames import check_outgoing, split
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
-from envhub_worker.protocol.codec.kinds import DOCUMENT_BYTES
-from envhub_worker.protocol.errors import (
-    LocalProtocolError,
-    MessageTooLargeError,
-    RemoteProtocolError,
-)
+from envhub_worker.protocol.codec.kinds import Buffer
+from envhub_worker.protocol.errors import LocalProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 
 __all__ = ["Buffer", "RemoteEnum", "RemoteObject", "decode", "encode"]
@@ -112,46 +109,3 @@ def decode_parts(
     value = decoder.value(document)
     reader.finish()
     return value
-
-
-def check_outgoing(frames: Sequence[Buffer], limits: WireLimits) -> None:
-    """Raises ``LocalProtocolError`` for frames that the receiver will not accept."""
-    try:
-        _check_sizes(frames, limits)
-    except MessageTooLargeError as error:
-        raise LocalProtocolError(f"The message is too large to be sent: {error}") from None
-
-
-def split(frames: Sequence[Buffer], limits: WireLimits) -> tuple[bytes, Buffer, list[Buffer]]:
-    """Checks the frames' sizes; returns document, tail of the header, and the other frames.
-
-    Raises:
-        MessageTooLargeError: Over one of ``limits``.
-        RemoteProtocolError: There is no header, or not all of it.
-    """
-    flat = [frame if type(frame) is bytes else memoryview(frame).cast("B") for frame in frames]
-    _check_sizes(flat, limits)
-    header, *buffers = flat
-    if len(header) < DOCUMENT_BYTES.size:
-        raise RemoteProtocolError("The header is too short.")
-    end = DOCUMENT_BYTES.size + DOCUMENT_BYTES.unpack_from(header)[0]
-    if end > len(header):
-        raise RemoteProtocolError("The header is shorter than it says.")
-    return bytes(header[DOCUMENT_BYTES.size : end]), header[end:], buffers
-
-
-def _check_sizes(frames: Sequence[Buffer], limits: WireLimits) -> None:
-    """Raises ``MessageTooLargeError`` for too much. Frames must consist of single bytes."""
-    if not frames:
-        raise RemoteProtocolError("A message has no frame.")
-    if len(frames) == 1 and len(frames[0]) <= min(limits.header_bytes, limits.message_bytes):
-        return
-    sizes = list(map(len, frames))
-    for name, size, cap in (
-        ("frames", len(sizes), limits.frames),
-        ("header_bytes", sizes[0], limits.header_bytes),
-        ("frame_bytes", max(sizes), max(limits.frame_bytes, sizes[0])),
-        ("message_bytes", sum(sizes), limits.message_bytes),
-    ):
-        if size > cap:
-            raise MessageTooLargeError(f"{size} is over the limit of {cap} ({name}).")

@@ -13,7 +13,6 @@ import numpy as np
 from envhub_worker.protocol.codec.arrays import (
     Array,
     ArrayReader,
-    Buffer,
     read_scalar,
     unpack_shape,
 )
@@ -46,6 +45,7 @@ from envhub_worker.protocol.codec.kinds import (
     TENSOR_DTYPES,
     TEXT_SCALAR,
     TUPLE,
+    Buffer,
 )
 from envhub_worker.protocol.errors import MessageTooLargeError, ProtocolError, RemoteProtocolError
 from envhub_worker.protocol.limits import WireLimits

@@ -11,7 +11,7 @@ import msgpack  # type: ignore[import-untyped]
 import numpy as np
 
 from envhub_worker.protocol.codec import structure
-from envhub_worker.protocol.codec.arrays import Array, ArrayWriter, Buffer, pack_shape, write_scalar
+from envhub_worker.protocol.codec.arrays import Array, ArrayWriter, pack_shape, write_scalar
 from envhub_worker.protocol.codec.exact import Pickled, Pickler
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject, describe, describe_enum
 from envhub_worker.protocol.codec.kinds import (
@@ -35,6 +35,7 @@ from envhub_worker.protocol.codec.kinds import (
     TENSOR_DTYPES,
     TEXT_SCALAR,
     TUPLE,
+    Buffer,
 )
 from envhub_worker.protocol.errors import LocalProtocolError
 from envhub_worker.protocol.limits import WireLimits

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import struct
 
+Buffer = bytes | memoryview
+
 # Extensions that are a value by themselves.
 ARRAY, SCALAR, INTEGER, COMPLEX, PICKLE, PICKLE_FRAME = 1, 2, 3, 4, 5, 6
 # Extensions that head a msgpack array and say what its other elements make.

@@ -3,30 +3,28 @@
 In a run of steps nearly every message is of that kind. So what the codec has made of a document
 is kept, when it is met again: a *form*, into which only the arrays are put. The key is the whole
 document, or all that it depends on, so a form says exactly what the codec would say. Forms are
-few and small: a peer that sends nothing twice gains nothing and costs nothing.
+few and small: a peer that sends nothing twice gains nothing and costs nothing. numpy is imported
+by the first array, for a server has none.
 """
 
 from __future__ import annotations
 
 import struct
+import sys
 from collections.abc import Callable
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import msgpack  # type: ignore[import-untyped]
-import numpy as np
 
-from envhub_worker.protocol.codec.arrays import (
-    Array,
-    ArrayReader,
-    ArrayWriter,
-    Buffer,
-    check_content,
-    parse_descriptor,
-)
-from envhub_worker.protocol.codec.codec import check_outgoing, split
-from envhub_worker.protocol.codec.kinds import ARRAY, DOCUMENT_BYTES, TUPLE
+from envhub_worker.protocol.codec.frames import check_outgoing, split
+from envhub_worker.protocol.codec.kinds import ARRAY, DOCUMENT_BYTES, TUPLE, Buffer
 from envhub_worker.protocol.errors import MessageTooLargeError
 from envhub_worker.protocol.limits import WireLimits
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from envhub_worker.protocol.codec.arrays import Array, ArrayReader
 
 MAX_DOCUMENT_BYTES = 1024
 _MAX_FORMS = 256
@@ -89,6 +87,8 @@ class Outgoing:
         """
         if self._in_header:
             return [b"".join([self._head, *[array.tobytes() for array in arrays]])]
+        from envhub_worker.protocol.codec.arrays import ArrayWriter
+
         writer = ArrayWriter()
         for array in arrays:
             writer.add(array)
@@ -109,7 +109,10 @@ class Incoming(Generic[T]):
         limits: For which it holds; None if it does not hold at all.
     """
 
-    __slots__ = ("_descriptors", "_make", "_message", "_shape", "_tail_bytes", "_views", "limits")
+    __slots__ = (
+        *("_descriptors", "_make", "_message", "_own", "_shape", "_tail_bytes", "_views"),
+        "limits",
+    )
 
     def __init__(self, document: bytes, make: Callable[..., T], limits: WireLimits) -> None:
         self._make = make
@@ -133,7 +136,12 @@ class Incoming(Generic[T]):
     def _lay_out(self) -> None:
         """Where each array lies, if all lie in the tail of the header and hold numbers."""
         start = 0
-        for dtype, shape, nbytes, own_frame in map(parse_descriptor, self._descriptors):
+        if self._descriptors:
+            from envhub_worker.protocol.codec.arrays import own, parse_descriptor
+
+            self._own = own
+        for descriptor in self._descriptors:
+            dtype, shape, nbytes, own_frame = parse_descriptor(descriptor)
             if own_frame or dtype.kind not in _NUMBERS:
                 self._tail_bytes = None
                 self._views.clear()
@@ -150,8 +158,10 @@ class Incoming(Generic[T]):
         """
         assert self.limits is not None
         if len(tail) == self._tail_bytes and not buffers:
-            arrays = [_own(tail[where], dtype, shape) for dtype, shape, where in self._views]
+            arrays = [self._own(tail[where], dtype, shape) for dtype, shape, where in self._views]
         else:
+            from envhub_worker.protocol.codec.arrays import ArrayReader
+
             arrays = self._read(ArrayReader(tail, buffers, self.limits, copy=True))
         if self._message is not None:
             return self._message
@@ -167,14 +177,6 @@ class Incoming(Generic[T]):
             raise MessageTooLargeError("There is not enough memory to decode it.") from error
         reader.finish()
         return arrays
-
-
-def _own(raw: Buffer, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
-    """An array of its own memory."""
-    array: Array = np.ndarray(shape, dtype, bytearray(raw))
-    if dtype.kind == "b":
-        check_content(array)
-    return array
 
 
 class _Place:
@@ -244,7 +246,7 @@ def outline(values: list[Any]) -> tuple[Any, list[Array]] | None:
 
 def _outlined(value: Any, arrays: list[Array]) -> Any:
     kind = type(value)
-    if kind is np.ndarray:
+    if kind.__name__ == "ndarray" and kind is getattr(sys.modules.get("numpy"), "ndarray", None):
         if value.dtype.kind not in _NUMBERS:
             raise _IrregularError
         arrays.append(value)

@@ -12,22 +12,24 @@ and the id stands in front of the header, so that a message that recurs is the s
 from __future__ import annotations
 
 import struct
+import sys
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgpack  # type: ignore[import-untyped]
 
-from envhub_worker.protocol.codec import templates
-from envhub_worker.protocol.codec.codec import Buffer, decode_parts, encode, split
-from envhub_worker.protocol.codec.decoder import ThingReader, Unpickler
-from envhub_worker.protocol.codec.encoder import Describer
-from envhub_worker.protocol.codec.exact import Pickler, handed_over
-from envhub_worker.protocol.codec.explain import unpicklable
-from envhub_worker.protocol.codec.kinds import DOCUMENT_BYTES
+from envhub_worker.protocol.codec import plain, templates
+from envhub_worker.protocol.codec.frames import split
+from envhub_worker.protocol.codec.kinds import DOCUMENT_BYTES, Buffer
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.messages.base import KINDS, Message, check_fields, values_of
 from envhub_worker.protocol.untrusted import UNTRUSTED
+
+if TYPE_CHECKING:
+    from envhub_worker.protocol.codec.decoder import ThingReader, Unpickler
+    from envhub_worker.protocol.codec.encoder import Describer
+    from envhub_worker.protocol.codec.exact import Pickler
 
 FIRST_NUMBERED_VERSION = 8
 _HEAD_BYTES = 64
@@ -77,6 +79,9 @@ def _handed(
     message: Message, values: list[Any], pickler: Pickler, limits: WireLimits
 ) -> list[object]:
     """The fields as they are sent."""
+    from envhub_worker.protocol.codec.exact import handed_over
+    from envhub_worker.protocol.codec.explain import unpicklable
+
     sent = list(values)
     for index, name in enumerate(message.FIELDS):
         if name not in message.HANDED:
@@ -98,11 +103,22 @@ def _encoded(
     describer: Describer | None = None,
 ) -> list[Buffer]:
     value, names = [message.kind, request_id, *values], ("kind", "id", *message.FIELDS)
+    if _without_numpy():
+        frame = plain.encode(value, limits)
+        if frame is not None:
+            return [frame]
+    from envhub_worker.protocol.codec.codec import encode
+
     try:
         how: Any = {"limits": limits, "names": names, "describer": describer}
         return encode(value, pickler=pickler, **how)
     except LocalProtocolError as error:
         raise LocalProtocolError(f"{_asked(message)}{error}") from error.__cause__
+
+
+def _without_numpy() -> bool:
+    """A server does without until it has to handle an array; all others have it already."""
+    return "numpy" not in sys.modules
 
 
 def _asked(message: Message) -> str:
@@ -216,7 +232,13 @@ def _decode(
     tensors: Callable[[Any, str], object] | None,
     things: ThingReader | None,
 ) -> tuple[int, Message]:
-    value = decode_parts(document, tail, buffers, limits, unpickler, tensors, things)
+    value = plain.NOT_PLAIN
+    if _without_numpy() and not tail and not buffers:
+        value = plain.decode(document, limits)
+    if value is plain.NOT_PLAIN:
+        from envhub_worker.protocol.codec.codec import decode_parts
+
+        value = decode_parts(document, tail, buffers, limits, unpickler, tensors, things)
     if type(value) is not list or len(value) < 2:
         raise RemoteProtocolError("a message is a list that starts with its kind and its id")
     kind, request_id, *rest = value
