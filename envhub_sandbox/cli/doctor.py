@@ -7,9 +7,11 @@ missing, so the layers are also tried one by one, to name all of them at once.
 
 from __future__ import annotations
 
+import contextlib
 import json as json_format
 import os
 import platform
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -21,8 +23,9 @@ from typing import Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared.console import console, print_json, safe_line, safe_text
-from envhub_sandbox.cli.shared.exits import Exit, describe, reported
+from envhub_sandbox.cli.shared.exits import Exit, UsageError, describe, reported
 from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.version import versions
 from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError
 
 _ENV_PY = '''"""Does nothing: `envhub doctor` runs it to see what confines it."""
@@ -73,6 +76,12 @@ class Finding:
 
 
 def doctor(
+    server: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[tcp://HOST:PORT]", help="A server on another host, to be asked instead."
+        ),
+    ] = None,
     profile: Annotated[
         str,
         typer.Option(
@@ -83,15 +92,30 @@ def doctor(
         bool, typer.Option("--json", help="Print one JSON document on stdout.")
     ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    server_key: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KEY",
+            help="That server's public key; else $ENVHUB_SERVER_KEY, or what known_hosts says.",
+        ),
+    ] = None,
 ) -> None:
     """Try what this host can enforce, say what is missing and how to get it.
 
-    Exits with 0 if the profile (strict by default) can be enforced, and with 6 if it cannot.
+    Exits with 0 if the profile (strict by default) can be enforced, and with 6 if it cannot. With
+    a server, asks it over our key: 6 also if it is not reached or does not know us, 5 if it is
+    about to end or refuses.
     """
     with reported(debug=debug):
         from envhub_sandbox.policy import PROFILES, Policy
 
         Policy(profile=profile)  # refuses a name that there is not, before anything is tried
+        if server is not None:
+            from envhub_sandbox.cli import remote_doctor
+
+            raise typer.Exit(remote_doctor.examine(server, server_key, profile, json=json))
+        if server_key is not None:
+            raise UsageError("--server-key is of a server: envhub doctor tcp://HOST:PORT")
         with Bar(quiet=json) as bar, tempfile.TemporaryDirectory(prefix="envhub-doctor-") as folder:
             (Path(folder) / "env.py").write_text(_ENV_PY)
             findings = []
@@ -102,7 +126,8 @@ def doctor(
             probed = probe()
         if json:
             profiles = [asdict(finding) for finding in findings]
-            print_json({"host": host(), "profiles": profiles, **probed})
+            told = {"versions": versions(), "engine": engine(), **resources()}
+            print_json({"host": host(), **told, "profiles": profiles, **probed})
         else:
             _print(findings)
             _print_missing(probed)
@@ -118,6 +143,35 @@ def host() -> dict[str, Any]:
         "root": os.geteuid() == 0,
         "python": f"{platform.python_implementation()} {platform.python_version()}",
     }
+
+
+def engine() -> dict[str, Any]:
+    """The container engine that ``sandbox="docker"`` would use, or why there is none."""
+    from envhub_sandbox.sandboxes.docker.engines import find_engine
+
+    try:
+        found = find_engine(None)
+    except EnvHubError as error:
+        return {"kind": None, "version": None, "rootless": None, "problem": describe(error)}
+    facts = {"kind": found.kind, "version": found.version, "rootless": found.rootless}
+    return {**facts, "problem": None}
+
+
+def resources() -> dict[str, Any]:
+    """Bytes that are free: of memory, None where the kernel does not tell, and for the cache."""
+    from envhub_sandbox.hub.store import cache_root
+
+    folder = next(one for one in (cache_root(), *cache_root().parents) if one.is_dir())
+    disk = {"folder": str(folder), "free_bytes": shutil.disk_usage(folder).free}
+    return {"free_memory_bytes": _available(Path("/proc/meminfo")), "disk": disk}
+
+
+def _available(meminfo: Path) -> int | None:
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        for line in meminfo.read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    return None
 
 
 def probe() -> dict[str, Any]:

@@ -17,18 +17,23 @@ def version(
     json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Print versions: ours, the protocol's, Python's and of the packages that matter."""
+    with reported(debug=False):
+        found = versions()
+        if json:
+            print_json(found)
+        else:
+            for name, text in found.items():
+                typer.echo(f"{name:<16} {text or 'not installed'}")
+
+
+def versions() -> dict[str, str | int | None]:
+    """Ours, and of what we stand on; None for what is not installed."""
     from envhub_sandbox import __version__
     from envhub_worker.protocol.messages import VERSION
 
-    with reported(debug=False):
-        versions = {"envhub-sandbox": __version__, "protocol": VERSION}
-        versions |= {"python": platform.python_version(), "platform": platform.platform()}
-        versions |= {name: _installed(name) for name in _PACKAGES}
-        if json:
-            print_json(versions)
-        else:
-            for name, text in versions.items():
-                typer.echo(f"{name:<16} {text or 'not installed'}")
+    own: dict[str, str | int | None] = {"envhub-sandbox": __version__, "protocol": VERSION}
+    own |= {"python": platform.python_version(), "platform": platform.platform()}
+    return own | {name: _installed(name) for name in _PACKAGES}
 
 
 def _installed(name: str) -> str | None:

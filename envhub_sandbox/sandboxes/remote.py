@@ -96,9 +96,14 @@ class RemoteSandbox:
             SandboxUnavailableError: A key is missing.
         """
         check_policy(policy, runtime)
-        return RemoteRepository(self.endpoint, self._far(), snapshot, policy, self.retry_s)
+        return RemoteRepository(self.endpoint, self.far(), snapshot, policy, self.retry_s)
 
-    def _far(self) -> Far:
+    def far(self) -> Far:
+        """The server's key and ours.
+
+        Raises:
+            SandboxUnavailableError: One is missing.
+        """
         if self.insecure_loopback:
             return Far(None, None, self.heartbeat_s)
         server_key = _server_key(self.endpoint, self.server_key)

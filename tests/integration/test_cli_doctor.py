@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from envhub_sandbox import api
+from envhub_sandbox import __version__, api
 from envhub_sandbox.cli import doctor as doctor_command
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
@@ -32,6 +32,19 @@ def test_the_strict_profile_is_tried_for_real() -> None:
     # what a plain user runs is counted together with the rest that he runs
     counted = set() if os.getuid() == 0 else {"user-quotas"}
     assert {layer["layer"] for layer in strict["layers"] if not layer["enforced"]} == counted
+
+
+def test_what_else_explains_a_host_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Versions, the container engine or why there is none, free memory and disk."""
+    fail_with(monkeypatch, {})
+    monkeypatch.setenv("PATH", "/nowhere")
+    found = json.loads(RUNNER.invoke(app, ["doctor", "--json"]).stdout)
+    assert found["versions"]["envhub-sandbox"] == __version__
+    assert found["versions"]["numpy"]
+    assert found["engine"]["kind"] is None
+    assert "no docker on PATH" in found["engine"]["problem"]
+    assert found["free_memory_bytes"] > 0
+    assert found["disk"]["free_bytes"] > 0
 
 
 def test_each_layer_is_tried_by_itself() -> None:

@@ -1,0 +1,79 @@
+"""``envhub doctor tcp://HOST:PORT``: what a server on another host says, if it lets us in."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from envhub_sandbox.cli.shared.console import console, print_json, safe_line
+from envhub_sandbox.cli.shared.exits import Exit
+from envhub_sandbox.sandboxes.remote import RemoteSandbox
+from envhub_sandbox.sandboxes.server_facts import ServerFacts, ask
+
+_USED = {
+    "sessions": "sessions",
+    "jails": "jails",
+    "runners": "runners",
+    "memory_bytes": "memory_limit_bytes",
+    "upload_bytes": "upload_bytes",
+    "inflight_bytes": "inflight_bytes",
+}
+"""Quotas, and what is used of them, by their names in the figures."""
+
+
+def examine(endpoint: str, server_key: str | None, profile: str, *, json: bool) -> Exit:
+    """Ask a server and print what it says; the exit code is that of the profile.
+
+    Raises:
+        EnvHubError: It is not reached, or does not let us in.
+    """
+    facts = ask(RemoteSandbox(endpoint, server_key=server_key))
+    code, problem = _verdict(facts, profile)
+    if json:
+        told = {**asdict(facts), "endpoint": endpoint}
+        print_json({"server": told, "profile": profile, "problem": problem, "code": code})
+    else:
+        _print(endpoint, facts, problem)
+    return code
+
+
+def _verdict(facts: ServerFacts, profile: str) -> tuple[Exit, str | None]:
+    if facts.draining:
+        return Exit.WORKER, "it is about to end, and lets nothing new in"
+    if not facts.told or facts.enforces(profile):
+        return Exit.OK, None
+    return Exit.SANDBOX, (
+        f"no jail with the profile {profile!r} there: {facts.profile!r} is the strongest that it "
+        f"can have, and {facts.weakest_profile!r} the weakest that its operator permits"
+    )
+
+
+def _print(endpoint: str, facts: ServerFacts, problem: str | None) -> None:
+    out = console()
+    out.print(
+        f"{safe_line(endpoint)}: envhub-worker {facts.version}, protocol {facts.protocol}; it "
+        f"knows our key, and answered after {facts.answered_s:.2f} s"
+    )
+    if not facts.told:
+        out.print("It is older than this client, and does not say what it can enforce.")
+    else:
+        granted = [name for name in ("network", "gpu") if getattr(facts, name)]
+        out.print(
+            f"Python {facts.python}; jails there can have the profile {facts.profile} at most, and "
+            f"a policy may ask for {facts.weakest_profile} at least"
+            + (f", and for: {', '.join(granted)}" if granted else "")
+        )
+    for line in _quotas(facts):
+        out.print(f"  {line}")
+    if problem is not None:
+        out.print(problem, style="bold red")
+
+
+def _quotas(facts: ServerFacts) -> list[str]:
+    used: dict[str, Any] = facts.used
+    return [
+        f"{safe_line(name)}: {used.get(_USED.get(name, ''), 0)} of {limit}"
+        if name in _USED
+        else f"{safe_line(name)}: at most {limit}"
+        for name, limit in facts.quotas.items()
+    ]

@@ -1,0 +1,133 @@
+"""What a server on another host says about itself, asked without taking a place of its client's."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from time import monotonic
+from typing import Any
+
+from envhub_sandbox.sandboxes.remote import RemoteSandbox
+from envhub_sandbox.transport.connection import WorkerClient, expect
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.confinement import PROFILES
+from envhub_worker.protocol.text import printable
+
+_WAIT_S = 15.0
+_LOOKER = b"status"
+"""The session of whoever only looks; it is not counted."""
+_WORDS = ("python", "profile", "weakest_profile")
+_MOST = 1 << 63
+_MOST_NAMES = 32
+_MOST_CHARS = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServerFacts:
+    """What is known of a server. Trust: its own words, checked for their types alone.
+
+    Attributes:
+        version: Of its package.
+        protocol: The version that was agreed on.
+        answered_s: From knocking to its welcome.
+        told: Whether it says more than that; older servers do not.
+        python: Of the server.
+        profile: The strongest that a jail can have there.
+        weakest_profile: That a policy may ask for.
+        network: Whether a policy may ask for the server's network.
+        gpu: Likewise.
+        draining: Whether it is about to end, and lets nothing new in.
+        quotas: What our key may have.
+        used: What it has of that, all its processes together.
+    """
+
+    version: str
+    protocol: int
+    answered_s: float
+    quotas: dict[str, int]
+    used: dict[str, int]
+    told: bool = False
+    python: str = ""
+    profile: str = ""
+    weakest_profile: str = ""
+    network: bool = False
+    gpu: bool = False
+    draining: bool = False
+
+    def enforces(self, profile: str) -> bool:
+        """Whether a jail can have a profile there, and may."""
+        known = (self.profile, profile, self.weakest_profile)
+        if not all(one in PROFILES for one in known):
+            return False
+        strongest, asked, weakest = map(PROFILES.index, known)
+        return strongest <= asked <= weakest
+
+
+def ask(sandbox: RemoteSandbox) -> ServerFacts:
+    """Ask a server.
+
+    Raises:
+        SandboxUnavailableError: Nothing answers there, or it does not let us in.
+        VersionMismatchError: It shares no version of the protocol with us.
+        WorkerError: It refuses to answer.
+    """
+    begun, deadline = monotonic(), Deadline(_WAIT_S)
+    with _connection(sandbox) as client:
+        greeting = m.Hello(m.OLDEST_VERSION, m.VERSION, _LOOKER)
+        welcome = expect(client.request(greeting, deadline=deadline)[0], m.Welcome)
+        answered_s = monotonic() - begun
+        client.version = welcome.version
+        sessions = expect(client.request(m.GetSessions(), deadline=deadline)[0], m.Sessions)
+    found = [
+        one["server"] for one in sessions.sessions if isinstance(one, dict) and "server" in one
+    ]
+    told = found[0] if found and isinstance(found[0], dict) else {}
+    return facts_of(welcome, answered_s, told)
+
+
+@contextlib.contextmanager
+def _connection(sandbox: RemoteSandbox) -> Iterator[WorkerClient]:
+    never, ends = os.pipe()
+    try:
+        client = WorkerClient(sandbox.endpoint, never, far=sandbox.far())
+        with contextlib.closing(client):
+            yield client
+    finally:
+        os.close(never)
+        os.close(ends)
+
+
+def facts_of(welcome: m.Welcome, answered_s: float, told: dict[Any, Any]) -> ServerFacts:
+    """What is kept of a server's answer. Trust: input from the server."""
+    clients = told.get("clients")
+    mine: object = next(iter(clients.values()), {}) if isinstance(clients, dict) else {}
+    words = {name: _text(told.get(name)) for name in _WORDS}
+    return ServerFacts(
+        version=_text(welcome.worker),
+        protocol=welcome.version,
+        answered_s=answered_s,
+        told=bool(told),
+        **words,
+        network=told.get("network") is True,
+        gpu=told.get("gpu") is True,
+        draining=told.get("draining_s") is not None,
+        quotas=_numbers(told.get("quotas")),
+        used=_numbers(mine),
+    )
+
+
+def _text(value: object) -> str:
+    return printable(value[:_MOST_CHARS]) if isinstance(value, str) else ""
+
+
+def _numbers(value: object) -> dict[str, int]:
+    """The whole numbers of a mapping, by name. Trust: input from the server."""
+    if not isinstance(value, dict):
+        return {}
+    items = list(value.items())[:_MOST_NAMES]
+    return {
+        _text(name): number for name, number in items if type(number) is int and 0 <= number < _MOST
+    }
