@@ -165,7 +165,9 @@ class SingleEnv(gym.Env[Any, Any]):
     __str__ = __repr__
 
     def _repr_html_(self) -> str:
-        return f"<code>{html.escape(repr(self))}</code>"
+        shown = getattr(type(self._vector), "_repr_html_", None)  # of the class: ours, or none
+        inside = "" if shown is None else shown(self._vector)
+        return f"<code>{html.escape(repr(self))}</code>{inside}"
 
     def _batch(self, action: Any) -> Any:
         space = self.action_space

@@ -17,6 +17,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
+from envhub_sandbox.hub.listing import Snapshot
 from envhub_sandbox.transport import described, results
 from envhub_worker.protocol import messages as m
 from tests.fuzz import child, traffic
@@ -132,6 +133,15 @@ def test_specs_that_are_not_read_as_facts_are_noticed(
     naive = {"id": "A-v0", "entry_point": "os:system"}
     monkeypatch.setattr(described, "spec_of", lambda facts: EnvSpec(**naive))
     assert "an entry point" in first_wrong(recorded, "things")
+
+
+def test_lines_that_are_not_the_repositorys_are_noticed(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the look into the snapshot, the fuzzer says so; with it, nothing."""
+    assert first_wrong(recorded, "tracebacks") == ""
+    monkeypatch.setattr(Snapshot, "known_as", lambda self, path: f'"{path}"')
+    assert first_wrong(recorded, "tracebacks") == "another file"
 
 
 def forgetful(*_: object) -> None:

@@ -7,8 +7,10 @@ else is what must never come out.
 from __future__ import annotations
 
 import random
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -16,12 +18,14 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.hub.listing import FileRecord, Snapshot
+from envhub_sandbox.session.author_lines import point_out
 from envhub_sandbox.transport import described, specs
 from envhub_sandbox.transport.connection import death, expect
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.described import Described
 from envhub_sandbox.transport.generators import generator
-from envhub_sandbox.transport.jail import RemoteJail, RunnersDiedError, check, open_jail
+from envhub_sandbox.transport.jail import RemoteJail, RunnersDiedError, check, open_jail, raised
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.vector import from_manifest
 from envhub_worker.protocol import messages as m
@@ -393,6 +397,37 @@ def server(dice: Dice) -> None:
     check(message)
 
 
+_PIECES = (
+    *(
+        '  File "env.py", line 3, in step\n    x\n',
+        '  File "',
+        '", line ',
+        ", in ",
+        "env.py",
+        "9" * 12,
+    ),
+    *("/store/tree/env.py", "lib/a.py", "../env.py", "/home/me/train.py", "x" * 300, "\n", "  | "),
+    *("Traceback (most recent call last):\n", "\x1b[2J", "\r", "\u202e", "\x00", '"', "\ud800"),
+)
+_FILES = tuple(FileRecord(path, 1, "sha256:0") for path in ("env.py", "lib/a.py"))
+_SNAPSHOT = Snapshot("/home/me/env", "local", "local-1", "env.py", Path("/store/tree"), _FILES)
+
+
+def tracebacks(dice: Dice) -> None:
+    """What a worker tells of an exception is text, and leads to its repository's own files only."""
+    rng = dice.rng
+    text = "".join(rng.choices(_PIECES, k=rng.choice((3, 10, 40, 4000))))
+    stage = rng.choice(("step", "import", "make_env"))
+    error: Any = raised(m.Raised("ValueError", text[:600], text[:9000], text, stage))
+    point_out(error, _SNAPSHOT)
+    for told in (str(error), *vars(error).get("__notes__", ())):
+        demand(all(one in "\n\t" or one.isprintable() for one in told), "a control character")
+        demand(len(told) < 60_000, "a text without end")
+    remote: Any = error if stage == "step" else error.__cause__
+    own = r'  File "/home/me/env/(env|lib/a)\.py", line [0-9]+(, in [^\n]*)?(\n    [^\n]*)?'
+    demand(not remote.where or re.fullmatch(own, remote.where), "another file")
+
+
 # --- the stream ----------------------------------------------------------------------------------
 
 
@@ -471,7 +506,7 @@ TARGETS: dict[str, Callable[[Dice], None]] = {
     one.__name__: one
     for one in (
         unpack, things, results, infos, apart, restore, manifest, built, generators, relay, server,
-        stream, packed, column_schemas,
+        tracebacks, stream, packed, column_schemas,
     )
 }  # fmt: skip
 

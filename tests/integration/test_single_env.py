@@ -84,3 +84,13 @@ def test_suites_give_one_as_a_single_environment() -> None:
     assert all(one.closed for one in suites.envs())
     with pytest.raises(ValueError, match="n_envs=1"), make_env(EXAMPLES / "catch", n_envs=2) as two:
         two.single()
+
+
+def test_a_notebook_shows_its_spaces() -> None:
+    """Those of the environment that it is the only one of; its text is the client's."""
+    html = "_repr_html_"
+    env = SandboxEnv(EXAMPLES / "cartpole")
+    try:
+        assert "Discrete(2)" in getattr(env, html)()
+    finally:
+        env.close()
