@@ -1,6 +1,6 @@
 """Our part of the ``logging`` tree. Silent until the application that uses us sets it up.
 
-``envhub_sandbox.worker`` tells of jails: opened, closed, died, timed out, restarted (INFO, DEBUG).
+``envhub_sandbox.worker`` tells of jails: opened, closed (DEBUG), died, timed out, restarted (INFO).
 ``envhub_sandbox.worker.output`` has every line that they print (DEBUG). ``envhub_sandbox.snapshot``
 tells of downloads, ``envhub_sandbox.dependencies`` of packages, ``envhub_sandbox.crashes`` of
 crash bundles.

@@ -313,7 +313,7 @@ class Repository:
             client.close()
             wanted.close()
             raise
-        WORKER.info("%s: jail %x opened", self.label, jail.number)
+        WORKER.debug("%s: jail %x opened", self.label, jail.number)
         try:
             if wanted.sinks:
                 follower = OutputFollower(lambda: self._connected(server), jail.number, wanted)
@@ -434,7 +434,7 @@ class Repository:
         if loaded.closed:
             return
         loaded.closed = True
-        WORKER.info("%s: jail %x closes", self.label, loaded.jail.number)
+        WORKER.debug("%s: jail %x closes", self.label, loaded.jail.number)
         try:
             parting = loaded.jail.ask_to_close()
             if wait or not self._hold.goes_on(loaded.server):

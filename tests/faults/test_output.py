@@ -143,7 +143,7 @@ def test_a_file_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_log_tells_the_life_of_a_jail(caplog: pytest.LogCaptureFixture) -> None:
-    """Opened, late, given up, died, closed at INFO; what it prints at DEBUG."""
+    """Late, given up and died at INFO; what is ordinary, and what it prints, at DEBUG."""
     caplog.set_level(logging.DEBUG, "envhub_sandbox")
     with made(None, "exit") as suites:
         suites.env.reset()
@@ -157,16 +157,24 @@ def test_the_log_tells_the_life_of_a_jail(caplog: pytest.LogCaptureFixture) -> N
         suites.env.reset()
     told = [(one.name, one.levelname, one.getMessage()) for one in caplog.records]
     for name, level, text in (
-        ("envhub_sandbox.worker", "INFO", "opened"),
+        ("envhub_sandbox.worker", "DEBUG", "opened"),
         ("envhub_sandbox.worker", "INFO", "died during step: it exited (exit code 7)"),
         ("envhub_sandbox.crashes", "INFO", "crash bundle"),
         ("envhub_sandbox.worker", "INFO", "no answer to step after 0.3 s"),
         ("envhub_sandbox.worker", "INFO", "given up for a fresh one"),
-        ("envhub_sandbox.worker", "INFO", "closes"),
+        ("envhub_sandbox.worker", "DEBUG", "closes"),
         ("envhub_sandbox.worker.output", "DEBUG", "about to exit"),
         ("envhub_sandbox.worker.output", "DEBUG", "about to hang"),
     ):
         assert any(one[:2] == (name, level) and text in one[2] for one in told), text
+
+
+def test_an_ordinary_life_clutters_nobodys_log(caplog: pytest.LogCaptureFixture) -> None:
+    """A host program that shows INFO is told of nothing that went as it should."""
+    caplog.set_level(logging.INFO)
+    with made(None, "never") as suites:
+        suites.env.reset()
+    assert [one.getMessage() for one in caplog.records if one.name.startswith("envhub")] == []
 
 
 def test_nobody_is_followed_without_need() -> None:

@@ -48,13 +48,16 @@ def logged(*, verbose: bool, worker_output: str | None) -> Iterator[None]:
 
     shown = []
     if verbose:
-        shown.append(_show(ROOT, logging.INFO, "%(asctime)s %(message)s"))
+        shown.append(_show(ROOT, logging.DEBUG, "%(asctime)s %(message)s"))
+        shown[-1][1].addFilter(lambda record: record.name != OUTPUT.name)
+        shown.append((OUTPUT, logging.NullHandler(), OUTPUT.level))
+        OUTPUT.setLevel(logging.INFO)  # nobody follows what nobody reads
     if worker_output == "-":
         shown.append(_show(OUTPUT, logging.DEBUG, "%(message)s"))
     try:
         yield
     finally:
-        for logger, handler, level in shown:
+        for logger, handler, level in reversed(shown):
             logger.removeHandler(handler)
             logger.setLevel(level)
 
