@@ -38,3 +38,7 @@ def _deferred(text: str) -> str:
     first = re.search(r"^(from|import) ", text, re.MULTILINE)
     at = first.start() if first else 0
     return text[:at] + _FUTURE + text[at:]
+
+
+if __name__ == "__main__":
+    adapt(Path(sys.argv[1]))

@@ -88,10 +88,35 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
         """
         return SingleEnv(self.choose(suite, task), self)
 
+    def keep(self, suite: str | None = None, task: int | str | None = None) -> None:
+        """Close and drop all but this suite and this task, which is told by its text, too.
+
+        Raises:
+            ValueError: Nothing would be left; the text names what there is.
+        """
+        chosen = {
+            (a_suite, a_task)
+            for a_suite, tasks in self.items()
+            for a_task in tasks
+            if suite in (None, a_suite) and task in (None, a_task, str(a_task))
+        }
+        if not chosen:
+            self.choose(suite, task)
+        for a_suite, tasks in list(self.items()):
+            for a_task in [one for one in tasks if (a_suite, one) not in chosen]:
+                tasks.pop(a_task).close()
+            if not tasks:
+                del self[a_suite]
+
     def envs(self) -> Iterator[VectorEnv[Any, Any, Any]]:
         """All environments, suite by suite."""
         for tasks in self.values():
             yield from tasks.values()
+
+    @property
+    def reference(self) -> str | None:
+        """What makes the very same again: the commit is in it. None where code runs here."""
+        return None if self._recipe is None else self._recipe.reference
 
     @property
     def provenance(self) -> dict[str, Any]:

@@ -36,6 +36,10 @@ CLIENTS_OWN = {
 OPTIONAL = {
     "envhub_worker.protocol.compression": {"lz4"},
     "envhub_sandbox.integrations.sb3": {"stable_baselines3"},
+    "envhub_sandbox.integrations.lerobot.config": {"draccus", "lerobot"},
+    "envhub_sandbox.integrations.lerobot.features": {"lerobot"},
+    "envhub_sandbox.integrations.lerobot.routing": {"lerobot"},
+    "envhub_sandbox.integrations.lerobot_eval": {"lerobot"},
     "envhub_worker.protocol.messages.base": {"typing_extensions"},  # for type checkers alone
     "envhub_sandbox.metrics": {"prometheus_client"},
     "envhub_worker.cli.metrics": {"prometheus_client"},
@@ -63,7 +67,7 @@ MAY_IMPORT = {
     "envhub_sandbox.check": {"api", "dependencies", "hub", "session", "vector"},
     "envhub_sandbox.gym": {"api", "vector"},
     "envhub_sandbox.pytest_plugin": {"api", "hub"},
-    "envhub_sandbox.integrations": {"api", "vector"},
+    "envhub_sandbox.integrations": {"api", "hub", "vector"},
     "envhub_sandbox.vector": {"session", "transport"},
     "envhub_sandbox.metrics": {"session"},
     "envhub_sandbox.session": {"crash", "folders", "hub", "policy", "sandboxes", "transport"},
@@ -124,6 +128,9 @@ IMPORTERS = {
     "envhub_worker.spawn.runner_entry": "the program of a runner, which the server names",
     "envhub_worker.spawn.zygote": "a list of our own",
 }
+
+# the modules of LeRobot's package that import make_env
+_LEROBOT = ("lerobot.config", "lerobot.routing")
 
 # where tests and benchmarks may name what starts with an underscore, and others' names that they do
 SEAM = "tests/support/inside.py"
@@ -302,7 +309,7 @@ def test_only_faces_and_the_command_line_import_make_env() -> None:
         "envhub_sandbox",
         "envhub_sandbox.check.judge",
         "envhub_sandbox.gym",
-        "envhub_sandbox.integrations.sb3",
+        *(f"envhub_sandbox.integrations.{name}" for name in ("sb3", *_LEROBOT)),
         "envhub_sandbox.pytest_plugin",
     }
 

@@ -1,0 +1,169 @@
+"""``--env.type=envhub_sandbox``: a repository of the Hub as one of LeRobot's own configurations.
+
+It is no ``HubEnvConfig``: those are refused without ``trust_remote_code``, which nobody needs who
+trusts nothing, and by ``lerobot-train`` altogether.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import draccus
+from lerobot.configs import parser
+from lerobot.configs.default import EvalConfig
+from lerobot.configs.types import PolicyFeature
+from lerobot.envs.configs import EnvConfig
+
+from envhub_sandbox.api import make_env
+from envhub_sandbox.errors import HubReferenceError
+from envhub_sandbox.hub.logins import without_login
+from envhub_sandbox.integrations.lerobot.features import features_of
+from envhub_sandbox.integrations.lerobot.waiting import Waiting
+from envhub_sandbox.vector.suites import EnvSuites
+
+ASKS_CONFIGS = hasattr(EnvConfig, "create_envs")
+"""Whether this LeRobot asks a configuration for its environments: 0.6 does, 0.4 and 0.5 do not."""
+
+_WAITING = Waiting()
+_OPTIONS = (
+    *("sandbox", "env_kwargs", "policy", "timeouts", "limits", "endpoint", "python"),
+    *("dependencies", "lock", "num_workers", "prewarm", "lane", "copy", "validate", "server_key"),
+    "hub_cache_dir",
+)
+
+
+@EnvConfig.register_subclass("envhub_sandbox")
+@dataclass
+class SandboxedEnvConfig(EnvConfig):
+    """The environments of a repository, each in a sandbox.
+
+    Making one fetches the repository and asks it for its spaces, in a jail; ``repo`` is a full
+    commit from then on, also in what LeRobot saves. No token is a field: LeRobot prints and saves
+    configurations. It is taken from where huggingface_hub has it.
+
+    Attributes:
+        repo: What ``envhub_sandbox.make_env`` takes: a hub reference, or a folder.
+        suite: The only suite that is wanted; all by default.
+        task: The only task that is wanted, by its id; all by default.
+        fps: What the environments say, where they do.
+        features: From their spaces, unless both are given.
+        features_map: Likewise.
+
+    The others are ``make_env``'s options; ``dependencies`` takes its mapping as JSON.
+    """
+
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(default_factory=dict)
+    repo: str | None = None
+    suite: str | None = None
+    sandbox: str = "process"
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    policy: dict[str, Any] = field(default_factory=dict)
+    timeouts: dict[str, Any] = field(default_factory=dict)
+    limits: dict[str, Any] = field(default_factory=dict)
+    dependencies: str = "auto"
+    lock: str | None = None
+    python: str | None = None
+    num_workers: int | None = None
+    prewarm: int | None = None
+    lane: str = "auto"
+    copy: bool = True
+    validate: bool = False
+    endpoint: str | None = None
+    server_key: str | None = None
+    hub_cache_dir: str | None = None
+
+    def __post_init__(self) -> None:
+        if not self.repo:
+            raise ValueError("env.repo is missing: which repository? --env.repo=org/repo@<commit>")
+        if self.endpoint is not None and without_login(self.endpoint) != self.endpoint:
+            raise HubReferenceError(
+                "env.endpoint holds a login, and LeRobot prints and saves configurations; put it "
+                "into the environment variable HF_ENDPOINT"
+            )
+        n_envs, use_async_envs = _expected()
+        suites = self._made(n_envs, use_async_envs)
+        try:
+            self.repo = suites.reference
+            self._describe(suites)
+        except BaseException:
+            suites.close()
+            raise
+        _WAITING.put(self._key(n_envs, use_async_envs), suites)
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Nothing: Gymnasium's registry makes none of these."""
+        return {}
+
+    @property
+    def gym_id(self) -> str:
+        """Only a LeRobot that asks no configuration for environments looks at it.
+
+        Raises:
+            RuntimeError: Always.
+        """
+        raise RuntimeError(
+            "this LeRobot asks no configuration for its environments: run lerobot-eval-sandboxed "
+            "instead of lerobot-eval, or call envhub_sandbox.integrations.lerobot.install()"
+        )
+
+    @property
+    def hub_path(self) -> str | None:
+        """The repository, for a LeRobot in which ``install()`` has to route this, too."""
+        return self.repo
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> EnvSuites:
+        """``{suite: {task_id: VectorEnv}}``; raises as ``envhub_sandbox.make_env``."""
+        waiting = _WAITING.take(self._key(n_envs, use_async_envs))
+        return self._made(n_envs, use_async_envs) if waiting is None else waiting
+
+    def _made(self, n_envs: int, use_async_envs: bool) -> EnvSuites:
+        options = {name: getattr(self, name) for name in _OPTIONS}
+        if isinstance(self.dependencies, str) and self.dependencies.startswith("{"):
+            options["dependencies"] = json.loads(self.dependencies)
+        for name in ("policy", "timeouts", "limits", "env_kwargs"):
+            options[name] = options[name] or None
+        suites = make_env(self.repo, n_envs=n_envs, use_async_envs=use_async_envs, **options)
+        try:
+            suites.keep(self.suite, self.task)
+        except BaseException:
+            suites.close()
+            raise
+        return suites
+
+    def _describe(self, suites: EnvSuites) -> None:
+        first, *others = suites.envs()
+        spaces = (first.single_observation_space, first.single_action_space)
+        for env in others:
+            if (env.single_observation_space, env.single_action_space) != spaces:
+                raise ValueError(
+                    f"{self.repo}: its tasks have different spaces, and LeRobot's features are "
+                    "those of all: choose one by env.suite and env.task"
+                )
+        features, names = features_of(*spaces, others=ASKS_CONFIGS)
+        if not self.features:
+            self.features, self.features_map = features, names
+        fps = first.metadata.get("render_fps")
+        if isinstance(fps, int) and fps > 0:
+            self.fps = fps
+
+    def _key(self, n_envs: int, use_async_envs: bool) -> str:
+        own = [item.name for item in fields(SandboxedEnvConfig)]
+        asked = {name: getattr(self, name) for name in own if not name.startswith("features")}
+        return repr((n_envs, bool(use_async_envs), asked))
+
+
+def _expected() -> tuple[int, bool]:
+    """How many sub-environments LeRobot's command line is about to ask for, and whether async.
+
+    A guess, to open one jail instead of two: where another number is asked for, another is opened.
+    """
+    if parser.parse_arg("env.repo") is None:
+        return 1, False
+    said = {item.name: parser.parse_arg(f"eval.{item.name}") for item in fields(EvalConfig)}
+    arguments = [f"--{name}={text}" for name, text in said.items() if text is not None]
+    chosen = draccus.parse(config_class=EvalConfig, args=arguments)
+    return chosen.batch_size, chosen.use_async_envs

@@ -1,0 +1,121 @@
+"""LeRobot's own ``make_env``, with the Hub's part of it in the sandbox.
+
+Its factory loads a repository in three steps, each a function that it looks up by its name when it
+is called: download, import, call. Those names are replaced; ``make_env`` itself cannot be, since
+whoever wants it has imported it already.
+"""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import gymnasium
+import lerobot.envs.factory
+
+from envhub_sandbox.api import make_env
+from envhub_sandbox.integrations.lerobot.config import ASKS_CONFIGS, SandboxedEnvConfig
+from envhub_sandbox.vector.suites import EnvSuites
+from envhub_sandbox.vector.vector_env import SandboxVectorEnv
+
+_HELPERS = ("_download_hub_file", "_import_hub_module", "_call_make_env")
+_GIVEN = ("cfg", "n_envs", "use_async_envs", "hub_cache_dir", "trust_remote_code")
+
+
+def install(**options: Any) -> None:
+    """From now on, LeRobot's ``make_env`` makes what the Hub has in the sandbox.
+
+    That holds for references and for every ``HubEnvConfig``. ``trust_remote_code`` is neither
+    needed nor heeded. A later call replaces the options of an earlier one.
+
+    Args:
+        options: ``envhub_sandbox.make_env``'s, for all repositories.
+
+    Raises:
+        TypeError: An option that it does not have.
+        RuntimeError: This LeRobot loads repositories in another way than is known here.
+    """
+    known = [name for name in inspect.signature(make_env).parameters if name not in _GIVEN]
+    unknown = [name for name in options if name not in known]
+    if unknown:
+        raise TypeError(f"there is no option {', '.join(unknown)}; there are {', '.join(known)}")
+    if options.get("sandbox", "process") is None:
+        raise TypeError("sandbox is None: LeRobot itself runs code in this process, uninstalled")
+    factory = lerobot.envs.factory
+    missing = [name for name in _HELPERS if not callable(getattr(factory, name, None))]
+    if missing:
+        raise RuntimeError(
+            f"lerobot.envs.factory has no {', '.join(missing)}: this LeRobot loads repositories in "
+            "another way than the versions that are known here (docs/lerobot.md). Nothing was "
+            "changed, and its make_env would run their code in this process"
+        )
+    routed = _Routed(options)
+    factory._download_hub_file = routed.download
+    factory._import_hub_module = routed.load
+    factory._call_make_env = routed.call
+    if not ASKS_CONFIGS:
+        hub_configs = lerobot.envs.configs.HubEnvConfig, SandboxedEnvConfig
+        factory.HubEnvConfig = hub_configs  # all that is done with it is isinstance()
+        _let_videos_be_written()
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What stands for the downloaded file, and then for the module that it would be."""
+
+    reference: str
+    hub_cache_dir: str | None
+
+
+@dataclass(frozen=True)
+class _Routed:
+    """The three steps, of which only the last does anything."""
+
+    options: dict[str, Any]
+
+    def download(
+        self, cfg_str: str, trust_remote_code: bool, hub_cache_dir: str | None
+    ) -> tuple[str, str, _Asked, None]:
+        """Nothing yet."""
+        return cfg_str, "", _Asked(cfg_str, hub_cache_dir), None
+
+    def load(self, local_file: _Asked, repo_id: str) -> _Asked:
+        """Nothing is imported."""
+        return local_file
+
+    def call(self, module: _Asked, n_envs: int, use_async_envs: bool, cfg: Any) -> EnvSuites:
+        """The environments, from the sandbox."""
+        if isinstance(cfg, SandboxedEnvConfig):
+            return cfg.create_envs(n_envs, use_async_envs)
+        return make_env(
+            module.reference if cfg is None else cfg,
+            n_envs=n_envs,
+            use_async_envs=use_async_envs,
+            hub_cache_dir=module.hub_cache_dir,
+            **self.options,
+        )
+
+
+class _AsyncOrSandboxed(type):
+    """What ``lerobot_eval`` draws frames of by ``call("render")``."""
+
+    def __instancecheck__(cls, instance: Any) -> bool:
+        return isinstance(instance, (gymnasium.vector.AsyncVectorEnv, SandboxVectorEnv))
+
+
+def _let_videos_be_written() -> None:
+    """LeRobot before 0.6 draws nothing but Gymnasium's two classes, by ``isinstance``.
+
+    So its evaluation, and it alone, sees a Gymnasium whose ``vector.AsyncVectorEnv`` includes ours.
+    """
+    try:
+        import lerobot.scripts.lerobot_eval as evaluation
+    except ImportError:
+        return  # without what an evaluation needs, nobody evaluates here
+    seen, vector = ModuleType("gymnasium"), ModuleType("gymnasium.vector")
+    vars(vector).update(vars(gymnasium.vector))
+    vars(vector)["AsyncVectorEnv"] = _AsyncOrSandboxed("AsyncVectorEnv", (), {})
+    vars(seen).update({**vars(gymnasium), "vector": vector})
+    evaluation.gym = seen

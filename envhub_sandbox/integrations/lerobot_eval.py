@@ -1,0 +1,50 @@
+"""``lerobot-eval-sandboxed``: LeRobot's evaluation, with the Hub's code in the sandbox.
+
+It takes what ``lerobot-eval`` takes, and ``make_env``'s options as ``--sandbox.NAME=VALUE``, where
+a value is JSON or text: ``--sandbox.policy='{"gpu": true}'``.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from importlib.util import find_spec
+from typing import Any
+
+_PREFIX = "--sandbox."
+
+
+def main() -> None:
+    """Take our options out of the command line, and hand the rest to LeRobot's own ``main``."""
+    if find_spec("lerobot") is None:
+        sys.exit("lerobot-eval-sandboxed needs LeRobot: pip install 'envhub-sandbox[lerobot]'")
+    from envhub_sandbox.integrations.lerobot import install
+
+    options, rest = split(sys.argv[1:])
+    try:
+        install(**options)
+    except (TypeError, RuntimeError) as error:
+        sys.exit(f"lerobot-eval-sandboxed: {error}")
+    sys.argv[1:] = rest
+    from lerobot.scripts.lerobot_eval import main as evaluate
+
+    evaluate()
+
+
+def split(arguments: list[str]) -> tuple[dict[str, Any], list[str]]:
+    """Our options by name, and the others."""
+    ours = [one for one in arguments if one.startswith(_PREFIX)]
+    options = {}
+    for one in ours:
+        name, equals, text = one.removeprefix(_PREFIX).partition("=")
+        if not equals:
+            sys.exit(f"lerobot-eval-sandboxed: {one} takes a value: {one}=...")
+        options[name.replace("-", "_")] = _value(text)
+    return options, [one for one in arguments if one not in ours]
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text

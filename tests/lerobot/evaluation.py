@@ -1,0 +1,27 @@
+"""LeRobot's evaluation is the same in the sandbox: run by ``python -m tests.lerobot`` only."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.hub.olah_server import OlahServer
+from tests.lerobot.kit import run
+from tests.lerobot.repositories import REACH
+
+
+def test_an_evaluation_is_the_same(olah: OlahServer, tmp_path: Path) -> None:
+    """Returns, successes and the bytes of videos, by each way into the sandbox."""
+    commit = olah.repository("robots/evaluated").commit({"env.py": REACH})
+    found = run("evaluation_program.py", olah, tmp_path, f"robots/evaluated@{commit}")
+    here = found["here"]
+    assert found["executed by LeRobot"]  # the control: that code was in that process
+    assert len(here["metrics"]) == 1
+    assert len(here["videos"]) == 4
+    assert found["installed"] == here
+    assert found["own"] == here
+    if found["asks configs"]:
+        assert found["plugin"] == here
+        assert found["jails of plugin"] == 1  # the one that told the spaces
+    assert "Refusing to execute" in found["train before"]
+    assert found["train after"] == "made"
+    assert not found["executed here"]

@@ -1,0 +1,58 @@
+"""Runs a program in an interpreter that has LeRobot, and reads what it found."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import envhub_sandbox
+import envhub_worker
+from tests.hub.olah_server import OlahServer
+
+OVERLAY = "ENVHUB_TEST_LEROBOT"
+"""A folder with LeRobot and what it imports at least, for this interpreter: ``./test`` makes it."""
+OWN = "ENVHUB_TEST_LEROBOT_PYTHON"
+"""An interpreter that has all of LeRobot: ``python -m tests.lerobot`` makes it."""
+
+
+def run(program: str, olah: OlahServer, home: Path, *arguments: str) -> Any:
+    """The last line that a program of this folder prints, which is JSON.
+
+    The test is skipped where there is no LeRobot.
+    """
+    own, overlay = os.environ.get(OWN), os.environ.get(OVERLAY)
+    if not own and not overlay:
+        pytest.skip("needs LeRobot")
+    plugin = Path(__file__).parents[2] / "plugins" / "lerobot_env_envhub_sandbox"
+    ours = [Path(module.__file__).parents[1] for module in (envhub_sandbox, envhub_worker)]
+    paths = [plugin, *ours] if own else [Path(str(overlay)), plugin]
+    environment = {
+        **{
+            name: text
+            for name, text in os.environ.items()
+            if not name.startswith(("HF_", "HUGGING"))
+        },
+        "PYTHONPATH": os.pathsep.join(map(str, paths)),
+        "ENVHUB_CACHE": str(home / "store"),
+        "HF_HOME": str(home / "hf"),
+        "HF_ENDPOINT": olah.endpoint,
+        "HF_HUB_DISABLE_XET": "1",
+        "SLURM_JOB_ID": "0",  # it draws no progress bars there
+    }
+    done = subprocess.run(
+        [own or sys.executable, str(Path(__file__).with_name(program)), *arguments],
+        env=environment,
+        cwd=home,
+        capture_output=True,
+        text=True,
+        timeout=280,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-6000:] + done.stdout[-2000:]
+    return {**json.loads(done.stdout.splitlines()[-1]), "stderr": done.stderr}

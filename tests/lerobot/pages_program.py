@@ -1,0 +1,192 @@
+"""What LeRobot's pages do, with LeRobot's own functions after ``install()``; prints findings.
+
+To be run in an interpreter that has LeRobot, by ``kit.run``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from dataclasses import fields
+from inspect import signature
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.envs.configs import EnvConfig, IsaaclabArenaEnv
+from lerobot.envs.factory import make_env
+from lerobot.envs.utils import env_to_policy_features, preprocess_observation
+
+import envhub_sandbox.integrations.lerobot as ours
+from envhub_sandbox import make_env as sandboxed
+from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.integrations.lerobot import waiting
+
+FOUND: dict[str, Any] = {}
+COMMITS: dict[str, str] = json.loads(sys.argv[1])
+
+
+def refused(*arguments: Any, **options: Any) -> list[str]:
+    """Which of the builtin errors that LeRobot raises a call fails with."""
+    theirs = (AttributeError, ImportError, OSError, RuntimeError, ValueError)
+    try:
+        make_env(*arguments, **options)
+    except theirs as error:
+        return [kind.__name__ for kind in theirs if isinstance(error, kind)]
+    return []
+
+
+def shape(envs: Any) -> dict[str, list[Any]]:
+    """The suites and tasks; closes them."""
+    found = {suite: list(tasks) for suite, tasks in envs.items()}
+    envs.close()
+    return found
+
+
+def loads() -> None:
+    """Every form of a reference, and every kind of result."""
+    for name, reference in {
+        "branch": "robots/cartpole@main",
+        "tag": "robots/cartpole@v1.0",
+        "commit": f"robots/cartpole@{COMMITS['cartpole'][:12]}",
+        "file": "robots/reach@v1.0:envs/reach_task.py",
+        "space": "robots/uploaded",
+        "suites": "robots/suites",
+        "single": "robots/single",
+    }.items():
+        FOUND[name] = shape(make_env(reference, n_envs=1, trust_remote_code=True))
+    FOUND["no consent"] = shape(make_env("robots/cartpole"))
+    FOUND["async"] = shape(make_env("robots/cartpole", n_envs=8, use_async_envs=True))
+
+
+def plays() -> None:
+    """The page's episode, on a vector environment."""
+    envs = make_env("robots/cartpole", n_envs=4, trust_remote_code=True)
+    env = envs[next(iter(envs))][0]
+    env.reset()
+    total, done = np.zeros(env.num_envs), np.zeros(env.num_envs, bool)
+    while not done.any():
+        _, reward, terminated, truncated, _ = env.step(env.action_space.sample())
+        total += reward
+        done = terminated | truncated
+    env.close()
+    FOUND["played"] = bool((total > 0).all())
+
+
+def one_by_one() -> None:
+    """LeIsaac's way, and that of the unitree robot."""
+    env = make_env("robots/reach", trust_remote_code=True)["hub_env"][0].envs[0].unwrapped
+    if hasattr(env, "initialize"):
+        env.initialize()
+    env.reset()
+    for _ in range(9):
+        action = torch.tensor(env.action_space.sample())
+        _, _, terminated, truncated, _ = env.step(action)
+        if terminated or truncated:
+            env.reset()
+    FOUND["one"] = [env.ready, hasattr(env, "initialise"), env.steps]
+    env.close()
+
+
+def configured() -> None:
+    """A configuration that is the Hub's already, and what a repository reads of it."""
+    cfg = IsaaclabArenaEnv(hub_path="robots/configured", environment="open the door")
+    envs = make_env(cfg, n_envs=2)
+    env = next(iter(envs.values()))[0]
+    env.reset(seed=0)
+    FOUND["configured"] = list(env.call("task"))
+    envs.close()
+
+
+def walked_through() -> None:
+    """Pendulum with ``agent_pos``: what a policy is given of it."""
+    envs = make_env("robots/pendulum", n_envs=2)
+    env = next(iter(envs.values()))[0]
+    observation, _ = env.reset(seed=0)
+    given = preprocess_observation(observation)
+    FOUND["pendulum"] = {name: list(tensor.shape) for name, tensor in given.items()}
+    envs.close()
+
+
+def described() -> None:
+    """Our own type: what a policy is built from, before there is an environment."""
+    cfg = EnvConfig.get_choice_class("envhub_sandbox")(repo="robots/cameras", task="0")
+    features = env_to_policy_features(cfg)
+    FOUND["features"] = {name: [one.type.value, *one.shape] for name, one in features.items()}
+    FOUND["pinned"] = f"robots/cameras@{COMMITS['cameras']}" in str(cfg.repo)
+    chosen = ours.SandboxedEnvConfig(repo="robots/suites", suite="near", task="1")
+    envs = make_env(chosen, n_envs=2)
+    FOUND["chosen"] = [list(env.get_attr("task")) for env in envs.envs()]
+    FOUND["chosen shape"] = shape(envs)
+
+
+def fails() -> None:
+    """What the page's troubleshooting is about."""
+    for name in ("nothing", "missing", "wrong"):
+        FOUND[name] = refused(f"robots/{name}", trust_remote_code=True)
+    FOUND["no repository"] = refused("robots/nowhere")
+    try:
+        ours.install(polcy={})
+    except TypeError as error:
+        FOUND["option"] = "polcy" in str(error)
+    try:
+        ours.SandboxedEnvConfig(repo="robots/cartpole", endpoint="http://me:secret@127.0.0.1:9")
+    except EnvHubError as error:
+        FOUND["login"] = "secret" not in str(error)
+
+
+def options() -> None:
+    """What ``make_env`` takes and a configuration does not."""
+    given = {item.name for item in fields(ours.SandboxedEnvConfig)}
+    FOUND["not options"] = sorted(set(signature(sandboxed).parameters) - given)
+
+
+def waits() -> None:
+    """What told its spaces is used once by whoever asks for the same, and closed by and by."""
+    kept = waiting.Waiting(0.02)
+    first, second = (make_env("robots/cartpole") for _ in range(2))
+    kept.put("a", first)
+    closed = eventually(lambda: first["hub_env"][0].closed)
+    forever = waiting.Waiting(3600.0)
+    forever.put("a", second)
+    taken = forever.take("a") is second and forever.take("a") is None
+    FOUND["waits"] = [closed, taken, second["hub_env"][0].closed]
+    second.close()
+
+
+def eventually(holds: Any) -> bool:
+    """Whether it comes to hold."""
+    deadline = time.monotonic() + 60
+    while not holds() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return bool(holds())
+
+
+def control() -> None:
+    """What LeRobot does without ``install``: the code runs here."""
+    FOUND["control refused"] = refused("robots/reach")
+    envs = make_env("robots/reach", trust_remote_code=True)
+    FOUND["control executed here"] = os.environ.pop("REACHED", None) is not None
+    envs["hub_env"][0].close()
+
+
+if __name__ == "__main__":
+    control()
+    ours.install(timeouts={"startup_s": 250})
+    for part in (
+        loads,
+        plays,
+        one_by_one,
+        configured,
+        walked_through,
+        described,
+        options,
+        waits,
+        fails,
+    ):
+        part()
+    FOUND["plugin"] = __import__("lerobot_env_envhub_sandbox").SandboxedEnvConfig.__name__
+    FOUND["executed here"] = "REACHED" in os.environ
+    print(json.dumps(FOUND))

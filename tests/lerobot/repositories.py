@@ -1,0 +1,155 @@
+"""Repositories in the shapes that LeRobot's pages show, each served by the Hub on loopback."""
+
+from __future__ import annotations
+
+from tests.hub.olah_server import OlahServer
+
+REACH = '''
+import os
+
+import gymnasium as gym
+import numpy as np
+
+os.environ["REACHED"] = "whoever executed this file"
+
+
+class Reach(gym.Env):
+    """A point that is to come to a goal: what a LeRobot policy looks for in an environment."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+
+    def __init__(self, task="reach"):
+        box = lambda n: gym.spaces.Box(-10.0, 10.0, (n,), np.float32)
+        spaces = {"agent_pos": box(2), "environment_state": box(2)}
+        self.observation_space = gym.spaces.Dict(spaces)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self.render_mode = "rgb_array"
+        self.task, self.task_description = task, f"{task} the goal"
+        self._max_episode_steps = 6
+        self.ready = False
+
+    def initialize(self):
+        self.ready = True
+
+    def _seen(self):
+        return {"agent_pos": self.at.copy(), "environment_state": self.goal.copy()}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.at = np.zeros(2, np.float32)
+        self.goal = self.np_random.uniform(-1, 1, 2).astype(np.float32)
+        self.steps = 0
+        return self._seen(), {"is_success": False}
+
+    def step(self, action):
+        self.steps += 1
+        self.at = np.clip(self.at + 0.5 * np.asarray(action, np.float32), -10, 10)
+        away = float(np.linalg.norm(self.at - self.goal))
+        ends = self.steps >= self._max_episode_steps
+        return self._seen(), -away, away < 0.1, ends, {"is_success": away < 0.1}
+
+    def render(self):
+        frame = np.full((32, 32, 3), 90, np.uint8)
+        x, y = (np.clip(self.at + 2, 0, 3.9) * 8).astype(int)
+        frame[x, y] = 255
+        return frame
+
+
+def make_env(n_envs=1, use_async_envs=False, cfg=None):
+    vector = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv
+    return vector([Reach] * n_envs)
+'''
+
+SUITES = """
+import gymnasium as gym
+from reach import Reach
+
+def make_env(n_envs=1, use_async_envs=False):
+    vector = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv
+    made = lambda task: vector([lambda: Reach(task)] * n_envs)
+    return {"near": {0: made("touch"), 1: made("push")}, "far": {0: made("throw")}}
+"""
+
+SINGLE = """
+from reach import Reach
+
+def make_env(n_envs=1, use_async_envs=False):
+    return Reach()
+"""
+
+CONFIGURED = """
+import gymnasium as gym
+from reach import Reach
+
+def make_env(n_envs=1, use_async_envs=False, cfg=None):
+    return gym.vector.SyncVectorEnv([lambda: Reach(cfg.environment)] * n_envs)
+"""
+
+CARTPOLE = """
+import gymnasium as gym
+
+def make_env(n_envs=1, use_async_envs=False):
+    vector = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv
+    return vector([lambda: gym.make("CartPole-v1")] * n_envs)
+"""
+
+PENDULUM = '''
+import gymnasium as gym
+import numpy as np
+
+
+class AsRobot(gym.ObservationWrapper):
+    """Pendulum, whose observation LeRobot takes for a robot's joints."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.observation_space = gym.spaces.Dict({"agent_pos": env.observation_space})
+
+    def observation(self, observation):
+        return {"agent_pos": observation.astype(np.float32)}
+
+
+def make_env(n_envs=1, use_async_envs=False):
+    vector = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv
+    make = lambda: AsRobot(gym.make("Pendulum-v1", max_episode_steps=5, render_mode="rgb_array"))
+    return vector([make] * n_envs)
+'''
+
+CAMERAS = """
+import gymnasium as gym
+import numpy as np
+
+class Seen(gym.Env):
+    def __init__(self):
+        camera = gym.spaces.Box(0, 255, (24, 32, 3), np.uint8)
+        spaces = gym.spaces.Dict
+        self.observation_space = spaces(
+            {"pixels": spaces({"top": camera, "wrist": camera}),
+             "agent_pos": gym.spaces.Box(-1, 1, (6,)), "forces": gym.spaces.Box(-1, 1, (3,))}
+        )
+        self.action_space = gym.spaces.Box(-1, 1, (6,))
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([Seen] * n_envs)
+"""
+
+
+def publish(olah: OlahServer) -> dict[str, str]:
+    """Everything that the pages load; the commits, by name."""
+    commits = {}
+    for name, files in {
+        "reach": {"env.py": REACH, "envs/reach_task.py": REACH},
+        "suites": {"env.py": SUITES, "reach.py": REACH},
+        "single": {"env.py": SINGLE, "reach.py": REACH},
+        "configured": {"env.py": CONFIGURED, "reach.py": REACH},
+        "cartpole": {"env.py": CARTPOLE},
+        "pendulum": {"env.py": PENDULUM},
+        "cameras": {"env.py": CAMERAS},
+        "nothing": {"env.py": "def build():\n    pass\n"},
+        "missing": {"env.py": "import gym_pybullet_drones_that_is_not_here\n"},
+        "wrong": {"env.py": "def make_env(n_envs=1, use_async_envs=False):\n    return 7\n"},
+    }.items():
+        commits[name] = olah.repository(f"robots/{name}").commit(files, tag="v1.0")
+    space = olah.repository("robots/uploaded", "space")
+    commits["uploaded"] = space.commit({"env.py": CARTPOLE, "requirements.txt": "gymnasium\n"})
+    return commits

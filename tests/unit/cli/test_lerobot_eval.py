@@ -1,0 +1,33 @@
+"""Whose options those of ``lerobot-eval-sandboxed`` are."""
+
+from __future__ import annotations
+
+import sys
+from importlib.util import find_spec
+
+import pytest
+
+from envhub_sandbox.integrations.lerobot_eval import main, split
+
+
+def test_ours_are_taken_out() -> None:
+    """JSON, or text; the others stay as they are, in order."""
+    ours = ['--sandbox.policy={"gpu": true}', "--sandbox.num-workers=2", "--sandbox.lane=frames"]
+    theirs = ["--env.type=pusht", "--env.sandbox=process", "--seed", "1"]
+    options, rest = split([theirs[0], *ours, *theirs[1:]])
+    assert options == {"policy": {"gpu": True}, "num_workers": 2, "lane": "frames"}
+    assert rest == theirs
+
+
+def test_an_option_without_a_value_is_refused() -> None:
+    """It would be taken for something else."""
+    with pytest.raises(SystemExit, match=r"--sandbox\.policy takes a value"):
+        split(["--sandbox.policy", "{}"])
+
+
+@pytest.mark.skipif(find_spec("lerobot") is not None, reason="there is LeRobot here")
+def test_without_lerobot_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And how to get it."""
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval-sandboxed"])
+    with pytest.raises(SystemExit, match="needs LeRobot"):
+        main()

@@ -1,0 +1,66 @@
+"""What ``make_env`` returns, with vector environments of this process in it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import pytest
+from gymnasium.vector import SyncVectorEnv
+
+from envhub_sandbox.vector.suites import EnvSuites
+
+
+class _Counted(gym.Env[Any, Any]):
+    observation_space = action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, name: str, closed: list[str]) -> None:
+        self._name, self._closed = name, closed
+
+    def close(self) -> None:
+        self._closed.append(self._name)
+
+
+def suites(closed: list[str]) -> EnvSuites:
+    """Two suites, three tasks, of which one is named by text."""
+
+    def made(name: str) -> Any:
+        return SyncVectorEnv([lambda: _Counted(name, closed)])
+
+    return EnvSuites({"a": {0: made("a0"), 1: made("a1")}, "b": {"x": made("bx")}}, dict)
+
+
+@pytest.mark.parametrize(
+    ("suite", "task", "left", "closed"),
+    [
+        (None, None, {"a": [0, 1], "b": ["x"]}, []),
+        ("a", None, {"a": [0, 1]}, ["bx"]),
+        ("a", "1", {"a": [1]}, ["a0", "bx"]),
+        (None, 0, {"a": [0]}, ["a1", "bx"]),
+        (None, "x", {"b": ["x"]}, ["a0", "a1"]),
+    ],
+)
+def test_what_is_not_kept_is_closed(
+    suite: str | None, task: Any, left: dict[str, list[Any]], closed: list[str]
+) -> None:
+    """And is in the mapping no more; a task of a command line is text."""
+    ended: list[str] = []
+    kept = suites(ended)
+    kept.keep(suite, task)
+    assert {name: list(tasks) for name, tasks in kept.items()} == left
+    assert ended == closed
+
+
+def test_keeping_nothing_is_refused() -> None:
+    """With what there is, and nothing is closed."""
+    ended: list[str] = []
+    kept = suites(ended)
+    with pytest.raises(ValueError, match=r"no suite 'a' with a task 'x'.*\['a'\]\[0\]"):
+        kept.keep("a", "x")
+    assert ended == []
+    assert len(list(kept.envs())) == 3
+
+
+def test_code_of_this_process_has_no_reference() -> None:
+    """Nothing could make it again elsewhere."""
+    assert suites([]).reference is None
