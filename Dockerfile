@@ -35,11 +35,15 @@ LABEL org.opencontainers.image.title="envhub-worker" \
       org.opencontainers.image.version="${VERSION}" \
       org.opencontainers.image.revision="${REVISION}"
 COPY --from=build /opt/envhub-worker /opt/envhub-worker
-ENV PATH=/opt/envhub-worker/bin:/usr/local/bin:/usr/bin:/bin \
+# Keys and snapshots of "listen". A volume that is mounted here, new and empty, gets its owner; without
+# one, keys last as long as the container, and in a read-only container as long as its start.
+RUN install -d -o 65532 -g 65532 -m 0700 /var/lib/envhub-worker
+ENV XDG_STATE_HOME=/var/lib \
+    PATH=/opt/envhub-worker/bin:/usr/local/bin:/usr/bin:/bin \
     HOME=/tmp \
     PYTHONDONTWRITEBYTECODE=1 \
     PYTHONUNBUFFERED=1
-# Nobody's: it owns no file, so it can change none.
+# Nobody's: it owns no file but that folder, so it can change none.
 USER 65532:65532
 WORKDIR /
 EXPOSE 5555

@@ -56,6 +56,16 @@ mmdebstrap --quiet --variant=minbase --include=python3,python3-venv,ca-certifica
 docker build --quiet --network host --build-arg "BASE_IMAGE=$base" --tag "$image" . >/dev/null
 docker image inspect --format 'the image has {{.Size}} bytes' "$image"
 
+# what runs and checks examples/deployment; Compose as a plugin of the engine's command
+make_venv "$(find_python 3.11 || command -v python3)" "$CI_WORK/deployment"
+"$CI_WORK/deployment/bin/uv" pip install --quiet --python "$CI_WORK/deployment/bin/python" \
+  --group deployment
+export PATH=$PATH:$CI_WORK/deployment/bin DOCKER_CONFIG=$CI_WORK/docker-config
+mkdir -p "$DOCKER_CONFIG/cli-plugins"
+ln -sf "$CI_WORK"/deployment/lib/python*/site-packages/compose/docker-compose \
+  "$DOCKER_CONFIG/cli-plugins/docker-compose"
+docker compose version
+
 export ENVHUB_CI=1 ENVHUB_TEST_IMAGE=$image
 if [ -x "$CI_WORK/tests/venv/bin/python" ]; then
   cd "$CI_WORK/tests/checkout"

@@ -501,6 +501,10 @@ def _make_private(folder: Path) -> None:
 
 
 def _is_ours(folder: Path) -> bool:
-    """Whether nobody else could have put it there: the temporary folder is everybody's."""
+    """Whether nobody else could have put it there: the temporary folder is everybody's.
+
+    One that we own and cannot write is a read-only container's, and no server's.
+    """
     found = folder.lstat()
-    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
+    ours = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid()
+    return ours and not found.st_mode & 0o022 and os.access(folder, os.W_OK)
