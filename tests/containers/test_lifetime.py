@@ -12,12 +12,13 @@ import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import psutil
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import WorkerDiedError
+from envhub_sandbox.errors import WorkerDiedError, WorkerStartupError
 from envhub_sandbox.sandboxes.docker import prune
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.run_arguments import CLIENT_LABEL, USER_LABEL
@@ -25,8 +26,23 @@ from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from envhub_sandbox.sandboxes.owner import identity_of
 from tests.containers.kit import IMAGE, container_of, containers_of, folders, nothing_left, pids_in
 from tests.support.processes import descendants, eventually
+from tests.support.repositories import write_repository
 from tests.support.samples import sample
 
+_HOG = """
+import gymnasium as gym
+
+class Hog(gym.Env):
+    observation_space = action_space = gym.spaces.Discrete(2)
+    def reset(self, *, seed=None, options=None):
+        return 0, {}
+    def step(self, action):
+        self.held = b"x" * (2 << 30)
+        return 0, 0.0, False, False, {}
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([Hog])
+"""
 _CLIENT = """
 import json, os, sys
 from envhub_sandbox import make_env
@@ -230,3 +246,21 @@ def test_gc_removes_what_is_ours_and_dead_and_nothing_else(engine: Engine) -> No
             assert found.remove()
         listed = engine.run("ps", "--all", "--no-trunc", "--format", "{{.ID}}").split()
         assert {who for who, name in made.items() if name in listed} == set(made) - {"dead"}
+
+
+def test_a_containers_own_limit_is_said_to_be_one(engine: Engine, tmp_path: Path) -> None:
+    """The policy permits the jail more than the container has: no signal out of nowhere."""
+    write_repository(tmp_path / "hog", _HOG)
+    sandbox = DockerSandbox(image=IMAGE, engine=engine.kind, memory=512 << 20)
+    with make_env(tmp_path / "hog", sandbox=sandbox) as suites:
+        suites.env.reset(seed=1)
+        with pytest.raises(WorkerDiedError, match="memory limit around the server") as caught:
+            suites.env.step([1])
+        assert caught.value.reason == "out-of-memory"
+
+
+def test_too_little_memory_for_the_server_is_said_to_be_so(engine: Engine) -> None:
+    """No image to build again, which would not help."""
+    sandbox = DockerSandbox(image=IMAGE, engine=engine.kind, memory=16 << 20)
+    with pytest.raises(WorkerStartupError, match=r"has 16 MiB.*DockerSandbox\(memory="):
+        make_env(sample("cartpole"), sandbox=sandbox)

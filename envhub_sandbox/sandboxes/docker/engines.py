@@ -194,10 +194,23 @@ _EXPLAINED = (
 )
 
 
-def explained(engine: str, stderr: str) -> str:
-    """What an engine's complaint means, and the command that mends it."""
+_WITHOUT_LIMITS = (
+    "it uses control groups of its own accord and cannot here, though it was asked for no limits: "
+    'tell it not to, with cgroups = "disabled" under [containers] in containers.conf, or docker.'
+)
+
+
+def explained(engine: str, stderr: str, *, limited: bool = True) -> str:
+    """What an engine's complaint means, and the command that mends it.
+
+    Args:
+        engine: Its kind.
+        stderr: The complaint.
+        limited: Whether it was asked for limits; to go without is no advice where it was not.
+    """
     for text, meaning in _EXPLAINED:
         if text in stderr:
+            meaning = meaning if limited or text != "cgroup" else _WITHOUT_LIMITS
             return f"{meaning} ({engine} says: {_last_line(stderr)})"
     return f"it failed: {_last_line(stderr) or 'without a word'}"
 

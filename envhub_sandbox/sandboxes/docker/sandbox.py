@@ -47,6 +47,7 @@ _STOP_S = 45.0
 _ANNOUNCEMENT_BYTES = 65536
 # of the engine's own: it failed, it could not run the program, there is no such program
 _ENGINES_CODES = (125, 126, 127)
+_KILLED = 128 + 9
 # Far above the users of distributions, systemd and rootless containers.
 _UNUSED_USERS = range(0x6E000000, 0x6EFFFFFF)
 
@@ -229,7 +230,7 @@ class RepositoryContainer:
     def _enclosed(
         self, wanted: Container, folder: Path, process: subprocess.Popen[bytes], answer: bytes
     ) -> ContainerServer:
-        _check_started(self._engine, answer)
+        _check_started(self._engine, wanted, answer)
         found = attestation.parse(answer)
         if not (folder / "sockets" / "fds").is_socket():
             raise SandboxUnavailableError(
@@ -325,7 +326,7 @@ def _answer(ready: int, process: subprocess.Popen[bytes]) -> bytes:
     return answer
 
 
-def _check_started(engine: Engine, answer: bytes) -> None:
+def _check_started(engine: Engine, wanted: Container, answer: bytes) -> None:
     """Say why there is no container, if there is none.
 
     Raises:
@@ -337,7 +338,14 @@ def _check_started(engine: Engine, answer: bytes) -> None:
     said = json.loads(answer)
     tail = str(said["tail"])
     if said["ended"] in _ENGINES_CODES:
-        raise SandboxUnavailableError(explained(engine.kind, tail))
+        limited = wanted.memory is not None
+        raise SandboxUnavailableError(explained(engine.kind, tail, limited=limited))
+    if said["ended"] == _KILLED and wanted.memory is not None:
+        raise WorkerStartupError(
+            "the container's program was killed (SIGKILL) while it started, as the kernel does "
+            f"where memory runs out: the container has {wanted.memory >> 20} MiB, and the worker's "
+            "own server needs a part of that; give it more with DockerSandbox(memory=...)"
+        )
     raise WorkerStartupError(
         f"the container's program ended at once (exit code {said['ended']}); an image that was "
         f"built from another version must be built again:\n{tail[-4000:]}"

@@ -338,6 +338,15 @@ def test_an_engines_complaint_becomes_advice(said: str, advice: str) -> None:
     assert advice in engines.explained("docker", said)
 
 
+def test_nobody_is_advised_to_do_what_he_has_done() -> None:
+    """An engine that fails over control groups all the same, without any limit."""
+    said = "Error: OCI runtime error: writing file cgroup.procs: permission denied"
+    assert "cgroups=False" in engines.explained("podman", said)
+    advice = engines.explained("podman", said, limited=False)
+    assert "cgroups=False" not in advice
+    assert "containers.conf" in advice
+
+
 def test_without_an_engine_each_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """And how to get it."""
     monkeypatch.setenv("PATH", str(tmp_path))

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from time import monotonic
 
 from envhub_worker.channel import close_fds
+from envhub_worker.lockdown.limits import around
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import ProtocolError
@@ -67,6 +68,7 @@ class JailEvents:
         self._deposits = deposits
         self._witness = witness
         self.deaths: Counter[str] = Counter()
+        self._around = around.Around()
 
     def follow(self, entry: JailEntry) -> None:
         """Hear of a new jail from now on."""
@@ -171,7 +173,18 @@ class JailEvents:
             signal=signal_name(event.signal),
             detail=event.detail,
         )
-        self._runner_died(entry, death)
+        self._runner_died(entry, self._judged(entry, death))
+
+    def _judged(self, entry: JailEntry, death: m.Died) -> m.Died:
+        """A kill is the kernel's, where it has counted one for the memory around all of us."""
+        by_signal = death.signal == "SIGKILL" and death.reason in ("signal", "exit")
+        if entry.death is None and by_signal and self._around.killed_one():
+            return m.replace(death, reason="out-of-memory", detail=around.WHY)
+        return death
+
+    def close(self) -> None:
+        """Nothing happens any more."""
+        self._around.close()
 
     def _runner_died(self, entry: JailEntry, death: m.Died) -> None:
         """The end of its jail too, unless that is kept."""
@@ -240,7 +253,8 @@ class JailEvents:
         else:
             self._jail_events(entry)  # its runners' exits say more than its own
             how = signal_name(event.signal)
-            self.end(entry, whole_jail("exit", exit_code=event.code, signal=how))
+            death = whole_jail("exit", exit_code=event.code, signal=how)
+            self.end(entry, self._judged(entry, death))
         self._release(entry)
         for asker in entry.closing:
             self._answers.reply(asker, m.Done())

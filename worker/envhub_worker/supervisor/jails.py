@@ -84,6 +84,7 @@ class Jails:
             self._events.kill(entry)
         self._zygotes.close()
         self._deposits.close()
+        self._events.close()
 
     # --- requests ------------------------------------------------------------------------------
 
