@@ -31,6 +31,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import envhub_worker.protocol
 from envhub_sandbox import folders
 from envhub_sandbox.dependencies import index, uv
 from envhub_sandbox.dependencies.bounds import Bounds, Watch, checked, walk
@@ -48,19 +49,7 @@ _COMPILE_S = 1800.0
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 _THERE = (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR)
 
-# Reads a stranger's source and runs none of it: -I -S, no package is on the path. Tests are left
-# out; nobody imports them. Bytecode is never held against its source again: both are read-only.
-_COMPILE = """\
-import compileall, py_compile, re, resource, sys
-for limit, value in ((resource.RLIMIT_AS, 8 << 30), (resource.RLIMIT_CPU, 1800),
-                     (resource.RLIMIT_CORE, 0)):
-    hard = resource.getrlimit(limit)[1]
-    value = value if hard == resource.RLIM_INFINITY else min(value, hard)
-    resource.setrlimit(limit, (value, value))
-left_out = re.compile(re.escape(sys.argv[1]) + r"(/.*)?/tests?/", re.DOTALL)
-compileall.compile_dir(sys.argv[1], quiet=2, stripdir=sys.argv[1], rx=left_out, maxlevels=64,
-                       invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH)
-"""
+_BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
 
 
 @dataclass(frozen=True)
@@ -323,10 +312,13 @@ def _size(packages: Path, bounds: Bounds) -> int:
 
 
 def _compile(interpreter: Interpreter, packages: Path, held: int) -> None:
-    """Bytecode for all of it. What fails is only slower, so it is nobody's error."""
+    """Bytecode for all of it, by a process that is confined to the folder (``bytecode.py``).
+
+    What fails is only slower, so it is nobody's error.
+    """
     with contextlib.suppress(subprocess.SubprocessError):
         subprocess.run(
-            [interpreter.path, "-I", "-S", "-c", _COMPILE, str(packages)],
+            [interpreter.path, "-I", "-S", str(_BOOTSTRAP), "bytecode", str(packages)],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

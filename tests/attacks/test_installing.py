@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import socket
 import subprocess
 import tarfile
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.dependencies import index as places
 from envhub_sandbox.dependencies import interpreters, uv
 from envhub_sandbox.errors import DependencyError, EnvHubError
+from envhub_sandbox.sandboxes.process import BOOTSTRAP
 from tests.support.repositories import write_repository
 from tests.support.wheels import Index, make_wheel
 
@@ -254,3 +256,52 @@ def test_making_bytecode_runs_nothing(real_index: Index, tmp_path: Path, traces:
     with make_env(folder) as suites:
         suites.env.reset(seed=0)
     assert sprung(traces) == set()
+
+
+ESCAPED = """\
+import runpy, socket, sys
+bootstrap = runpy.run_path(sys.argv[1])
+bootstrap["load_package"]()
+from envhub_worker import bytecode
+if sys.argv[2] == "confined":
+    bytecode.confine(sys.argv[3])
+def attempt(work):
+    try:
+        work()
+    except OSError:
+        pass
+attempt(lambda: open(sys.argv[4] + "/written", "w").close())
+attempt(lambda: open(sys.argv[3] + "/copied", "w").write(open(sys.argv[4] + "/secret").read()))
+attempt(lambda: socket.socket().connect(("127.0.0.1", int(sys.argv[5]))))
+open(sys.argv[3] + "/reached", "w").close()
+"""
+
+
+def escaped(how: str, folder: Path, outside: Path) -> set[str]:
+    """What somebody gets who takes the compiler over, judged from outside."""
+    folder.mkdir()
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        words = [str(BOOTSTRAP), how, str(folder), str(outside), str(listener.getsockname()[1])]
+        command = [interpreters.own().path, "-I", "-S", "-c", ESCAPED, *words]
+        subprocess.run(command, timeout=300, stderr=subprocess.DEVNULL)
+        listener.setblocking(False)
+        found = {path.name for path in (folder, outside) for path in path.iterdir()} - {"secret"}
+        try:
+            listener.accept()[0].close()
+        except BlockingIOError:
+            return found
+        return found | {"heard"}
+
+
+def test_a_compiler_that_is_taken_over_has_only_the_folder(tmp_path: Path) -> None:
+    """What it reads is a stranger's: no other file, no network; the folder is theirs anyway."""
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "secret").write_text("a secret")
+    assert escaped("free", tmp_path / "control", outside) == {
+        *("written", "copied", "heard", "reached"),
+    }
+    assert (tmp_path / "control/copied").read_text() == "a secret"
+    (outside / "written").unlink()
+    assert escaped("confined", tmp_path / "folder", outside) == {"copied", "reached"}
+    assert (tmp_path / "folder/copied").read_text() == ""

@@ -7,6 +7,7 @@ from the folder of this very file::
     python -I .../bootstrap.py worker ARGS...    envhub_worker.__main__.main(ARGS)
     python -I .../bootstrap.py zygote ARGS...    envhub_worker.spawn.zygote.main(ARGS)
     python -I .../bootstrap.py probe             envhub_worker.lockdown.probe.main([])
+    python -I -S .../bootstrap.py bytecode PATH  envhub_worker.bytecode.main([PATH])
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ _PROGRAMS = {
     "worker": "envhub_worker.__main__",
     "zygote": "envhub_worker.spawn.zygote",
     "probe": "envhub_worker.lockdown.probe",
+    "bytecode": "envhub_worker.bytecode",
 }
 
 _NEEDED = {

@@ -92,6 +92,7 @@ MAY_IMPORT = {
     "envhub_worker.lockdown": {"", "channel"},
     "envhub_worker.runner": {"lockdown", "unreadable"},
     "envhub_worker.bootstrap": set(),
+    "envhub_worker.bytecode": {"lockdown"},
     "envhub_worker.multipart": set(),
     "envhub_worker.loop": set(),
     "envhub_worker.channel": set(),
