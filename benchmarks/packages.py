@@ -64,7 +64,7 @@ CASES: Mapping[str, Case] = {
     "panda-gym": Case("panda-gym", "import panda_gym", '"PandaReach-v3"'),
     "gym-pusht": Case("gym-pusht\npymunk<7", "import gym_pusht", '"gym_pusht/PushT-v0"'),
     "dm_control": Case(
-        "shimmy[dm-control]\nmujoco<4",
+        "shimmy[dm-control]\nmujoco<4\npackaging",  # which one of them imports, and none declares
         "import shimmy\ngym.register_envs(shimmy)",
         '"dm_control/cartpole-balance-v0"',
     ),
@@ -136,7 +136,8 @@ def _reason(message: str) -> str:
     """The line that says it, without where it came from."""
     lines = [line.strip() for line in message.splitlines() if line.strip()]
     causes = [line for line in lines if line.startswith(("cause:", "hint:", "Because"))]
-    return (causes or lines)[0].removeprefix("cause: ")[:300]
+    text = (causes or lines)[0].removeprefix("cause: ")
+    return text.partition("env.py: ")[2][:300] or text[:300]
 
 
 def _environments(variables: Mapping[str, str]) -> dict[str, Any] | None:
