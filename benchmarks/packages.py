@@ -73,7 +73,9 @@ CASES: Mapping[str, Case] = {
     ),
     "gym-xarm": Case("gym-xarm", "import gym_xarm", '"gym_xarm/XarmLift-v0", obs_type="state"'),
     "pybullet": Case("gym-pybullet-drones", "import gym_pybullet_drones", '"hover-aviary-v0"'),
-    "metaworld": Case("metaworld", "import metaworld", '"Meta-World/MT1", env_name="reach-v3"'),
+    "metaworld": Case(
+        "metaworld\npackaging", "import metaworld", '"Meta-World/MT1", env_name="reach-v3"'
+    ),
 }
 
 
