@@ -123,20 +123,29 @@ class EnvSession:
             LocalProtocolError: It cannot be sent; nothing was.
             WorkerError: The environment is not in a state to take it.
         """
-        with self._turn(operation):
-            self._make_ready(operation)
-            lane = self._lane()
-            messages = [message_for(lane.number, bounds) for bounds in self.bounds]
+        with self._lock:
             try:
-                request = lane.request(operation, messages)
-            except LocalProtocolError:
-                self._refuse_whole(operation, message_for)
-                raise
-            self._send(operation, lambda: lane.send(request))
-            self._recovery.sent(request)
-            self.history.requested(request)
-            if self._first_use is not None:
-                self._note_first_use()
+                self._submit(operation, message_for)
+            except BaseException:
+                with self._turn(operation):  # only now: what goes well has no need of it
+                    raise
+            if self.lifecycle.state is State.CLOSED:
+                self.lease.let_go()
+
+    def _submit(self, operation: str, message_for: MessageFor) -> None:
+        self._make_ready(operation)
+        lane = self._lane()
+        messages = [message_for(lane.number, bounds) for bounds in self.bounds]
+        try:
+            request = lane.request(operation, messages)
+        except LocalProtocolError:
+            self._refuse_whole(operation, message_for)
+            raise
+        self._send(operation, lambda: lane.send(request))
+        self._recovery.sent(request)
+        self.history.requested(request)
+        if self._first_use is not None:
+            self._note_first_use()
 
     def _refuse_whole(self, operation: str, message_for: MessageFor) -> None:
         """Raise what cannot be sent as it is called in the caller's arguments, not in a shard's."""
@@ -152,18 +161,28 @@ class EnvSession:
             WorkerDiedError: The environment is then DEAD; with ``restart="transparent"`` READY.
             RemoteEnvError: The repository's code raised; the environment is still usable.
         """
-        with self._turn("a request"), self._judging():
+        with self._lock:
             try:
-                lane = self.lease.lane
-                if lane is None or self.lifecycle.state is not State.PENDING:
-                    raise self._nothing_asked()
-                replies = self._finish(lane.replies, Deadline(timeout_s))
-            except RunnersDiedError as deaths:
-                replies = self._survive_request(deaths)
-            for reply in replies:
-                check(reply)
-            self._recovery.answered()
+                replies = self._collect(timeout_s)
+            except BaseException:
+                with self._turn("a request"), self._judging():
+                    raise
+            if self.lifecycle.state is State.CLOSED:
+                self.lease.let_go()
             return replies
+
+    def _collect(self, timeout_s: float | None) -> list[m.Message]:
+        try:
+            lane = self.lease.lane
+            if lane is None or self.lifecycle.state is not State.PENDING:
+                raise self._nothing_asked()
+            replies = self._finish(lane.replies, Deadline(timeout_s))
+        except RunnersDiedError as deaths:
+            replies = self._survive_request(deaths)
+        for reply in replies:
+            check(reply)
+        self._recovery.answered()
+        return replies
 
     def request(
         self, operation: str, message_for: MessageFor, timeout_s: float | None
@@ -252,6 +271,7 @@ class EnvSession:
         if refused is not None:
             self._refuse_others(operation)
             raise refused
+        self._note_first_use()  # already: what is started ahead of the next is started beside this
         self._start(StartupDeadline(self.repository.timeouts.startup_s))
 
     def _refuse_others(self, operation: str) -> None:

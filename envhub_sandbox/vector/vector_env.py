@@ -230,8 +230,11 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         replies = self._collect(timeout_s, m.Value)
         if not self._manifest.shardable:
             return cast("tuple[Any, ...]", replies[0].value)
-        with self._remote.handling():
+        try:
             return self._remote.results.one_each("call", replies)
+        except BaseException:
+            with self._remote.handling():
+                raise
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """An attribute of every sub-environment."""
@@ -418,8 +421,11 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         except WorkerDiedError:
             self._raise_if_closed()  # close() in another thread ended it under us
             raise
-        with self._remote.handling():
+        try:
             return [typed(reply, kind) for reply in replies]
+        except BaseException:
+            with self._remote.handling():
+                raise
 
     def _end_wait(self, operation: str) -> None:
         self._raise_if_closed()

@@ -176,36 +176,62 @@ def test_what_was_given_up_starts_again_when_it_is_asked(tasks: Callable[..., Ta
     assert observations[0][0] == 1.0
 
 
-def test_while_one_is_waited_for_the_next_is_started(tmp_path: Path) -> None:
-    """Else, where starting takes longer than playing, nothing would be gained."""
-    held_up = f"        while task == 1 and not os.path.exists({str(tmp_path / 'gate/open')!r}):"
+@pytest.fixture
+def gated(tmp_path: Path) -> tuple[Path, Path, dict[str, Any]]:
+    """A repository whose task 1 is made once there is a file; the file; the policy to see it.
+
+    Its manifest is remembered.
+    """
+    gate = tmp_path / "gate"
+    gate.mkdir()
+    gate.chmod(0o755)
+    opened = gate / "open"
+    held_up = f"        while task == 1 and not os.path.exists({str(opened)!r}):"
     suite = SUITE.replace(
         "        self.task, self.made", f"{held_up}\n            pass\n        self.task, self.made"
     )
     repository = write_repository(tmp_path / "repository", f"import os\n{suite}")
-    gate = tmp_path / "gate"
-    gate.mkdir()
-    gate.chmod(0o755)
-    (gate / "open").touch()
+    opened.touch()
     policy = {"readable": (str(gate),)}
     with make_env(repository, policy=policy):
-        pass  # its manifest is remembered
-    (gate / "open").unlink()
+        pass
+    opened.unlink()
     stop_idle()
+    return repository, opened, policy
+
+
+def test_while_one_is_waited_for_the_next_is_started(
+    gated: tuple[Path, Path, dict[str, Any]],
+) -> None:
+    """Else, where starting takes longer than playing, nothing would be gained."""
+    repository, opened, policy = gated
     elsewhere = descendants()
     with make_env(repository, policy=policy, prewarm=1) as suites:
         envs = list(suites.envs())
         envs[0].reset()
         # the server, its zygote's two, and two jails of two: the second one is at the gate
         assert eventually(lambda: len(descendants() - elsewhere) == 7)
-        with concurrent.futures.ThreadPoolExecutor(1) as pool:
-            asked = pool.submit(envs[1].reset)
-            begun = eventually(lambda: ahead(envs) == [2])
-            waited = not asked.done()
-            (gate / "open").touch()
-            assert asked.result()[0][0][0] == 1.0
-        assert begun
-        assert waited
+        assert all(_begun_meanwhile(envs, opened))
+
+
+def test_while_the_first_is_started_the_next_is(
+    gated: tuple[Path, Path, dict[str, Any]],
+) -> None:
+    """Nothing of it was up when it was asked."""
+    repository, opened, policy = gated
+    with make_env(repository, policy=policy, prewarm=1) as suites:
+        assert all(_begun_meanwhile(list(suites.envs()), opened))
+
+
+def _begun_meanwhile(envs: Tasks, opened: Path) -> tuple[bool, bool]:
+    """Whether task 2 comes up, and task 1, at the gate until then, has not answered."""
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        asked = pool.submit(envs[1].reset)
+        begun = eventually(lambda: ahead(envs) == [2])
+        waited = not asked.done()
+        opened.touch()
+        assert asked.result()[0][0][0] == 1.0
+    return begun, waited
 
 
 def test_what_fails_is_raised_by_the_first_request_of_that_task(
