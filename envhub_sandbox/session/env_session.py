@@ -658,7 +658,8 @@ class EnvSession:
         process is left for it to end.
         """
         if not self.lease.interrupt(self._end_life):
-            return  # whoever brings a jail sees that it is closed
+            self.lease.depart()  # who has the turn may be past seeing that it is closed
+            return  # whoever brings a jail sees it
         close_s = self.repository.timeouts.close_s
         patience_s = _INTERRUPT_S if close_s is None else min(close_s, _INTERRUPT_S)
         if self._lock.acquire(timeout=patience_s):

@@ -234,7 +234,11 @@ class Lease:
             self.give_back(wait=wait)
         finally:
             self._let_server_go()
-            self._departs()
+            self.depart()
+
+    def depart(self) -> None:
+        """Say that the server is not needed again, at least not by this one. Idempotent."""
+        self._departs()
 
     def interrupt(self, close: Callable[[], None]) -> bool:
         """In another thread: ``close`` the environment, and end the jail under who waits for it.

@@ -6,6 +6,7 @@ import concurrent.futures
 import contextlib
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,6 +19,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvError
 from envhub_sandbox.hub import store
 from envhub_sandbox.sandboxes.lingering import stop_idle
+from tests.support import inside
 from tests.support.processes import descendants, eventually
 from tests.support.repositories import write_repository
 from tests.support.samples import sample
@@ -174,6 +176,27 @@ def test_what_was_given_up_starts_again_when_it_is_asked(tasks: Callable[..., Ta
     assert states(envs)[1] == "IDLE"
     observations, _ = envs[1].reset()
     assert observations[0][0] == 1.0
+
+
+def test_closing_what_is_being_given_up_leaves_no_server(tasks: Callable[..., Tasks]) -> None:
+    """Whoever gives it up has its turn still, and nothing of it any more: neither waits."""
+    envs = tasks(2)
+    envs[0].reset()
+    owner, name = inside.turn_lock(envs[1])
+    held, closed = threading.Event(), threading.Event()
+
+    def give_up() -> None:
+        with getattr(owner, name):
+            held.set()
+            closed.wait(60)
+
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        last = pool.submit(give_up)
+        assert held.wait(60)
+        envs[1].close()
+        closed.set()
+        last.result()
+    envs[0].close()  # that nothing is left, the fixture asks
 
 
 @pytest.fixture
