@@ -31,7 +31,7 @@ class Warm:
         self._patience = patience
         self._suites = make_env(reference)
         self._suites.env.reset(seed=0)
-        self._repository: Any = inside.repository(self._suites.env)
+        self._launcher: Any = inside.launcher(self._suites.env)
         self._server = inside.server(self._suites.env)
         report = self._suites.env.sandbox_report
         self.layers = [layer["layer"] for layer in report if layer["enforced"]]
@@ -44,11 +44,11 @@ class Warm:
 
     def spawn(self) -> float:
         """Milliseconds until a worker is confined, has tried its denials and reports."""
-        repository, server = self._repository, self._server
-        client = WorkerClient(server.endpoint, server.process_fd, repository.wire_limits)
+        limits, server = self._launcher.repository.wire_limits, self._server
+        client = WorkerClient(server.endpoint, server.process_fd, limits)
         client.hello(Deadline(_LONG_S))
         self._patience.wait()
-        order, limits = inside.order(repository, server), repository.wire_limits
+        order = inside.order(self._launcher, server)
         start = perf_counter()
         jail = open_jail(client, order, limits, Deadline(_LONG_S))
         taken = (perf_counter() - start) * 1000

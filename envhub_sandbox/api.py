@@ -21,13 +21,15 @@ from envhub_sandbox.policy import Limits, Policy, Timeouts, policy_from, timeout
 from envhub_sandbox.sandboxes import inprocess
 from envhub_sandbox.sandboxes.base import Sandbox
 from envhub_sandbox.session.env_session import EnvSession
-from envhub_sandbox.session.jail_sources import JailSource, OwnJails, SharedJail
-from envhub_sandbox.session.launcher import Known, LoadArguments, LoadedJail, Repository
-from envhub_sandbox.session.line import wait_in_line
+from envhub_sandbox.session.jails.launcher import Launcher
+from envhub_sandbox.session.jails.line import wait_in_line
+from envhub_sandbox.session.jails.loaded import Known, LoadedJail
+from envhub_sandbox.session.jails.sources import JailSource, OwnJails, SharedJail
 from envhub_sandbox.session.manifest_cache import ManifestCache, manifest_key
 from envhub_sandbox.session.prewarming import Prewarming
 from envhub_sandbox.session.provenance import provenance_of
 from envhub_sandbox.session.recipe import Recipe, pinned
+from envhub_sandbox.session.repository import LoadArguments, Repository
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.shared_memory.sharding import bounds_for
 from envhub_sandbox.vector.suites import EnvSuites
@@ -179,9 +181,7 @@ def make_env(
         ),
         chosen_policy,
         chosen_timeouts,
-        place,
         runs_on,
-        store.cache_root() / "snapshots",
         lane,
         copy,
     )
@@ -216,7 +216,8 @@ def make_env(
             0  # a container's memory is all its jails', a quota all a key's, a GPU everybody's
         )
     agrees = locks.checker(locked, snapshot.label, further, config)
-    return _Maker(repository, num_workers, prewarm, _face(validate), agrees).make()
+    launcher = Launcher(repository, place, store.cache_root() / "snapshots")
+    return _Maker(launcher, num_workers, prewarm, _face(validate), agrees).make()
 
 
 def _face(validate: bool) -> type[SandboxVectorEnv]:
@@ -235,7 +236,7 @@ class _Maker:
 
     def __init__(
         self,
-        repository: Repository,
+        launcher: Launcher,
         num_workers: int | None,
         prewarm: int | None,
         face: type[SandboxVectorEnv],
@@ -243,11 +244,12 @@ class _Maker:
     ) -> None:
         self._face = face
         self._agrees = agrees
-        self._repository = repository
+        self._launcher = launcher
+        self._repository = repository = launcher.repository
         self._num_workers = num_workers
         self._prewarm = prewarm
         load = repository.arguments.message()
-        key = manifest_key(repository.snapshot, load, repository.policy, repository.runs_on)
+        key = manifest_key(repository.snapshot, load, repository.policy, launcher.runs_on)
         self._cache = ManifestCache(store.cache_root() / "manifests", key)
 
     def make(self) -> EnvSuites:
@@ -258,28 +260,28 @@ class _Maker:
             return self._suites(manifest, None)
         with repository.named():
             deadline = Deadline(repository.timeouts.startup_s)
-            ask = partial(repository.open, deadline)
-            loaded = wait_in_line(ask, repository.retry_s, deadline, repository.label)
+            ask = partial(self._launcher.open, deadline)
+            loaded = wait_in_line(ask, self._launcher.retry_s, deadline, repository.label)
         self._cache.save(loaded.value)
         try:
             self._agrees(loaded.manifest)
             return self._suites(loaded.manifest, loaded)
         except BaseException:
-            repository.close(loaded)
+            self._launcher.close(loaded)
             raise
 
     def _suites(self, manifest: Manifest, loaded: LoadedJail | None) -> EnvSuites:
         repository = self._repository
         shared = None if manifest.lazy or len(manifest.envs) == 1 else self._shared(loaded)
-        remotes = [self._remote(manifest, env, shared) for env in manifest.envs]
+        sessions = [self._session(manifest, env, shared) for env in manifest.envs]
         if loaded is not None and shared is None:
-            self._use(loaded, remotes)
+            self._use(loaded, sessions)
         envs: dict[str, dict[Any, Any]] = {}
         suites: dict[str, list[EnvSession]] = {}
-        for remote in remotes:
-            env = remote.manifest
-            envs.setdefault(env.suite, {})[env.task] = self._face(remote)
-            suites.setdefault(env.suite, []).append(remote)
+        for session in sessions:
+            env = session.manifest
+            envs.setdefault(env.suite, {})[env.task] = self._face(session)
+            suites.setdefault(env.suite, []).append(session)
         if shared is None and self._prewarm != 0:
             Prewarming(list(suites.values()), self._prewarm)
         return EnvSuites(
@@ -292,28 +294,28 @@ class _Maker:
         )
 
     def _shared(self, loaded: LoadedJail | None) -> SharedJail:
-        shared = SharedJail(self._repository, self._cache.forget)
+        shared = SharedJail(self._launcher, self._cache.forget)
         if loaded is not None:
             shared.provide(loaded)
         return shared
 
-    def _remote(
+    def _session(
         self, manifest: Manifest, env: EnvManifest, shared: SharedJail | None
     ) -> EnvSession:
         paces = self._cache.paces
         bounds = bounds_for(env, self._num_workers, paces.of(env))
         known = Known(manifest, env, len(bounds))
-        own = OwnJails(self._repository, self._cache.forget, known)
+        own = OwnJails(self._launcher, self._cache.forget, known)
         source: JailSource = own if shared is None else shared
         return EnvSession(source, env, bounds, paces)
 
-    def _use(self, loaded: LoadedJail, remotes: list[EnvSession]) -> None:
+    def _use(self, loaded: LoadedJail, sessions: list[EnvSession]) -> None:
         """The jail that told the manifest becomes the only task's; a suite holds none in stock."""
-        if len(remotes) == 1:
+        if len(sessions) == 1:
             with self._repository.named():
-                remotes[0].adopt(loaded)
+                sessions[0].head_start.adopt(loaded)
         else:
-            self._repository.close(loaded)
+            self._launcher.close(loaded)
 
 
 def _reference(cfg: Any) -> tuple[str, Any]:

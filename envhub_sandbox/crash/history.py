@@ -16,7 +16,7 @@ import numpy as np
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.transport.request import Request, whole
-from envhub_sandbox.transport.tensors import to_tensor
+from envhub_sandbox.transport.values.tensors import to_tensor
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.manifest import EnvManifest

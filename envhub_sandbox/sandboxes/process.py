@@ -24,6 +24,7 @@ from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.base import WorkerServer
 from envhub_sandbox.sandboxes.lingering import Lingering
 from envhub_sandbox.sandboxes.refcount import Sharing
+from envhub_sandbox.transport.forks import Owner
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
@@ -40,7 +41,7 @@ class ProcessServer:
     process_fd: int
     process: subprocess.Popen[bytes]
     folder: Path
-    owner: int = field(default_factory=os.getpid)
+    owner: Owner = field(default_factory=Owner)
     users: int = 0
 
     @property
@@ -59,7 +60,7 @@ class ProcessServer:
 
     def stop(self) -> None:
         """End it and everything below it, in bounded time. A fork of its owner does nothing."""
-        if os.getpid() != self.owner:
+        if not self.owner.is_here:
             return
         self.process.terminate()
         try:

@@ -26,6 +26,7 @@ from envhub_sandbox.sandboxes.base import WorkerServer
 from envhub_sandbox.sandboxes.refcount import Sharing
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.forks import Owner
 from envhub_sandbox.transport.tcp import Far
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import parse_key
@@ -318,7 +319,7 @@ class Host:
         self.endpoint = endpoint
         self.far = far
         self.users = 0
-        self.owner = os.getpid()
+        self.owner = Owner()
         self.uploading = threading.Lock()
         self.stopped, self._stops = os.pipe()
         self._stop = threading.Event()
@@ -365,7 +366,7 @@ class Host:
 
     def stop(self) -> None:
         """No longer tell it. A fork of its owner does nothing."""
-        if os.getpid() == self.owner:
+        if self.owner.is_here:
             self._close_jails()
             self._stop.set()
             os.close(self._stops)  # wakes the thread, should it wait for an answer

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from envhub_sandbox.errors import SnapshotError, WorkerError
-from envhub_sandbox.transport.connection import WorkerClient, expect
+from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.replies import expect
 from envhub_worker.protocol import messages as m
 
 PIECE_BYTES = 256 * 1024

@@ -6,20 +6,22 @@ Nothing here knows what is asked of the environment, nor why a jail has to be le
 from __future__ import annotations
 
 import contextlib
-import os
 import threading
 import weakref
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerDiedError, WorkerError
+from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerError
 from envhub_sandbox.session.counters import Counters
-from envhub_sandbox.session.jail_sources import JailSource, SharedJail
-from envhub_sandbox.session.launcher import LoadedJail, Repository
-from envhub_sandbox.session.line import of_a_lost_server, of_a_server_that_ends, wait_in_line
-from envhub_sandbox.session.placement import Builder, Place
+from envhub_sandbox.session.jails.line import of_a_lost_server, of_a_server_that_ends, wait_in_line
+from envhub_sandbox.session.jails.loaded import LoadedJail
+from envhub_sandbox.session.jails.placement import Builder, Place
+from envhub_sandbox.session.jails.sources import JailSource, SharedJail
+from envhub_sandbox.session.refusals import closed_during
+from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
+from envhub_sandbox.transport.forks import Owner
 from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.shared_memory.sharding import PaceBook
@@ -61,22 +63,23 @@ class Lease:
         counters: Counters,
         paces: PaceBook,
     ) -> None:
-        self.repository: Repository = jails.repository
+        self.repository: Repository = jails.launcher.repository
         self.lifecycle = lifecycle
         self.loaded: LoadedJail | None = None
         self.lane: Lane | None = None
         self.make_room: Callable[[], bool] = _no_room
         self._jails = jails
+        self._launcher = jails.launcher
         self._results = results
         self._counters = counters
         self._paces = paces
         self._builder = Builder(jails, results)
         self._ending = threading.RLock()  # nothing is given back that another thread is ending
-        self._owner = os.getpid()
+        self._owner = Owner()
         self._was_loaded = False
         self._startup: StartupDeadline | None = None
         self._release_server: Callable[[], None] = _nothing
-        self._departs = weakref.finalize(self, jails.repository.stay())
+        self._departs = weakref.finalize(self, jails.launcher.stay())
         self._departs.atexit = False
 
     @property
@@ -93,7 +96,7 @@ class Lease:
 
     def states(self) -> tuple[str, ...]:
         """What its runners are doing, one word each."""
-        return () if self.loaded is None else self.repository.states(self.loaded)
+        return () if self.loaded is None else self._launcher.states(self.loaded)
 
     def look(self, operation: str, deadline: Deadline) -> None:
         """Ask the server whether the jail lives.
@@ -150,7 +153,7 @@ class Lease:
             retry_s = self._patience_s(error)
             if deadline.unasked or not (full or retry_s):
                 raise
-            room = full and self.repository.settle() | self.make_room()
+            room = full and self._launcher.settle() | self.make_room()
             if not room and not retry_s:
                 raise
             told = error
@@ -160,7 +163,7 @@ class Lease:
     def _patience_s(self, error: EnvHubError) -> float:
         """How long to wait: after a server that ended, where restarts are wanted, for another."""
         full = type(error) is WorkerError or isinstance(error, ServerBusyError)
-        retry_s = self.repository.retry_s if full else 0.0
+        retry_s = self._launcher.retry_s if full else 0.0
         if self.repository.policy.restart == "never":
             return retry_s
         lost = self._was_loaded and of_a_lost_server(error)
@@ -195,14 +198,14 @@ class Lease:
     def leave(self) -> None:
         """End the jail and give it back, but keep its server for another."""
         self._let_server_go()
-        self._release_server = self.repository.hold()
+        self._release_server = self._launcher.hold()
         try:
             self.end()
         finally:
             self.give_back()
 
     def give_back(self, *, wait: bool = True) -> None:
-        """Give the jail back, if there is one; see ``Repository.close``."""
+        """Give the jail back, if there is one; see ``Launcher.close``."""
         with self._ending:
             loaded, self.loaded = self.loaded, None
             try:
@@ -228,7 +231,7 @@ class Lease:
 
     def let_go(self, *, wait: bool = True) -> None:
         """Give back whatever is left, for good. A fork of its owner gives back nothing."""
-        if os.getpid() != self._owner:
+        if not self._owner.is_here:
             return
         try:
             self.give_back(wait=wait)
@@ -268,12 +271,6 @@ class Lease:
     def _let_server_go(self) -> None:
         release, self._release_server = self._release_server, _nothing
         release()
-
-
-def closed_during(operation: str) -> WorkerDiedError:
-    """What is told to whoever waits for an environment that somebody closes."""
-    text = f"the environment was closed during {operation}"
-    return WorkerDiedError(text, reason="killed", request=operation)
 
 
 def _nothing() -> None:

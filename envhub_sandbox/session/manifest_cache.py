@@ -17,9 +17,9 @@ from envhub_sandbox import folders
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.policy import Policy
-from envhub_sandbox.transport import pickles
-from envhub_sandbox.transport.generators import generator
 from envhub_sandbox.transport.shared_memory.sharding import PaceBook
+from envhub_sandbox.transport.values import pickles
+from envhub_sandbox.transport.values.generators import generator
 from envhub_worker import protocol
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import encode

@@ -41,7 +41,7 @@ class Prewarming:
         self._giving_up = 0
         for suite in suites:
             for env in suite:
-                env.on_first_use(partial(self._used, weakref.ref(env)), self.make_room)
+                env.head_start.on_first_use(partial(self._used, weakref.ref(env)), self.make_room)
 
     def make_room(self) -> bool:
         """Give up what nobody has used yet, since a server has no place left; whether there was."""
@@ -93,7 +93,7 @@ class Prewarming:
     def _run(self, env: EnvSession, start: bool) -> None:
         try:
             with contextlib.suppress(Exception):  # whoever asks for it meets it, too
-                env.warm_up() if start else env.cool_down()
+                env.head_start.warm_up() if start else env.head_start.cool_down()
         finally:
             if not start:
                 with self._lock:
@@ -125,4 +125,4 @@ def _is_closed(ref: weakref.ref[EnvSession]) -> bool:
 
 def _cool(ref: weakref.ref[EnvSession]) -> bool:
     env = ref()
-    return env is not None and env.cool_down()
+    return env is not None and env.head_start.cool_down()

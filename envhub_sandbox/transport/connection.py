@@ -10,25 +10,20 @@ from collections.abc import Sequence
 import zmq
 
 from envhub_sandbox.errors import (
-    PolicyError,
     RemoteProtocolError,
-    SandboxUnavailableError,
-    ServerBusyError,
-    SnapshotIntegrityError,
     VersionMismatchError,
     WorkerDiedError,
     WorkerError,
     WorkerTimeoutError,
 )
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.forks import Owner, foreign
+from envhub_sandbox.transport.replies import expect
 from envhub_sandbox.transport.tcp import Far, Link
 from envhub_worker.protocol import compression
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.busy import ERROR, Busy
 from envhub_worker.protocol.codec.codec import Buffer
-from envhub_worker.protocol.confinement import Reason
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimits
-from envhub_worker.protocol.text import printable
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _NOW = int(zmq.NOBLOCK)
@@ -80,7 +75,7 @@ class WorkerClient:
         limits: WireLimits = DEFAULT_LIMITS,
         far: Far | None = None,
     ) -> None:
-        self._pid = os.getpid()
+        self._owner = Owner()
         self._limits = limits
         self._ids = itertools.count(1)
         self._socket = _context().socket(zmq.DEALER)
@@ -269,93 +264,12 @@ class WorkerClient:
         Raises:
             WorkerError: This is not the process that made the connection.
         """
-        if os.getpid() != self._pid:
-            raise WorkerError(
-                f"this environment belongs to process {self._pid}, and this is a fork of it "
-                f"({os.getpid()}); call make_env here to get one of its own"
-            )
+        if os.getpid() != self._owner.pid:
+            raise WorkerError(foreign(self._owner.pid))
 
     def close(self) -> None:
         """Close the connection. Idempotent; in a forked child nothing is touched."""
-        if os.getpid() == self._pid and not self._socket.closed:
+        if self._owner.is_here and not self._socket.closed:
             if self._link is not None:
                 self._link.close()
             self._socket.close(0)
-
-
-def expect(reply: m.Message, kind: type[m.M]) -> m.M:
-    """The reply, if it is of the kind that the request asks for.
-
-    Raises:
-        SandboxUnavailableError: A layer of the confinement is missing.
-        WorkerDiedError: A process of the jail ended.
-        RemoteProtocolError: It is another message.
-    """
-    if isinstance(reply, kind):
-        return reply
-    if isinstance(reply, m.Refused):
-        raise refusal(reply)
-    if isinstance(reply, m.Died):
-        raise death(reply)
-    raise RemoteProtocolError(
-        f"the worker answered with {type(reply).__name__} where {kind.__name__} belongs"
-    )
-
-
-def refusal(reply: m.Refused) -> Exception:
-    """The error for a refused request. Trust: text from the worker."""
-    message = printable(reply.message)
-    if reply.error == "SandboxUnavailableError":
-        layer = f"{printable(reply.layer)}: " if reply.layer else ""
-        fix = f"\n{printable(reply.fix)}" if reply.fix else ""
-        return SandboxUnavailableError(f"this host cannot enforce {layer}{message}{fix}")
-    if reply.error == "WorkerDiedError":
-        return WorkerDiedError(message, reason="gone")
-    if reply.error == ERROR:
-        busy = Busy.read(reply.layer, reply.fix)
-        return ServerBusyError(
-            message, quota=busy.quota, used=busy.used, limit=busy.limit, retry_s=busy.retry_s
-        )
-    return _REFUSALS.get(reply.error, WorkerError)(message)
-
-
-_REFUSALS: dict[str, type[Exception]] = {
-    "PolicyError": PolicyError,
-    "SnapshotIntegrityError": SnapshotIntegrityError,
-    "VersionMismatchError": VersionMismatchError,
-}
-
-
-_REASONS: dict[Reason, str] = {
-    "exit": "it exited",
-    "signal": "a signal ended it",
-    "out-of-memory": "it ran out of memory",
-    "cpu-limit": "it used up its cpu limit",
-    "disk-limit": "it used up its disk limit",
-    "protocol": "it broke the rules of the wire and was killed",
-    "killed": "it was closed",
-    "zygote": "the process that forks workers ended",
-    "idle": "the server ended it",
-    "unavailable": "it could not be confined",
-}
-
-
-def death(reply: m.Died) -> WorkerDiedError:
-    """The error for a jail that ended."""
-    how = _REASONS.get(reply.reason, reply.reason)
-    if reply.signal:
-        how += f" ({reply.signal})"
-    elif reply.exit_code is not None:
-        how += f" (exit code {reply.exit_code})"
-    during = f" during {reply.operation}" if reply.operation else ""
-    detail = f"\n{reply.detail}" if reply.detail else ""
-    tail = f"\nIts last output:\n{reply.tail}" if reply.tail else ""
-    return WorkerDiedError(
-        f"the worker process died{during}: {how}{detail}{tail}",
-        exit_code=reply.exit_code,
-        signal=reply.signal,
-        reason=reply.reason,
-        log_tail=reply.tail,
-        request=reply.operation or None,
-        detail=reply.detail,
-    )

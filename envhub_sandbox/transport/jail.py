@@ -10,23 +10,19 @@ from typing import Any
 
 from envhub_sandbox.errors import (
     EnvHubError,
-    MissingModuleError,
     RemoteProtocolError,
     WorkerDiedError,
     WorkerError,
-    load_error,
-    remote_error,
 )
-from envhub_sandbox.transport import pickles
-from envhub_sandbox.transport.connection import WorkerClient, death, expect
+from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.described import Described
-from envhub_sandbox.transport.tensors import to_tensor
+from envhub_sandbox.transport.replies import check, death, expect, typed
+from envhub_sandbox.transport.values import pickles
+from envhub_sandbox.transport.values.described import Described
+from envhub_sandbox.transport.values.tensors import to_tensor
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
-from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.limits import WireLimits
-from envhub_worker.protocol.text import printable
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _CAUSE_S = 10.0
@@ -290,68 +286,3 @@ def _runners(opened: m.JailOpened, count: int) -> list[int]:
     ):
         raise RemoteProtocolError(f"the worker did not start {count} runners, each with a number")
     return runners
-
-
-def check(reply: m.Message) -> None:
-    """Raise what a runner's reply says went wrong.
-
-    Raises:
-        EnvHubError: What the repository raised.
-        RemoteProtocolError: A runner spoke in the server's name.
-    """
-    if isinstance(reply, m.Raised):
-        raise raised(reply)
-    if reply.kind < m.FIRST_RUNNER_KIND:
-        raise RemoteProtocolError(f"a runner sent {type(reply).__name__}")
-
-
-def typed(reply: m.Message, kind: type[m.M]) -> m.M:
-    """The reply, if it is of the kind that the request asks for.
-
-    Raises:
-        RemoteProtocolError: It is another message.
-    """
-    if not isinstance(reply, kind):
-        raise RemoteProtocolError(
-            f"the worker answered with {type(reply).__name__} where {kind.__name__} belongs"
-        )
-    return reply
-
-
-_LOADING = {
-    "import": "the entry file could not be imported",
-    "make_env": "its make_env failed",
-    "return": "its make_env returned something unusable",
-}
-_LOADERS_OWN = (".EntryError", ".ArgumentsError")
-"""What our own loader raises, which has a traceback of nobody's interest."""
-
-
-def raised(reply: m.Raised) -> EnvHubError:
-    """The error for an exception of the repository. Trust: text from the worker."""
-    reply = _harmless(reply)
-    if reply.stage not in _LOADING:
-        return remote_error(reply.builtin, reply.type_name, reply.message, reply.traceback)
-    what = _LOADING[reply.stage]
-    if reply.stage == "return":
-        return load_error("ValueError", reply.message)
-    cause: Any = remote_error(reply.builtin, reply.type_name, reply.message, reply.traceback)
-    if reply.builtin == "ModuleNotFoundError":
-        error: EnvHubError = MissingModuleError(f"{what}: {reply.message}")
-    elif reply.type_name.endswith(_LOADERS_OWN):
-        return load_error(reply.builtin, reply.message)
-    else:
-        error = load_error(reply.builtin, f"{what}: {reply.type_name}: {reply.message}")
-    error.__cause__ = cause
-    return error
-
-
-def _harmless(reply: m.Raised) -> m.Raised:
-    """The same without what a terminal would obey, and no longer than anybody reads."""
-    return m.Raised(
-        reply.builtin,
-        one_line(reply.type_name, 512),
-        printable(reply.message),
-        printable(reply.traceback, 32_768),
-        reply.stage,
-    )

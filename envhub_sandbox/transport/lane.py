@@ -1,7 +1,8 @@
 """The way of an environment's requests to its runners: one interface, and the way over the server.
 
 There are two: ``RelayLane``, below, and ``SharedMemoryLane``. Which of them an environment has is
-decided once, when it is built (``session/placement``); whoever asks for something does not know.
+decided once, when it is built (``session/jails/placement``); whoever asks for something does not
+know.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ from typing import Any, Protocol
 
 from envhub_sandbox.errors import EnvHubError, WorkerError
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import RemoteJail, RunnersDiedError, check, typed
+from envhub_sandbox.transport.jail import RemoteJail, RunnersDiedError
+from envhub_sandbox.transport.replies import check, typed
 from envhub_sandbox.transport.request import Frames, Request
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.sharding import Pace

@@ -18,8 +18,9 @@ from typing import TextIO
 
 from envhub_sandbox.errors import EnvHubError, PolicyError
 from envhub_sandbox.log import OUTPUT
-from envhub_sandbox.transport.connection import WorkerClient, expect
+from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.replies import expect
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.text import printable
 

@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, remote_error
-from envhub_sandbox.transport.jail import check, typed
+from envhub_sandbox.transport.replies import check, typed
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.limits import DEFAULT_LIMITS

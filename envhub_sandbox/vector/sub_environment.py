@@ -13,8 +13,8 @@ from typing import Any, Protocol
 import gymnasium as gym
 
 from envhub_sandbox.errors import RemoteProtocolError
-from envhub_sandbox.transport import generators
-from envhub_sandbox.transport.jail import typed
+from envhub_sandbox.transport.replies import typed
+from envhub_sandbox.transport.values import generators
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject
 from envhub_worker.protocol.names import is_servable

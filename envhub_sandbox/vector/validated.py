@@ -33,8 +33,8 @@ class ValidatedVectorEnv(SandboxVectorEnv):
         ObservationError: An observation is. The environment is still usable.
     """
 
-    def __init__(self, remote: EnvSession) -> None:
-        super().__init__(remote)
+    def __init__(self, session: EnvSession) -> None:
+        super().__init__(session)
         spaces_of_actions = self.single_action_space, self.action_space
         # not a method of ours: who holds himself is not closed when nobody else holds him
         self._read_actions = partial(_read_and_check, self._read_actions, *spaces_of_actions)
@@ -61,7 +61,7 @@ class ValidatedVectorEnv(SandboxVectorEnv):
         return result
 
     def _check_batch(self, operation: str, observations: Any) -> None:
-        with self._remote.repository.named():
+        with self._session.repository.named():
             try:
                 members = list(_members(self.observation_space, observations))
             except Exception as error:  # a vector environment of the repository's own gave it
@@ -71,7 +71,7 @@ class ValidatedVectorEnv(SandboxVectorEnv):
 
     def _check(self, operation: str, observations: Iterable[Any]) -> None:
         space = self.single_observation_space
-        with self._remote.repository.named():
+        with self._session.repository.named():
             for index, observation in enumerate(observations):
                 if observation is not None and not holds(space, observation):
                     raise ObservationError(

@@ -8,25 +8,21 @@ from __future__ import annotations
 
 import warnings
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from typing import Any, cast
 
 import numpy as np
-from gymnasium.error import (
-    AlreadyPendingCallError,
-    ClosedEnvironmentError,
-    Error,
-    NoAsyncCallError,
-)
+from gymnasium.error import Error
 from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.session.env_session import EnvSession
-from envhub_sandbox.transport import generators
-from envhub_sandbox.transport.jail import typed
+from envhub_sandbox.transport.replies import typed
 from envhub_sandbox.transport.results import StepResult
+from envhub_sandbox.transport.values import generators
 from envhub_sandbox.vector import from_manifest
+from envhub_sandbox.vector.asking import Asking
 from envhub_sandbox.vector.shown import environment_html
 from envhub_sandbox.vector.sub_environment import MessageFor as OneMessageFor
 from envhub_sandbox.vector.sub_environment import SubEnvironment
@@ -37,8 +33,6 @@ from envhub_worker.protocol.untrusted import UNTRUSTED
 _NOT_CALLED = frozenset({"reset", "step", "close"})
 """What ``AsyncVectorEnv.call`` refuses: it would take one sub-environment from under the others."""
 Bounds = tuple[int, int]
-_SHOWN = 64
-"""Characters of a name that are told of what is asked."""
 
 
 class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
@@ -55,14 +49,14 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         sandbox_report: What confines it: one mapping per layer, while it runs.
     """
 
-    def __init__(self, remote: EnvSession) -> None:
-        manifest = remote.manifest
-        self._remote = remote
+    def __init__(self, session: EnvSession) -> None:
+        manifest = session.manifest
+        self._session = session
+        self._exchange = session.exchange
         self._manifest = manifest
-        self._timeouts = remote.repository.timeouts
-        self._waiting: str | None = None
+        self._timeouts = session.repository.timeouts
+        self._asking = Asking(session.exchange, self._timeouts, type(self).__name__)
         self._read_actions = from_manifest.action_reader(manifest)
-        self.closed = False
         self.num_envs = manifest.num_envs
         self.single_observation_space = manifest.single_observation_space
         self.single_action_space = manifest.single_action_space
@@ -70,14 +64,19 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         self.action_space = manifest.action_space
         self.metadata = from_manifest.metadata(manifest)
         self.render_mode = manifest.render_mode
-        self.spec = from_manifest.spec(manifest, remote.repository.label)
+        self.spec = from_manifest.spec(manifest, session.repository.label)
         if manifest.shardable:  # another one's are its own, if it has them
             self.autoreset_mode = self.metadata.get("autoreset_mode")
-            self.copy = remote.repository.copy
-            self.env_fns = from_manifest.env_fns(manifest, remote.repository.label)
+            self.copy = session.repository.copy
+            self.env_fns = from_manifest.env_fns(manifest, session.repository.label)
             self.observation_mode = "same"
         # a proxy that nobody holds any more must not keep processes alive
-        weakref.finalize(self, remote.close).atexit = False
+        weakref.finalize(self, session.close).atexit = False
+
+    @property
+    def closed(self) -> bool:  # type: ignore[override]  # there is nothing to set
+        """Whether ``close`` has been called."""
+        return self._asking.closed
 
     def prewarm(self) -> None:
         """Start its processes now, in the background; returns at once.
@@ -87,8 +86,8 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         evaluation can prewarm the next task while it plays one. What fails is raised by the
         first request.
         """
-        self._raise_if_closed()
-        self._remote.prewarm()
+        self._asking.refuse_if_closed()
+        self._session.head_start.prewarm()
 
     # --- reset and step ------------------------------------------------------------------------
 
@@ -113,7 +112,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             RemoteEnvError: The environment raised; it is still usable.
         """
         # not by the two halves: an interrupt between them would leave a wait that nobody ends
-        self._refuse_if_busy("reset_async")
+        self._asking.refuse_if_busy("reset_async")
         self._send_reset(seed, options)
         return self._end_reset(self._timeouts.reset_s)
 
@@ -123,9 +122,9 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         options: dict[str, Any] | None = None,
     ) -> None:
         """Send the reset; ``reset_wait`` returns its results."""
-        self._refuse_if_busy("reset_async")
+        self._asking.refuse_if_busy("reset_async")
         self._send_reset(seed, options)
-        self._waiting = "reset"
+        self._asking.waiting = "reset"
 
     def _send_reset(self, seed: Any, options: dict[str, Any] | None) -> None:
         mask = None
@@ -134,7 +133,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             mask = options.pop("reset_mask")
             from_manifest.check_mask(mask, self.num_envs)
         seeds = self._seeds(seed)
-        self._recover()
+        self._asking.guarded(self._session.recover)
         sliced = self._manifest.shardable and seeds is not None
 
         def message(number: int, bounds: Bounds) -> m.Message:  # kept: it must not hold us
@@ -142,16 +141,16 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             some = seeds[start:stop] if sliced else seeds
             return m.Reset(number, some, options, None if mask is None else mask[start:stop])
 
-        self._submit("reset", message)
+        self._asking.submit("reset", message)
 
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
         """The results of ``reset_async``; ``timeout`` in seconds, else ``Timeouts.reset_s``."""
-        self._end_wait("reset")
+        self._asking.end_wait("reset")
         return self._end_reset(self._timeouts.reset_s if timeout is None else timeout)
 
     def _end_reset(self, timeout_s: float | None) -> tuple[Any, dict[Any, Any]]:
-        replies = self._collect(timeout_s, m.ResetDone)
-        return self._remote.finish_reset(replies, timeout_s)
+        replies = self._asking.collect(timeout_s, m.ResetDone)
+        return self._exchange.finish_reset(replies, timeout_s)
 
     def step(self, actions: Any) -> StepResult:
         """Step every sub-environment.
@@ -169,49 +168,43 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             WorkerDiedError: The worker process ended.
             RemoteEnvError: The environment raised; it is still usable.
         """
-        if self.closed or self._waiting is not None:
-            self._refuse_if_busy("step_async")
-        remote = self._remote  # both halves in one: this is the way that is taken most
+        asking, exchange = self._asking, self._exchange
+        if asking.closed or asking.waiting is not None:
+            asking.refuse_if_busy("step_async")
+        # both halves in one, and not guarded: this is the way that is taken most
         try:
-            remote.submit_step(self._read_actions(actions))
-            return remote.collect_step(self._timeouts.step_s)
+            exchange.submit_step(self._read_actions(actions))
+            return exchange.collect_step(self._timeouts.step_s)
         except WorkerDiedError:
-            self._raise_if_closed()  # close() in another thread ended it under us
+            asking.refuse_if_closed()  # close() in another thread ended it under us
             raise
 
     def step_async(self, actions: Any) -> None:
         """Send the actions; ``step_wait`` returns the results."""
-        self._refuse_if_busy("step_async")
+        self._asking.refuse_if_busy("step_async")
         batch = self._read_actions(actions)
-        try:
-            self._remote.submit_step(batch)
-        except WorkerDiedError:
-            self._raise_if_closed()
-            raise
-        self._waiting = "step"
+        self._asking.guarded(self._exchange.submit_step, batch)
+        self._asking.waiting = "step"
 
     def step_wait(self, timeout: float | None = None) -> StepResult:
         """The results of ``step_async``; ``timeout`` in seconds, else ``Timeouts.step_s``."""
-        self._end_wait("step")
-        try:
-            return self._remote.collect_step(self._timeouts.step_s if timeout is None else timeout)
-        except WorkerDiedError:
-            self._raise_if_closed()  # close() in another thread ended it under us
-            raise
+        self._asking.end_wait("step")
+        timeout_s = self._timeouts.step_s if timeout is None else timeout
+        return self._asking.guarded(self._exchange.collect_step, timeout_s)
 
     # --- everything else -----------------------------------------------------------------------
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method, or read an attribute, of every sub-environment: a tuple of results."""
-        self._refuse_if_busy("call_async")
+        self._asking.refuse_if_busy("call_async")
         self._send_call(name, args, kwargs)  # as reset
         return self._end_call(self._timeouts.call_s)
 
     def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
         """Send the call; ``call_wait`` returns its results."""
-        self._refuse_if_busy("call_async")
+        self._asking.refuse_if_busy("call_async")
         self._send_call(name, args, kwargs)
-        self._waiting = "call"
+        self._asking.waiting = "call"
 
     def _send_call(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         _check_name(name)
@@ -219,21 +212,21 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             raise ValueError(
                 f"Trying to call function `{name}` with `call`, use `{name}` directly instead."
             )
-        self._submit("call", lambda number, _: m.Call(number, name, args, kwargs))
+        self._asking.submit("call", lambda number, _: m.Call(number, name, args, kwargs))
 
     def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
         """The results of ``call_async``; ``timeout`` in seconds, else ``Timeouts.call_s``."""
-        self._end_wait("call")
+        self._asking.end_wait("call")
         return self._end_call(self._timeouts.call_s if timeout is None else timeout)
 
     def _end_call(self, timeout_s: float | None) -> tuple[Any, ...]:
-        replies = self._collect(timeout_s, m.Value)
+        replies = self._asking.collect(timeout_s, m.Value)
         if not self._manifest.shardable:
             return cast("tuple[Any, ...]", replies[0].value)
         try:
-            return self._remote.results.one_each("call", replies)
+            return self._exchange.results.one_each("call", replies)
         except BaseException:
-            with self._remote.handling():
+            with self._exchange.handling():
                 raise
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
@@ -249,37 +242,38 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
                 "Values must be a list or tuple with length equal to the number of environments. "
                 f"Got `{len(each)}` values for {self.num_envs} environments."
             )
-        self._ask(
+        self._asking.ask(
             "set_attr",
             lambda number, bounds: m.SetAttr(number, name, tuple(each[bounds[0] : bounds[1]])),
         )
 
     def render(self) -> tuple[Any, ...] | None:
         """What each sub-environment renders; None where the environment gives None."""
-        replies = self._ask("render", lambda number, _: m.Render(number))
+        replies = self._asking.ask("render", lambda number, _: m.Render(number))
         if not self._manifest.shardable:
             return cast("tuple[Any, ...] | None", replies[0].value)
-        with self._remote.handling():
-            return self._remote.results.one_each("render", replies)
+        with self._exchange.handling():
+            return self._exchange.results.one_each("render", replies)
 
     @property  # type: ignore[misc]  # there is nothing to set, as in SyncVectorEnv
     def np_random(self) -> Any:
         """Copies of the generators: ``SyncVectorEnv`` has one for each sub-environment."""
-        replies = self._ask("np_random", lambda number, _: m.GetRandom(number))
+        replies = self._asking.ask("np_random", lambda number, _: m.GetRandom(number))
         with UNTRUSTED:  # a generator that numpy does not know breaks no rule of the wire
             if type(replies[0].value) is dict:
                 return generators.generator(replies[0].value)
-            states = self._remote.results.one_each("np_random", replies)
+            states = self._exchange.results.one_each("np_random", replies)
             return tuple(generators.generator(state) for state in states)
 
     @property
     def np_random_seed(self) -> Any:
         """Their seeds."""
-        replies = self._ask("np_random_seed", lambda number, _: m.GetOwn(number, "np_random_seed"))
+        name = "np_random_seed"
+        replies = self._asking.ask(name, lambda number, _: m.GetOwn(number, name))
         if type(replies[0].value) is not tuple:
             return generators.seeds(replies[0].value)
-        with self._remote.handling():
-            seeds = self._remote.results.one_each("np_random_seed", replies)
+        with self._exchange.handling():
+            seeds = self._exchange.results.one_each(name, replies)
         return generators.seeds(seeds)
 
     @property
@@ -300,7 +294,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     @property
     def sandbox_report(self) -> list[dict[str, Any]]:
         """One mapping per layer: ``layer``, ``enforced``, ``detail``. None unless it runs."""
-        return [dict(layer) for layer in self._remote.report()]
+        return [dict(layer) for layer in self._session.report()]
 
     def stats(self) -> dict[str, Any]:
         """Counters, at any moment, from any thread; asks nothing of the worker.
@@ -312,19 +306,19 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             the reply in seconds, ``p50``, ``p90``, ``p99`` and ``max`` of the last 1024 steps, and
             the ``total`` of all.
         """
-        return self._remote.stats()
+        return self._session.stats()
 
     def close(self, **kwargs: Any) -> None:
         """Close the sub-environments and end their processes, in bounded time. Idempotent."""
-        if self._waiting is not None and not self.closed:
+        if self._asking.waiting is not None and not self.closed:
             warnings.warn(
-                f"Calling `close` while waiting for a pending call to `{self._waiting}` "
+                f"Calling `close` while waiting for a pending call to `{self._asking.waiting}` "
                 "to complete.",
                 UserWarning,
                 stacklevel=2,
             )
-        self.closed = True
-        self._remote.close()
+        self._asking.closed = True
+        self._session.close()
 
     def close_extras(self, **kwargs: Any) -> None:
         """There is nothing beyond ``close``."""
@@ -337,119 +331,38 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         ours = not is_servable(name) or hasattr(type(self), name)
         if manifest is None or ours or name not in manifest.attributes:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        self._refuse_if_busy(name)
-        [reply] = self._own("get attribute", m.GetOwn, name)
+        self._asking.refuse_if_busy(name)
+        reply = self._asking.own("get attribute", m.GetOwn, name)
         if isinstance(reply, m.Value):
             return reply.value
         if not isinstance(reply, m.Method):
             raise RemoteProtocolError(f"the worker answered GetOwn with {type(reply).__name__}")
 
         def method(*args: Any, **kwargs: Any) -> Any:
-            self._refuse_if_busy(name)
-            [result] = self._own(name, m.CallOwn, name, args, kwargs)
+            self._asking.refuse_if_busy(name)
+            result = self._asking.own(name, m.CallOwn, name, args, kwargs)
             return typed(result, m.Value).value
 
         return method
 
     def __reduce__(self) -> tuple[Any, ...]:
         # For copy and deepcopy, too: two environments cannot share processes that either may end.
-        recipe = self._remote.repository.recipe
+        recipe = self._session.repository.recipe
         if recipe is None:
             raise TypeError(f"{self!r} does not know how it was made, so it cannot be pickled")
         return recipe.make_one, (self._manifest.suite, self._manifest.task)
 
     def __repr__(self) -> str:
-        return f"SandboxVectorEnv({self._remote.repository.label}, num_envs={self.num_envs})"
+        return f"SandboxVectorEnv({self._session.repository.label}, num_envs={self.num_envs})"
 
     def _repr_html_(self) -> str:
         return environment_html(self, self.sandbox_report)
 
     __html__ = _repr_html_
 
-    # --- inside --------------------------------------------------------------------------------
-
-    def _recover(self) -> None:
-        try:
-            self._remote.recover()
-        except WorkerDiedError:
-            self._raise_if_closed()  # close() in another thread ended the wait
-            raise
-
-    def _own(self, operation: str, kind: Callable[..., m.Message], *fields: Any) -> list[m.Message]:
-        try:
-            return self._remote.request(
-                operation, lambda number, _: kind(number, *fields), self._timeouts.call_s
-            )
-        except WorkerDiedError:
-            self._raise_if_closed()
-            raise
-
     def _ask_one(self, name: str, index: int, message: OneMessageFor) -> m.Message:
-        """Ask about one sub-environment; other shards have nothing to say to it."""
-        operation = f"envs[{index}].{name[:_SHOWN]}"  # which is no reset or step of all
-        self._refuse_if_busy(operation)
-
-        def message_for(number: int, bounds: Bounds) -> m.Message:
-            start, stop = bounds
-            return message(number, index - start if start <= index < stop else None)
-
-        timeouts = {"reset": self._timeouts.reset_s, "step": self._timeouts.step_s}
-        timeout_s = timeouts.get(name, self._timeouts.call_s)
-        try:
-            replies = self._remote.request(operation, message_for, timeout_s)
-        except WorkerDiedError:
-            self._raise_if_closed()  # close() in another thread ended it under us
-            raise
-        holds = (start <= index < stop for start, stop in self._remote.bounds)
-        return next(reply for reply, here in zip(replies, holds, strict=True) if here)
-
-    def _ask(self, operation: str, message: Callable[[int, Bounds], m.Message]) -> list[m.Value]:
-        self._refuse_if_busy(operation)
-        self._submit(operation, message)
-        return self._collect(self._timeouts.call_s, m.Value)
-
-    def _submit(self, operation: str, message: Callable[[int, Bounds], m.Message]) -> None:
-        try:
-            self._remote.submit(operation, message)
-        except WorkerDiedError:
-            self._raise_if_closed()
-            raise
-
-    def _collect(self, timeout_s: float | None, kind: type[m.M]) -> list[m.M]:
-        try:
-            replies = self._remote.collect(timeout_s)
-        except WorkerDiedError:
-            self._raise_if_closed()  # close() in another thread ended it under us
-            raise
-        try:
-            return [typed(reply, kind) for reply in replies]
-        except BaseException:
-            with self._remote.handling():
-                raise
-
-    def _end_wait(self, operation: str) -> None:
-        self._raise_if_closed()
-        if self._waiting != operation:
-            raise NoAsyncCallError(
-                f"Calling `{operation}_wait` without any prior call to `{operation}_async`.",
-                operation,
-            )
-        self._waiting = None
-
-    def _refuse_if_busy(self, name: str) -> None:
-        self._raise_if_closed()
-        if self._waiting is not None:
-            raise AlreadyPendingCallError(
-                f"Calling `{name}` while waiting for a pending call to `{self._waiting}` to "
-                "complete.",
-                self._waiting,
-            )
-
-    def _raise_if_closed(self) -> None:
-        if self.closed:
-            raise ClosedEnvironmentError(
-                f"Trying to operate on `{type(self).__name__}`, after a call to `close()`."
-            )
+        # a method of ours: with a copy of a sub-environment, what it asks is another one's
+        return self._asking.one(name, index, message)
 
     def _seeds(self, seed: Any) -> Any:
         """One seed or None per sub-environment, or None for none at all."""

@@ -99,8 +99,8 @@ class Naive:
         return method
 
     def _ask(self, kind: type[Any], *fields: Any) -> m.Message:
-        remote = inside.session(self._env)
-        [reply] = remote.request("ask", lambda number, _: kind(number, *fields), 20.0)
+        exchange = inside.session(self._env).exchange
+        [reply] = exchange.request("ask", lambda number, _: kind(number, *fields), 20.0)
         return reply
 
 

@@ -12,7 +12,7 @@ import pytest
 from gymnasium import spaces
 
 from envhub_sandbox.errors import RemoteProtocolError
-from envhub_sandbox.transport.generators import generator
+from envhub_sandbox.transport.values.generators import generator
 from envhub_worker.protocol.manifest import EnvManifest, Manifest, decode_manifest, encode_manifest
 from tests.attacks.lying_server import env_manifest
 

@@ -18,7 +18,8 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
 from envhub_sandbox.hub.listing import Snapshot
-from envhub_sandbox.transport import described, results
+from envhub_sandbox.transport import results
+from envhub_sandbox.transport.values import described
 from envhub_worker.protocol import messages as m
 from tests.fuzz import child, traffic
 from tests.fuzz.oracle import WrongError, fits

@@ -12,7 +12,7 @@ import pytest
 from gymnasium.error import ClosedEnvironmentError
 
 from envhub_sandbox import errors, make_env
-from envhub_sandbox.session import restart_policy
+from envhub_sandbox.session.survival import restart_policy
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from tests.support import inside
 from tests.support.processes import descendants
@@ -39,7 +39,7 @@ def interrupted(*arguments: Any, **options: Any) -> Any:
 def released(env: Any) -> list[bool]:
     """Have the environment hold its server; what is returned says when it has let it go."""
     found: list[bool] = []
-    give_back = inside.repository(env).hold()
+    give_back = inside.launcher(env).hold()
 
     def release() -> None:
         give_back()
@@ -80,15 +80,15 @@ def test_ctrl_c_while_what_was_started_ahead_is_given_up(
     make_env(sample("counter"), n_envs=2).close()  # known from here on: it starts later
     with make_env(sample("counter"), n_envs=2) as suites:
         env = suites.env
-        remote = inside.session(env)
-        remote.warm_up()
-        give_back = remote.lease.give_back
+        lease, ahead = inside.session(env).lease, inside.session(env).head_start
+        ahead.warm_up()
+        give_back = lease.give_back
         with monkeypatch.context() as patch:
-            patch.setattr(remote.lease, "give_back", lambda: interrupted(give_back()))
+            patch.setattr(lease, "give_back", lambda: interrupted(give_back()))
             if why == "it has died":
-                remote.lease.end()
+                lease.end()
             with pytest.raises(KeyboardInterrupt):
-                env.reset() if why == "it has died" else remote.cool_down()
+                env.reset() if why == "it has died" else ahead.cool_down()
         with pytest.raises(errors.WorkerDiedError, match="call reset"):
             env.step([0, 0])
         env.reset()
@@ -305,7 +305,7 @@ class Closing(Lifecycle):
 
 def recover(env: Any) -> None:
     """Reset after a step that nobody waits for any more."""
-    inside.session(env).submit_step(np.zeros(2, np.int64))
+    inside.session(env).exchange.submit_step(np.zeros(2, np.int64))
     env.reset()
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from envhub_sandbox import errors, make_env
 from envhub_sandbox.policy import Policy
-from envhub_sandbox.session.restart_policy import backoff_s
+from envhub_sandbox.session.survival.restart_policy import backoff_s
 from tests.support.samples import sample
 
 

@@ -13,7 +13,7 @@ import pytest
 from gymnasium.error import ClosedEnvironmentError
 
 from envhub_sandbox import api, errors, make_env
-from envhub_sandbox.session.reseed import derived_seed
+from envhub_sandbox.session.survival.reseed import derived_seed
 from envhub_sandbox.transport.shared_memory.sharding import bounds_for
 from envhub_worker.protocol.lifecycle import State
 from tests.support import inside

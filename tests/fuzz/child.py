@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.transport.described import Described
+from envhub_sandbox.transport.values.described import Described
 from envhub_worker.protocol import messages as m
 from tests.fuzz import bundle
 from tests.fuzz.controls import CONTROLS

@@ -20,13 +20,13 @@ from gymnasium.envs.registration import EnvSpec
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
 from envhub_sandbox.session.author_lines import point_out
-from envhub_sandbox.transport import described, specs
-from envhub_sandbox.transport.connection import death, expect
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.described import Described
-from envhub_sandbox.transport.generators import generator
-from envhub_sandbox.transport.jail import RemoteJail, RunnersDiedError, check, open_jail, raised
+from envhub_sandbox.transport.jail import RemoteJail, RunnersDiedError, open_jail
+from envhub_sandbox.transport.replies import check, death, expect, raised
 from envhub_sandbox.transport.results import Results
+from envhub_sandbox.transport.values import described, specs
+from envhub_sandbox.transport.values.described import Described
+from envhub_sandbox.transport.values.generators import generator
 from envhub_sandbox.vector import from_manifest
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import decode

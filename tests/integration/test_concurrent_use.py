@@ -29,15 +29,15 @@ def env(request: pytest.FixtureRequest) -> Iterator[Any]:
 
 def held_between_the_halves(env: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Any]:
     """Have another thread step, and stop it once that was sent; returns what lets it go on."""
-    session, stopped, go_on = inside.session(env), threading.Event(), threading.Event()
-    collect, results = session.collect_step, []
+    exchange, stopped, go_on = inside.session(env).exchange, threading.Event(), threading.Event()
+    collect, results = exchange.collect_step, []
 
     def slow(timeout_s: float | None = None) -> Any:
         stopped.set()
         assert go_on.wait(DEADLINE_S)
         return collect(timeout_s)
 
-    monkeypatch.setattr(session, "collect_step", slow)
+    monkeypatch.setattr(exchange, "collect_step", slow)
     thread = threading.Thread(target=lambda: results.append(env.step(ACTIONS)), name="rollout")
     thread.start()
     assert stopped.wait(DEADLINE_S)
@@ -68,11 +68,11 @@ def test_what_nobody_waits_for_is_late(env: Any, monkeypatch: pytest.MonkeyPatch
     def interrupted(timeout_s: float | None = None) -> Any:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(inside.session(env), "collect_step", interrupted)
+    monkeypatch.setattr(inside.session(env).exchange, "collect_step", interrupted)
     with pytest.raises(KeyboardInterrupt):
         env.step(ACTIONS)
     monkeypatch.undo()
-    with pytest.raises(WorkerTimeoutError, match="late; call reset"):
+    with pytest.raises(WorkerTimeoutError, match="the last step was interrupted"):
         env.step(ACTIONS)
     env.reset(seed=0)
     env.step(ACTIONS)

@@ -14,7 +14,7 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, ServerBusyError, WorkerError
 from envhub_sandbox.sandboxes.remote import RemoteSandbox
-from envhub_sandbox.session.line import wait_in_line
+from envhub_sandbox.session.jails.line import wait_in_line
 from envhub_sandbox.transport.deadline import StartupDeadline
 from envhub_worker.access import keys
 from envhub_worker.access.line import Line

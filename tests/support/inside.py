@@ -23,8 +23,10 @@ from envhub_sandbox.sandboxes.docker import sandbox
 from envhub_sandbox.session import env_session
 from envhub_sandbox.session.counters import Ledger
 from envhub_sandbox.session.env_session import EnvSession
-from envhub_sandbox.session.launcher import LoadedJail, Repository
+from envhub_sandbox.session.jails.launcher import Launcher
+from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.recipe import Recipe
+from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RemoteJail
@@ -49,7 +51,7 @@ Spot = tuple[Any, str]
 
 def session(env: Any) -> EnvSession:
     """What lies behind the Gymnasium face of an environment."""
-    found: EnvSession = env._remote
+    found: EnvSession = env._session
     return found
 
 
@@ -65,18 +67,20 @@ def choice_of_runtime() -> Spot:
 
 def turn_lock(env: Any) -> Spot:
     """What a thread holds while it asks the environment something."""
-    return session(env), "_lock"
+    return session(env).turns, "lock"
 
 
 def clean_up(env: Any) -> None:
     """What a thread does that has outlasted a ``close``."""
-    with session(env)._turn("a test"):
+    with session(env).turns.take("a test"):
         return
 
 
 def live_by(env: Any, lifecycle: Lifecycle) -> None:
     """Have another table of its states."""
-    session(env).lifecycle = session(env).lease.lifecycle = lifecycle
+    found = session(env)
+    for owner in (found, found.lease, found.head_start, found.exchange):
+        owner.lifecycle = lifecycle
 
 
 def manifest(env: Any) -> EnvManifest:
@@ -92,6 +96,11 @@ def bounds(env: Any) -> list[tuple[int, int]]:
 def repository(env: Any) -> Repository:
     """The repository that it comes from, with its policy and its servers."""
     return session(env).repository
+
+
+def launcher(env: Any) -> Launcher:
+    """What opens its jails."""
+    return session(env).lease._launcher
 
 
 def recipe(suites: Any) -> Recipe | None:
@@ -157,7 +166,7 @@ def hold_server(env: Any, release: Callable[[], None]) -> None:
     session(env).lease._release_server = release
 
 
-def order(known: Repository, of: Any) -> Any:
+def order(known: Launcher, of: Any) -> Any:
     """What is asked of a server for a jail of this repository."""
     return known._order(of)
 
@@ -205,7 +214,7 @@ def send_half(connection: WorkerClient, frames: Sequence[Buffer]) -> None:
 
 LATE_REPLY_GRACE: Spot = (env_session, "_GRACE_S")
 """For how long ``reset`` waits for a late reply."""
-CLOSE_PATIENCE: Spot = (env_session, "_INTERRUPT_S")
+CLOSE_PATIENCE: Spot = (env_session, "INTERRUPT_S")
 """For how long ``close`` waits for another thread."""
 MAKER: Spot = (api, "_Maker")
 """What ``make_env`` starts to work with when its arguments have been checked."""
@@ -245,7 +254,7 @@ def ending(env: Any) -> Spot:
 
 def holding(env: Any) -> Spot:
     """Where it takes hold of its server, while it has no jail."""
-    return repository(env), "hold"
+    return launcher(env), "hold"
 
 
 def noting_pace(env: Any) -> Spot:

@@ -39,6 +39,7 @@ from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.lingering import Lingering
 from envhub_sandbox.sandboxes.owner import identity_of
 from envhub_sandbox.sandboxes.refcount import Sharing
+from envhub_sandbox.transport.forks import Owner
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 _MONITOR = Path(__file__).with_name("monitor.py")
@@ -150,7 +151,7 @@ class ContainerServer:
     layers: list[Mapping[str, Any]]
     profile: str
     python: str
-    owner: int = field(default_factory=os.getpid)
+    owner: Owner = field(default_factory=Owner)
     users: int = 0
     snapshot: str = run_arguments.SNAPSHOT
 
@@ -171,7 +172,7 @@ class ContainerServer:
 
     def stop(self) -> None:
         """End the container, in bounded time. A fork of its owner does nothing."""
-        if os.getpid() != self.owner:
+        if not self.owner.is_here:
             return
         _end(self.process)
         with contextlib.suppress(OSError):

@@ -13,8 +13,9 @@ from typing import Any
 
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import RunnersDiedError, typed
+from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import RelayLane
+from envhub_sandbox.transport.replies import typed
 from envhub_sandbox.transport.request import Request
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.affinity import CPUS, Cores

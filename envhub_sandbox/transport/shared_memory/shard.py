@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from envhub_sandbox.errors import RemoteProtocolError
-from envhub_sandbox.transport.described import Described
 from envhub_sandbox.transport.shared_memory.doorbell import OwnBell, RunnerBell
 from envhub_sandbox.transport.shared_memory.memfd import SEAL_FUTURE_WRITE, slab
-from envhub_sandbox.transport.tensors import to_tensor
+from envhub_sandbox.transport.values.described import Described
+from envhub_sandbox.transport.values.tensors import to_tensor
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.shared_memory.columns import Column, columns_of

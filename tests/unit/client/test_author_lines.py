@@ -13,7 +13,7 @@ from envhub_sandbox import errors
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
 from envhub_sandbox.session.author_lines import point_out
-from envhub_sandbox.transport.jail import raised
+from envhub_sandbox.transport.replies import raised
 from envhub_worker.protocol import messages as m
 from envhub_worker.runner.exceptions import raised as described
 

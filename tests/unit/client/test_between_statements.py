@@ -49,7 +49,7 @@ def interrupted(file: str | None, line: int, act: Callable[[], object]) -> bool:
     return False
 
 
-class _Remote:
+class _Session:
     """The life of an environment that answers at once, as far as its face knows of it."""
 
     def __init__(self) -> None:
@@ -57,6 +57,7 @@ class _Remote:
         timeouts = SimpleNamespace(reset_s=1.0, step_s=1.0, call_s=1.0)
         self.repository = SimpleNamespace(timeouts=timeouts, label="a/b", copy=True)
         self.results = SimpleNamespace(one_each=lambda what, replies: replies[0].value)
+        self.exchange = self
         self.pending = ""
 
     def submit(self, operation: str, message_for: object) -> None:
@@ -102,7 +103,7 @@ def test_an_interrupted_request_leaves_no_wait_that_nobody_can_end(
     """A reset brings the environment back, wherever it was."""
     line = 0
     while True:
-        env = SandboxVectorEnv(cast("EnvSession", _Remote()))
+        env = SandboxVectorEnv(cast("EnvSession", _Session()))
         came = interrupted(vector_env.__file__, line, lambda env=env: act(env))  # type: ignore[misc]
         assert env.reset() == (0, {})
         env.close()

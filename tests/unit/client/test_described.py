@@ -14,7 +14,7 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
 from envhub_sandbox.errors import RemoteProtocolError
-from envhub_sandbox.transport.described import Described
+from envhub_sandbox.transport.values.described import Described
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject
 from envhub_worker.protocol.limits import WireLimits

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from envhub_sandbox.session.partings import Partings
+from envhub_sandbox.session.jails.partings import Partings
 
 
 def test_each_is_waited_for_once_by_the_next_or_at_the_end() -> None:

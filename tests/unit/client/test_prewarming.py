@@ -20,6 +20,7 @@ class _Task:
     def __init__(self) -> None:
         self.warm = threading.Event()
         self.used: Callable[[], None] = self.warm.set
+        self.head_start = self
 
     def on_first_use(self, used: Callable[[], None], make_room: Callable[[], bool]) -> None:
         """Whom to tell."""

@@ -12,8 +12,7 @@ import gymnasium as gym
 import pytest
 
 from envhub_sandbox import errors
-from envhub_sandbox.transport.connection import death, expect, refusal
-from envhub_sandbox.transport.jail import check, raised
+from envhub_sandbox.transport.replies import check, death, expect, raised, refusal
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import REASONS
 from envhub_worker.runner.exceptions import raised as described

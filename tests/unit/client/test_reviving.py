@@ -9,12 +9,12 @@ import pytest
 from gymnasium import spaces
 
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
-from envhub_sandbox.session.reseed import SeedBook, derived_seed, resets, truncated
+from envhub_sandbox.session.survival.reseed import SeedBook, derived_seed, resets, truncated
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.described import Described
 from envhub_sandbox.transport.jail import RemoteJail, RunnersDiedError
 from envhub_sandbox.transport.results import Results
+from envhub_sandbox.transport.values.described import Described
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS

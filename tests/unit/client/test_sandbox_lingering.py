@@ -16,7 +16,7 @@ from envhub_sandbox.sandboxes.docker import sandbox as docker
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.lingering import Lingering
 from envhub_sandbox.sandboxes.refcount import Sharing
-from envhub_sandbox.session.server_hold import ServerHold
+from envhub_sandbox.session.jails.server_hold import ServerHold
 from tests.support import inside
 from tests.support.processes import eventually
 

@@ -43,7 +43,7 @@ OPTIONAL = {
     "envhub_worker.protocol.messages.base": {"typing_extensions"},  # for type checkers alone
     "envhub_sandbox.metrics": {"prometheus_client"},
     "envhub_worker.cli.metrics": {"prometheus_client"},
-    "envhub_sandbox.transport.tensors": {"torch"},
+    "envhub_sandbox.transport.values.tensors": {"torch"},
     "envhub_sandbox.cli.rollout.video": {"imageio_ffmpeg"},
     "envhub_sandbox.pytest_plugin": {"pytest"},
 }
@@ -68,7 +68,7 @@ MAY_IMPORT = {
     "envhub_sandbox.gym": {"api", "vector"},
     "envhub_sandbox.pytest_plugin": {"api", "hub"},
     "envhub_sandbox.integrations": {"api", "hub", "vector"},
-    "envhub_sandbox.vector": {"session", "transport"},
+    "envhub_sandbox.vector": {"policy", "session", "transport"},
     "envhub_sandbox.metrics": {"session"},
     "envhub_sandbox.session": {"crash", "folders", "hub", "policy", "sandboxes", "transport"},
     "envhub_sandbox.crash": {"folders", "hub", "policy", "transport"},
@@ -392,7 +392,7 @@ def test_no_deserialiser_is_imported() -> None:
     ]
     assert found == []
     users = {name for name in modules() if "cloudpickle" in imported(name)}
-    assert users == {"envhub_sandbox.transport.pickles", "envhub_worker.runner.runner"}
+    assert users == {"envhub_sandbox.transport.values.pickles", "envhub_worker.runner.runner"}
 
 
 def test_only_the_loader_imports_by_computed_names() -> None:
@@ -462,7 +462,7 @@ def private(name: str) -> bool:
 
 def test_reaching_inside_would_be_seen() -> None:
     """In each of the ways that there are; what is one's own, public or Gymnasium's is not."""
-    wrong = ("env._remote", "from a import _b", "patch.setattr(a, '_b', 1)", "setattr('a._b', 1)")
+    wrong = ("env._session", "from a import _b", "patch.setattr(a, '_b', 1)", "setattr('a._b', 1)")
     right = ("self._own", "env.remote", "env._add_info({}, {}, 0)", "setattr('a.b', 1)", "a.__b__")
     seen = {one: any(map(reaches_inside, ast.walk(ast.parse(one)))) for one in wrong + right}
     assert seen == {one: one in wrong for one in wrong + right}

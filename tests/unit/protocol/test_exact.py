@@ -11,7 +11,7 @@ import cloudpickle
 import numpy as np
 import pytest
 
-from envhub_sandbox.transport.pickles import framed
+from envhub_sandbox.transport.values.pickles import framed
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.arrays import INLINE_BYTES
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_sandbox.errors import RemoteEnvError, RemoteProtocolError, remote_error
-from envhub_sandbox.transport import generators
+from envhub_sandbox.transport.values import generators
 from envhub_sandbox.vector import from_manifest
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.codec.codec import decode, encode
@@ -252,5 +252,5 @@ def test_the_proxys_own_names_are_never_served() -> None:
     """Its methods and properties are found in the class, and its fields mean nothing outside."""
     public = [name for name in vars(SandboxVectorEnv) if not name.startswith("_")]
     assert {"prewarm", "stats", "sandbox_report"} <= set(public)
-    for name in ("_remote", "_manifest", "_waiting", "_timeouts", "_read_actions"):
+    for name in ("_session", "_exchange", "_manifest", "_asking", "_timeouts", "_read_actions"):
         assert not is_servable(name)

@@ -1,31 +1,20 @@
-"""One repository under one policy: opens jails for it, and keeps what they said about it."""
+"""Opens jails for one repository, in the place where its workers run."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
-from functools import cache, partial
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import Any
 
-from envhub_sandbox.crash.history import Recording
-from envhub_sandbox.crash.writer import Crash, keep
 from envhub_sandbox.errors import (
-    DependencyError,
     EnvHubError,
     LoadError,
     VersionMismatchError,
-    WorkerDiedError,
     WorkerTimeoutError,
-    name_bundle,
-    name_source,
 )
-from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.hub.store import cache_root
-from envhub_sandbox.log import CRASHES, WORKER
-from envhub_sandbox.policy import Policy, Timeouts
+from envhub_sandbox.log import WORKER
 from envhub_sandbox.sandboxes.base import (
     Crowded,
     EnclosedServer,
@@ -34,21 +23,18 @@ from envhub_sandbox.sandboxes.base import (
     Sandbox,
     WorkerServer,
 )
-from envhub_sandbox.session.author_lines import point_out
-from envhub_sandbox.session.provenance import provenance_of
-from envhub_sandbox.session.recipe import Recipe
-from envhub_sandbox.session.server_hold import ServerHold
-from envhub_sandbox.transport.connection import WorkerClient, expect
+from envhub_sandbox.session.jails.loaded import Known, LoadedJail
+from envhub_sandbox.session.jails.server_hold import ServerHold
+from envhub_sandbox.session.repository import Repository
+from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.generators import generator
-from envhub_sandbox.transport.jail import RemoteJail, open_jail, typed
+from envhub_sandbox.transport.jail import RemoteJail, open_jail
 from envhub_sandbox.transport.output import OutputFollower, Wanted
+from envhub_sandbox.transport.replies import expect, typed
+from envhub_sandbox.transport.values.generators import generator
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.confinement import LACKS_PACKAGES
-from envhub_worker.protocol.limits import WireLimits
-from envhub_worker.protocol.manifest import EnvManifest, Manifest, decode_manifest
+from envhub_worker.protocol.manifest import EnvManifest, decode_manifest
 from envhub_worker.protocol.runtime import Runtime
-from envhub_worker.protocol.text import printable
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _CLOSE_S = 5.0
@@ -58,204 +44,31 @@ _FIRST_WITH_LOAD_TASK = 3
 _FIRST_WITH_PACKAGES = 5
 
 
-@dataclass(frozen=True, kw_only=True)
-class LoadArguments:
-    """What the repository's ``make_env`` is called with."""
-
-    n_envs: int = 1
-    use_async_envs: bool = False
-    cfg: dict[str, object] | None = None
-    env_kwargs: dict[str, object] = field(default_factory=dict)
-
-    def message(self) -> m.Load:
-        """As it travels."""
-        return m.Load(self.n_envs, self.use_async_envs, self.cfg, self.env_kwargs)
-
-    def message_for(self, task: EnvManifest) -> m.LoadTask:
-        """The same, where it is known what it returns."""
-        given = (self.n_envs, self.use_async_envs, self.cfg, self.env_kwargs)
-        return m.LoadTask(*given, task.suite, task.task)
-
-
-@dataclass(frozen=True)
-class Known:
-    """What a repository's ``make_env`` has returned before.
-
-    Attributes:
-        manifest: All of it.
-        task: The environment that a jail is wanted for.
-        shards: Over how many runners it is going to be spread.
-    """
-
-    manifest: Manifest
-    task: EnvManifest
-    shards: int = 1
-
-
-@dataclass
-class LoadedJail:
-    """An open jail whose first runner has called ``make_env``.
-
-    Attributes:
-        jail: The jail.
-        manifest: What ``make_env`` returned, checked.
-        loaded: Runners that have called it.
-        changed: Whether it returned something else in one of them than the manifest says.
-    """
-
-    jail: RemoteJail
-    manifest: Manifest
-    value: dict[str, object]
-    loaded: set[int]
-    server: WorkerServer
-    closed: bool = False
-    changed: bool = False
-
-
-class Repository:
-    """Opens jails for one snapshot. Thread-safe.
+class Launcher:
+    """Opens and ends the jails of one repository. Thread-safe.
 
     Args:
-        snapshot: The verified files.
-        arguments: For the repository's ``make_env``.
-        policy: What a jail may do.
-        timeouts: How long operations may take.
+        repository: What they are for.
         sandbox: Where workers run.
-        runtime: The interpreter of the jails, and their packages.
         store: The folder that snapshots lie in.
-        lane: ``"auto"`` or ``"frames"``.
-        copy: Whether observations are copied for the caller, or lent.
 
     Attributes:
-        cure: Says what to do where a module is missing.
-        installed: What was installed for it, for the provenance.
         runs_on: What runs it where it runs; a remembered manifest holds for this only.
-        latest_report: The layers of the jail that was opened last, for the provenance of what was
-            made. Which of them hold for an environment, only its own jail says.
+        retry_s: For how long to ask again, where a server has no room.
     """
 
-    def __init__(
-        self,
-        snapshot: Snapshot,
-        arguments: LoadArguments,
-        policy: Policy,
-        timeouts: Timeouts,
-        sandbox: Sandbox,
-        runtime: Runtime,
-        store: Path,
-        lane: str,
-        copy: bool,
-    ) -> None:
-        self.snapshot = snapshot
-        self.arguments = arguments
-        self.policy = policy
-        self.timeouts = timeouts
-        self.runtime = runtime
-        self.lane = lane
-        self.copy = copy
-        self.latest_report: list[dict[str, Any]] = []
-        self.recipe: Recipe | None = None
-        self.cure: Callable[[], str] = str
-        self.installed: dict[str, Any] | None = None
+    def __init__(self, repository: Repository, sandbox: Sandbox, store: Path) -> None:
+        self.repository = repository
         self._sandbox = sandbox
-        self.runs_on = runtime
+        self.runs_on = runtime = repository.runtime
         if isinstance(sandbox, PerRepository):
-            own = sandbox.for_repository(snapshot.root, policy, runtime)
+            root, policy = repository.snapshot.root, repository.policy
+            own = sandbox.for_repository(root, policy, runtime)
             self._sandbox, self.runs_on = own, Runtime(own.interpreter)
         self.retry_s = self._sandbox.retry_s if isinstance(self._sandbox, Crowded) else 0.0
         self._store = store
         self._hold = ServerHold(self._acquire, self._release)
         self._jail_numbers = count(1)
-
-    @property
-    def label(self) -> str:
-        """Repository, commit and entry file, for errors."""
-        return self.snapshot.label
-
-    @property
-    def wire_limits(self) -> WireLimits:
-        """Bounds on what a jail may send."""
-        return _wire_limits(self.policy.limits.message_bytes)
-
-    @contextmanager
-    def named(self) -> Iterator[None]:
-        """Put the repository's name in front of the errors of this project."""
-        try:
-            yield
-        except EnvHubError as error:
-            if isinstance(error, DependencyError) and not str(error).startswith(self.label):
-                error.args = (f"{error}. {self.cure()}",)
-            name_source(error, self.label)
-            point_out(error, self.snapshot)
-            raise
-
-    @contextmanager
-    def starting(self, deadline: Deadline) -> Iterator[None]:
-        """Say what it was that took too long, and keep what led to a death that matters."""
-        try:
-            yield
-        except WorkerDiedError as error:
-            if error.reason == "zygote" and error.exit_code == LACKS_PACKAGES:
-                what = error.detail.strip().removeprefix("ModuleNotFoundError: ")
-                raise DependencyError(f"{self.label}: {printable(what)}") from error
-            if not deadline.unasked:
-                self.keep_crash(error)
-            raise
-        except WorkerTimeoutError as error:
-            if error.request is not None or deadline.unasked:
-                raise
-            startup_s = self.timeouts.startup_s
-            late = WorkerTimeoutError(
-                f"make_env has not finished after {startup_s} s and was ended; give it longer "
-                "with timeouts={'startup_s': ...}, or make it again",
-                request="make_env",
-                timeout_s=startup_s,
-            )
-            self.keep_crash(late)
-            raise late from error
-
-    def keep_crash(
-        self,
-        error: WorkerDiedError | WorkerTimeoutError,
-        recording: Recording | None = None,
-        task: dict[str, Any] | None = None,
-        loaded: LoadedJail | None = None,
-        *,
-        shared: bool = False,
-    ) -> None:
-        """Write a crash bundle and name it in the error. What hinders that is only logged.
-
-        Args:
-            error: What the user is going to be told.
-            recording: What was asked of the environment; None before there is one.
-            task: Which environment, as in ``Crash``.
-            loaded: Its jail.
-            shared: Whether other environments lived in it.
-        """
-        ours = self.policy.crash_history and error.bundle is None and self.recipe is not None
-        if not ours or getattr(error, "reason", "") in ("killed", "idle", "gone", "connection"):
-            return
-        assert self.recipe is not None
-        manifest = None if loaded is None else loaded.manifest
-        report = self.latest_report if loaded is None else loaded.jail.report
-        crash = Crash(
-            error=error,
-            label=self.label,
-            provenance=provenance_of(self.snapshot, manifest, report, self.installed),
-            load=self.arguments.message(),
-            options=self.recipe.options,
-            task=task,
-            shared=shared,
-            recording=recording or Recording(),
-        )
-        try:
-            folder = self.policy.crash_folder or cache_root() / "crashes"
-            bundle = keep(Path(folder).absolute(), crash)
-        except Exception as problem:
-            CRASHES.warning("%s: no crash bundle could be written: %s", self.label, problem)
-        else:
-            name_bundle(error, str(bundle))
-            CRASHES.info("%s: crash bundle %s", self.label, bundle)
 
     def hold(self) -> Callable[[], None]:
         """Keep the server between two jails; returns what gives it back."""
@@ -266,10 +79,10 @@ class Repository:
         return self._hold.enter()
 
     def _acquire(self) -> WorkerServer:
-        return self._sandbox.acquire(self._store, self.runtime)
+        return self._sandbox.acquire(self._store, self.repository.runtime)
 
     def _release(self, server: WorkerServer) -> None:
-        self._sandbox.release(server, self.timeouts.server_idle_s)
+        self._sandbox.release(server, self.repository.timeouts.server_idle_s)
 
     def open(self, deadline: Deadline, known: Known | None = None) -> LoadedJail:
         """Fork a jail and have its first runner call ``make_env``.
@@ -285,9 +98,9 @@ class Repository:
         """
         server = self._acquire()
         try:
-            if self.timeouts.server_idle_s != 0 and not isinstance(server, FarServer):
+            if self.repository.timeouts.server_idle_s != 0 and not isinstance(server, FarServer):
                 self._hold.keep()
-            with self.starting(deadline):
+            with self.repository.starting(deadline):
                 return self._open(server, deadline, known)
         except BaseException:
             self._release(server)
@@ -308,18 +121,18 @@ class Repository:
                     f"the worker speaks protocol {client.version}, and a repository with packages "
                     f"of its own needs {_FIRST_WITH_PACKAGES}: upgrade the worker"
                 )
-            jail = open_jail(client, order, self.wire_limits, deadline)
+            jail = open_jail(client, order, self.repository.wire_limits, deadline)
         except BaseException:
             client.close()
             wanted.close()
             raise
-        WORKER.debug("%s: jail %x opened", self.label, jail.number)
+        WORKER.debug("%s: jail %x opened", self.repository.label, jail.number)
         try:
             if wanted.sinks:
                 follower = OutputFollower(lambda: self._connected(server), jail.number, wanted)
                 jail.before_end = follower.stop
             around = server.layers if isinstance(server, EnclosedServer) else ()
-            jail.report = self.latest_report = [*map(dict, around), *jail.report]
+            jail.report = self.repository.latest_report = [*map(dict, around), *jail.report]
             if known is None:
                 return self._load(jail, server, deadline)
             loaded = LoadedJail(jail, known.manifest, {}, set(), server)
@@ -331,26 +144,28 @@ class Repository:
 
     def _client(self, server: WorkerServer) -> WorkerClient:
         far = server.far if isinstance(server, FarServer) else None
-        return WorkerClient(server.endpoint, server.process_fd, self.wire_limits, far)
+        return WorkerClient(server.endpoint, server.process_fd, self.repository.wire_limits, far)
 
     def _order(self, server: WorkerServer, runners: int) -> m.OpenJail:
-        confinement = self.policy.confinement()
-        snapshot, runtime = str(self.snapshot.root), self.runtime
+        confinement = self.repository.policy.confinement()
+        snapshot, runtime = str(self.repository.snapshot.root), self.repository.runtime
         if isinstance(server, EnclosedServer):
             snapshot, runtime = server.snapshot, Runtime(server.python)
             confinement = replace(confinement, profile=server.profile)
-        entry, permitted = self.snapshot.path, asdict(confinement)
-        order = (self.label, runtime.python, snapshot, entry, permitted, runners)
+        entry, permitted = self.repository.snapshot.path, asdict(confinement)
+        order = (self.repository.label, runtime.python, snapshot, entry, permitted, runners)
         if not runtime.packages:
             return m.OpenJail(*order)
         return m.OpenJailWith(*order, runtime.packages)
 
     def _load(self, jail: RemoteJail, server: WorkerServer, deadline: Deadline) -> LoadedJail:
         runner = jail.runners[0]
-        [reply] = jail.exchange("make_env", [(runner, self.arguments.message())], deadline)
+        [reply] = jail.exchange(
+            "make_env", [(runner, self.repository.arguments.message())], deadline
+        )
         if not isinstance(reply, m.Loaded):
             raise LoadError(f"the worker answered Load with {type(reply).__name__}")
-        elements = self.policy.limits.elements
+        elements = self.repository.policy.limits.elements
         in_time = partial(_refuse_late, deadline)
         manifest = decode_manifest(
             reply.manifest, max_elements=elements, check=in_time, generator=generator
@@ -359,14 +174,14 @@ class Repository:
 
     def _wanted_output(self) -> Wanted:
         """Where the next jail's output goes: each has a file of its own."""
-        output = self.policy.output
+        output = self.repository.policy.output
         if output in ("stderr", "-"):
-            return Wanted(self.label, None, stderr=True)
+            return Wanted(self.repository.label, None, stderr=True)
         path = None if output == "tail" else Path(output)
         number = next(self._jail_numbers)
         if path is not None and number > 1:
             path = path.with_name(f"{path.stem}-{number}{path.suffix}")
-        return Wanted(self.label, path)
+        return Wanted(self.repository.label, path)
 
     def _connected(self, server: WorkerServer) -> WorkerClient:
         client = self._client(server)
@@ -396,10 +211,10 @@ class Repository:
         """Have runners of a jail call ``make_env``, for a task that is known."""
         jail = loaded.jail
         if jail.client.version < _FIRST_WITH_LOAD_TASK:
-            load = self.arguments.message()
+            load = self.repository.arguments.message()
             jail.exchange("make_env", [(runner, load) for runner in runners], deadline)
         else:
-            again = self.arguments.message_for(task)
+            again = self.repository.arguments.message_for(task)
             replies = jail.exchange("make_env", [(runner, again) for runner in runners], deadline)
             found = [typed(reply, m.Value).value for reply in replies]
             loaded.changed |= not all(_is_what(value, task) for value in found)
@@ -434,7 +249,7 @@ class Repository:
         if loaded.closed:
             return
         loaded.closed = True
-        WORKER.debug("%s: jail %x closes", self.label, loaded.jail.number)
+        WORKER.debug("%s: jail %x closes", self.repository.label, loaded.jail.number)
         try:
             parting = loaded.jail.ask_to_close()
             if wait or not self._hold.goes_on(loaded.server):
@@ -494,9 +309,3 @@ def _is_what(value: object, task: EnvManifest) -> bool:
 def _refuse_late(deadline: Deadline) -> None:
     if deadline.passed:
         raise WorkerTimeoutError("the worker's manifest could not be read in time")
-
-
-@cache
-def _wire_limits(size: int) -> WireLimits:
-    # one for all environments: what is remembered of a message is for the limits that it met
-    return WireLimits(frame_bytes=size, message_bytes=size)

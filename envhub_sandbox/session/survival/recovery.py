@@ -11,13 +11,14 @@ from typing import Any, Protocol
 
 from envhub_sandbox.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
 from envhub_sandbox.log import WORKER
-from envhub_sandbox.session.failures import Failures
 from envhub_sandbox.session.lease import Lease
-from envhub_sandbox.session.reseed import SeedBook, Settings, marked, resets, truncated
-from envhub_sandbox.session.restart_policy import Restarts
+from envhub_sandbox.session.survival.failures import Failures
+from envhub_sandbox.session.survival.reseed import SeedBook, Settings, marked, resets, truncated
+from envhub_sandbox.session.survival.restart_policy import Restarts
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
-from envhub_sandbox.transport.jail import RunnersDiedError, typed
+from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Lane
+from envhub_sandbox.transport.replies import typed
 from envhub_sandbox.transport.request import Request
 from envhub_sandbox.transport.results import Results
 from envhub_worker.protocol import messages as m

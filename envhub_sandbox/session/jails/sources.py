@@ -6,25 +6,26 @@ its processes. Where ``make_env`` has already built all of them, they live in on
 
 from __future__ import annotations
 
-import os
 import threading
 import weakref
 from collections.abc import Callable
 from typing import Protocol
 
-from envhub_sandbox.session.launcher import Known, LoadedJail, Repository
+from envhub_sandbox.session.jails.launcher import Launcher
+from envhub_sandbox.session.jails.loaded import Known, LoadedJail
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.forks import Owner
 
 
 class JailSource(Protocol):
     """Gives jails and takes them back.
 
     Attributes:
-        repository: Opens them.
+        launcher: Opens them.
         forget_manifest: Drops the remembered manifest, when a jail contradicts it.
     """
 
-    repository: Repository
+    launcher: Launcher
     forget_manifest: Callable[[], None]
 
     def take(self, deadline: Deadline) -> LoadedJail:
@@ -41,23 +42,23 @@ class OwnJails:
     """A jail for each environment, of which ``known`` says what it is going to be."""
 
     def __init__(
-        self, repository: Repository, forget_manifest: Callable[[], None], known: Known
+        self, launcher: Launcher, forget_manifest: Callable[[], None], known: Known
     ) -> None:
-        self.repository = repository
+        self.launcher = launcher
         self.forget_manifest = forget_manifest
         self._known = known
 
     def take(self, deadline: Deadline) -> LoadedJail:
         """A fresh jail."""
-        return self.repository.open(deadline, self._known)
+        return self.launcher.open(deadline, self._known)
 
     def end(self, loaded: LoadedJail) -> None:
         """End it."""
-        self.repository.interrupt(loaded)
+        self.launcher.interrupt(loaded)
 
     def give_back(self, loaded: LoadedJail, *, wait: bool = True) -> None:
         """End it and drop the connection."""
-        self.repository.close(loaded, wait=wait)
+        self.launcher.close(loaded, wait=wait)
 
 
 class SharedJail:
@@ -66,11 +67,11 @@ class SharedJail:
     A death or a time-out of one environment takes the others' process along: they share it.
     """
 
-    def __init__(self, repository: Repository, forget_manifest: Callable[[], None]) -> None:
-        self.repository = repository
+    def __init__(self, launcher: Launcher, forget_manifest: Callable[[], None]) -> None:
+        self.launcher = launcher
         self.forget_manifest = forget_manifest
         self._lock = threading.RLock()  # the garbage collector may close one of them meanwhile
-        self._owner = os.getpid()
+        self._owner = Owner()
         self._first: LoadedJail | None = None
         self._users = 0
 
@@ -78,26 +79,26 @@ class SharedJail:
         """Start with a jail that is loaded already."""
         self._first = loaded
         # nobody may ever take it, nor close
-        weakref.finalize(self, self.repository.close, loaded).atexit = False
+        weakref.finalize(self, self.launcher.close, loaded).atexit = False
 
     def take(self, deadline: Deadline) -> LoadedJail:
         """A connection to the jail, which is opened if there is none."""
         with self._lock:
             if self._first is None:
-                self._first = self.repository.open(deadline)
+                self._first = self.launcher.open(deadline)
             self._users += 1
-            return self.repository.connect(self._first, deadline)
+            return self.launcher.connect(self._first, deadline)
 
     def end(self, loaded: LoadedJail) -> None:
         """End the jail, for everybody."""
-        self.repository.interrupt(loaded)
+        self.launcher.interrupt(loaded)
         with self._lock:
             if self._first is not None and self._first.jail.number == loaded.jail.number:
                 self._close_first()
 
     def give_back(self, loaded: LoadedJail, *, wait: bool = True) -> None:
         """Drop a connection; with the last one the jail ends."""
-        self.repository.disconnect(loaded)
+        self.launcher.disconnect(loaded)
         with self._lock:
             self._users -= 1
             if self._users == 0:
@@ -105,7 +106,7 @@ class SharedJail:
 
     def close(self) -> None:
         """End a jail that was provided and never taken. A fork of its owner does nothing."""
-        if os.getpid() != self._owner:
+        if not self._owner.is_here:
             return
         with self._lock:
             if self._users == 0:
@@ -114,4 +115,4 @@ class SharedJail:
     def _close_first(self) -> None:
         first, self._first = self._first, None
         if first is not None:
-            self.repository.close(first)
+            self.launcher.close(first)

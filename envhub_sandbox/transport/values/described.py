@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 from envhub_sandbox.errors import RemoteProtocolError
-from envhub_sandbox.transport.generators import generator
-from envhub_sandbox.transport.specs import spec_of
+from envhub_sandbox.transport.values.generators import generator
+from envhub_sandbox.transport.values.specs import spec_of
 from envhub_worker.protocol.codec.inert import RemoteObject, one_line
 from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
 from envhub_worker.protocol.facts import read_spec

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable
 
 from envhub_sandbox.sandboxes.base import WorkerServer
-from envhub_sandbox.session.partings import Partings
+from envhub_sandbox.session.jails.partings import Partings
+from envhub_sandbox.transport.forks import Owner
 
 
 class ServerHold:
@@ -31,7 +31,7 @@ class ServerHold:
         self.partings = Partings()
         # reentrant: the garbage collector may close an environment in the midst of this
         self._lock = threading.RLock()
-        self._owner = os.getpid()
+        self._owner = Owner()
         self._open: set[object] = set()
         self._server: WorkerServer | None = None
 
@@ -59,7 +59,7 @@ class ServerHold:
             return self._server is server and len(self._open) > 1
 
     def _leave(self, ticket: object) -> None:
-        if os.getpid() != self._owner:
+        if not self._owner.is_here:
             return  # a fork: the server is the parent's, and somebody may have held the lock
         with self._lock:
             self._open.discard(ticket)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from typing import Any, NoReturn
 
 from envhub_sandbox.errors import LoadError
-from envhub_sandbox.session.jail_sources import JailSource, SharedJail
-from envhub_sandbox.session.launcher import LoadedJail
+from envhub_sandbox.session.jails.loaded import LoadedJail
+from envhub_sandbox.session.jails.sources import JailSource, SharedJail
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import typed
 from envhub_sandbox.transport.lane import Lane, RelayLane
+from envhub_sandbox.transport.replies import typed
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
 from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
@@ -45,14 +45,15 @@ class Builder:
 
     def __init__(self, jails: JailSource, results: Results) -> None:
         self._jails = jails
-        self._repository = jails.repository
+        self._launcher = jails.launcher
+        self._repository = jails.launcher.repository
         self._results = results
         self._manifest = results.manifest
         self._bounds = results.bounds
         # runners of a jail that several environments share die with it, for all of them
         own = not isinstance(jails, SharedJail)
         self._own = own
-        self._keeps = own and jails.repository.policy.restart == "transparent"
+        self._keeps = own and jails.launcher.repository.policy.restart == "transparent"
         self._number = next(_numbers)  # in every jail: what was packed for one, another understands
 
     def build(self, loaded: LoadedJail, deadline: Deadline) -> Place:
@@ -68,7 +69,7 @@ class Builder:
         idle_s = self._repository.timeouts.idle_s
         if idle_s is not None and idle_s < float("inf"):
             loaded.jail.expire(idle_s, deadline)
-        runners = self._repository.spread(loaded, len(self._bounds), deadline, self._manifest)
+        runners = self._launcher.spread(loaded, len(self._bounds), deadline, self._manifest)
         self._check_manifest(loaded)
         relay = RelayLane(loaded.jail, runners, self._number, self._results)
         self._build(relay, range(len(runners)), deadline)
@@ -85,7 +86,7 @@ class Builder:
         gone = [lane.runners[index] for index in dead]
         fresh = loaded.jail.replace_runners(gone, deadline)
         loaded.loaded.difference_update(gone)
-        self._repository.load(loaded, fresh, deadline, self._manifest)
+        self._launcher.load(loaded, fresh, deadline, self._manifest)
         self._check_manifest(loaded)
         relay = RelayLane(loaded.jail, lane.runners, self._number, self._results)
         relay.renew(dead, fresh, deadline)

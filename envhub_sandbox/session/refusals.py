@@ -1,0 +1,61 @@
+"""Why an environment takes no request now: it was closed, has died, is late, or is of a fork."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
+from envhub_sandbox.transport.forks import foreign
+from envhub_worker.protocol.lifecycle import State
+
+
+def closed_during(operation: str) -> WorkerDiedError:
+    """What is told to whoever waits for an environment that somebody closes."""
+    text = f"the environment was closed during {operation}"
+    return WorkerDiedError(text, reason="killed", request=operation)
+
+
+def expiry(operation: str, why: str) -> WorkerDiedError:
+    """What is told of an environment that nobody used for too long."""
+    text = f"cannot {operation}: {why}, so its processes were ended; call reset() first"
+    return WorkerDiedError(text, reason="idle", request=operation, detail=why)
+
+
+def refusal(
+    state: State, operation: str, restart: str, interrupted: str | None = None
+) -> EnvHubError | None:
+    """Why an environment takes no request now; None if it takes one.
+
+    Args:
+        state: Where it is in its life.
+        operation: What is asked.
+        restart: What the policy says of an environment that has died.
+        interrupted: The request whose reply nobody waited for any more.
+    """
+    if state in (State.IDLE, State.READY):
+        return None
+    if state in (State.LATE, State.PENDING) and interrupted is not None:
+        text = (
+            f"cannot {operation}: the last {interrupted} was interrupted, by Ctrl-C or a stopped "
+            "cell, and where the environment is now is not known; call reset() first"
+        )
+        return WorkerTimeoutError(text, request=operation)
+    if state in (State.LATE, State.PENDING):
+        text = f"cannot {operation}: the reply to the last request is late; call reset() first"
+        return WorkerTimeoutError(text, request=operation)
+    if state is State.DEAD:
+        text = f"cannot {operation}: the worker process has died; {_ADVICE.get(restart, _RESET)}"
+        return WorkerDiedError(text, request=operation)
+    if state is State.EXPIRED:
+        return expiry(operation, "it was idle for too long")
+    if state is State.FOREIGN:
+        return WorkerError(f"cannot {operation}: {foreign()}")
+    if state is State.CLOSED:
+        return closed_during(operation)
+    return WorkerError(f"cannot {operation}: the environment is {state.value}")
+
+
+_RESET = "call reset() first"
+_ADVICE: Mapping[str, str] = {
+    "never": "make the environment again, or use policy={'restart': 'on_reset'} and call reset()"
+}

@@ -1,0 +1,194 @@
+"""One repository under one policy: what is asked of it, and what is told of it when it fails."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from envhub_sandbox.crash.history import Recording
+from envhub_sandbox.crash.writer import Crash, keep
+from envhub_sandbox.errors import (
+    DependencyError,
+    EnvHubError,
+    WorkerDiedError,
+    WorkerTimeoutError,
+    name_bundle,
+    name_source,
+)
+from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.hub.store import cache_root
+from envhub_sandbox.log import CRASHES
+from envhub_sandbox.policy import Policy, Timeouts
+from envhub_sandbox.session.author_lines import point_out
+from envhub_sandbox.session.jails.loaded import LoadedJail
+from envhub_sandbox.session.provenance import provenance_of
+from envhub_sandbox.session.recipe import Recipe
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.confinement import LACKS_PACKAGES
+from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.runtime import Runtime
+from envhub_worker.protocol.text import printable
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadArguments:
+    """What the repository's ``make_env`` is called with."""
+
+    n_envs: int = 1
+    use_async_envs: bool = False
+    cfg: dict[str, object] | None = None
+    env_kwargs: dict[str, object] = field(default_factory=dict)
+
+    def message(self) -> m.Load:
+        """As it travels."""
+        return m.Load(self.n_envs, self.use_async_envs, self.cfg, self.env_kwargs)
+
+    def message_for(self, task: EnvManifest) -> m.LoadTask:
+        """The same, where it is known what it returns."""
+        given = (self.n_envs, self.use_async_envs, self.cfg, self.env_kwargs)
+        return m.LoadTask(*given, task.suite, task.task)
+
+
+class Repository:
+    """What the environments of one ``make_env`` have in common. Opens nothing: see ``Launcher``.
+
+    Args:
+        snapshot: The verified files.
+        arguments: For the repository's ``make_env``.
+        policy: What a jail may do.
+        timeouts: How long operations may take.
+        runtime: The interpreter of the jails, and their packages.
+        lane: ``"auto"`` or ``"frames"``.
+        copy: Whether observations are copied for the caller, or lent.
+
+    Attributes:
+        cure: Says what to do where a module is missing.
+        installed: What was installed for it, for the provenance.
+        latest_report: The layers of the jail that was opened last, for the provenance of what was
+            made. Which of them hold for an environment, only its own jail says.
+        recipe: How to make it again.
+    """
+
+    def __init__(
+        self,
+        snapshot: Snapshot,
+        arguments: LoadArguments,
+        policy: Policy,
+        timeouts: Timeouts,
+        runtime: Runtime,
+        lane: str,
+        copy: bool,
+    ) -> None:
+        self.snapshot = snapshot
+        self.arguments = arguments
+        self.policy = policy
+        self.timeouts = timeouts
+        self.runtime = runtime
+        self.lane = lane
+        self.copy = copy
+        self.latest_report: list[dict[str, Any]] = []
+        self.recipe: Recipe | None = None
+        self.cure: Callable[[], str] = str
+        self.installed: dict[str, Any] | None = None
+
+    @property
+    def label(self) -> str:
+        """Repository, commit and entry file, for errors."""
+        return self.snapshot.label
+
+    @property
+    def wire_limits(self) -> WireLimits:
+        """Bounds on what a jail may send."""
+        return _wire_limits(self.policy.limits.message_bytes)
+
+    @contextmanager
+    def named(self) -> Iterator[None]:
+        """Put the repository's name in front of the errors of this project."""
+        try:
+            yield
+        except EnvHubError as error:
+            if isinstance(error, DependencyError) and not str(error).startswith(self.label):
+                error.args = (f"{error}. {self.cure()}",)
+            name_source(error, self.label)
+            point_out(error, self.snapshot)
+            raise
+
+    @contextmanager
+    def starting(self, deadline: Deadline) -> Iterator[None]:
+        """Say what it was that took too long, and keep what led to a death that matters."""
+        try:
+            yield
+        except WorkerDiedError as error:
+            if error.reason == "zygote" and error.exit_code == LACKS_PACKAGES:
+                what = error.detail.strip().removeprefix("ModuleNotFoundError: ")
+                raise DependencyError(f"{self.label}: {printable(what)}") from error
+            if not deadline.unasked:
+                self.keep_crash(error)
+            raise
+        except WorkerTimeoutError as error:
+            if error.request is not None or deadline.unasked:
+                raise
+            startup_s = self.timeouts.startup_s
+            late = WorkerTimeoutError(
+                f"make_env has not finished after {startup_s} s and was ended; give it longer "
+                "with timeouts={'startup_s': ...}, or make it again",
+                request="make_env",
+                timeout_s=startup_s,
+            )
+            self.keep_crash(late)
+            raise late from error
+
+    def keep_crash(
+        self,
+        error: WorkerDiedError | WorkerTimeoutError,
+        recording: Recording | None = None,
+        task: dict[str, Any] | None = None,
+        loaded: LoadedJail | None = None,
+        *,
+        shared: bool = False,
+    ) -> None:
+        """Write a crash bundle and name it in the error. What hinders that is only logged.
+
+        Args:
+            error: What the user is going to be told.
+            recording: What was asked of the environment; None before there is one.
+            task: Which environment, as in ``Crash``.
+            loaded: Its jail.
+            shared: Whether other environments lived in it.
+        """
+        ours = self.policy.crash_history and error.bundle is None and self.recipe is not None
+        if not ours or getattr(error, "reason", "") in ("killed", "idle", "gone", "connection"):
+            return
+        assert self.recipe is not None
+        manifest = None if loaded is None else loaded.manifest
+        report = self.latest_report if loaded is None else loaded.jail.report
+        crash = Crash(
+            error=error,
+            label=self.label,
+            provenance=provenance_of(self.snapshot, manifest, report, self.installed),
+            load=self.arguments.message(),
+            options=self.recipe.options,
+            task=task,
+            shared=shared,
+            recording=recording or Recording(),
+        )
+        try:
+            folder = self.policy.crash_folder or cache_root() / "crashes"
+            bundle = keep(Path(folder).absolute(), crash)
+        except Exception as problem:
+            CRASHES.warning("%s: no crash bundle could be written: %s", self.label, problem)
+        else:
+            name_bundle(error, str(bundle))
+            CRASHES.info("%s: crash bundle %s", self.label, bundle)
+
+
+@cache
+def _wire_limits(size: int) -> WireLimits:
+    # one for all environments: what is remembered of a message is for the limits that it met
+    return WireLimits(frame_bytes=size, message_bytes=size)

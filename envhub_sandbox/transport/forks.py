@@ -1,0 +1,32 @@
+"""Which process something belongs to: a fork of it inherits that, and must leave it alone."""
+
+from __future__ import annotations
+
+import os
+
+
+class Owner:
+    """The process that made this.
+
+    Attributes:
+        pid: Its number. Where each step asks, this is compared without a call.
+    """
+
+    def __init__(self) -> None:
+        self.pid = os.getpid()
+
+    @property
+    def is_here(self) -> bool:
+        """Whether it is this one, and no fork of it."""
+        return os.getpid() == self.pid
+
+
+def foreign(owner: int | None = None) -> str:
+    """What is told to whoever uses an environment in a fork of its owner, whose number it is."""
+    whose = "this environment belongs to another process"
+    if owner is not None:
+        whose = f"this environment belongs to process {owner}"
+    return (
+        f"{whose}, and this is a fork of it ({os.getpid()}); call make_env here to get one of its "
+        "own"
+    )

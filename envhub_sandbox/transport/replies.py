@@ -1,0 +1,179 @@
+"""What a reply says: the message that was asked for, or the error that it means.
+
+Everything that a server or a runner can say becomes an exception here, and nowhere else: out of
+fixed tables, with texts that are cut and made printable.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from envhub_sandbox.errors import (
+    EnvHubError,
+    MissingModuleError,
+    PolicyError,
+    RemoteProtocolError,
+    SandboxUnavailableError,
+    ServerBusyError,
+    SnapshotIntegrityError,
+    VersionMismatchError,
+    WorkerDiedError,
+    WorkerError,
+    load_error,
+    remote_error,
+)
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.busy import ERROR, Busy
+from envhub_worker.protocol.codec.inert import one_line
+from envhub_worker.protocol.confinement import Reason
+from envhub_worker.protocol.text import printable
+
+# --- what was asked for ------------------------------------------------------------------------
+
+
+def expect(reply: m.Message, kind: type[m.M]) -> m.M:
+    """The reply, if it is of the kind that the request asks for.
+
+    Raises:
+        SandboxUnavailableError: A layer of the confinement is missing.
+        WorkerDiedError: A process of the jail ended.
+        RemoteProtocolError: It is another message.
+    """
+    if isinstance(reply, kind):
+        return reply
+    if isinstance(reply, m.Refused):
+        raise refusal(reply)
+    if isinstance(reply, m.Died):
+        raise death(reply)
+    raise RemoteProtocolError(
+        f"the worker answered with {type(reply).__name__} where {kind.__name__} belongs"
+    )
+
+
+def check(reply: m.Message) -> None:
+    """Raise what a runner's reply says went wrong.
+
+    Raises:
+        EnvHubError: What the repository raised.
+        RemoteProtocolError: A runner spoke in the server's name.
+    """
+    if isinstance(reply, m.Raised):
+        raise raised(reply)
+    if reply.kind < m.FIRST_RUNNER_KIND:
+        raise RemoteProtocolError(f"a runner sent {type(reply).__name__}")
+
+
+def typed(reply: m.Message, kind: type[m.M]) -> m.M:
+    """The reply, if it is of the kind that the request asks for.
+
+    Raises:
+        RemoteProtocolError: It is another message.
+    """
+    if not isinstance(reply, kind):
+        raise RemoteProtocolError(
+            f"the worker answered with {type(reply).__name__} where {kind.__name__} belongs"
+        )
+    return reply
+
+
+# --- what a server says ---------------------------------------------------------------------
+
+
+def refusal(reply: m.Refused) -> Exception:
+    """The error for a refused request. Trust: text from the worker."""
+    message = printable(reply.message)
+    if reply.error == "SandboxUnavailableError":
+        layer = f"{printable(reply.layer)}: " if reply.layer else ""
+        fix = f"\n{printable(reply.fix)}" if reply.fix else ""
+        return SandboxUnavailableError(f"this host cannot enforce {layer}{message}{fix}")
+    if reply.error == "WorkerDiedError":
+        return WorkerDiedError(message, reason="gone")
+    if reply.error == ERROR:
+        busy = Busy.read(reply.layer, reply.fix)
+        return ServerBusyError(
+            message, quota=busy.quota, used=busy.used, limit=busy.limit, retry_s=busy.retry_s
+        )
+    return _REFUSALS.get(reply.error, WorkerError)(message)
+
+
+_REFUSALS: dict[str, type[Exception]] = {
+    "PolicyError": PolicyError,
+    "SnapshotIntegrityError": SnapshotIntegrityError,
+    "VersionMismatchError": VersionMismatchError,
+}
+
+
+_REASONS: dict[Reason, str] = {
+    "exit": "it exited",
+    "signal": "a signal ended it",
+    "out-of-memory": "it ran out of memory",
+    "cpu-limit": "it used up its cpu limit",
+    "disk-limit": "it used up its disk limit",
+    "protocol": "it broke the rules of the wire and was killed",
+    "killed": "it was closed",
+    "zygote": "the process that forks workers ended",
+    "idle": "the server ended it",
+    "unavailable": "it could not be confined",
+}
+
+
+def death(reply: m.Died) -> WorkerDiedError:
+    """The error for a jail that ended."""
+    how = _REASONS.get(reply.reason, reply.reason)
+    if reply.signal:
+        how += f" ({reply.signal})"
+    elif reply.exit_code is not None:
+        how += f" (exit code {reply.exit_code})"
+    during = f" during {reply.operation}" if reply.operation else ""
+    detail = f"\n{reply.detail}" if reply.detail else ""
+    tail = f"\nIts last output:\n{reply.tail}" if reply.tail else ""
+    return WorkerDiedError(
+        f"the worker process died{during}: {how}{detail}{tail}",
+        exit_code=reply.exit_code,
+        signal=reply.signal,
+        reason=reply.reason,
+        log_tail=reply.tail,
+        request=reply.operation or None,
+        detail=reply.detail,
+    )
+
+
+# --- what a runner says ---------------------------------------------------------------------
+
+_LOADING = {
+    "import": "the entry file could not be imported",
+    "make_env": "its make_env failed",
+    "return": "its make_env returned something unusable",
+}
+_LOADERS_OWN = (".EntryError", ".ArgumentsError")
+"""What our own loader raises, which has a traceback of nobody's interest."""
+
+
+def raised(reply: m.Raised) -> EnvHubError:
+    """The error for an exception of the repository. Trust: text from the worker."""
+    reply = _harmless(reply)
+    if reply.stage not in _LOADING:
+        return remote_error(reply.builtin, reply.type_name, reply.message, reply.traceback)
+    what = _LOADING[reply.stage]
+    if reply.stage == "return":
+        return load_error("ValueError", reply.message)
+    cause: Any = remote_error(reply.builtin, reply.type_name, reply.message, reply.traceback)
+    if reply.builtin == "ModuleNotFoundError":
+        error: EnvHubError = MissingModuleError(f"{what}: {reply.message}")
+    elif reply.type_name.endswith(_LOADERS_OWN):
+        return load_error(reply.builtin, reply.message)
+    else:
+        error = load_error(reply.builtin, f"{what}: {reply.type_name}: {reply.message}")
+    error.__cause__ = cause
+    return error
+
+
+def _harmless(reply: m.Raised) -> m.Raised:
+    """The same without what a terminal would obey, and no longer than anybody reads."""
+    return m.Raised(
+        reply.builtin,
+        one_line(reply.type_name, 512),
+        printable(reply.message),
+        printable(reply.traceback, 32_768),
+        reply.stage,
+    )

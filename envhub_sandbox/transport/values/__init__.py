@@ -1,0 +1,1 @@
+"""What crosses the wire and is not plain: spaces, generators, tensors; pickles on their way in."""
