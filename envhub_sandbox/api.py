@@ -83,7 +83,7 @@ def make_env(
         token: As in huggingface_hub.
         endpoint: As in huggingface_hub.
         python: The interpreter that runs the repository; this one by default. It needs cloudpickle,
-            gymnasium, msgpack, numpy and pyzmq beside the repository's own packages.
+            gymnasium, msgpack and numpy beside the repository's own packages.
         dependencies: Where its packages come from. ``"auto"`` makes an environment of its own from
             what it declares, wheels only, where this interpreter lacks some of that; ``"host"``
             takes this interpreter as it is; a path that interpreter or virtual environment. A

@@ -15,6 +15,8 @@ from envhub_sandbox.cli.shared.console import console, print_json, safe_line, sa
 from envhub_sandbox.cli.shared.exits import UsageError, reported
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from envhub_sandbox.dependencies.environments import Environment
 
 app = typer.Typer(
@@ -122,13 +124,7 @@ def _environment_data(made: list[Environment]) -> list[dict[str, Any]]:
 
 
 def _print_environments(made: list[Environment]) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for title in ("environment", "Python", "packages", "last used"):
-        table.add_column(title, overflow="fold")
-    table.add_column("size", justify="right")
+    table = _table("environment", "Python", "packages", "last used")
     for one in made:
         used = time.strftime("%F", time.localtime(one.used))
         pins = safe_line(" ".join(one.pins), 300)
@@ -150,18 +146,24 @@ def _data(found: list[Stored]) -> list[dict[str, Any]]:
 
 
 def _print(found: list[Stored]) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for title in ("repository", "commit", "revision", "last used"):
-        table.add_column(title, overflow="fold")
-    table.add_column("size", justify="right")
+    table = _table("repository", "commit", "revision", "last used")
     for one in found:
         used = time.strftime("%F", time.localtime(one.used))
         revision = safe_line(one.revision or "", 40)
         table.add_row(safe_line(one.repository), one.commit, revision, used, size_of(one.size))
     console().print(table)
+
+
+def _table(*titles: str) -> Table:
+    """These columns, and the size of each row."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for title in titles:
+        table.add_column(title, overflow="fold")
+    table.add_column("size", justify="right")
+    return table
 
 
 @app.command("remove", no_args_is_help=True)

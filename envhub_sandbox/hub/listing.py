@@ -137,7 +137,8 @@ def within_limits(files: Iterable[_File], limits: SnapshotLimits, title: str) ->
 def _too_large(title: str, what: str, name: str, limit: int) -> SnapshotTooLargeError:
     return SnapshotTooLargeError(
         f"{title}: {what}, over the limit {name}={limit}. If you trust it with the disk space, "
-        f"raise the limit: SnapshotLimits({name}=...)"
+        "fetch it once, which make_env then uses: envhub_sandbox.hub.snapshot.fetch("
+        f"HubRef.parse(...), limits=SnapshotLimits({name}=...))"
     )
 
 

@@ -10,8 +10,9 @@ from time import monotonic
 from typing import Any
 
 from envhub_sandbox.sandboxes.remote import RemoteSandbox
-from envhub_sandbox.transport.connection import WorkerClient, expect
+from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.replies import expect
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import PROFILES
 from envhub_worker.protocol.text import printable

@@ -56,7 +56,7 @@ class RunnersDiedError(WorkerDiedError):
         self.jail_gone = jail_gone
 
 
-class RemoteJail:
+class JailHandle:
     """An open jail. Not thread-safe: its owner holds a lock.
 
     Attributes:
@@ -85,9 +85,9 @@ class RemoteJail:
         self._limits = limits
         self._asked: dict[int, int] = {}  # how many runners, by request
 
-    def through(self, client: WorkerClient) -> RemoteJail:
+    def through(self, client: WorkerClient) -> JailHandle:
         """The same jail over another connection of ours."""
-        jail = RemoteJail(client, self.number, self.runners, self.report, self._limits)
+        jail = JailHandle(client, self.number, self.runners, self.report, self._limits)
         jail.before_end = self.before_end
         return jail
 
@@ -262,7 +262,7 @@ def _nothing() -> None:
 
 def open_jail(
     client: WorkerClient, request: m.OpenJail, limits: WireLimits, deadline: Deadline
-) -> RemoteJail:
+) -> JailHandle:
     """Open a jail.
 
     Raises:
@@ -274,7 +274,7 @@ def open_jail(
     runners = _runners(opened, request.runners)
     report = [dict(layer) for layer in opened.report if isinstance(layer, dict)]
     client.hold(opened.jail)
-    return RemoteJail(client, opened.jail, runners, report, limits)
+    return JailHandle(client, opened.jail, runners, report, limits)
 
 
 def _runners(opened: m.JailOpened, count: int) -> list[int]:

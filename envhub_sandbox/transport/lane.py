@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from envhub_sandbox.errors import EnvHubError, WorkerError
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import RemoteJail, RunnersDiedError
+from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError
 from envhub_sandbox.transport.replies import check, typed
 from envhub_sandbox.transport.request import Frames, Request
 from envhub_sandbox.transport.results import Results, StepResult
@@ -40,7 +40,7 @@ class Lane(Protocol):
     """
 
     name: str
-    jail: RemoteJail
+    jail: JailHandle
     runners: list[int]
     number: int
     elapsed_ns: int
@@ -134,7 +134,7 @@ class RelayLane:
     name = "frames"
 
     def __init__(
-        self, jail: RemoteJail, runners: Sequence[int], number: int, results: Results
+        self, jail: JailHandle, runners: Sequence[int], number: int, results: Results
     ) -> None:
         self.jail = jail
         self.runners = list(runners)

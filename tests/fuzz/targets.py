@@ -21,7 +21,7 @@ from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
 from envhub_sandbox.session.author_lines import point_out
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import RemoteJail, RunnersDiedError, open_jail
+from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError, open_jail
 from envhub_sandbox.transport.replies import check, death, expect, raised
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.values import described, specs
@@ -358,7 +358,7 @@ def relay(dice: Dice) -> None:
     if rng.random() < 0.3:
         payload = payload[: rng.randrange(len(payload) + 1)]
     server: Any = _Server(lambda: (reply, payload))
-    jail = RemoteJail(server, 1, range(runners), [], DEFAULT_LIMITS)
+    jail = JailHandle(server, 1, range(runners), [], DEFAULT_LIMITS)
     jail.kept = rng.random() < 0.5
     if isinstance(reply, m.JailOpened):
         asked = m.OpenJail("", "", "", "", {}, runners)

@@ -18,7 +18,7 @@ from typing import Any
 
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.confinement import Confinement
-from envhub_worker.spawn.jail_handle import (
+from envhub_worker.spawn.spawner import (
     Jail,
     JailExited,
     Ready,

@@ -11,7 +11,7 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvError
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline
-from envhub_sandbox.transport.jail import RemoteJail
+from envhub_sandbox.transport.jail import JailHandle
 from envhub_worker.protocol.shared_memory import slabs
 from tests.support import inside
 from tests.support.compare import assert_same
@@ -190,12 +190,12 @@ def test_a_signal_without_a_name_is_told(talker: Path) -> None:
 
 def test_what_a_request_is_called_decides_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Descriptors go with the request that follows them, whatever its label for people says."""
-    exchange = RemoteJail.exchange
+    exchange = JailHandle.exchange
 
-    def renamed(jail: RemoteJail, _: str, *rest: Any) -> Any:
+    def renamed(jail: JailHandle, _: str, *rest: Any) -> Any:
         return exchange(jail, "beginning", *rest)
 
-    monkeypatch.setattr(RemoteJail, "exchange", renamed)
+    monkeypatch.setattr(JailHandle, "exchange", renamed)
     with make_env(sample("counter"), n_envs=2, num_workers=2) as suites:
         suites.env.reset(seed=0)
         assert inside.lane(suites.env) is not None

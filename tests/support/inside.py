@@ -29,7 +29,7 @@ from envhub_sandbox.session.recipe import Recipe
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import RemoteJail
+from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
 from envhub_sandbox.transport.shared_memory.shard import LaneShard
 from envhub_worker.access.connection_limit import Doorman
@@ -42,7 +42,7 @@ from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.lifecycle import Lifecycle, State
 from envhub_worker.protocol.manifest import EnvManifest
 from envhub_worker.protocol.messages import packing
-from envhub_worker.spawn.jail_handle import Spawner
+from envhub_worker.spawn.spawner import Spawner
 
 Spot = tuple[Any, str]
 
@@ -117,7 +117,7 @@ def loaded(env: Any) -> LoadedJail | None:
     return session(env).lease.loaded
 
 
-def jail(env: Any) -> RemoteJail:
+def jail(env: Any) -> JailHandle:
     """The jail that it runs in."""
     return _running(env).jail
 

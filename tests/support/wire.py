@@ -8,7 +8,7 @@ from unittest.mock import Mock
 
 import msgpack
 
-from envhub_sandbox.transport.jail import RemoteJail
+from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.lane import RelayLane
 from envhub_sandbox.transport.request import Request
 from envhub_worker.protocol import messages as m
@@ -41,6 +41,6 @@ def deep(levels: int) -> list[Any]:
 
 def requested(*messages: m.Message) -> Request:
     """A request of a message for each shard of two sub-environments, as it is sent."""
-    jail = RemoteJail(Mock(version=m.VERSION), 1, [], [], DEFAULT_LIMITS)
+    jail = JailHandle(Mock(version=m.VERSION), 1, [], [], DEFAULT_LIMITS)
     bounds = [(2 * index, 2 * index + 2) for index in range(len(messages))]
     return RelayLane(jail, [], 1, Mock(bounds=bounds)).request("a test", messages)

@@ -28,7 +28,7 @@ from envhub_sandbox.session.jails.server_hold import ServerHold
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import RemoteJail, open_jail
+from envhub_sandbox.transport.jail import JailHandle, open_jail
 from envhub_sandbox.transport.output import OutputFollower, Wanted
 from envhub_sandbox.transport.replies import expect, typed
 from envhub_sandbox.transport.values.generators import generator
@@ -158,7 +158,7 @@ class Launcher:
             return m.OpenJail(*order)
         return m.OpenJailWith(*order, runtime.packages)
 
-    def _load(self, jail: RemoteJail, server: WorkerServer, deadline: Deadline) -> LoadedJail:
+    def _load(self, jail: JailHandle, server: WorkerServer, deadline: Deadline) -> LoadedJail:
         runner = jail.runners[0]
         [reply] = jail.exchange(
             "make_env", [(runner, self.repository.arguments.message())], deadline

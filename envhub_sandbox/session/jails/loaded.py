@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from envhub_sandbox.sandboxes.base import WorkerServer
-from envhub_sandbox.transport.jail import RemoteJail
+from envhub_sandbox.transport.jail import JailHandle
 from envhub_worker.protocol.manifest import EnvManifest, Manifest
 
 
@@ -35,7 +35,7 @@ class LoadedJail:
         changed: Whether it returned something else in one of them than the manifest says.
     """
 
-    jail: RemoteJail
+    jail: JailHandle
     manifest: Manifest
     value: dict[str, object]
     loaded: set[int]

@@ -12,7 +12,7 @@ from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.session.survival.reseed import SeedBook, derived_seed, resets, truncated
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import RemoteJail, RunnersDiedError
+from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.values.described import Described
 from envhub_worker.protocol import messages as m
@@ -44,10 +44,10 @@ class Told:
         return self.reply, self.payload
 
 
-def jail(reply: m.Message, *parts: m.Message, kept: bool = True) -> RemoteJail:
+def jail(reply: m.Message, *parts: m.Message, kept: bool = True) -> JailHandle:
     """A jail of two runners whose server says this."""
     client = cast("WorkerClient", Told(reply, *parts))
-    made = RemoteJail(client, 1, [1, 2], [], DEFAULT_LIMITS)
+    made = JailHandle(client, 1, [1, 2], [], DEFAULT_LIMITS)
     made.kept = kept
     return made
 

@@ -11,7 +11,7 @@ import pytest
 
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.runtime import Runtime
-from envhub_worker.spawn.jail_handle import RUNNER_TARGET, Failed, RunnerExited
+from envhub_worker.spawn.spawner import RUNNER_TARGET, Failed, RunnerExited
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from tests.integration.confinement_kit import (
     Cell,

@@ -14,9 +14,9 @@ import psutil
 import pytest
 
 from envhub_worker import bootstrap
-from envhub_worker.protocol.confinement import Confinement, Limits
+from envhub_worker.protocol.confinement import LACKS_PACKAGES, Confinement, Limits
 from envhub_worker.protocol.runtime import Runtime
-from envhub_worker.spawn.jail_handle import Spawner, ZygoteDied
+from envhub_worker.spawn.spawner import Spawner, ZygoteDied
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from tests.integration.confinement_kit import (
     Cell,
@@ -282,7 +282,7 @@ def test_dead_zygote_is_told_with_its_log(folder: Path, confinement: Confinement
     assert "ModuleNotFoundError" in died.log
     assert "pip install cloudpickle gymnasium msgpack numpy pyzmq" in died.log
     assert "Traceback" not in died.log
-    assert died.code == 1
+    assert died.code == LACKS_PACKAGES
     spawner.close()
 
 

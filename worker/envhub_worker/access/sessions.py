@@ -12,7 +12,7 @@ from envhub_worker.protocol.messages import OLDEST_VERSION
 WATCHER = b"status"
 """The session of whoever only looks: the same each time, and not counted."""
 
-MAX_CONNECTIONS = 4096
+CONNECTIONS_OF_ONE = 4096
 """Of one session; the longest unused is dropped."""
 
 MAX_HELD = 8192
@@ -87,7 +87,7 @@ class Sessions:
         self._disconnect((identity, key))
         self._of[identity, key] = session
         session.connections[identity, key] = Connection(wire)
-        if len(session.connections) > MAX_CONNECTIONS:
+        if len(session.connections) > CONNECTIONS_OF_ONE:
             self._disconnect(next(iter(session.connections)))
         return session
 

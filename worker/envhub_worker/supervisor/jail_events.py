@@ -16,7 +16,7 @@ from envhub_worker.lockdown.limits import around
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import ProtocolError
-from envhub_worker.spawn.jail_handle import (
+from envhub_worker.spawn.spawner import (
     Failed,
     JailExited,
     RunnerExited,

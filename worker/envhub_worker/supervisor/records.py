@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.confinement import Reason
-from envhub_worker.spawn.jail_handle import Jail
+from envhub_worker.spawn.spawner import Jail
 from envhub_worker.supervisor.idle_timer import Idleness
 from envhub_worker.supervisor.output_tail import OutputTail
 from envhub_worker.supervisor.runner_stream import RunnerLink
