@@ -125,12 +125,12 @@ def load(slot: Slot) -> tuple[FileRecord, ...] | None:
     Raises:
         SnapshotIntegrityError: The tree is not what was verified; the text says how to remove it.
     """
-    try:
-        _refuse_shared_store(slot.record)
-        text = slot.record.read_bytes()
-    except FileNotFoundError:
-        if os.path.lexists(slot.home):
-            raise _damaged(slot, "its record.json is missing") from None
+    text = _record_of(slot)
+    if text is None and os.path.lexists(slot.home):
+        text = _record_of(slot)  # another may have put the whole of it there in between
+        if text is None:
+            raise _damaged(slot, "its record.json is missing")
+    if text is None:
         return None
     with contextlib.suppress(FileNotFoundError):  # which is said below
         _refuse_shared_store(slot.tree)
@@ -143,6 +143,14 @@ def load(slot: Slot) -> tuple[FileRecord, ...] | None:
         with contextlib.suppress(OSError):  # A read-only store only stays slower.
             _write_record(slot.home, slot.tree, document, [_plain(entry) for entry in entries])
     return tuple(_plain(entry) for entry in entries)
+
+
+def _record_of(slot: Slot) -> bytes | None:
+    try:
+        _refuse_shared_store(slot.record)
+        return slot.record.read_bytes()
+    except FileNotFoundError:
+        return None
 
 
 def _plain(entry: _Entry) -> FileRecord:
