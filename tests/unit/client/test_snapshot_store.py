@@ -57,6 +57,24 @@ def test_empty_store_has_nothing(slot: store.Slot) -> None:
     assert store.commits(slot.folder) == []
 
 
+def test_what_another_puts_there_meanwhile_is_not_damaged(
+    published: store.Slot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is not there when its record is read, and is when one asks whether it is."""
+    elsewhere, exists = published.home.with_name("elsewhere"), os.path.lexists
+    published.home.rename(elsewhere)
+
+    def appearing(path: Path) -> bool:
+        if elsewhere.exists():
+            elsewhere.rename(published.home)
+        return exists(path)
+
+    monkeypatch.setattr(os.path, "lexists", appearing)
+    found = store.load(published)
+    assert found is not None
+    assert [one.path for one in found] == sorted(CONTENT)
+
+
 def test_published_files_load(published: store.Slot) -> None:
     """What went in comes out, and the tree holds nothing else."""
     assert store.load(published) == records()
