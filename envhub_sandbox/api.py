@@ -261,11 +261,17 @@ class _Maker:
         with repository.named():
             deadline = Deadline(repository.timeouts.startup_s)
             ask = partial(self._launcher.open, deadline)
-            loaded = wait_in_line(ask, self._launcher.retry_s, deadline, repository.label)
+            try:
+                loaded = wait_in_line(ask, self._launcher.retry_s, deadline, repository.label)
+            except BaseException:
+                repository.tell()
+                raise
         self._cache.save(loaded.value)
         try:
             self._agrees(loaded.manifest)
-            return self._suites(loaded.manifest, loaded)
+            suites = self._suites(loaded.manifest, loaded)
+            repository.tell()
+            return suites
         except BaseException:
             self._launcher.close(loaded)
             raise

@@ -41,7 +41,8 @@
         RemoteResetNeeded (gymnasium.error.ResetNeeded), ...
 
 A remote exception arrives as text. ``remote_error`` maps its builtin ancestor through a fixed
-table, so ``except AttributeError`` keeps working although nothing of the worker is imported.
+table, so ``except AttributeError`` keeps working although nothing of the worker is imported. What
+the repository warns of is a ``RemoteEnvWarning``, whatever its category is there.
 """
 
 from __future__ import annotations
@@ -82,6 +83,7 @@ __all__ = [
     "PolicyError",
     "ProtocolError",
     "RemoteEnvError",
+    "RemoteEnvWarning",
     "RemoteProtocolError",
     "RepositoryUnavailableError",
     "RequirementError",
@@ -338,6 +340,25 @@ class RemoteEnvError(EnvHubError):
             (_builtin_of(type(self)), self.type_name, self.message, self.traceback),
             {**vars(self), "args": self.args},  # with where it came from
         )
+
+
+class RemoteEnvWarning(UserWarning):
+    """The repository's code has warned. Trust: category and text are the worker's words.
+
+    Attributes:
+        label: Which repository.
+        category: The class, as the worker named it (``"DeprecationWarning"``).
+        text: What it says.
+    """
+
+    def __init__(self, label: str, category: str, text: str) -> None:
+        super().__init__(f"{label}: {category}: {text}")
+        self.label = label
+        self.category = category
+        self.text = text
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return RemoteEnvWarning, (self.label, self.category, self.text)
 
 
 _BUILTINS: tuple[type[Exception], ...] = (

@@ -28,6 +28,7 @@ from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.provenance import provenance_of
 from envhub_sandbox.session.recipe import Recipe
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.warned import Heard
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import LACKS_PACKAGES
 from envhub_worker.protocol.limits import WireLimits
@@ -70,6 +71,7 @@ class Repository:
     Attributes:
         cure: Says what to do where a module is missing.
         installed: What was installed for it, for the provenance.
+        heard: What it has warned of, in any jail.
         latest_report: The layers of the jail that was opened last, for the provenance of what was
             made. Which of them hold for an environment, only its own jail says.
         recipe: How to make it again.
@@ -92,6 +94,7 @@ class Repository:
         self.runtime = runtime
         self.lane = lane
         self.copy = copy
+        self.heard = Heard()
         self.latest_report: list[dict[str, Any]] = []
         self.recipe: Recipe | None = None
         self.cure: Callable[[], str] = str
@@ -118,6 +121,10 @@ class Repository:
             name_source(error, self.label)
             point_out(error, self.snapshot)
             raise
+
+    def tell(self) -> None:
+        """Warn the caller of what it has warned of, and of what he has not been told yet."""
+        self.heard.tell(self.label)
 
     @contextmanager
     def starting(self, deadline: Deadline) -> Iterator[None]:

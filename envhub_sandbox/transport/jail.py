@@ -20,6 +20,7 @@ from envhub_sandbox.transport.replies import check, death, expect, typed
 from envhub_sandbox.transport.values import pickles
 from envhub_sandbox.transport.values.described import Described
 from envhub_sandbox.transport.values.tensors import to_tensor
+from envhub_sandbox.transport.warned import Heard
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.limits import WireLimits
@@ -66,6 +67,7 @@ class JailHandle:
         report: One mapping per layer of the confinement: ``layer``, ``enforced``, ``detail``; of
             a container around it too.
         before_end: Runs before it is ended; brings what it has printed last.
+        heard: What its repository has warned of.
     """
 
     def __init__(
@@ -82,13 +84,14 @@ class JailHandle:
         self.kept = False
         self.report = report
         self.before_end: Callable[[], None] = _nothing
+        self.heard = Heard()
         self._limits = limits
         self._asked: dict[int, int] = {}  # how many runners, by request
 
     def through(self, client: WorkerClient) -> JailHandle:
         """The same jail over another connection of ours."""
         jail = JailHandle(client, self.number, self.runners, self.report, self._limits)
-        jail.before_end = self.before_end
+        jail.before_end, jail.heard = self.before_end, self.heard
         return jail
 
     def start_runners(self, count: int, deadline: Deadline) -> list[int]:
@@ -167,7 +170,8 @@ class JailHandle:
         return RunnersDiedError(living, deaths)
 
     def _unpack(self, frames: Sequence[Buffer]) -> m.Message:
-        return m.unpack(frames, limits=self._limits, tensors=to_tensor, things=Described)[1]
+        own = self.heard.take(frames)
+        return m.unpack(own, limits=self._limits, tensors=to_tensor, things=Described)[1]
 
     def exchange(
         self, operation: str, requests: Sequence[tuple[int, m.Message]], deadline: Deadline

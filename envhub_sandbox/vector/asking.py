@@ -11,8 +11,8 @@ from typing import ParamSpec, TypeVar
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 
 from envhub_sandbox.errors import WorkerDiedError
-from envhub_sandbox.policy import Timeouts
 from envhub_sandbox.session.exchange import Exchange, MessageFor
+from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.transport.replies import typed
 from envhub_sandbox.vector.sub_environment import MessageFor as OneMessageFor
 from envhub_worker.protocol import messages as m
@@ -28,7 +28,7 @@ class Asking:
 
     Args:
         exchange: Takes the requests.
-        timeouts: How long answers may take.
+        repository: Says how long answers may take, and of what the caller is to be warned.
         face: What the environment is called in errors.
 
     Attributes:
@@ -36,11 +36,12 @@ class Asking:
         waiting: What was asked by an ``*_async``, and not waited for yet.
     """
 
-    def __init__(self, exchange: Exchange, timeouts: Timeouts, face: str) -> None:
+    def __init__(self, exchange: Exchange, repository: Repository, face: str) -> None:
         self.closed = False
         self.waiting: str | None = None
         self._exchange = exchange
-        self._timeouts = timeouts
+        self._timeouts = repository.timeouts
+        self._repository = repository
         self._face = face
 
     def refuse_if_busy(self, name: str) -> None:
@@ -94,6 +95,16 @@ class Asking:
         except WorkerDiedError:
             self.refuse_if_closed()
             raise
+        finally:
+            self.tell()
+
+    def tell(self) -> None:
+        """Warn of what the repository has warned of meanwhile.
+
+        Never while a reply is handled: what the caller's filters raise is his.
+        """
+        if self._repository.heard.untold:
+            self._repository.tell()
 
     def submit(self, operation: str, message_for: MessageFor) -> None:
         """Send a request to every shard."""

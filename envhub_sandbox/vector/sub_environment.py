@@ -164,8 +164,9 @@ class SubEnvironment(gym.Env[Any, Any]):
     @property
     def np_random_seed(self) -> Any:
         """Its seed."""
+        seed = self._get("np_random_seed")
         with UNTRUSTED:
-            return generators.seeds(self._get("np_random_seed"))
+            return generators.seeds(seed)
 
     @property
     def _is_shown(self) -> bool:

@@ -55,7 +55,8 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         self._exchange = session.exchange
         self._manifest = manifest
         self._timeouts = session.repository.timeouts
-        self._asking = Asking(session.exchange, self._timeouts, type(self).__name__)
+        self._untold = session.repository.heard.untold
+        self._asking = Asking(session.exchange, session.repository, type(self).__name__)
         self._read_actions = from_manifest.action_reader(manifest)
         self.num_envs = manifest.num_envs
         self.single_observation_space = manifest.single_observation_space
@@ -178,6 +179,9 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         except WorkerDiedError:
             asking.refuse_if_closed()  # close() in another thread ended it under us
             raise
+        finally:
+            if self._untold:
+                self._asking.tell()
 
     def step_async(self, actions: Any) -> None:
         """Send the actions; ``step_wait`` returns the results."""
@@ -319,6 +323,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             )
         self._asking.closed = True
         self._session.close()
+        self._asking.tell()
 
     def close_extras(self, **kwargs: Any) -> None:
         """There is nothing beyond ``close``."""

@@ -145,6 +145,15 @@ def test_lines_that_are_not_the_repositorys_are_noticed(
     assert first_wrong(recorded, "tracebacks") == "another file"
 
 
+def test_warnings_that_are_not_checked_are_noticed(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the check of what is said, the fuzzer says so; with it, nothing."""
+    assert first_wrong(recorded, "warnings") == ""
+    monkeypatch.setattr(*inside.CHECK_OF_WARNINGS, lambda one: one)
+    assert first_wrong(recorded, "warnings") in ("a giant", "no text")
+
+
 def forgetful(*_: object) -> None:
     """In the place of what reads a document that is known."""
     raise TypeError("unhashable type: 'list'")

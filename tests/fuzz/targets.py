@@ -27,8 +27,10 @@ from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.values import described, specs
 from envhub_sandbox.transport.values.described import Described
 from envhub_sandbox.transport.values.generators import generator
+from envhub_sandbox.transport.warned import MOST, Heard
 from envhub_sandbox.vector import from_manifest
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol import warned
 from envhub_worker.protocol.codec.codec import decode
 from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
 from envhub_worker.protocol.compression import pack_frames, unpack_frames
@@ -376,6 +378,27 @@ def relay(dice: Dice) -> None:
         check(one)
 
 
+def warnings(dice: Dice) -> None:
+    """What is told of warnings is short, plain text, however it is said; the reply is the same."""
+    rng, heard = dice.rng, Heard()
+    reply = rng.choice(dice.corpus)
+    for _ in range(rng.randrange(1, 9)):
+        some = [(f"UserWarning {rng.random()}", "x" * rng.randrange(3000)) for _ in range(3)]
+        told = m.Warned(tuple(dice.inside(list(some))))
+        front = attempt(lambda told=told: m.pack(told))  # type: ignore[misc]
+        if is_error(front):
+            raise NotSentError
+        frames = [*front, *reply]
+        if rng.random() < 0.3:
+            frames = dice.spoiler.frames(frames, dice.corpus)
+        rest = heard.take(frames)
+        demand(list(rest) in (list(frames), list(frames[1:])), "another reply")
+    demand(len(heard.untold) <= MOST + 1, "a flood")
+    for one in heard.untold:
+        demand(tuple(map(type, one)) == (str, str), "no text")
+        demand(max(map(len, one)) <= warned.MAX_TEXT, "a giant")
+
+
 def spoiled_message(dice: Dice, message: m.Message) -> m.Message:
     """A message, spoiled, as far as its class permits it."""
     fields = dice.inside(parts(message))
@@ -505,8 +528,8 @@ def column_schemas(dice: Dice) -> None:
 TARGETS: dict[str, Callable[[Dice], None]] = {
     one.__name__: one
     for one in (
-        unpack, things, results, infos, apart, restore, manifest, built, generators, relay, server,
-        tracebacks, stream, packed, column_schemas,
+        unpack, things, results, infos, apart, restore, manifest, built, generators, relay,
+        warnings, server, tracebacks, stream, packed, column_schemas,
     )
 }  # fmt: skip
 

@@ -38,6 +38,7 @@ from envhub_worker.access.rate_limited_log import Log
 from envhub_worker.cli import listen
 from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol import warned
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.lifecycle import Lifecycle, State
 from envhub_worker.protocol.manifest import EnvManifest
@@ -226,6 +227,8 @@ DECODING: Spot = (packing, "_decode")
 """What makes a message of a document that has no form yet."""
 FORMS: tuple[Spot, Spot] = ((packing, "_OUTGOING"), (packing, "_INCOMING"))
 """What is remembered of the shape of messages, each way."""
+CHECK_OF_WARNINGS: Spot = (warned, "_checked")
+"""What looks at each warning of a worker's."""
 IDLE_CONTAINERS: Spot = (sandbox, "_IDLE")
 """Where a container is that nobody uses."""
 CONTAINER_STARTS: Spot = (sandbox.RepositoryContainer, "_start")

@@ -126,6 +126,7 @@ class Launcher:
             client.close()
             wanted.close()
             raise
+        jail.heard = self.repository.heard
         WORKER.debug("%s: jail %x opened", self.repository.label, jail.number)
         try:
             if wanted.sinks:

@@ -126,6 +126,8 @@ def said(value: Any) -> str:
         inner = ", ".join(f"{key!r}: {said(item)}" for key, item in value.items())
     elif isinstance(value, (list, tuple)):
         inner = ", ".join(map(said, value))
+    elif isinstance(value, (set, frozenset)):  # which have another order in another process
+        inner = ", ".join(sorted(map(said, value)))
     elif isinstance(value, np.ndarray):
         inner = f"{value.dtype}{value.shape} {value.tolist()}"
     else:

@@ -86,6 +86,7 @@ SAMPLES: list[m.Message] = [
     m.FollowOutput(3, 4096),
     m.OutputBytes(4096, b"caf\xc3\xa9\x1b"),
     m.Raised("KeyError", "mypkg.Oops", "gone", "Traceback ...", "step"),
+    m.Warned((("UserWarning", "slow"), ("mypkg.Own", "caf\u00e9"))),
 ]  # fmt: skip
 BY_NAME = {type(message).__name__: message for message in SAMPLES}
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import mmap
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from time import perf_counter_ns
 from typing import Any
 
@@ -39,6 +39,8 @@ class Lane:
         answer: Gives the frames of the answer to a message.
         pack: Gives the frames of a message.
         raised: Makes a message of an exception.
+        warned: What the repository has warned of, and no reply has taken along: while there is
+            something, answers are fetched by the server, with that in front of them.
 
     Attributes:
         number: The environment's.
@@ -53,11 +55,13 @@ class Lane:
         answer: Callable[[Packet], list[Any]],
         pack: Callable[[m.Message, int], list[Any]],
         raised: Callable[[BaseException, str], m.Raised],
+        warned: Sequence[Any] = (),
     ) -> None:
         self.number = attach.env
         self.unsent: list[Any] = []
         self._answer = answer
         self._raised = raised
+        self._warned = warned
         layout = slabs.layout_of(env.single_action_space, env.num_envs)
         observed = slabs.observation_layout(
             env.single_observation_space, attach.count, attach.slots
@@ -163,16 +167,22 @@ class Lane:
             # copied, because an environment may keep its action and the client writes the next one
             actions = self._assemble([take() for take in self._takes])
             pairs = self._pairs = self._env.run_step(actions)
+            if self._warned:
+                return slabs.FETCH, 0
             return self._writer.write(pairs) if pairs else (slabs.DONE, 0)
         except BaseException as error:
-            return slabs.RAISED, self._writer.put(_raised_frame(self._raised(error, "step")))
+            frame = _raised_frame(self._raised(error, "step"))
+            if self._warned:
+                self.unsent = [frame]
+                return slabs.FETCH, 0
+            return slabs.RAISED, self._writer.put(frame)
 
     def _run_message(self, length: int) -> tuple[int, int]:
         start = self._layout.message
         packet = read_packet(self._request[start : start + length])
         frames = self._answer(packet)
         data = b"".join(pack_packet(packet.request_id, frames))
-        if len(data) > slabs.INFO_BYTES:
+        if self._warned or len(data) > slabs.INFO_BYTES:
             self.unsent = frames
             return slabs.FETCH, 0
         self.unsent = []

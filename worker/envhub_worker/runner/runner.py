@@ -22,6 +22,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest import encode_env, encode_manifest
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
+from envhub_worker.protocol.warned import FIRST_VERSION
 from envhub_worker.runner import loader, manifest
 from envhub_worker.runner.deferred import standing_in
 from envhub_worker.runner.described import described
@@ -31,6 +32,7 @@ from envhub_worker.runner.infos import join
 from envhub_worker.runner.lane import Lane
 from envhub_worker.runner.sync_envs import SubEnvs
 from envhub_worker.runner.tasks import ResultError, Task, tasks_of
+from envhub_worker.runner.warned import Warned
 
 _ANCILLARY_BYTES = socket.CMSG_SPACE(8 * array("i").itemsize)
 _RECHECK_MS = 2
@@ -41,6 +43,8 @@ _FIRST_WITH_DESCRIPTIONS = 7
 def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
     """Serve until the other side closes the stream. Runs confined, as the jail's main program."""
     runner = Runner(spec.snapshot, spec.entry, spec.version)
+    if spec.version >= FIRST_VERSION:
+        runner.warned.listen()
     reader = PacketReader()
     poller = select.poll()
     poller.register(stream, select.POLLIN)
@@ -89,6 +93,9 @@ class Runner:
         entry: The entry file in it.
         version: Of the protocol, as the client reads it: an older one's answers hold descriptions
             as texts.
+
+    Attributes:
+        warned: What the repository has warned of.
     """
 
     def __init__(self, snapshot: str, entry: str, version: int = m.VERSION) -> None:
@@ -100,10 +107,15 @@ class Runner:
         self._tasks: dict[tuple[str, Any], Task] = {}
         self._envs: dict[int, Any] = {}
         self._stage = ""
+        self.warned = Warned()
         self.lane: Lane | None = None
         self.descriptors: list[int] = []
 
-    def answer(self, packet: Packet, *, by_lane: bool = False) -> list[Any]:
+    def answer(self, packet: Packet) -> list[Any]:
+        """The reply's frames, with what was warned of until then in front of them."""
+        return self.warned.in_front(self.reply(packet))
+
+    def reply(self, packet: Packet, *, by_lane: bool = False) -> list[Any]:
         """The reply's frames; whatever the repository raises becomes ``Raised``."""
         try:
             # the caller's own arguments may be pickled: this is the only place that unpickles
@@ -205,9 +217,10 @@ class Runner:
         env = self._envs[request.env]
         if not isinstance(env, SubEnvs) or env.reward_shape:
             return m.Value(False)
-        answer = partial(self.answer, by_lane=True)
+        reply = partial(self.reply, by_lane=True)
         fail = partial(raised, root=self._snapshot)
-        self.lane = Lane(env, request, self.descriptors, answer, self._pack, fail)
+        warned = self.warned.pending
+        self.lane = Lane(env, request, self.descriptors, reply, self._pack, fail, warned)
         return m.Value(True)
 
     def fetch_infos(self, request: m.FetchInfos) -> m.Message:

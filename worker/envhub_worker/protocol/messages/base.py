@@ -20,14 +20,14 @@ else:
         return lambda cls: cls
 
 
-VERSION = 9
+VERSION = 10
 """The newest version of the protocol: ``Hello`` offers a range, ``Welcome`` agrees to one.
 
 Version 2 added kinds 17 to 30, version 3 kind 53, version 4 kind 54, version 5 kind 31, version 6
 pickles in frames of their own, version 7 kinds 55 and 56, the extensions 26 to 28 and lists of
 actions in slabs; nothing that there was changed. From version 8 on the id stands in front of what
 client and server say to one another, and from version 9 on the last mapping of ``Sessions`` is
-about the server.
+about the server. Version 10 added kind 57.
 """
 FIRST_WITH_FIGURES_VERSION = 9
 OLDEST_VERSION = 1

@@ -216,6 +216,15 @@ class Value(Message, kind=48):
     value: object
 
 
+class Warned(Message, kind=57):
+    """In front of the frames of a reply: what the repository has warned of. See ``warnings``.
+
+    ``((category, text), ...)``. Since version 10 of the protocol.
+    """
+
+    warnings: tuple[object, ...]
+
+
 class Raised(Message, kind=49):
     """The repository's code raised. ``builtin`` is its nearest builtin ancestor."""
 

@@ -1,0 +1,80 @@
+"""What a client makes of warnings: Python's own, once each, bounded, where the caller stands."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import warnings
+from typing import Any
+
+import pytest
+
+from envhub_sandbox.errors import RemoteEnvWarning
+from envhub_sandbox.transport.warned import MOST, Heard
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol import warned
+
+REPLY = m.pack(m.Value(1))
+
+
+def told(heard: Heard, *some: tuple[str, str]) -> list[Any]:
+    """What the caller is told after a reply with these."""
+    if some:
+        assert heard.take(warned.in_front(some, REPLY)) == REPLY
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always")
+        heard.tell("a/b@c")
+    return shown
+
+
+def test_each_is_told_once() -> None:
+    """Whichever process has said it, and however often."""
+    heard = Heard()
+    assert heard.take(REPLY) is REPLY
+    [one, other] = told(heard, ("UserWarning", "slow"), ("x.Own", "slow"), ("x.Own", "slow"))
+    assert str(one.message) == "a/b@c: UserWarning: slow"
+    assert str(other.message) == "a/b@c: x.Own: slow"
+    assert one.category is other.category is RemoteEnvWarning
+    assert told(heard, ("UserWarning", "slow")) == []
+
+
+def test_it_stands_where_the_caller_does() -> None:
+    """At his line, not in one of ours; Python's filters go by that."""
+    [one] = told(Heard(), ("UserWarning", "slow"))
+    assert one.filename == __file__
+
+
+def test_nothing_is_painted() -> None:
+    """Neither by the text nor by the name of the category."""
+    [one] = told(Heard(), ("\x1b]0;owned\x07\n", "\x1b[2J\r\u202eslow"))
+    assert str(one.message).isprintable()
+
+
+def test_a_flood_ends_with_a_word() -> None:
+    """Who has more than so many different ones is not listened to any more."""
+    heard, shown = Heard(), []
+    for number in range(3 * MOST):
+        shown += told(heard, ("UserWarning", str(number)))
+    assert len(shown) == MOST + 1
+    assert "more than" in str(shown[-1].message)
+
+
+def test_what_the_filters_raise_leaves_the_rest() -> None:
+    """As an error it comes out; what follows is told the next time."""
+    heard = Heard()
+    heard.take(warned.in_front([("UserWarning", "one"), ("UserWarning", "two")], REPLY))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(RemoteEnvWarning, match="one"):
+            heard.tell("a/b@c")
+    [two] = told(heard)
+    assert two.message.text == "two"
+
+
+def test_it_can_be_copied() -> None:
+    """As loggers and processes do."""
+    one = RemoteEnvWarning("a/b@c", "UserWarning", "slow")
+    for twin in (copy.copy(one), pickle.loads(pickle.dumps(one))):
+        assert (str(twin), twin.label, twin.category, twin.text) == (
+            str(one), "a/b@c", "UserWarning", "slow",
+        )  # fmt: skip

@@ -1,0 +1,65 @@
+"""What a repository has warned of, in front of the reply that comes after it.
+
+Where there is something, a runner puts the frame of a ``Warned`` in front of its reply's frames:
+then there are at least two, and the first says what it is. Where there is nothing, nothing is sent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
+
+FIRST_VERSION = 10
+"""Of the protocol: an older client reads no ``Warned``."""
+MOST_AT_ONCE = 16
+"""Warnings of one reply."""
+MAX_CATEGORY = 256
+MAX_TEXT = 2048
+"""Characters."""
+_MAX_BYTES = 4 * MOST_AT_ONCE * (MAX_CATEGORY + MAX_TEXT) + 1024
+_HEAD = b"\x93" + bytes([m.Warned.kind])
+"""A list of three that starts with the kind; in front of it there is the length of the document."""
+_LENGTH_BYTES = 4
+
+Told = tuple[str, str]
+"""The category's name, and the text."""
+
+
+def in_front(warnings: Sequence[Told], frames: Sequence[Buffer]) -> list[Buffer]:
+    """A reply's frames with these warnings in front of them."""
+    return [*m.pack(m.Warned(tuple(warnings))), *frames]
+
+
+def stand_in_front(frames: Sequence[Buffer]) -> bool:
+    """Whether there are warnings in front of a reply."""
+    if len(frames) < 2:
+        return False
+    head = memoryview(frames[0]).cast("B")[_LENGTH_BYTES : _LENGTH_BYTES + len(_HEAD)]
+    return head == _HEAD
+
+
+def read(frame: Buffer) -> list[Told]:
+    """The warnings of the first frame. Trust: input from the worker, bounded before it is decoded.
+
+    Raises:
+        RemoteProtocolError: They are too many, too long, or something else.
+    """
+    size = memoryview(frame).nbytes
+    if size > _MAX_BYTES:
+        raise MessageTooLargeError(f"{size} bytes of warnings are over the limit of {_MAX_BYTES}.")
+    message = m.unpack([frame])[1]
+    if not isinstance(message, m.Warned) or len(message.warnings) > MOST_AT_ONCE:
+        raise RemoteProtocolError("the worker warns in another way than was agreed on")
+    return [_checked(one) for one in message.warnings]
+
+
+def _checked(one: object) -> Told:
+    if type(one) is not tuple or list(map(type, one)) != [str, str]:
+        raise RemoteProtocolError("a warning of the worker is not a category and a text")
+    category, text = one
+    if len(category) > MAX_CATEGORY or len(text) > MAX_TEXT:
+        raise RemoteProtocolError("a warning of the worker is too long")
+    return category, text
