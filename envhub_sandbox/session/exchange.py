@@ -6,7 +6,7 @@ stands in for those that die of it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, NoReturn, TypeVar
 
@@ -24,6 +24,7 @@ from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.refusals import refusal
 from envhub_sandbox.session.survival.failures import Failures
 from envhub_sandbox.session.survival.recovery import Recovery
+from envhub_sandbox.session.survival.reseed import marked
 from envhub_sandbox.session.turns import Turns, collision
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline
 from envhub_sandbox.transport.jail import RunnersDiedError
@@ -77,6 +78,7 @@ class Exchange:
         self._failures = failures
         self._recovery = recovery
         self._interruption: str | None = None  # the request that is late for that reason
+        self._fresh: tuple[int, ...] = ()  # shards that came back in the last request
         self._step_deadline = StepDeadline(lease.repository.timeouts.step_s)
 
     # --- requests ------------------------------------------------------------------------------
@@ -136,6 +138,7 @@ class Exchange:
             return replies
 
     def _collect(self, timeout_s: float | None) -> list[m.Message]:
+        self._fresh = ()
         try:
             lane = self._lease.lane
             if lane is None or self.lifecycle.state is not State.PENDING:
@@ -173,7 +176,8 @@ class Exchange:
             try:
                 return self.results.reset(replies)
             except batches.Misfit:
-                return self.results.reset(replies, self._infos_apart(Deadline(timeout_s)))
+                infos, fresh = self._infos_apart(Deadline(timeout_s)), self._fresh
+                return self.results.reset(replies, self._marked(infos, fresh) if fresh else infos)
 
     # --- steps ---------------------------------------------------------------------------------
 
@@ -353,6 +357,7 @@ class Exchange:
             raise deaths.first
         fresh = self._revive(deaths, self._recovery.resets)
         merged = [fresh.get(index, reply) for index, reply in enumerate(replies)]
+        self._fresh = tuple(fresh)
         return [reply for reply in merged if reply is not None]
 
     def _survive_step(self, deaths: RunnersDiedError) -> StepResult:
@@ -360,7 +365,17 @@ class Exchange:
         replies = self._of_survivors(deaths)
         fresh = self._revive(deaths, self._recovery.steps)
         merged = [fresh.get(index, reply) for index, reply in enumerate(replies)]
-        return self.results.step([typed(one, m.StepDone) for one in merged if one is not None])
+        done = [typed(one, m.StepDone) for one in merged if one is not None]
+        try:
+            return self.results.step(done)
+        except batches.Misfit:
+            infos = self._infos_apart(Deadline(self._lease.repository.timeouts.reset_s))
+            return self.results.step(done, self._marked(infos, fresh))
+
+    def _marked(self, infos: dict[Any, Any], fresh: Iterable[int]) -> dict[Any, Any]:
+        """All infos, of which those of the fresh shards say so, as they do when they fit."""
+        bounds = [self.results.bounds[index] for index in fresh]
+        return marked(infos, self.results.manifest.num_envs, bounds)
 
     def _of_survivors(self, deaths: RunnersDiedError) -> list[m.Message | None]:
         """What the others answered; None where nobody did.

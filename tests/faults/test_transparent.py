@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from envhub_sandbox.transport.shared_memory.sharding import bounds_for
 from envhub_worker.protocol.lifecycle import State
 from tests.support import inside
 from tests.support.processes import eventually
+from tests.support.repositories import write_repository
 from tests.support.samples import reference, sample
 
 LIVE, EXIT, KILL, CRASH, RAISE, SLOW, MEMORY, SPIN = range(8)
@@ -201,6 +203,56 @@ def test_a_reset_is_done_again_in_the_fresh_process(lane: str) -> None:
         assert np.array_equal(observation, expected)
         assert restarted(info, slice(0, 2)) or restarted(info, DEAD)
         assert env.step(ALL_LIVE)[0][:, 1].tolist() == [1, 1, 1, 1]
+
+
+@lanes
+@pytest.mark.parametrize("dies_in", ["step", "reset"])
+def test_infos_that_differ_in_kind_survive_a_death(tmp_path: Path, lane: str, dies_in: str) -> None:
+    """They are joined as without a death, and say who came back."""
+    folder = write_repository(tmp_path / "mixed", _MIXED)
+    policy = {"restart": "transparent", "restart_backoff_s": 0, "crash_history": 0}
+    options: dict[str, Any] = {"num_workers": 2, "lane": lane, "policy": policy}
+    with make_env(str(folder), n_envs=4, use_async_envs=True, **options) as suites:
+        env = suites.env
+        _, expected = env.reset()
+        info = env.step(LAST_DIES)[4] if dies_in == "step" else env.reset(options={"exit": 1})[1]
+        assert restarted(info)
+        assert {key: info[key] for key in expected}.keys() == expected.keys() > {"k", "_k"}
+        assert list(info["n"]) == [0, 1, 2, 3]
+        assert repr({key: info[key] for key in expected}) == repr(expected)
+        assert env.stats()["state"] == "READY"
+        assert repr(env.step(ALL_LIVE)[4]) == repr(expected)
+
+
+_MIXED = """
+import gymnasium as gym, numpy as np, os, tempfile
+
+class Mixed(gym.Env):
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Discrete(8)
+
+    def __init__(self, index):
+        self.index = index
+
+    def told(self):
+        return np.zeros(2, np.float32), {"k": {"a": 1} if self.index < 2 else None, "n": self.index}
+
+    def reset(self, *, seed=None, options=None):
+        mark = os.path.join(tempfile.gettempdir(), "died")
+        if options and "exit" in options and self.index == 2 and not os.path.exists(mark):
+            open(mark, "x").close()
+            os._exit(3)
+        return self.told()
+
+    def step(self, action):
+        if action == 1:
+            os._exit(3)
+        observation, info = self.told()
+        return observation, 0.0, False, False, info
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.AsyncVectorEnv([lambda i=i: Mixed(i) for i in range(n_envs)])
+"""
 
 
 @lanes

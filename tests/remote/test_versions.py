@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,19 +14,21 @@ import pytest
 import zmq
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import VersionMismatchError
+from envhub_sandbox.errors import RemoteEnvWarning, VersionMismatchError
 from envhub_sandbox.sandboxes.process import PROCESS
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.tcp import Far
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol import warned
 from envhub_worker.protocol.codec.inert import RemoteObject
+from tests.support.repositories import CARTPOLES, write_repository
 from tests.support.samples import SAMPLES
 
 # Taken from version 1 as it was released; never to be written anew.
 HELLO_OF_1 = bytes.fromhex("170000009501070101c410000102030405060708090a0b0c0d0e0f")
 WELCOME_OF_1 = bytes.fromhex("0d00000095020701a5302e312e30cd1092")
-FAR_FUTURE = 10
+FAR_FUTURE = m.VERSION + 1
 
 
 def test_the_pinned_bytes_are_those_of_version_1() -> None:
@@ -81,6 +84,23 @@ def test_an_older_client_is_sent_texts(
         suites.env.reset(seed=0)
         found = suites.env.get_attr("action_space")[0]
         assert isinstance(found, kind)
+
+
+@pytest.mark.parametrize("version", [warned.FIRST_VERSION - 1, warned.FIRST_VERSION])
+def test_an_older_client_is_sent_no_warnings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: int
+) -> None:
+    """It would take them for a reply; a newer one is told."""
+    monkeypatch.setattr(m, "VERSION", version)
+    text = CARTPOLES + "import warnings\ndef make_env(n_envs=1, use_async_envs=False):\n"
+    text += "    warnings.warn('made')\n    return cartpoles(n_envs)\n"
+    folder = write_repository(tmp_path / "warner", text)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        with make_env(str(folder), n_envs=2) as suites:
+            assert suites.env.reset(seed=0)[0].shape == (2, 4)
+    found = [one.message.text for one in told if isinstance(one.message, RemoteEnvWarning)]
+    assert found == (["made"] if version >= warned.FIRST_VERSION else [])
 
 
 def test_a_client_with_its_ids_inside_is_served(monkeypatch: pytest.MonkeyPatch) -> None:

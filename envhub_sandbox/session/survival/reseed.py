@@ -5,7 +5,7 @@ Nothing here asks anybody: it makes the requests for a fresh runner and reads it
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -130,7 +130,11 @@ def truncated(reply: m.StepDone, count: int) -> m.StepDone:
     )
 
 
-def marked(info: dict[Any, Any], count: int) -> dict[Any, Any]:
-    """Infos that say of every sub-environment of a shard that it was lost and came back."""
-    yes = np.ones(count, np.bool_)
+def marked(
+    info: dict[Any, Any], count: int, bounds: Iterable[tuple[int, int]] | None = None
+) -> dict[Any, Any]:
+    """Infos that say of each sub-environment, or of those within, that it came back."""
+    yes = np.zeros(count, np.bool_)
+    for start, stop in [(0, count)] if bounds is None else bounds:
+        yes[start:stop] = True
     return {**info, RESTARTED: yes, f"_{RESTARTED}": yes.copy()}
