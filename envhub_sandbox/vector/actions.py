@@ -14,6 +14,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import CustomSpaceError
 
 from envhub_sandbox.errors import ActionError, ActionTypeError
 from envhub_worker.protocol.shared_memory.slabs import DTYPE_CODES
@@ -23,6 +24,10 @@ _INTEGERS = frozenset("iub")
 _NUMBERS = frozenset("fiub")
 _PYTHONS = {np.dtype(kind): kind for kind in (bool, int, float)}
 """What numpy makes of lists of such numbers."""
+
+
+class UniterableError(ActionTypeError, CustomSpaceError):
+    """A scalar for several members of a space that is no array: which Gymnasium raises there."""
 
 
 @singledispatch
@@ -45,7 +50,7 @@ def batch_of(space: gym.Space[Any], value: Any, count: int, where: str = "action
     try:
         members = tuple(value)
     except TypeError:
-        raise ActionTypeError(
+        raise UniterableError(
             f"{where}: expected {count} members of {space}, got {_named(value)}"
         ) from None
     if len(members) != count:

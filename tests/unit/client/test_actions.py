@@ -9,11 +9,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from gymnasium.vector.utils import batch_space
+from gymnasium.error import CustomSpaceError
+from gymnasium.vector.utils import batch_space, iterate
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envhub_sandbox.errors import ActionError
+from envhub_sandbox.errors import ActionError, ActionTypeError
 from envhub_sandbox.vector.actions import batch_of
 from tests.support.compare import assert_same
 
@@ -141,3 +142,14 @@ def test_action_errors_are_value_errors() -> None:
     """``except ValueError`` catches them, as with Gymnasium's own."""
     with pytest.raises(ValueError, match="expected"):
         batch_of(DISCRETE, [0], 2)
+
+
+@pytest.mark.parametrize("value", [5, 1.5, None])
+@pytest.mark.parametrize("space", [spaces.Text(3), spaces.Graph(spaces.Discrete(2), None)])
+def test_a_scalar_for_members_is_gymnasiums_error_too(space: Any, value: Any) -> None:
+    """Whoever catches what ``SyncVectorEnv`` raises catches ours."""
+    with pytest.raises(CustomSpaceError):
+        list(iterate(batch_space(space, 2), value))
+    with pytest.raises(CustomSpaceError) as caught:
+        batch_of(space, value, 2)
+    assert isinstance(caught.value, ActionTypeError)
