@@ -68,7 +68,7 @@ MAY_IMPORT = {
     "envhub_sandbox.gym": {"api", "vector"},
     "envhub_sandbox.pytest_plugin": {"api", "hub"},
     "envhub_sandbox.integrations": {"api", "hub", "vector"},
-    "envhub_sandbox.vector": {"policy", "session", "transport"},
+    "envhub_sandbox.vector": {"session", "transport"},
     "envhub_sandbox.metrics": {"session"},
     "envhub_sandbox.session": {"crash", "folders", "hub", "policy", "sandboxes", "transport"},
     "envhub_sandbox.crash": {"folders", "hub", "policy", "transport"},
