@@ -20,7 +20,7 @@ from envhub_sandbox import RemoteSandbox, make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
 from envhub_worker.access import keys
 from envhub_worker.access.keys import AuthorizedClients
-from envhub_worker.access.rate_limited_log import CLIENT_LINES, LINES, Log
+from envhub_worker.access.telling.rate_limited_log import CLIENT_LINES, LINES, Log
 from envhub_worker.cli import listen
 from envhub_worker.protocol.keys import key_text, parse_key
 from tests.remote.listening import WORKER, Listening, listening

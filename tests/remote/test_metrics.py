@@ -25,7 +25,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import ServerBusyError, WorkerDiedError
-from envhub_worker.access import figures, usage
+from envhub_worker.access.telling import figures, usage
 from envhub_worker.cli import http_port
 from envhub_worker.cli.http_port import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpPort, parse_address
 from envhub_worker.cli.metrics import STALE_S, Page

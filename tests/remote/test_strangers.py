@@ -22,13 +22,14 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerError
 from envhub_sandbox.transport.tcp import Link
 from envhub_worker.access import keys
-from envhub_worker.access.connection_limit import Doorman
-from envhub_worker.access.gate import Arrived, Asked, Greeting, RemoteGate, Rules
+from envhub_worker.access.gate import Arrived, Asked, Greeting
 from envhub_worker.access.keys import AuthorizedClients
+from envhub_worker.access.port.connection_limit import Doorman
 from envhub_worker.access.quotas import Permissions, Quotas, RefusedError
-from envhub_worker.access.rate_limited_log import LINES, PERIOD_S, Log
+from envhub_worker.access.remote_gate import RemoteGate, Rules
 from envhub_worker.access.sessions import Sessions
-from envhub_worker.access.uploads import Uploads
+from envhub_worker.access.store.uploads import Uploads
+from envhub_worker.access.telling.rate_limited_log import LINES, PERIOD_S, Log
 from envhub_worker.cli import listen
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m

@@ -15,9 +15,9 @@ from envhub_sandbox import make_env
 from envhub_sandbox.sandboxes import upload
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_worker.access.blob_store import BLOCK_BYTES
 from envhub_worker.access.quotas import Quotas, RefusedError
-from envhub_worker.access.uploads import PREFIX, Uploads
+from envhub_worker.access.store.blob_store import BLOCK_BYTES
+from envhub_worker.access.store.uploads import PREFIX, Uploads
 from envhub_worker.protocol import messages as m
 from tests.remote.listening import Listening, counting
 from tests.support import inside
@@ -244,7 +244,7 @@ def test_snapshots_and_their_folders_are_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The longest unused go; paths of too many steps are refused before any is made."""
-    monkeypatch.setattr("envhub_worker.access.uploads.MAX_TREES", 2)
+    monkeypatch.setattr("envhub_worker.access.store.uploads.MAX_TREES", 2)
     uploads = Uploads(tmp_path / "store", Quotas())
     first, second = (uploads.tree(ALICE, bring(uploads, (name, b""))) for name in "ab")
     with pytest.raises(RefusedError, match="more than 2"):

@@ -32,9 +32,9 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
 from envhub_sandbox.transport.shared_memory.shard import LaneShard
-from envhub_worker.access.connection_limit import Doorman
-from envhub_worker.access.gate import RemoteGate
-from envhub_worker.access.rate_limited_log import Log
+from envhub_worker.access.port.connection_limit import Doorman
+from envhub_worker.access.remote_gate import RemoteGate
+from envhub_worker.access.telling.rate_limited_log import Log
 from envhub_worker.cli import listen
 from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.protocol import messages as m

@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from envhub_worker.access.figures import Client, Facts
 from envhub_worker.access.quotas import Permissions, Quotas
+from envhub_worker.access.telling.figures import Client, Facts
 from envhub_worker.cli import listen, metrics
 
 ROOT = Path(__file__).parents[3]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from envhub_worker.access.line import RETRY_S
 from envhub_worker.access.quotas import BusyError
-from envhub_worker.access.rate_limited_log import Log
+from envhub_worker.access.telling.rate_limited_log import Log
 from envhub_worker.protocol.busy import DRAINING, Busy
 
 _QUIET_S = 1.0

@@ -25,13 +25,13 @@ from typing import Any
 
 from envhub_worker import __version__
 from envhub_worker.access import keys
-from envhub_worker.access.connection_limit import MAX_CONNECTIONS
-from envhub_worker.access.gate import RemoteGate, Rules
 from envhub_worker.access.keys import AuthorizedClients, KeyPair
-from envhub_worker.access.log_lines import FORMS, LEVELS
+from envhub_worker.access.port.connection_limit import MAX_CONNECTIONS
 from envhub_worker.access.quotas import Permissions, Quotas
-from envhub_worker.access.rate_limited_log import Log
-from envhub_worker.access.uploads import Uploads
+from envhub_worker.access.remote_gate import RemoteGate, Rules
+from envhub_worker.access.store.uploads import Uploads
+from envhub_worker.access.telling.log_lines import FORMS, LEVELS
+from envhub_worker.access.telling.rate_limited_log import Log
 from envhub_worker.lockdown import probe, surroundings
 from envhub_worker.lockdown.mechanisms import landlock, locked_folder
 from envhub_worker.lockdown.mechanisms.locked_folder import LockedFolder

@@ -16,7 +16,7 @@ import struct
 
 import zmq
 
-from envhub_worker.access.rate_limited_log import Log
+from envhub_worker.access.telling.rate_limited_log import Log
 from envhub_worker.loop import Loop
 
 MAX_CONNECTIONS = 1024

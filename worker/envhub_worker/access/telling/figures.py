@@ -18,7 +18,7 @@ from typing import Any
 from envhub_worker import __version__
 from envhub_worker.access.quotas import Permissions, Quotas
 from envhub_worker.access.sessions import Session
-from envhub_worker.access.usage import Usage
+from envhub_worker.access.telling.usage import Usage
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.text import printable
 from envhub_worker.supervisor.records import JailEntry

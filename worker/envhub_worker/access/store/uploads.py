@@ -19,8 +19,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from envhub_worker.access.blob_store import Listed, Store, blob_charge, make_passable, tree_charge
 from envhub_worker.access.quotas import Quotas, RefusedError
+from envhub_worker.access.store.blob_store import (
+    Listed,
+    Store,
+    blob_charge,
+    make_passable,
+    tree_charge,
+)
 from envhub_worker.lockdown.mechanisms.scratch import remove_tree
 from envhub_worker.protocol import messages as m
 

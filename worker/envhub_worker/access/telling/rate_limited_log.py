@@ -12,7 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 
-from envhub_worker.access.log_lines import LEVELS, Form, text_line
+from envhub_worker.access.telling.log_lines import LEVELS, Form, text_line
 
 LINES = 10
 """Of an event that nobody's key stands behind."""

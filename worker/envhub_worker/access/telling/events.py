@@ -6,8 +6,8 @@ import traceback
 from collections.abc import Callable
 from time import monotonic
 
-from envhub_worker.access.rate_limited_log import Log
 from envhub_worker.access.sessions import WATCHER, Session
+from envhub_worker.access.telling.rate_limited_log import Log
 from envhub_worker.protocol import busy
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.busy import Busy

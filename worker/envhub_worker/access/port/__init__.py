@@ -1,0 +1,1 @@
+"""The TCP port: keys are proved there, and connections bounded."""

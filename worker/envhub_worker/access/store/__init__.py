@@ -1,0 +1,1 @@
+"""Snapshots that clients bring along, by content."""
