@@ -16,6 +16,9 @@ from functools import partial
 from envhub_sandbox.log import WORKER
 from envhub_sandbox.session.env_session import EnvSession
 
+_GOING_S = 30.0
+"""How long a jail that is given up may take to go: its ``close``, and its processes' ends."""
+
 
 class Prewarming:
     """Starts the tasks after the one that was used last, and gives up what nobody came for.
@@ -35,6 +38,7 @@ class Prewarming:
         # weak: an environment that nobody holds is closed
         self._suites = [[weakref.ref(env) for env in suite] for suite in suites]
         self._lock = threading.Lock()
+        self._given_up = threading.Condition(self._lock)
         self._wanted: list[weakref.ref[EnvSession]] = []
         self._tried: set[weakref.ref[EnvSession]] = set()
         self._ahead: list[weakref.ref[EnvSession]] = []  # started here and not used yet
@@ -48,8 +52,11 @@ class Prewarming:
         with self._lock:
             self._wanted = []
             ahead, self._ahead = self._ahead, []
+            going = self._giving_up > 0
         given_up = [_cool(env) for env in ahead]
-        return any(given_up)
+        with self._lock:  # what others are giving up makes room, too, once it has gone
+            self._given_up.wait_for(lambda: not self._giving_up, _GOING_S)
+        return going or any(given_up)
 
     def _used(self, used: weakref.ref[EnvSession]) -> None:
         """A task has been asked something for the first time."""
@@ -73,6 +80,7 @@ class Prewarming:
             except RuntimeError as error:
                 WORKER.info("nothing is started ahead: %s", error)
                 self._giving_up -= not todo[1]
+                self._given_up.notify_all()
                 return
 
     def _stale(self) -> list[weakref.ref[EnvSession]]:
@@ -99,6 +107,7 @@ class Prewarming:
                 with self._lock:
                     self._giving_up -= 1
                     self._staff()
+                    self._given_up.notify_all()
 
     def _next(self) -> tuple[EnvSession, bool] | None:
         """What to give up (False) or start (True); first the former, which bounds their number."""

@@ -116,7 +116,8 @@ If both are killed at once, or a client that has no server yet, a folder and emp
 stay. The folder says whose it was: the next server that this user starts removes it, and
 `envhub gc` both.)
 
-- **Ctrl-C in a step** comes at once. The reply is then late: a step says so, `reset()` recovers.
+- **Ctrl-C in a step** comes at once. The reply is then late: the next step (a notebook's next cell)
+  says what was interrupted, `reset()` recovers.
 - **A fork of the client** refuses its parent's environments with a `WorkerError` and may make its
   own. Whatever it does, the parent's go on; its end ends nothing of theirs.
 - **`close()` from another thread, or from a signal handler**, ends a running step or a start with

@@ -16,9 +16,10 @@ from typing import Any
 
 import zmq
 
-from envhub_sandbox import api, folders
+from envhub_sandbox import folders
 from envhub_sandbox.crash import writer
 from envhub_sandbox.dependencies import environments
+from envhub_sandbox.making import making
 from envhub_sandbox.sandboxes.docker import sandbox
 from envhub_sandbox.session import env_session
 from envhub_sandbox.session.counters import Ledger
@@ -63,7 +64,7 @@ def state(env: Any) -> State:
 
 def choice_of_runtime() -> Spot:
     """Makes of an interpreter what a repository's jails run on."""
-    return api, "Runtime"
+    return making, "Runtime"
 
 
 def turn_lock(env: Any) -> Spot:
@@ -217,7 +218,7 @@ LATE_REPLY_GRACE: Spot = (env_session, "_GRACE_S")
 """For how long ``reset`` waits for a late reply."""
 CLOSE_PATIENCE: Spot = (env_session, "INTERRUPT_S")
 """For how long ``close`` waits for another thread."""
-MAKER: Spot = (api, "_Maker")
+MAKER: Spot = (making, "Proxies")
 """What ``make_env`` starts to work with when its arguments have been checked."""
 CONTAINER_MARKS: Spot = (listen, "_CONTAINER_MARKS")
 """The files by which a container is told."""

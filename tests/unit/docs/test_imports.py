@@ -59,10 +59,9 @@ MAY_IMPORT = {
         *("", "api", "check", "crash", "dependencies", "hub", "locks", "policy"),
         *("sandboxes", "session"),
     },
-    "envhub_sandbox.api": {
-        *("arguments", "config", "dependencies", "hub", "locks", "policy", "sandboxes"),
-        "session",
-        *("transport", "vector"),
+    "envhub_sandbox.api": {"making", "policy", "sandboxes", "vector"},
+    "envhub_sandbox.making": {
+        *("dependencies", "hub", "locks", "policy", "sandboxes", "session", "transport", "vector"),
     },
     "envhub_sandbox.check": {"api", "dependencies", "hub", "session", "vector"},
     "envhub_sandbox.gym": {"api", "vector"},
@@ -77,8 +76,6 @@ MAY_IMPORT = {
     "envhub_sandbox.locks": {"dependencies", "hub"},
     "envhub_sandbox.dependencies": {"folders", "hub"},
     "envhub_sandbox.hub": {"folders"},
-    "envhub_sandbox.arguments": set(),
-    "envhub_sandbox.config": set(),
     "envhub_sandbox.policy": set(),
     "envhub_sandbox.folders": set(),
     "envhub_sandbox.log": set(),

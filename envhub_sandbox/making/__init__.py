@@ -1,0 +1,1 @@
+"""What ``make_env`` does with its arguments, step by step."""

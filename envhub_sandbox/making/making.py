@@ -1,0 +1,181 @@
+"""From a reference to environments: snapshot, packages, sandbox, proxies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from envhub_sandbox.dependencies.choice import Choice, chosen
+from envhub_sandbox.dependencies.cure import cure
+from envhub_sandbox.dependencies.prepare import provided
+from envhub_sandbox.errors import PolicyError
+from envhub_sandbox.hub import store
+from envhub_sandbox.hub.snapshot import Snapshot, named
+from envhub_sandbox.locks import use as locks
+from envhub_sandbox.making import arguments
+from envhub_sandbox.making.config import plain_config
+from envhub_sandbox.making.options import Options
+from envhub_sandbox.making.places import reference_of, sandbox_of
+from envhub_sandbox.making.proxies import Proxies
+from envhub_sandbox.policy import Policy, Timeouts, policy_from, timeouts_from
+from envhub_sandbox.sandboxes import inprocess
+from envhub_sandbox.sandboxes.base import Sandbox
+from envhub_sandbox.session.jails.launcher import Launcher
+from envhub_sandbox.session.provenance import provenance_of
+from envhub_sandbox.session.recipe import Recipe, pinned
+from envhub_sandbox.session.repository import LoadArguments, Repository
+from envhub_sandbox.vector.suites import EnvSuites
+from envhub_sandbox.vector.vector_env import SandboxVectorEnv
+from envhub_worker.protocol.runtime import Runtime
+
+if TYPE_CHECKING:
+    from envhub_sandbox.dependencies.environments import Environment
+    from envhub_sandbox.locks.lockfile import LockFile
+
+
+def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSuites:
+    """What ``make_env`` does; returns and raises as it does.
+
+    Args:
+        make_env: The function itself, by whose name a pickle makes the environments again.
+        cfg: Its first argument.
+        given: The others.
+    """
+    reference, config = reference_of(cfg)
+    options = given.checked()
+    if options.sandbox is None:
+        return _make_here(reference, config, options)
+    wanted = _wanted(options.sandbox, options)
+    snapshot = _snapshot(reference, options)
+    environment = _environment(snapshot, wanted, options)
+    repository = _repository(snapshot, config, wanted, environment, options)
+    repository.recipe = Recipe(
+        make_env=make_env,
+        reference=pinned(snapshot),
+        config=repository.arguments.cfg,
+        options=options.for_a_recipe(
+            env_kwargs=repository.arguments.env_kwargs,
+            policy=wanted.policy,
+            timeouts=wanted.timeouts,
+            python=wanted.python,
+            dependencies="auto" if wanted.python is not None else options.dependencies,
+        ),
+    )
+    further = repository.arguments.env_kwargs
+    return Proxies(
+        Launcher(repository, wanted.place, store.cache_root() / "snapshots"),
+        options.num_workers,
+        _ahead(wanted, options),
+        _face(options.validate),
+        locks.checker(wanted.lock, snapshot.label, further, config),
+    ).make()
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """What was asked for, looked at before anything is fetched or started."""
+
+    place: Sandbox
+    policy: Policy
+    timeouts: Timeouts
+    choice: Choice
+    python: Any
+    runtime: Runtime
+    lock: LockFile | None
+
+
+def _wanted(sandbox: str | Sandbox, options: Options) -> _Wanted:
+    lock = None
+    if options.lock is not None:
+        lock = locks.opened(options.lock, sandbox, options.python, options.dependencies)
+    choice, python = chosen(options.dependencies, options.python)
+    if choice.where == "own" and sandbox != "process":
+        raise PolicyError(
+            "dependencies={...} is for sandbox='process'. For a container, build an image: envhub "
+            "image build REF; on another host, whoever runs the server chooses its packages"
+        )
+    policy = policy_from(options.policy, options.limits)
+    timeouts = timeouts_from(options.timeouts)
+    place = sandbox_of(sandbox, options.server_key)
+    runtime = Runtime(arguments.interpreter(python))
+    if sandbox == "process":
+        arguments.check_executable(runtime.python)
+        arguments.check_readable(policy.readable)
+    return _Wanted(place, policy, timeouts, choice, python, runtime, lock)
+
+
+def _snapshot(reference: str, options: Options) -> Snapshot:
+    return named(
+        reference,
+        hub_cache_dir=options.hub_cache_dir,
+        token=options.token,
+        endpoint=options.endpoint,
+    )
+
+
+def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
+    """In this process, without a sandbox, as LeRobot does."""
+    if not options.trust_remote_code:
+        raise inprocess.refusal(reference)
+    options.refuse_what_does_nothing()
+    snapshot = _snapshot(reference, options)
+    further = dict(options.env_kwargs or {})
+    envs = inprocess.make(snapshot, options.n_envs, options.use_async_envs, config, further)
+    return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))
+
+
+def _environment(snapshot: Snapshot, wanted: _Wanted, options: Options) -> Environment | None:
+    """The packages that are made for it; None where its interpreter has them."""
+    if wanted.lock is not None:
+        return locks.provided(snapshot, wanted.lock)
+    return provided(snapshot, wanted.choice) if options.sandbox == "process" else None
+
+
+def _repository(
+    snapshot: Snapshot,
+    config: Any,
+    wanted: _Wanted,
+    environment: Environment | None,
+    options: Options,
+) -> Repository:
+    runtime = wanted.runtime
+    if environment is not None:
+        runtime = Runtime(environment.python, str(environment.packages))
+    repository = Repository(
+        snapshot,
+        LoadArguments(
+            n_envs=options.n_envs,
+            use_async_envs=options.use_async_envs,
+            cfg=None if config is None else plain_config(config),
+            env_kwargs=dict(options.env_kwargs or {}),
+        ),
+        wanted.policy,
+        wanted.timeouts,
+        runtime,
+        options.lane,
+        options.copy,
+    )
+    repository.installed = None if environment is None else environment.facts
+    place, choice, python = wanted.place.name, wanted.choice, wanted.python
+    repository.cure = partial(cure, snapshot, place, choice, python, environment)
+    return repository
+
+
+def _ahead(wanted: _Wanted, options: Options) -> int | None:
+    """How many tasks are started ahead, unasked none where it is not ours alone to say.
+
+    A container's memory is all its jails', a quota is all a key's, and a GPU everybody's.
+    """
+    if options.prewarm is None and (options.sandbox != "process" or wanted.policy.gpu):
+        return 0
+    return options.prewarm
+
+
+def _face(validate: bool) -> type[SandboxVectorEnv]:
+    if not validate:
+        return SandboxVectorEnv
+    from envhub_sandbox.vector.validated import ValidatedVectorEnv
+
+    return ValidatedVectorEnv

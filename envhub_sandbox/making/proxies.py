@@ -1,0 +1,124 @@
+"""The environments that a caller gets, of a remembered manifest or out of a first jail."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from envhub_sandbox.hub import store
+from envhub_sandbox.session.env_session import EnvSession
+from envhub_sandbox.session.jails.launcher import Launcher
+from envhub_sandbox.session.jails.line import wait_in_line
+from envhub_sandbox.session.jails.loaded import Known, LoadedJail
+from envhub_sandbox.session.jails.sources import JailSource, OwnJails, SharedJail
+from envhub_sandbox.session.manifest_cache import ManifestCache, manifest_key
+from envhub_sandbox.session.prewarming import Prewarming
+from envhub_sandbox.session.provenance import provenance_of
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.shared_memory.sharding import bounds_for
+from envhub_sandbox.vector.suites import EnvSuites
+from envhub_sandbox.vector.vector_env import SandboxVectorEnv
+from envhub_worker.protocol.manifest import EnvManifest, Manifest
+
+
+class Proxies:
+    """Makes the proxies, from the remembered manifest or from a first jail.
+
+    Args:
+        launcher: Opens jails.
+        num_workers: Over how many processes sub-environments are spread; None for as many as help.
+        prewarm: How many tasks are started ahead; None for what is seen to help.
+        face: The class that callers get.
+        agrees: Raises where the repository is not what was locked.
+    """
+
+    def __init__(
+        self,
+        launcher: Launcher,
+        num_workers: int | None,
+        prewarm: int | None,
+        face: type[SandboxVectorEnv],
+        agrees: Callable[[Manifest], None],
+    ) -> None:
+        self._face = face
+        self._agrees = agrees
+        self._launcher = launcher
+        self._repository = repository = launcher.repository
+        self._num_workers = num_workers
+        self._prewarm = prewarm
+        load = repository.arguments.message()
+        key = manifest_key(repository.snapshot, load, repository.policy, launcher.runs_on)
+        self._cache = ManifestCache(store.cache_root() / "manifests", key)
+
+    def make(self) -> EnvSuites:
+        """The environments; a first jail is opened where nothing is remembered of them."""
+        repository = self._repository
+        manifest = self._cache.load(max_elements=repository.policy.limits.elements)
+        if manifest is not None:
+            self._agrees(manifest)
+            return self._suites(manifest, None)
+        with repository.named():
+            deadline = Deadline(repository.timeouts.startup_s)
+            ask = partial(self._launcher.open, deadline)
+            try:
+                loaded = wait_in_line(ask, self._launcher.retry_s, deadline, repository.label)
+            except BaseException:
+                repository.tell()
+                raise
+        self._cache.save(loaded.value)
+        try:
+            self._agrees(loaded.manifest)
+            suites = self._suites(loaded.manifest, loaded)
+            repository.tell()
+            return suites
+        except BaseException:
+            self._launcher.close(loaded)
+            raise
+
+    def _suites(self, manifest: Manifest, loaded: LoadedJail | None) -> EnvSuites:
+        repository = self._repository
+        shared = None if manifest.lazy or len(manifest.envs) == 1 else self._shared(loaded)
+        sessions = [self._session(manifest, env, shared) for env in manifest.envs]
+        if loaded is not None and shared is None:
+            self._use(loaded, sessions)
+        envs: dict[str, dict[Any, Any]] = {}
+        suites: dict[str, list[EnvSession]] = {}
+        for session in sessions:
+            env = session.manifest
+            envs.setdefault(env.suite, {})[env.task] = self._face(session)
+            suites.setdefault(env.suite, []).append(session)
+        if shared is None and self._prewarm != 0:
+            Prewarming(list(suites.values()), self._prewarm)
+        return EnvSuites(
+            envs,
+            lambda: provenance_of(
+                repository.snapshot, manifest, repository.latest_report, repository.installed
+            ),
+            shared.close if shared else lambda: None,
+            repository.recipe,
+        )
+
+    def _shared(self, loaded: LoadedJail | None) -> SharedJail:
+        shared = SharedJail(self._launcher, self._cache.forget)
+        if loaded is not None:
+            shared.provide(loaded)
+        return shared
+
+    def _session(
+        self, manifest: Manifest, env: EnvManifest, shared: SharedJail | None
+    ) -> EnvSession:
+        paces = self._cache.paces
+        bounds = bounds_for(env, self._num_workers, paces.of(env))
+        known = Known(manifest, env, len(bounds))
+        own = OwnJails(self._launcher, self._cache.forget, known)
+        source: JailSource = own if shared is None else shared
+        return EnvSession(source, env, bounds, paces)
+
+    def _use(self, loaded: LoadedJail, sessions: list[EnvSession]) -> None:
+        """The jail that told the manifest becomes the only task's; a suite holds none in stock."""
+        if len(sessions) == 1:
+            with self._repository.named():
+                sessions[0].head_start.adopt(loaded)
+        else:
+            self._launcher.close(loaded)
