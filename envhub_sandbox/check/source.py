@@ -214,11 +214,18 @@ def _in_folder(packages: Path) -> set[str]:
 def _of_this_interpreter(declared: Mapping[str, Requirement]) -> set[str]:
     wanted = [*map(Requirement, _GIVEN), *declared.values()]
     brought = _closure([(one.name, frozenset(one.extras)) for one in wanted])
-    return {
-        module
-        for module, names in metadata.packages_distributions().items()
-        if brought & {canonicalize_name(name) for name in names}
-    }
+    return {module for name in brought for module in _modules(name)}
+
+
+def _modules(name: str) -> set[str]:
+    """What a distribution lets one import; Python 3.10 itself overlooks some of it."""
+    try:
+        found = metadata.distribution(name)
+    except (metadata.PackageNotFoundError, ValueError):
+        return set()
+    named = (found.read_text("top_level.txt") or "").split()
+    tops = {file.parts[0] for file in found.files or () if file.suffix in (".py", ".so")}
+    return {*named, *(top.partition(".")[0] for top in tops)}
 
 
 def _closure(waiting: list[tuple[str, frozenset[str]]]) -> set[str]:
