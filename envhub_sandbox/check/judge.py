@@ -26,6 +26,7 @@ from envhub_sandbox.errors import (
     ObservationError,
     PackageIntegrityError,
     RemoteEnvError,
+    RemoteProtocolError,
     RequirementError,
     ResolutionError,
     WorkerDiedError,
@@ -146,6 +147,9 @@ class _Judge:
             if not self._found("imports"):  # where it stands has been said already
                 self._report.judged("imports", [str(error)])
             raise _StoppedError from error
+        except RemoteProtocolError as error:  # such as a suite's name that a terminal would obey
+            self._report.judged("loads", [str(error)])
+            raise _StoppedError from error
         except (WorkerDiedError, WorkerTimeoutError) as error:
             self._report.judged("survives", [f"while it loaded: {error}"])
             raise _StoppedError from error
@@ -166,6 +170,8 @@ class _Judge:
             self._report.judged("observation-space", [str(error)], task)
         except RemoteEnvError as error:
             self._report.judged("runs", [f"{error.type_name}: {error.message}"], task)
+        except (LoadError, DependencyError, RemoteProtocolError) as error:
+            self._report.judged("loads", [f"not as it did at first: {error}"], task)
         except (WorkerDiedError, WorkerTimeoutError) as error:
             self._report.judged("survives", [str(error)], task)
         else:

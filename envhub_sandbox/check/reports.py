@@ -111,10 +111,16 @@ def _result(one: Finding, failures: Sequence[Finding]) -> dict[str, Any]:
     return {
         "ruleId": one.id,
         "level": one.check.severity.value,
-        "message": {"text": f"{where}{one.message}"},
+        "message": {"text": _sarif_text(f"{where}{one.message}")},
         "locations": [{"physicalLocation": place}],
         "properties": {"fails": one in failures},
     }
+
+
+def _sarif_text(text: str) -> str:
+    """Without SARIF's embedded links and placeholders."""
+    plain = re.sub(r"([\\\[\]])", r"\\\1", text)
+    return plain.replace("{", "{{").replace("}", "}}")
 
 
 def _uri(path: str) -> str:
@@ -157,7 +163,9 @@ def summary(report: Report, failures: Collection[Finding]) -> str:
 
 def _cell(text: str) -> str:
     # every character that Markdown or HTML gives a meaning to, by its number
-    return re.sub(r"[^\w .,;=/-]", lambda found: f"&#{ord(found[0])};", text.replace("\n", " "))
+    return re.sub(
+        r"[^a-zA-Z0-9 ,;=-]", lambda found: f"&#{ord(found[0])};", text.replace("\n", " ")
+    )
 
 
 def write(path: Path, text: str) -> None:

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import itertools
 import sys
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
@@ -20,8 +22,13 @@ from packaging.utils import canonicalize_name
 from envhub_sandbox.check.findings import Finding
 from envhub_sandbox.hub.snapshot import Snapshot
 
-_MOST_BYTES = 2 << 20
-"""Of one file: a larger one is no code that a person wrote, and Python's parser takes memory."""
+_MOST_BYTES = 256 << 10
+"""Of one file: Python's parser takes a thousand bytes of memory for one of a hostile text."""
+_MOST_BYTES_IN_ALL = 16 << 20
+_MOST_CONSTRUCTS = 100
+"""Of one file."""
+_LONGEST_NAME = 1024
+"""Of a module, as a path of a file can be."""
 _GIVEN = ("gymnasium", "numpy", "cloudpickle", "msgpack", "pyzmq")
 """What every jail has: the worker's own."""
 _NATIVE = (".so", ".dylib", ".dll", ".pyd", ".o", ".a")
@@ -54,11 +61,15 @@ def look(snapshot: Snapshot) -> list[Finding]:
     """What is worth a look before anything is run."""
     names = {record.path for record in snapshot.files}
     found = [*_papers(snapshot, names)]
-    for name in sorted(names):
+    left = _MOST_BYTES_IN_ALL
+    for record in sorted(snapshot.files, key=lambda one: one.path):
+        name = record.path
         if name.endswith(_NATIVE):
             found.append(Finding("source-native", "a file of machine code", file=name))
-        elif name.endswith(".py"):
-            found += _constructs(name, parsed(snapshot.root / name))
+        elif name.endswith(".py") and record.size <= left:
+            left -= record.size
+            constructs = _constructs(name, parsed(snapshot.root / name))
+            found += itertools.islice(constructs, _MOST_CONSTRUCTS)
     return found
 
 
@@ -86,7 +97,11 @@ def parsed(path: Path) -> ast.Module | None:
     try:
         if path.stat().st_size > _MOST_BYTES:
             return None
-        return ast.parse(path.read_bytes())
+        # as text: of bytes, a stranger's own first line would choose the codec, and some take hours
+        text = path.read_bytes().decode("utf-8-sig")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the parser shows a stranger's lines with its own
+            return ast.parse(text)
     except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):
         return None
 
@@ -166,8 +181,9 @@ def _targets(
     else:
         for _ in range(node.level - 1):
             folder = folder.rpartition("/")[0]
-        module = node.module or ""
-        dotted = [module, *(f"{module}.{alias.name}".strip(".") for alias in node.names)]
+        module = (node.module or "")[:_LONGEST_NAME]
+        names = [alias.name[:_LONGEST_NAME] for alias in node.names]
+        dotted = [module, *dict.fromkeys(f"{module}.{name}".strip(".") for name in names)]
     for number, name in enumerate(dotted):
         own = _own(name, folder, files)
         foreign = not getattr(node, "level", 0) and (isinstance(node, ast.Import) or number == 0)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable, Sequence
+import secrets
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -83,7 +87,7 @@ def check(
 
     [bold]envhub check org/repo@<commit> --junit report.xml[/bold]
     """
-    with reported(debug=debug):
+    with _unheard(github) as heard, reported(debug=debug):
         make = opt.MakeOptions(
             ref=ref,
             n_envs=n_envs,
@@ -114,7 +118,8 @@ def check(
         failures = report.failures(least, allowed)
         _write(report, failures, junit=junit, sarif=sarif)
         if github:
-            _annotate(report, failures)
+            with heard():
+                _annotate(report, failures)
         if json:
             from envhub_sandbox.check.reports import document
 
@@ -123,6 +128,32 @@ def check(
             _print(report, failures)
         if failures:
             raise typer.Exit(Exit.ENVIRONMENT)
+
+
+@contextlib.contextmanager
+def _unheard(github: bool) -> Iterator[Callable[[], AbstractContextManager[None]]]:
+    """Let GitHub obey nothing that is printed: warnings and errors hold a stranger's text.
+
+    It obeys any line of stdout and stderr that looks like a command. Both are one stream here, for
+    of two nobody knows which it reads first.
+    """
+    if not github:
+        yield contextlib.nullcontext
+        return
+    token = secrets.token_hex(16)
+
+    @contextlib.contextmanager
+    def heard() -> Iterator[None]:
+        typer.echo(f"\n::{token}::")
+        yield
+        typer.echo(f"::stop-commands::{token}")
+
+    with contextlib.redirect_stderr(sys.stdout):
+        typer.echo(f"::stop-commands::{token}")
+        try:
+            yield heard
+        finally:
+            typer.echo(f"\n::{token}::")
 
 
 def _level(name: str) -> Severity:

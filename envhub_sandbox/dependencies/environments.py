@@ -236,6 +236,7 @@ def _made(
         size = _size(packages, watch.bounds)
         tell(f"compiling {size / 2**20:.0f} MiB")
         _compile(interpreter, packages, held)
+        checked(packages)  # again: a compiler with a fault may leave a link, which chmod follows
         _close(packages)
         facts = {
             "format": _FORMAT,

@@ -12,6 +12,7 @@ import threading
 import weakref
 from collections.abc import Iterator, Sequence
 from functools import partial
+from itertools import chain
 
 from envhub_sandbox.log import WORKER
 from envhub_sandbox.session.env_session import EnvSession
@@ -37,6 +38,8 @@ class Prewarming:
         self._count = count
         # weak: an environment that nobody holds is closed
         self._suites = [[weakref.ref(env) for env in suite] for suite in suites]
+        for ref in chain.from_iterable(self._suites):
+            hash(ref)  # which it keeps: one that was never asked has none once its env has gone
         self._lock = threading.Lock()
         self._given_up = threading.Condition(self._lock)
         self._wanted: list[weakref.ref[EnvSession]] = []

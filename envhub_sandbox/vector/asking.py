@@ -5,12 +5,13 @@ Followed: ``gymnasium.vector.AsyncVectorEnv``, whose errors and words these are.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 
-from envhub_sandbox.errors import WorkerDiedError
+from envhub_sandbox.errors import RemoteEnvWarning, WorkerDiedError
 from envhub_sandbox.session.exchange import Exchange, MessageFor
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.transport.replies import typed
@@ -91,12 +92,20 @@ class Asking:
             ClosedEnvironmentError: A ``close`` in another thread has ended it under us.
         """
         try:
+            answer = self.unwarned(ask, *args, **kwargs)
+        except BaseException:
+            self.tell_beside_an_error()
+            raise
+        self.tell()
+        return answer
+
+    def unwarned(self, ask: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """The same for what only sends: a filter that raised then would leave a reply owed."""
+        try:
             return ask(*args, **kwargs)
         except WorkerDiedError:
             self.refuse_if_closed()
             raise
-        finally:
-            self.tell()
 
     def tell(self) -> None:
         """Warn of what the repository has warned of meanwhile.
@@ -106,9 +115,14 @@ class Asking:
         if self._repository.heard.untold:
             self._repository.tell()
 
+    def tell_beside_an_error(self) -> None:
+        """The same, where a filter that raises must not stand in for what is raised: a Ctrl-C."""
+        with contextlib.suppress(RemoteEnvWarning):
+            self.tell()
+
     def submit(self, operation: str, message_for: MessageFor) -> None:
         """Send a request to every shard."""
-        self.guarded(self._exchange.submit, operation, message_for)
+        self.unwarned(self._exchange.submit, operation, message_for)
 
     def collect(self, timeout_s: float | None, kind: type[m.M]) -> list[m.M]:
         """The shards' replies, each of the kind that was asked for."""

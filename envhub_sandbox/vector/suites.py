@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from types import TracebackType
 from typing import Any
@@ -128,11 +129,10 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
 
     def close(self) -> None:
         """Close every environment and end its processes. Idempotent."""
-        try:
-            for env in self.envs():
-                env.close()
-        finally:
-            self._on_close()
+        with contextlib.ExitStack() as all_of_them:  # what one raises keeps no other open
+            all_of_them.callback(self._on_close)
+            for env in list(self.envs())[::-1]:
+                all_of_them.callback(env.close)
 
     def __enter__(self) -> EnvSuites:
         return self

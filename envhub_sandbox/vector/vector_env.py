@@ -175,19 +175,21 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         # both halves in one, and not guarded: this is the way that is taken most
         try:
             exchange.submit_step(self._read_actions(actions))
-            return exchange.collect_step(self._timeouts.step_s)
-        except WorkerDiedError:
-            asking.refuse_if_closed()  # close() in another thread ended it under us
+            result = exchange.collect_step(self._timeouts.step_s)
+        except BaseException as error:
+            asking.tell_beside_an_error()
+            if isinstance(error, WorkerDiedError):
+                asking.refuse_if_closed()  # close() in another thread ended it under us
             raise
-        finally:
-            if self._untold:
-                self._asking.tell()
+        if self._untold:
+            asking.tell()
+        return result
 
     def step_async(self, actions: Any) -> None:
         """Send the actions; ``step_wait`` returns the results."""
         self._asking.refuse_if_busy("step_async")
         batch = self._read_actions(actions)
-        self._asking.guarded(self._exchange.submit_step, batch)
+        self._asking.unwarned(self._exchange.submit_step, batch)
         self._asking.waiting = "step"
 
     def step_wait(self, timeout: float | None = None) -> StepResult:

@@ -158,7 +158,50 @@ def test_the_command_line_judges(tmp_path: Path) -> None:
     assert result["ruleId"] == "runs"
     allowed = envhub("check", folder, "--steps", "5", "--allow", "runs", "--github")
     assert allowed.returncode == 0, allowed.stderr
-    assert allowed.stdout.startswith("::error title=envhub check%3A runs")
+    [command] = obeyed(allowed.stdout.splitlines())
+    assert command.startswith("::error title=envhub check%3A runs")
+
+
+def obeyed(lines: list[str]) -> list[str]:
+    """The commands that GitHub's runner would obey, as it reads a step's output."""
+    found, token = [], ""
+    for line in lines:
+        text = line.strip()
+        if token:
+            token = "" if text == f"::{token}::" else token
+        elif text.startswith("::stop-commands::"):
+            token = text.removeprefix("::stop-commands::")
+        elif text.startswith("::") or "##[" in text:
+            found.append(text)
+    return found
+
+
+def test_a_repository_gives_github_no_commands(tmp_path: Path) -> None:
+    """What it warns of and raises is printed, and nothing of it obeyed; our findings are."""
+    forged = "x\\n::error::forged\\n::stop-commands::mine\\n##[error]forged"
+    text = _HONEST.replace(
+        "import numpy as np", f"import numpy as np\nimport warnings\nwarnings.warn('{forged}')", 1
+    )
+    folder = repository(
+        tmp_path / "walk", text.replace("self.count += 1", f"raise ValueError('{forged}')")
+    )
+    done = envhub("check", folder, "--steps", "5", "--github")
+    assert done.returncode == 1, done.stderr
+    assert "forged" in done.stdout, "the control: it is there"
+    assert obeyed(done.stderr.splitlines()) == []
+    commands = obeyed(done.stdout.splitlines())
+    assert [one.partition(" ")[0] for one in commands] == ["::error"]
+    assert commands[0].startswith("::error title=envhub check%3A runs")
+
+
+def test_a_name_that_a_terminal_would_obey_is_a_finding(tmp_path: Path) -> None:
+    """And no reason not to judge."""
+    text = _HONEST.replace(
+        "return gym.vector.SyncVectorEnv([Walk] * n_envs)",
+        "return {'a\\x9b': {0: gym.vector.SyncVectorEnv([Walk] * n_envs)}}",
+    )
+    report = judged(repository(tmp_path / "walk", text))
+    assert {one.id for one in report.findings} == {"loads"}
 
 
 @pytest.mark.parametrize(

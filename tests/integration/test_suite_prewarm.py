@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
+import gc
 import os
 import signal
 import threading
@@ -176,6 +177,16 @@ def test_what_was_given_up_starts_again_when_it_is_asked(tasks: Callable[..., Ta
     assert states(envs)[1] == "IDLE"
     observations, _ = envs[1].reset()
     assert observations[0][0] == 1.0
+
+
+def test_one_task_outlives_the_suite_that_it_came_from(repository: Path) -> None:
+    """Whoever takes one, and lets the others go, can use it."""
+    env = make_env(repository, env_kwargs={"tasks": 3})["suite0"][1]
+    gc.collect()
+    try:
+        assert env.reset()[0][0][0] == 1.0
+    finally:
+        env.close()
 
 
 def test_closing_what_is_being_given_up_leaves_no_server(tasks: Callable[..., Tasks]) -> None:

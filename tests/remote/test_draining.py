@@ -115,6 +115,20 @@ def test_drain_is_told_to_the_server_of_the_state_folder(tmp_path: Path) -> None
         assert "SIGTERM" in done.stderr
 
 
+def test_a_second_drain_only_waits(tmp_path: Path, repository: Path) -> None:
+    """It is no second signal, which would end what runs."""
+    with listening(tmp_path / "server", *_LONG) as server:
+        command = [*WORKER, "drain", "--state-dir", str(server.state), "--no-wait"]
+        with make_env(repository, sandbox=server.sandbox()) as suites:
+            suites.env.reset(seed=1)
+            for _ in range(2):
+                subprocess.run(command, check=True, timeout=60, capture_output=True)
+                assert draining(server)
+            assert suites.env.step(np.array([0]))[0].tolist() == [[1.0]]
+            assert server.process.poll() is None
+        assert ends(server)
+
+
 def test_the_time_of_a_drain() -> None:
     """It begins once, and is over for the server when nothing has run for a moment."""
     now, said = [0.0], list[str]()

@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import os
 import signal
+import socket
 import stat
 import subprocess
 from pathlib import Path
@@ -21,7 +22,7 @@ from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
 from envhub_worker.access import keys
 from envhub_worker.access.keys import AuthorizedClients
 from envhub_worker.access.telling.rate_limited_log import CLIENT_LINES, LINES, Log
-from envhub_worker.cli import listen
+from envhub_worker.cli import listen, status
 from envhub_worker.protocol.keys import key_text, parse_key
 from tests.remote.listening import WORKER, Listening, listening
 from tests.support import inside
@@ -296,3 +297,36 @@ def test_a_state_folder_of_somebody_else_is_not_used(
     assert listen.state_dir(None, create=True) == folder
     folder.chmod(0o777)
     assert listen.state_dir(None, create=True) is None
+
+
+def test_a_relative_state_folder_is_where_one_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Jails are made elsewhere, and are told where snapshots lie."""
+    monkeypatch.chdir(tmp_path)
+    assert listen.state_dir(Path("here"), create=True) == tmp_path / "here"
+
+
+@pytest.mark.parametrize("bind", ["a taken port", "tcp://192.0.2.1:5555", "tcp://no.invalid:5555"])
+def test_an_address_that_cannot_be_had_is_said_in_a_line(bind: str, tmp_path: Path) -> None:
+    """And no traceback; nothing is left."""
+    with contextlib.closing(socket.create_server(("127.0.0.1", 0))) as taken:
+        if bind == "a taken port":
+            bind = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+        command = [*WORKER, "listen", "--bind", bind, "--state-dir", str(tmp_path / "state")]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    assert f"--bind {bind}: " in done.stderr
+    assert not (tmp_path / "state/endpoint").exists()
+
+
+def test_a_name_is_no_line_of_the_status() -> None:
+    """Nor does it crowd out what others have."""
+    jail = {"name": "evil\n0 sessions", "states": ["idle"], "operation": "", "busy_s": 0.0}
+    one = {"client": "a", "session": "1", "heard_s": 0.0, "connections": 1, "upload_bytes": 0}
+    many = [{**jail, "name": "x" * 512} for _ in range(40)]
+    sessions = [{**one, "jails": (jail, *many)}, {**one, "client": "bob", "jails": ()}]
+    lines = status.table(sessions).splitlines()
+    assert not [line for line in lines if line.startswith("0 sessions")]
+    assert [line for line in lines if "bob" in line]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import traceback
@@ -84,6 +85,7 @@ class Loop:
             self._failures += 1
             if self._failures >= _MAX_FAILURES:
                 raise
-            traceback.print_exc()
+            with contextlib.suppress(OSError, ValueError):  # nobody may read stderr any more
+                traceback.print_exc()
         else:
             self._failures = 0

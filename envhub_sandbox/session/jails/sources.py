@@ -86,8 +86,9 @@ class SharedJail:
         with self._lock:
             if self._first is None:
                 self._first = self.launcher.open(deadline)
-            self._users += 1
-            return self.launcher.connect(self._first, deadline)
+            connected = self.launcher.connect(self._first, deadline)
+            self._users += 1  # only now: what raises is used by nobody
+            return connected
 
     def end(self, loaded: LoadedJail) -> None:
         """End the jail, for everybody."""

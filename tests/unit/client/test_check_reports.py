@@ -75,6 +75,21 @@ def test_sarif_is_data(text: str) -> None:
     assert place["region"] == {"startLine": 3}
 
 
+def test_sarif_has_no_strangers_links() -> None:
+    """Nor placeholders: what has a meaning in a message is escaped."""
+    made = report("[Approve](https://example.com) {0} \\")
+    [result] = json.loads(reports.sarif(made, made.findings))["runs"][0]["results"]
+    assert "\\[Approve\\](" in result["message"]["text"]
+    assert "{{0}} \\\\" in result["message"]["text"]
+
+
+def test_a_summary_makes_no_links_of_names() -> None:
+    """A host's name is one without any markup."""
+    made = report("www.example.com/x __bold__")
+    assert "www.example" not in reports.summary(made, made.findings)
+    assert "__" not in reports.summary(made, made.findings)
+
+
 def test_findings_are_bounded() -> None:
     """Neither their number nor their length is a repository's choice."""
     made = Report("./walk:env.py")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 from pathlib import Path
 
 import pytest
@@ -92,6 +93,25 @@ def test_what_cannot_be_read_is_nothing(text: str, tmp_path: Path) -> None:
     folder = write_repository(tmp_path / "r", "def make_env(): pass")
     (folder / "odd.py").write_bytes(text.encode("latin-1"))
     assert not [one for one in source.look(local(folder)) if one.file == "odd.py"]
+
+
+def test_a_file_does_not_choose_how_it_is_read(tmp_path: Path) -> None:
+    """Its first line may name a codec, some of which take hours; the control obeys it."""
+    data = b"# coding: utf-7\n+AGkAbQBwAG8AcgB0- hidden\n"
+    assert "hidden" in ast.dump(ast.parse(data))
+    folder = write_repository(tmp_path / "r", "import odd\ndef make_env(): pass")
+    (folder / "odd.py").write_bytes(data)
+    assert imported(folder) == set()
+
+
+def test_what_is_found_in_a_file_is_bounded(tmp_path: Path) -> None:
+    """Neither long names nor many of them multiply."""
+    folder = write_repository(tmp_path / "r", "import odd\ndef make_env(): pass")
+    (folder / "odd.py").write_text("eval()\n" * 20_000)
+    assert len([one for one in source.look(local(folder)) if one.file == "odd.py"]) == 100
+    (folder / "odd.py").write_text(f"from {'a' * 100_000} import {'b,' * 50_000}b")
+    [one] = source.imports(local(folder))
+    assert len(one.name) == 1024
 
 
 def test_machine_code_is_named(tmp_path: Path) -> None:

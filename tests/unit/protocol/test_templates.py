@@ -211,12 +211,11 @@ class _Own:
 
 
 def test_a_peer_that_never_repeats_itself_fills_nothing() -> None:
-    """Forms are bounded."""
+    """Of what comes once no more is kept than a number."""
     for number in range(2000):
         m.unpack(m.pack(m.Value(f"{number}")))
-    assert len(inside.forms(INCOMING)) <= 256
-    assert len(inside.forms(OUTGOING)) <= 256
-    assert set(inside.forms(INCOMING).values()) == {None}
+    assert not inside.forms(INCOMING)
+    assert not inside.forms(OUTGOING)
 
 
 @pytest.mark.parametrize("message", [m.Value(None), m.Done()], ids=["a field", "no field"])

@@ -12,6 +12,7 @@ import signal
 import sys
 from pathlib import Path
 
+from envhub_worker.access.telling.figures import pid_namespace
 from envhub_worker.cli import status
 from envhub_worker.protocol.errors import ProtocolError
 
@@ -25,31 +26,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Send the signal; 0 once the server has ended, or been told."""
     try:
-        pidfd = _server(arguments.state_dir)
+        pidfd, drains = _server(arguments.state_dir)
     except (OSError, ValueError, ProtocolError, status.UnreachableError) as error:
         sys.stderr.write(f"envhub-worker drain: {error}\n")
         return 1
-    signal.pidfd_send_signal(pidfd, signal.SIGTERM)
+    if not drains:  # a second one would end it at once
+        signal.pidfd_send_signal(pidfd, signal.SIGTERM)
     if not arguments.no_wait:
         select.select([pidfd], [], [])
     os.close(pidfd)
     return 0
 
 
-def _server(chosen: Path | None) -> int:
-    """A pidfd of the server that listens. It is asked for its number over its key."""
+def _server(chosen: Path | None) -> tuple[int, bool]:
+    """A pidfd of the server that listens, and whether it drains. It is asked over its key."""
     address = status.address_here(chosen)
     if address[1] is None:
         raise status.UnreachableError(
             "a server without keys cannot prove that it is ours: send it SIGTERM yourself"
         )
-    pid = status.pid_of(*address)
-    pidfd = os.pidfd_open(pid)
+    told = status.of_server(*address)
+    if not told["pid_namespace"] or told["pid_namespace"] != pid_namespace():
+        raise status.UnreachableError(
+            "the server runs in a container, where processes have other numbers than here: stop it "
+            "as containers are stopped, or run this inside"
+        )
+    pidfd = os.pidfd_open(told["pid"])
     try:
         # a number may be given out anew; who says again that it is his has had it meanwhile
-        if status.pid_of(*address) != pid:
+        if status.pid_of(*address) != told["pid"]:
             raise status.UnreachableError("the server has just been replaced: try again")
     except BaseException:
         os.close(pidfd)
         raise
-    return pidfd
+    return pidfd, told["draining_s"] is not None

@@ -23,6 +23,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import zmq
+
 from envhub_worker import __version__
 from envhub_worker.access import keys
 from envhub_worker.access.keys import AuthorizedClients, KeyPair
@@ -78,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--state-dir", type=Path, help="keys and snapshots; private, writable")
     parser.add_argument(
         "--idle-s",
-        type=int,
+        type=_seconds,
         default=_IDLE_S,
         help=f"end jails of clients that are silent for so long; 0: never (default: {_IDLE_S})",
     )
@@ -138,17 +140,18 @@ def _add_quotas(parser: argparse.ArgumentParser) -> None:
 
 
 def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise ValueError
-    return value
+    return _at_least(1, text)
 
 
 def _seconds(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise ValueError
-    return value
+    return _at_least(0, text)
+
+
+def _at_least(least: int, text: str) -> int:
+    with contextlib.suppress(ValueError):
+        if int(text) >= least:
+            return int(text)
+    raise argparse.ArgumentTypeError(f"takes a whole number, {least} or more, not {text!r}")
 
 
 def _weakest_profile() -> str:
@@ -197,18 +200,21 @@ def _serve(
         gate = _gate(arguments, state, identity, log, publish)
         store = state / "store"
         server = Server(arguments.bind, runtime.path, [str(store)], gate=gate)
+    except zmq.ZMQError as error:
+        runtime.remove()
+        raise UsageError(f"--bind {arguments.bind}: {error.strerror}") from None
     except BaseException:
         runtime.remove()
         raise
     server.stop_on(signal.SIGINT, gently=(signal.SIGTERM,))
     note = state / "endpoint"
     key_file = (arguments.key or state / "server.key").absolute()
-    note.write_text(f"{server.endpoint} {identity.public} {key_file}\n")
-    if arguments.log_format == "text" or identity.authorized is None:  # a client needs to read it
-        print(announcement(server.endpoint, identity), flush=True)
-    _log_start(log, server.endpoint, identity, arguments.weakest_profile)
     began = time.monotonic()
     try:
+        note.write_text(f"{server.endpoint} {identity.public} {key_file}\n")
+        if arguments.log_format == "text" or identity.authorized is None:  # a client needs it
+            print(announcement(server.endpoint, identity), flush=True)
+        _log_start(log, server.endpoint, identity, arguments.weakest_profile)
         server.run()
     finally:
         log.say("stopped", "info", seconds=time.monotonic() - began)
@@ -282,7 +288,8 @@ def check_bind(endpoint: str, insecure: bool) -> None:
         UsageError: With what to do instead.
     """
     host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
-    if not endpoint.startswith("tcp://") or not host or not (port.isdigit() or port == "*"):
+    a_port = port == "*" or (port.isdigit() and int(port) <= 65_535)
+    if not endpoint.startswith("tcp://") or not host or not a_port:
         raise UsageError(f"--bind takes tcp://HOST:PORT, not {endpoint!r}")
     if insecure and not _is_loopback(host):
         raise UsageError(
@@ -431,7 +438,7 @@ def _gate(
             network=arguments.allow_network,
             gpu=arguments.allow_gpu,
         ),
-        idle_s=max(0, arguments.idle_s),
+        idle_s=arguments.idle_s,
         max_connections=most_connections(arguments.max_connections),
         drain_s=arguments.drain_s,
         profile=identity.profile,
@@ -474,7 +481,7 @@ def state_dir(chosen: Path | None, *, create: bool) -> Path | None:
     if chosen is not None:
         if create:
             _make_private(chosen)
-        return chosen
+        return chosen.absolute()  # jails are made elsewhere, and are told where snapshots lie
     home = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
     temporary = Path(tempfile.gettempdir()) / f"envhub-worker-{os.getuid()}"
     for candidate in (Path(home) / "envhub-worker", temporary):

@@ -106,6 +106,18 @@ def _ask(endpoint: str, server_key: bytes | None, pair: keys.KeyPair) -> list[di
         return [dict(one) for one in reply.sessions if isinstance(one, dict)]
 
 
+def of_server(endpoint: str, server_key: bytes | None, pair: keys.KeyPair) -> dict[str, Any]:
+    """What the server says about itself to its operator.
+
+    Raises:
+        UnreachableError: Nothing: it is older than that.
+    """
+    for one in _ask(endpoint, server_key, pair):
+        if "pid_namespace" in one.get("server", {}):
+            return dict(one["server"])
+    raise UnreachableError("the server is older than this command: send it SIGTERM yourself")
+
+
 def pid_of(endpoint: str, server_key: bytes | None, pair: keys.KeyPair) -> int:
     """The number of the server's process, as it says itself."""
     with _greeted(endpoint, server_key, pair) as (_, welcome):
@@ -171,4 +183,5 @@ def table(sessions: list[dict[str, Any]]) -> str:
         for jail in one["jails"]:
             doing = f"{jail['operation']} for {jail['busy_s']:.1f} s" if jail["operation"] else "-"
             lines.append(f"  {jail['name']}: {', '.join(jail['states'])}; {doing}")
-    return printable("\n".join(lines))
+    # line by line: a name is a client's, and neither ends its line nor crowds out another's
+    return "\n".join(printable(line).replace("\n", "\\n") for line in lines)

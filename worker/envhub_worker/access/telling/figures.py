@@ -6,6 +6,7 @@ them. Clients go by name, and what is counted by a word of theirs has a fixed li
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import shutil
@@ -107,10 +108,18 @@ class Facts:
             size = free = 0
         return {
             "pid": os.getpid(),
+            "pid_namespace": pid_namespace(),
             "started": self.started,
             "max_connections": self.max_connections,
             "disk": {"size_bytes": size, "free_bytes": free},
         }
+
+
+def pid_namespace() -> str:
+    """Where our process numbers hold; empty if the kernel does not tell."""
+    with contextlib.suppress(OSError):
+        return os.readlink("/proc/self/ns/pid")
+    return ""
 
 
 @dataclass

@@ -84,8 +84,10 @@ class _Reader:
 
 
 def _map(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
+    if len(pairs) > _FEW_KEYS:  # first: keys may be chosen so that their hashes collide
+        raise TypeError
     made = dict(pairs)
-    if len(pairs) > _FEW_KEYS or len(made) != len(pairs):
+    if len(made) != len(pairs):
         raise TypeError
     return made
 

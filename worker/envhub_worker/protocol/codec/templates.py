@@ -41,20 +41,30 @@ T = TypeVar("T")
 
 
 class Forms(Generic[K, F]):
-    """Forms by key; one is made when its key is met for the second time."""
+    """Forms by key; one is made when its key is met for the second time.
+
+    Until then there is no more of a key than its hash: most keys of a server come once, with the
+    number of a jail or a time in them, and some are large. Two keys of one hash only get forms
+    earlier, for a form is kept under the whole key.
+    """
 
     def __init__(self) -> None:
-        self._forms: dict[K, F | None] = {}
+        self._forms: dict[K, F] = {}
+        self._once: set[int] = set()
         self.get = self._forms.get
 
     def met(self, key: K, make: Callable[[], F]) -> None:
-        """Take note of a key that has no form."""
-        if key in self._forms:
-            self._forms[key] = make()
-        elif len(self._forms) < _MAX_FORMS:
-            self._forms[key] = None
-        else:
+        """Take note of a key that has no form, or none that holds."""
+        hashed = hash(key)
+        if hashed not in self._once and key not in self._forms:
+            if len(self._once) >= _MAX_FORMS:
+                self._once.clear()
+            self._once.add(hashed)
+            return
+        if len(self._forms) >= _MAX_FORMS:
             self._forms.clear()
+        self._forms[key] = make()
+        self._once.discard(hashed)
 
 
 class Outgoing:
