@@ -32,6 +32,12 @@ class Finding:
     line: int = 0
 
     @property
+    def text(self) -> str:
+        """What was seen, behind where it stands in the repository."""
+        place = f"{self.file}:{self.line}: " if self.line else f"{self.file}: " if self.file else ""
+        return f"{place}{self.message}"
+
+    @property
     def check(self) -> Check:
         """What did not hold."""
         return CHECKS[self.id]

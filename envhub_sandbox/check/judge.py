@@ -16,6 +16,7 @@ import numpy as np
 from envhub_sandbox.api import make_env
 from envhub_sandbox.check import source, traces
 from envhub_sandbox.check.findings import Report
+from envhub_sandbox.check.table import CHECKS
 from envhub_sandbox.check.traces import Trace
 from envhub_sandbox.dependencies.choice import chosen
 from envhub_sandbox.dependencies.declared import declared
@@ -101,7 +102,7 @@ class _Judge:
         found = source.look(self._snapshot)
         for finding in found:
             self._report.add(finding)
-        read = ("licence", "card", *(f"source-{of}" for of in _SOURCES))
+        read = [check for check in CHECKS if check.startswith(("licence", "card", "source-"))]
         for check in set(read) - {one.id for one in found}:
             self._report.judged(check, [])
 
@@ -180,9 +181,6 @@ class _Judge:
 
     def _found(self, check: str) -> bool:
         return any(finding.id == check for finding in self._report.findings)
-
-
-_SOURCES = ("network", "process", "dynamic", "pickle", "native")
 
 
 class _Task:

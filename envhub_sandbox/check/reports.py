@@ -65,7 +65,7 @@ def junit(report: Report, failures: Sequence[Finding]) -> str:
             suite, "testcase", classname=_xml(task or "repository"), name=check
         )
         found = [one for one in report.findings if (one.id, one.task) == (check, task)]
-        text = "\n".join(_line(one) for one in found)
+        text = "\n".join(one.text for one in found)
         if (check, task) in failed:
             words = _xml(CHECKS[check].sentence)
             ElementTree.SubElement(case, "failure", message=words).text = _xml(text)
@@ -77,11 +77,6 @@ def junit(report: Report, failures: Sequence[Finding]) -> str:
 
 def _xml(text: str) -> str:
     return _NO_XML.sub("?", text)
-
-
-def _line(one: Finding) -> str:
-    place = f"{one.file}:{one.line}: " if one.line else f"{one.file}: " if one.file else ""
-    return f"{place}{one.message}"
 
 
 def sarif(report: Report, failures: Sequence[Finding]) -> str:
@@ -157,7 +152,7 @@ def summary(report: Report, failures: Collection[Finding]) -> str:
         lines += ["| | check | task | finding |", "| --- | --- | --- | --- |"]
     for one in report.findings:
         mark = "**fails**" if one in failures else one.check.severity.value
-        lines.append(f"| {mark} | {one.id} | {_cell(one.task)} | {_cell(_line(one))} |")
+        lines.append(f"| {mark} | {one.id} | {_cell(one.task)} | {_cell(one.text)} |")
     return "\n".join(lines) + "\n"
 
 

@@ -7,7 +7,6 @@ hide a call can. The walls are the sandbox's.
 from __future__ import annotations
 
 import ast
-import contextlib
 import itertools
 import sys
 import warnings
@@ -16,10 +15,11 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
-from packaging.requirements import InvalidRequirement, Requirement
-from packaging.utils import canonicalize_name
+from packaging.requirements import Requirement
 
 from envhub_sandbox.check.findings import Finding
+from envhub_sandbox.dependencies import host
+from envhub_sandbox.dependencies.resolve import WORKERS
 from envhub_sandbox.hub.snapshot import Snapshot
 
 _MOST_BYTES = 256 << 10
@@ -29,8 +29,6 @@ _MOST_CONSTRUCTS = 100
 """Of one file."""
 _LONGEST_NAME = 1024
 """Of a module, as a path of a file can be."""
-_GIVEN = ("gymnasium", "numpy", "cloudpickle", "msgpack", "pyzmq")
-"""What every jail has: the worker's own."""
 _NATIVE = (".so", ".dylib", ".dll", ".pyd", ".o", ".a")
 _MODULES = {
     **dict.fromkeys(
@@ -228,43 +226,12 @@ def _in_folder(packages: Path) -> set[str]:
 
 
 def _of_this_interpreter(declared: Mapping[str, Requirement]) -> set[str]:
-    wanted = [*map(Requirement, _GIVEN), *declared.values()]
-    brought = _closure([(one.name, frozenset(one.extras)) for one in wanted])
-    return {module for name in brought for module in _modules(name)}
+    wanted = [*map(Requirement, WORKERS), *declared.values()]
+    return {module for one in host.brought(wanted) for module in _modules(one)}
 
 
-def _modules(name: str) -> set[str]:
+def _modules(found: metadata.Distribution) -> set[str]:
     """What a distribution lets one import; Python 3.10 itself overlooks some of it."""
-    try:
-        found = metadata.distribution(name)
-    except (metadata.PackageNotFoundError, ValueError):
-        return set()
     named = (found.read_text("top_level.txt") or "").split()
     tops = {file.parts[0] for file in found.files or () if file.suffix in (".py", ".so")}
     return {*named, *(top.partition(".")[0] for top in tops)}
-
-
-def _closure(waiting: list[tuple[str, frozenset[str]]]) -> set[str]:
-    """These distributions, and all that they need here, by canonical name."""
-    met: set[tuple[str, frozenset[str]]] = set()
-    while waiting:
-        one = canonicalize_name(waiting[-1][0]), waiting.pop()[1]
-        if one in met:
-            continue
-        met.add(one)
-        try:
-            texts = metadata.requires(one[0]) or []
-        except (metadata.PackageNotFoundError, ValueError):
-            continue
-        for text in texts:
-            with contextlib.suppress(InvalidRequirement):
-                needed = Requirement(text)
-                if _applies(needed, one[1]):
-                    waiting.append((needed.name, frozenset(needed.extras)))
-    return {name for name, _ in met}
-
-
-def _applies(needed: Requirement, extras: frozenset[str]) -> bool:
-    if needed.marker is None:
-        return True
-    return any(needed.marker.evaluate({"extra": extra}) for extra in extras or ("",))

@@ -232,9 +232,8 @@ def _print(report: Report, failures: list[Finding]) -> None:
     grid.add_column(overflow="fold")
     for one in report.findings:
         severity = one.check.severity.value
-        place = f"{one.file}:{one.line}: " if one.line else f"{one.file}: " if one.file else ""
         where = f"{one.task}: " if one.task else ""
-        text = safe_line(f"{where}{place}{one.message}", 500)
+        text = safe_line(f"{where}{one.text}", 500)
         grid.add_row(severity, one.id, text, style=_STYLES[severity])
         if one in failures:
             grid.add_row("", "", one.check.cure, style="dim")

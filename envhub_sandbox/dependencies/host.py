@@ -6,7 +6,7 @@ The metadata of what is installed is read, and nothing is imported.
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from importlib import metadata
 
 from packaging.markers import default_environment
@@ -31,7 +31,15 @@ def lacks(declared: Declared) -> str | None:
     hashed = next((wanted for wanted in declared.wanted if wanted.hashes), None)
     if hashed is not None:
         return str(hashed.requirement)
-    return _Installed().lacks(wanted.requirement for wanted in declared.wanted)
+    for wanted, met_by in _Installed().reached(one.requirement for one in declared.wanted):
+        if met_by is None or not _is_among(met_by, wanted.specifier):
+            return str(wanted)
+    return None
+
+
+def brought(requirements: Iterable[Requirement]) -> list[metadata.Distribution]:
+    """What this interpreter has of these, whichever version, and of all that they lead to."""
+    return [one for _, one in _Installed().reached(requirements) if one is not None]
 
 
 class _Installed:
@@ -40,8 +48,10 @@ class _Installed:
         self._found: dict[str, metadata.Distribution | None] = {}
         self._environment = {str(k): str(v) for k, v in default_environment().items()}
 
-    def lacks(self, requirements: Iterable[Requirement]) -> str | None:
-        """The first that is not met, of all that they lead to."""
+    def reached(
+        self, requirements: Iterable[Requirement]
+    ) -> Iterator[tuple[Requirement, metadata.Distribution | None]]:
+        """Each that applies here, of all that they lead to, and what is here of that name."""
         waiting = [(one, frozenset[str]()) for one in requirements]
         while waiting:
             wanted, extras = waiting.pop()
@@ -49,15 +59,14 @@ class _Installed:
                 if not self._applies(wanted, extras):
                     continue
             except (ValueError, LookupError):  # its marker compares what nobody can: let uv say so
-                return str(wanted)
+                yield wanted, None
+                continue
             found = self._distribution(wanted.name)
-            if found is None or not _is_among(found, wanted.specifier):
-                return str(wanted)
+            yield wanted, found
             key = (canonicalize_name(wanted.name), frozenset(wanted.extras))
-            if key not in self._met:
+            if found is not None and key not in self._met:
                 self._met.add(key)
                 waiting += [(one, key[1]) for one in _needs(found)]
-        return None
 
     def _applies(self, wanted: Requirement, extras: frozenset[str]) -> bool:
         if wanted.marker is None:

@@ -54,7 +54,7 @@ def _server(chosen: Path | None) -> tuple[int, bool]:
     pidfd = os.pidfd_open(told["pid"])
     try:
         # a number may be given out anew; who says again that it is his has had it meanwhile
-        if status.pid_of(*address) != told["pid"]:
+        if status.of_server(*address)["pid"] != told["pid"]:
             raise status.UnreachableError("the server has just been replaced: try again")
     except BaseException:
         os.close(pidfd)

@@ -118,12 +118,6 @@ def of_server(endpoint: str, server_key: bytes | None, pair: keys.KeyPair) -> di
     raise UnreachableError("the server is older than this command: send it SIGTERM yourself")
 
 
-def pid_of(endpoint: str, server_key: bytes | None, pair: keys.KeyPair) -> int:
-    """The number of the server's process, as it says itself."""
-    with _greeted(endpoint, server_key, pair) as (_, welcome):
-        return welcome.pid
-
-
 @contextmanager
 def _greeted(
     endpoint: str, server_key: bytes | None, pair: keys.KeyPair
