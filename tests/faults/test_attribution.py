@@ -37,6 +37,8 @@ _SLOW_S = 0.12
 _SOON_S = 0.03
 _AGES_S = 60.0
 _tokens = itertools.count(1)
+_OWED = (State.LATE, State.PENDING)
+"""A reply may still come: late, or nobody has begun to wait for it."""
 
 delays = st.sampled_from([0.0, 0.0, _SLOW_S])
 waits = st.sampled_from([_AGES_S, _AGES_S, _SOON_S])
@@ -81,14 +83,15 @@ class Attribution(RuleBasedStateMachine):
             answer = ask()
         except errors.WorkerTimeoutError as error:
             refused = "cannot" in str(error)
-            assert not refused or before is State.LATE
-            self.expected = State.LATE
+            assert not refused or before in _OWED
+            self.expected = before if refused else State.LATE
         except errors.WorkerDiedError:
             self.expected = self.after_death
         except KeyboardInterrupt:
-            self.expected = State.LATE
+            # it may come between the sending and the waiting, of which nobody is told
+            self.expected = State.PENDING if self.state is State.PENDING else State.LATE
         else:
-            assert before not in (State.LATE, State.DEAD, State.CLOSED)
+            assert before not in (*_OWED, State.DEAD, State.CLOSED)
             assert check(answer), answer
             self.expected = State.READY
 
@@ -105,7 +108,7 @@ class Attribution(RuleBasedStateMachine):
     def reset(self, delay: float, wait: float) -> None:
         """A reset brings it back from everywhere, and answers with its own token."""
         token = float(next(_tokens))
-        if self.expected in (State.LATE, State.DEAD):
+        if self.expected in (*_OWED, State.DEAD):
             self.expected = State.IDLE
 
         def ask() -> Any:
@@ -154,22 +157,22 @@ class Attribution(RuleBasedStateMachine):
         setattr(*inside.LATE_REPLY_GRACE, grace)
 
     @precondition(lambda self: self.expected is not State.CLOSED)
-    @rule()
-    def interrupt(self) -> None:
-        """Ctrl-C while a step is waited for, or while the worker starts."""
+    @rule(moment=st.sampled_from([_SOON_S]))
+    def interrupt(self, moment: float) -> None:
+        """Ctrl-C while a step is sent or waited for, or while the worker starts."""
         token = float(next(_tokens))
-        was_running = self.state is State.READY
+        nothing_owed = self.state in (State.IDLE, State.READY)
 
         def ask() -> Any:
-            signal.setitimer(signal.ITIMER_REAL, _SOON_S)
+            signal.setitimer(signal.ITIMER_REAL, moment)
             try:
                 return self.env.step([[token, _SLOW_S]] * 2)
             finally:
                 signal.setitimer(signal.ITIMER_REAL, 0)
 
         self.after(ask, lambda got: self.is_step(got, token))
-        if not was_running and self.state is State.IDLE:
-            self.expected = State.IDLE
+        if nothing_owed and self.state in (State.IDLE, State.READY):
+            self.expected = self.state  # it came before anything was sent
 
     @precondition(lambda self: self.expected is not State.CLOSED)
     @rule(running=st.booleans())
