@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,6 +13,8 @@ from envhub_worker.protocol.text import printable
 _LONGEST = 1_000
 _MOST = 500
 """Findings: a repository of ten thousand files is no reason for as many lines."""
+_OF_EACH = 20
+"""Of one check, which are kept whatever there is of others: no flood of notes hides an error."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,7 @@ class Report:
     figures: dict[str, dict[str, float]] = field(default_factory=dict)
     provenance: dict[str, Any] | None = None
     left_out: int = 0
+    _kept: Counter[str] = field(default_factory=Counter, repr=False)
 
     def judged(self, check: str, found: Collection[str], task: str = "") -> None:
         """A check was made: it found this, or nothing. Trust: texts from the worker."""
@@ -72,9 +76,10 @@ class Report:
 
     def add(self, finding: Finding) -> None:
         """Add what was found, made printable."""
-        if len(self.findings) >= _MOST:
+        if len(self.findings) >= _MOST and self._kept[finding.id] >= _OF_EACH:
             self.left_out += 1
             return
+        self._kept[finding.id] += 1
         kept = Finding(
             finding.id,
             printable(finding.message, _LONGEST),

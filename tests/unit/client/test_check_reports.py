@@ -100,6 +100,16 @@ def test_findings_are_bounded() -> None:
     assert max(len(one.message) + len(one.task) + len(one.file) for one in made.findings) < 2_000
 
 
+def test_a_flood_of_notes_hides_no_error() -> None:
+    """What fails a repository is kept, however much was found in its source before."""
+    made = Report("./walk:env.py")
+    for number in range(10_000):
+        made.add(Finding("source-dynamic", "calls eval", file="env.py", line=number))
+    made.judged("seeding", ["step 3 differs"], "hub_env / 0")
+    assert [one.id for one in made.failures(Severity.ERROR)] == ["seeding"]
+    assert len(made.findings) < 1_000
+
+
 def test_severities_are_ordered() -> None:
     """A note fails nothing but where notes are asked for."""
     assert Severity.ERROR.reaches(Severity.WARNING)
