@@ -16,7 +16,7 @@ from envhub_worker.protocol.text import printable
 
 _FRAME = re.compile(
     r'^(?P<margin>[ |+-]*)File "(?P<file>[^"\n]{1,4096})", line (?P<line>[0-9]{1,9})'
-    r"(?:, in (?P<function>[^\n]*))?(?P<source>\n[ |]{4}[^\n]*)?",
+    r"(?:, in (?P<function>[^\n]*))?(?:\n(?P<source>[ |]{4}[^\n]*)(?:\n(?P<caret>[ |\t]*\^+))?)?",
     re.MULTILINE,
 )
 _TRACEBACK_CHARS = 32_768
@@ -54,5 +54,18 @@ def _line(found: re.Match[str], snapshot: Snapshot) -> str:
     place = printable(str(_place(found, snapshot)))
     function = found["function"]
     inside = f", in {one_line(function, _FUNCTION_CHARS)}" if function else ""
-    source = one_line((found["source"] or "").strip(" |\n"), _SOURCE_CHARS)
-    return f"  File {place}, line {found['line']}{inside}" + (f"\n    {source}" if source else "")
+    told = [f"  File {place}, line {found['line']}{inside}", *_source(found)]
+    return "\n    ".join(told)
+
+
+def _source(found: re.Match[str]) -> list[str]:
+    """The line, and below it the caret of a syntax error, whose line alone says little.
+
+    Python indents both alike, by blanks and by the tabs of the line itself.
+    """
+    source = (found["source"] or "").replace("\t", " ")
+    text = source.lstrip(" |")
+    shown = one_line(text.rstrip(" |"), _SOURCE_CHARS)
+    caret = (found["caret"] or "")[len(source) - len(text) :].replace("\t", " ")
+    aligned = text.startswith(shown) and len(caret) <= _SOURCE_CHARS
+    return [line for line in (shown, caret if aligned and not found["function"] else "") if line]

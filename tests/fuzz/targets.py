@@ -447,7 +447,9 @@ def tracebacks(dice: Dice) -> None:
         demand(all(one in "\n\t" or one.isprintable() for one in told), "a control character")
         demand(len(told) < 60_000, "a text without end")
     remote: Any = error if stage == "step" else error.__cause__
-    own = r'  File "/home/me/env/(env|lib/a)\.py", line [0-9]+(, in [^\n]*)?(\n    [^\n]*)?'
+    own = (
+        r'  File "/home/me/env/(env|lib/a)\.py", line [0-9]+(, in [^\n]*)?(\n    [^\n]*)?(\n +\^+)?'
+    )
     demand(not remote.where or re.fullmatch(own, remote.where), "another file")
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import traceback
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.errors import EnvHubError, LoadError
 from tests.hub.stub_hub import StubHub
 from tests.support.repositories import write_repository
 
@@ -75,3 +76,31 @@ def test_the_line_in_a_repository_of_the_hub(stub_hub: StubHub, hub_cache: Path)
     place = f'"parts/motor.py" of org/motor@{made.commit[:12]}, line 2, in turn'
     assert f"File {place}\n" in str(error)
     assert str(hub_cache) not in str(error) + vars(error)["__notes__"][0]
+
+
+@pytest.mark.parametrize(
+    ("name", "source"),
+    [
+        ("env.py", "import gymnasium\n\ndef make_env(:\n    pass\n"),
+        ("env.py", "def make_env(n_envs=1):\n\tif n_envs:\n\t\treturn 1 +\t* 2\n"),
+        ("parts/motor.py", "def turn(angle):\n    value = (angle +\n    return value\n"),
+    ],
+    ids=["entry", "tabs", "imported"],
+)
+def test_a_syntax_error_is_shown_as_python_shows_it(tmp_path: Path, name: str, source: str) -> None:
+    """File, line and caret: what the same file gives in this process, without a sandbox."""
+    folder = Path(write_repository(tmp_path / "mine", "import parts.motor\n"))
+    (folder / "parts").mkdir()
+    (folder / name).write_text(source)
+    with pytest.raises(SyntaxError) as here:
+        compile(source, str(folder / name), "exec")
+    *place, _ = "".join(traceback.format_exception_only(here.value)).splitlines()
+    with pytest.raises(LoadError) as caught:
+        make_env(str(folder))
+    assert str(caught.value).splitlines()[-3:] == [
+        line.replace("    \t\t", "    ").replace("\t", " ") for line in place
+    ]
+    [note] = vars(caught.value)["__notes__"]
+    assert "\n".join(place) in note
+    # the import of what is broken, where it is not the entry file, and no line of ours
+    assert note.count("File ") == (1 if name == "env.py" else 2), note

@@ -89,6 +89,24 @@ def test_it_is_told_once() -> None:
     assert (str(error), notes(error)) == before
 
 
+@pytest.mark.parametrize(
+    ("margin", "source", "caret", "shown"),
+    [
+        ("    ", "x = (1 +", "    ^^^^", "    x = (1 +\n        ^^^^"),
+        ("    ", "\tx =\t(", "\t   \t^", "    x = (\n        ^"),
+        ("  |     ", "x = (", "    ^", "    x = (\n        ^"),
+        ("    ", "x" * 300, " " * 290 + "^", "    " + "x" * 200 + "..."),
+        ("    ", "x = (", " " * 9000 + "^", "    x = ("),
+    ],
+    ids=["plain", "tabs", "of a group", "long line", "far"],
+)
+def test_a_syntax_error_has_its_caret(margin: str, source: str, caret: str, shown: str) -> None:
+    """Below the very character, or not at all."""
+    lines = ("Traceback:", '  File "env.py", line 1', margin + source, margin + caret, "no")
+    error = told("\n".join(lines), stage="import")
+    assert str(error).endswith(f'  File "/home/me/my-env/env.py", line 1\n{shown}')
+
+
 def test_copies_and_pickles_keep_the_line() -> None:
     """As those of a pool's worker do."""
     for stage in ("step", "make_env"):
@@ -160,7 +178,7 @@ def test_files_of_the_repository_have_their_names_in_it(tmp_path: Path) -> None:
 def test_a_syntax_error_has_its_line(tmp_path: Path) -> None:
     """It has no frame in the repository."""
     told = a_failure(tmp_path, "def make_env(:\n")
-    assert '  File "env.py", line 1\n    def make_env(:\n' in told.traceback
+    assert '  File "env.py", line 1\n    def make_env(:\n                 ^\n' in told.traceback
 
 
 def test_our_own_frames_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

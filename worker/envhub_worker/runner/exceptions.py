@@ -88,11 +88,12 @@ def _chain(whole: traceback.TracebackException) -> Iterator[traceback.TracebackE
 def _tell(one: traceback.TracebackException, root: str) -> None:
     """Leave out whose line helps nobody, and name the repository's files as it does."""
     theirs = [frame for frame in one.stack if not frame.filename.startswith((_OURS, *_IMPORTING))]
-    if theirs:
+    syntax = getattr(one, "filename", None) is not None  # which tells its line without a frame
+    if theirs or syntax:
         one.stack[:] = theirs
     for frame in one.stack:
         frame.filename = _in_repository(frame.filename, root)
-    if getattr(one, "filename", None):  # of a SyntaxError
+    if syntax:
         one.filename = _in_repository(str(one.filename), root)
 
 
