@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from envhub_sandbox.api import make_env
-from envhub_sandbox.check import source, traces
+from envhub_sandbox.check import parsing, source, traces
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.table import CHECKS
 from envhub_sandbox.check.traces import Trace
@@ -84,6 +84,7 @@ def judge(asked: Asked) -> Report:
 class _Judge:
     def __init__(self, asked: Asked, snapshot: Snapshot, report: Report) -> None:
         self._asked, self._snapshot, self._report = asked, snapshot, report
+        self._files = parsing.read(snapshot)
 
     def ask(self) -> None:
         self._read()
@@ -99,7 +100,7 @@ class _Judge:
         )
         moving = [f"{self._asked.reference} may mean another commit tomorrow"] if is_moving else []
         self._report.judged("pinned", moving)
-        found = source.look(self._snapshot)
+        found = source.look(self._snapshot, self._files)
         for finding in found:
             self._report.add(finding)
         read = [check for check in CHECKS if check.startswith(("licence", "card", "source-"))]
@@ -124,7 +125,7 @@ class _Judge:
             self._report.judged("requirements", [str(error)])
             raise _StoppedError from error
         self._report.judged("requirements", [])
-        found = source.undeclared(source.imports(self._snapshot), wanted, packages)
+        found = source.undeclared(source.imports(self._snapshot, self._files), wanted, packages)
         for finding in found:
             self._report.add(finding)
         if not found:

@@ -6,10 +6,8 @@ hide a call can. The walls are the sandbox's.
 
 from __future__ import annotations
 
-import ast
 import itertools
 import sys
-import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
@@ -18,17 +16,14 @@ from pathlib import Path
 from packaging.requirements import Requirement
 
 from envhub_sandbox.check.findings import Finding
+from envhub_sandbox.check.parsing import Named, Parsed
 from envhub_sandbox.dependencies import host
 from envhub_sandbox.dependencies.resolve import WORKERS
 from envhub_sandbox.hub.snapshot import Snapshot
 
-_MOST_BYTES = 256 << 10
-"""Of one file: Python's parser takes a thousand bytes of memory for one of a hostile text."""
-_MOST_BYTES_IN_ALL = 16 << 20
+Files = Mapping[str, Parsed | None]
 _MOST_CONSTRUCTS = 100
 """Of one file."""
-_LONGEST_NAME = 1024
-"""Of a module, as a path of a file can be."""
 _NATIVE = (".so", ".dylib", ".dll", ".pyd", ".o", ".a")
 _MODULES = {
     **dict.fromkeys(
@@ -55,18 +50,20 @@ class Import:
     line: int
 
 
-def look(snapshot: Snapshot) -> list[Finding]:
-    """What is worth a look before anything is run."""
+def look(snapshot: Snapshot, files: Files) -> list[Finding]:
+    """What is worth a look before anything is run.
+
+    Args:
+        snapshot: The repository.
+        files: What ``parsing.read`` read of it.
+    """
     names = {record.path for record in snapshot.files}
     found = [*_papers(snapshot, names)]
-    left = _MOST_BYTES_IN_ALL
-    for record in sorted(snapshot.files, key=lambda one: one.path):
-        name = record.path
+    for name in sorted(names):
         if name.endswith(_NATIVE):
             found.append(Finding("source-native", "a file of machine code", file=name))
-        elif name.endswith(".py") and record.size <= left:
-            left -= record.size
-            constructs = _constructs(name, parsed(snapshot.root / name))
+        else:
+            constructs = _constructs(name, files.get(name))
             found += itertools.islice(constructs, _MOST_CONSTRUCTS)
     return found
 
@@ -90,101 +87,59 @@ def _card_names_a_licence(root: Path) -> bool:
     return any(line.startswith("license:") for line in block.splitlines())
 
 
-def parsed(path: Path) -> ast.Module | None:
-    """A file's tree; None of what is too large or no Python (of this version)."""
-    try:
-        if path.stat().st_size > _MOST_BYTES:
-            return None
-        # as text: of bytes, a stranger's own first line would choose the codec, and some take hours
-        text = path.read_bytes().decode("utf-8-sig")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the parser shows a stranger's lines with its own
-            return ast.parse(text)
-    except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):
-        return None
-
-
-def _constructs(file: str, tree: ast.Module | None) -> Iterator[Finding]:
-    if tree is None:
+def _constructs(file: str, parsed: Parsed | None) -> Iterator[Finding]:
+    if parsed is None:
         return
-    for node in ast.walk(tree):
-        if isinstance(node, (ast.Import, ast.ImportFrom)):
-            for name in _names(node):
-                if check := _MODULES.get(name):
-                    yield Finding(check, f"imports {name}", file=file, line=node.lineno)
-        elif isinstance(node, ast.Call) and isinstance(node.func, (ast.Name, ast.Attribute)):
-            called = _dotted(node.func)
-            if check := _CALLS.get(called):
-                yield Finding(check, f"calls {called}", file=file, line=node.lineno)
+    for one in parsed.imports:
+        for name in _firsts(one):
+            if check := _MODULES.get(name):
+                yield Finding(check, f"imports {name}", file=file, line=one.line)
+    for called, line in parsed.calls:
+        if check := _CALLS.get(called):
+            yield Finding(check, f"calls {called}", file=file, line=line)
 
 
-def _dotted(node: ast.expr) -> str:
-    if isinstance(node, ast.Name):
-        return node.id
-    if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
-        return f"{node.value.id}.{node.attr}"
-    return ""
+def _firsts(one: Named) -> list[str]:
+    if one.level < 0:
+        return [name.partition(".")[0] for name in one.names]
+    return [] if one.level else [one.module.partition(".")[0]]
 
 
 # --- imports -----------------------------------------------------------------------------------
 
 
-def imports(snapshot: Snapshot) -> list[Import]:
+def imports(snapshot: Snapshot, files: Files) -> list[Import]:
     """What the entry file imports, and the repository's own modules that it leads to.
 
     What is imported within ``try`` may be missing, and what nobody imports is not needed.
     """
-    files = {record.path for record in snapshot.files}
+    names = {record.path for record in snapshot.files}
     waiting, seen, found = [snapshot.path], {snapshot.path}, []
     while waiting:
         file = waiting.pop()
-        tree = parsed(snapshot.root / file)
-        for node in [] if tree is None else _unguarded(tree):
-            for name, own in _targets(node, file, files):
+        parsed = files.get(file)
+        for one in () if parsed is None else parsed.imports:
+            for name, own in _targets(one, file, names) if one.unguarded else ():
                 if own and own not in seen:
                     seen.add(own)
                     waiting.append(own)
                 elif not own and name and name not in sys.stdlib_module_names:
-                    found.append(Import(name, file, node.lineno))
+                    found.append(Import(name, file, one.line))
     return sorted(set(found), key=lambda one: (one.file, one.line, one.name))
 
 
-def _unguarded(tree: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
-    waiting = [tree]  # no recursion: a stranger chose how deep it is
-    while waiting:
-        for node in ast.iter_child_nodes(waiting.pop()):
-            if isinstance(node, (ast.Import, ast.ImportFrom)):
-                yield node
-            elif not isinstance(node, ast.Try) and not _is_for_types(node):
-                waiting.append(node)
-
-
-def _is_for_types(node: ast.AST) -> bool:
-    return isinstance(node, ast.If) and _dotted(node.test).endswith("TYPE_CHECKING")
-
-
-def _names(node: ast.Import | ast.ImportFrom) -> list[str]:
-    if isinstance(node, ast.Import):
-        return [alias.name.partition(".")[0] for alias in node.names]
-    return [] if node.level else [(node.module or "").partition(".")[0]]
-
-
-def _targets(
-    node: ast.Import | ast.ImportFrom, file: str, files: set[str]
-) -> Iterator[tuple[str, str]]:
+def _targets(one: Named, file: str, files: set[str]) -> Iterator[tuple[str, str]]:
     """Each module that is named: its first name, and the repository's own file if it is one."""
     folder = file.rpartition("/")[0]
-    if isinstance(node, ast.Import):
-        dotted = [alias.name for alias in node.names]
-    else:
-        for _ in range(node.level - 1):
-            folder = folder.rpartition("/")[0]
-        module = (node.module or "")[:_LONGEST_NAME]
-        names = [alias.name[:_LONGEST_NAME] for alias in node.names]
-        dotted = [module, *dict.fromkeys(f"{module}.{name}".strip(".") for name in names)]
+    for _ in range(one.level - 1):
+        folder = folder.rpartition("/")[0]
+    dotted = list(one.names)
+    if one.level >= 0:
+        names = dict.fromkeys(f"{one.module}.{name}".strip(".") for name in one.names)
+        dotted = [one.module, *names]
     for number, name in enumerate(dotted):
         own = _own(name, folder, files)
-        foreign = not getattr(node, "level", 0) and (isinstance(node, ast.Import) or number == 0)
+        foreign = one.level < 0 or (one.level == 0 and number == 0)
         is_package = _own(name.partition(".")[0], folder, files)
         if own or (foreign and not is_package):
             yield name.partition(".")[0], own

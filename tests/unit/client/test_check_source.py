@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
 
-from envhub_sandbox.check import source
-from envhub_sandbox.hub.snapshot import local
+from envhub_sandbox.check import parser, parsing, source
+from envhub_sandbox.check.findings import Finding
+from envhub_sandbox.hub.snapshot import Snapshot, local
 from tests.support.repositories import write_repository
 
 _ENTRY = """
@@ -33,7 +36,18 @@ def make_env(n_envs=1, use_async_envs=False):
 
 def imported(folder: Path) -> set[tuple[str, str]]:
     """Names, and the files in which they stand."""
-    return {(one.name, one.file) for one in source.imports(local(folder))}
+    return {(one.name, one.file) for one in imports(local(folder))}
+
+
+def imports(snapshot: Snapshot) -> list[source.Import]:
+    """What ``source.imports`` finds in what was read of a snapshot."""
+    return source.imports(snapshot, parsing.read(snapshot))
+
+
+def look(folder: Path) -> list[Finding]:
+    """What ``source.look`` finds."""
+    snapshot = local(folder)
+    return source.look(snapshot, parsing.read(snapshot))
 
 
 def test_imports_are_followed_through_the_repository(tmp_path: Path) -> None:
@@ -57,7 +71,7 @@ def test_imports_are_followed_through_the_repository(tmp_path: Path) -> None:
 def test_what_is_declared_brings_what_it_needs(tmp_path: Path) -> None:
     """Of this interpreter's packages: pytest needs pluggy; nothing declared needs pytest."""
     text = "import numpy, pytest, pluggy\ndef make_env(): pass"
-    found = source.imports(local(write_repository(tmp_path / "r", text)))
+    found = imports(local(write_repository(tmp_path / "r", text)))
     nothing = source.undeclared(found, {}, None)
     assert [one.message.split()[0] for one in nothing] == ["pluggy", "pytest"]
     assert {(one.file, one.line) for one in nothing} == {("env.py", 1)}
@@ -70,7 +84,7 @@ def test_an_environment_of_its_own_brings_what_lies_in_it(tmp_path: Path) -> Non
     (packages / "yaml").mkdir(parents=True)
     (packages / "single.py").touch()
     text = "import yaml, single, pytest\ndef make_env(): pass"
-    found = source.imports(local(write_repository(tmp_path / "r", text)))
+    found = imports(local(write_repository(tmp_path / "r", text)))
     missing = source.undeclared(found, {}, packages)
     assert [one.message.split()[0] for one in missing] == ["pytest"]
 
@@ -92,7 +106,7 @@ def test_what_cannot_be_read_is_nothing(text: str, tmp_path: Path) -> None:
     """No crash, no recursion without end, no time for what no person wrote."""
     folder = write_repository(tmp_path / "r", "def make_env(): pass")
     (folder / "odd.py").write_bytes(text.encode("latin-1"))
-    assert not [one for one in source.look(local(folder)) if one.file == "odd.py"]
+    assert not [one for one in look(folder) if one.file == "odd.py"]
 
 
 def test_a_file_does_not_choose_how_it_is_read(tmp_path: Path) -> None:
@@ -108,9 +122,9 @@ def test_what_is_found_in_a_file_is_bounded(tmp_path: Path) -> None:
     """Neither long names nor many of them multiply."""
     folder = write_repository(tmp_path / "r", "import odd\ndef make_env(): pass")
     (folder / "odd.py").write_text("eval()\n" * 20_000)
-    assert len([one for one in source.look(local(folder)) if one.file == "odd.py"]) == 100
+    assert len([one for one in look(folder) if one.file == "odd.py"]) == 100
     (folder / "odd.py").write_text(f"from {'a' * 100_000} import {'b,' * 50_000}b")
-    [one] = source.imports(local(folder))
+    [one] = imports(local(folder))
     assert len(one.name) == 1024
 
 
@@ -118,6 +132,64 @@ def test_machine_code_is_named(tmp_path: Path) -> None:
     """By the names of files; nothing opens them."""
     folder = write_repository(tmp_path / "r", "def make_env(): pass")
     (folder / "fast.so").write_bytes(b"\x7fELF")
-    assert [one.file for one in source.look(local(folder)) if one.id == "source-native"] == [
-        "fast.so"
-    ]
+    assert [one.file for one in look(folder) if one.id == "source-native"] == ["fast.so"]
+
+
+def weaker(folder: Path, *changes: tuple[str, str]) -> str:
+    """The parser's program, changed."""
+    text = Path(parser.__file__).read_text()
+    for old, new in changes:
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    (folder / "weaker.py").write_text(text)
+    return str(folder / "weaker.py")
+
+
+@pytest.mark.parametrize(
+    ("bound", "spend"),
+    [
+        ("CPU_S = 0.5", "any(iter(int, 1))"),
+        ("MEMORY = 1 << 29", "bytes(1 << 30)"),
+    ],
+    ids=["time", "memory"],
+)
+def test_a_file_that_costs_too_much_is_not_read(
+    bound: str, spend: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The kernel sees to it, and those beside it are read; without the cost it is read, too."""
+    texts = {"first.py": b"import a", "second.py": b"import SPEND", "third.py": b"import c"}
+    read = parsing.parsed(texts)
+    assert [one and one.imports[0].names for one in read.values()] == [("a",), ("SPEND",), ("c",)]
+    name = bound.partition(" ")[0]
+    [old] = [line for line in Path(parser.__file__).read_text().splitlines() if name + " =" in line]
+    spending = f"\n        assert b'SPEND' not in data or not {spend}, data\n        tree = "
+    change = ((old, bound), ("\n        tree = ", spending))
+    monkeypatch.setattr(parser, "__file__", weaker(tmp_path, *change))
+    assert parsing.parsed(texts) == {**read, "second.py": None}
+
+
+def test_children_that_are_lost_are_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thousand deadly files end no thousand of them."""
+    ended = weaker(
+        tmp_path, ("\n        tree = ", "\n        signal.raise_signal(9)\n        tree = ")
+    )
+    monkeypatch.setattr(parser, "__file__", ended)
+    began: list[object] = []
+    run = subprocess.run
+    monkeypatch.setattr(subprocess, "run", lambda *a, **k: (began.append(a), run(*a, **k))[1])
+    assert set(parsing.parsed({f"{number}.py": b"" for number in range(1000)}).values()) == {None}
+    assert len(began) == parsing.MOST_LOST
+
+
+def test_a_link_is_not_followed(tmp_path: Path) -> None:
+    """A snapshot holds real files; whoever swaps one afterwards leads nobody out of it."""
+    folder = write_repository(tmp_path / "r", "import a\ndef make_env(): pass")
+    snapshot = local(folder)
+    (tmp_path / "outside.py").write_text("import secret")
+    swapped = tmp_path / "swapped"
+    swapped.mkdir()
+    (swapped / "env.py").symlink_to(tmp_path / "outside.py")
+    assert parsing.read(snapshot)["env.py"] is not None
+    assert parsing.read(replace(snapshot, root=swapped))["env.py"] is None

@@ -1,0 +1,142 @@
+"""What a snapshot's Python files import and call, each read once and parsed in a bounded child.
+
+A text can take hours of Python's parser, gigabytes, or its process. What becomes of the child is
+no matter of ours: the file that ended it is one that cannot be read.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from envhub_sandbox.check import parser
+from envhub_sandbox.hub.snapshot import Snapshot
+
+MOST_BYTES = 256 << 10
+"""Of one file."""
+MOST_BYTES_IN_ALL = 16 << 20
+MOST_LOST = 4
+"""Children; what is left then is not read."""
+_PATIENCE_S = 600.0
+"""For a child that neither computes nor ends, as nothing lets it; the bound is its CPU time."""
+
+
+@dataclass(frozen=True)
+class Named:
+    """One statement of import.
+
+    Attributes:
+        level: Of a relative ``from``; -1 for ``import``.
+        module: Behind ``from``.
+        names: What is imported.
+        unguarded: Not within ``try``, nor for type checkers alone.
+        line: Where it stands.
+    """
+
+    level: int
+    module: str
+    names: tuple[str, ...]
+    unguarded: bool
+    line: int
+
+
+@dataclass(frozen=True)
+class Parsed:
+    """What a file imports and calls; ``calls`` are dotted names and lines."""
+
+    imports: tuple[Named, ...]
+    calls: tuple[tuple[str, int], ...]
+
+
+def read(snapshot: Snapshot) -> dict[str, Parsed | None]:
+    """Every Python file of a snapshot; None for those that cannot be read.
+
+    That is: larger than a person writes, no Python of this version, beyond what all may take, or
+    what the parser has not survived.
+    """
+    names = sorted(one.path for one in snapshot.files if one.path.endswith(".py"))
+    found: dict[str, Parsed | None] = dict.fromkeys(names)
+    left, texts = MOST_BYTES_IN_ALL, {}
+    for name in names:
+        data = _bytes(snapshot.root / name)
+        if data is not None and len(data) <= left:
+            left -= len(data)
+            texts[name] = data
+    return {**found, **parsed(texts)}
+
+
+def _bytes(path: Path) -> bytes | None:
+    """A regular file's content; looked at and read by one and the same descriptor."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:
+        return None
+    with open(fd, "rb") as file:
+        try:
+            if not stat.S_ISREG(os.fstat(fd).st_mode):
+                return None
+            data = file.read(MOST_BYTES + 1)
+        except OSError:
+            return None
+    return data if len(data) <= MOST_BYTES else None
+
+
+def parsed(texts: Mapping[str, bytes]) -> dict[str, Parsed | None]:
+    """What each text is; None where it is no Python, or was too much for a child."""
+    found: dict[str, Parsed | None] = dict.fromkeys(texts)
+    waiting = list(texts)
+    for _ in range(MOST_LOST):
+        if not waiting:
+            break
+        answers = list(_answers([texts[name] for name in waiting]))
+        for name, answer in zip(waiting, answers, strict=False):
+            found[name] = answer
+        waiting = waiting[len(answers) + 1 :]  # the next one is what ended it
+    return found
+
+
+def _answers(texts: list[bytes]) -> Iterator[Parsed | None]:
+    with tempfile.TemporaryFile() as given, tempfile.TemporaryFile() as taken:
+        for text in texts:
+            given.write(len(text).to_bytes(4, "big"))
+            given.write(text)
+        given.seek(0)
+        _run(given, taken)
+        taken.seek(0)
+        for line in taken.read(parser.OUTPUT).split(b"\n")[:-1]:  # the last one may be cut off
+            yield _answer(json.loads(line))
+
+
+def _run(given: IO[bytes], taken: IO[bytes]) -> None:
+    command = [sys.executable, "-I", "-S", parser.__file__]
+    try:
+        subprocess.run(
+            command,
+            stdin=given,
+            stdout=taken,
+            stderr=subprocess.DEVNULL,
+            cwd="/",
+            env={},
+            timeout=_PATIENCE_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return  # it has been killed; what it has answered counts
+
+
+def _answer(row: Any) -> Parsed | None:
+    if row is None:
+        return None
+    imports = (
+        Named(level, module, tuple(names), unguarded, line)
+        for level, module, names, unguarded, line in row["imports"]
+    )
+    return Parsed(tuple(imports), tuple((name, line) for name, line in row["calls"]))
