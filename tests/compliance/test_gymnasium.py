@@ -38,7 +38,7 @@ WAYS: dict[str, dict[str, Any]] = {
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Listening]:
     """A server on loopback, with keys."""
-    with listening(tmp_path_factory.mktemp("server"), "--idle-s", "2") as found:
+    with listening(tmp_path_factory.mktemp("server")) as found:
         yield found
 
 

@@ -81,7 +81,7 @@ def make(
     if request.param != "tcp":
         yield build
     else:
-        with listening(tmp_path_factory.mktemp("server"), "--idle-s", "2") as place:
+        with listening(tmp_path_factory.mktemp("server")) as place:
             yield partial(build, options={"sandbox": place.sandbox()})
     for env in made:
         env.close()

@@ -1,4 +1,4 @@
-"""One server for tests that leave it as it was."""
+"""Servers for tests that leave them as they were."""
 
 from __future__ import annotations
 
@@ -9,11 +9,20 @@ import pytest
 
 from tests.remote.listening import Listening, counting, listening
 
+IMPATIENT_S = 8
+
 
 @pytest.fixture(scope="package")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Listening]:
-    """A server on loopback, with keys."""
-    with listening(tmp_path_factory.mktemp("server"), "--idle-s", "2") as found:
+    """A server on loopback, with keys; as patient as by default."""
+    with listening(tmp_path_factory.mktemp("server")) as found:
+        yield found
+
+
+@pytest.fixture
+def impatient(tmp_path: Path) -> Iterator[Listening]:
+    """One that soon ends what belongs to a silent client: later than a loaded machine is silent."""
+    with listening(tmp_path / "impatient", "--idle-s", str(IMPATIENT_S)) as found:
         yield found
 
 
