@@ -19,7 +19,7 @@ from envhub_sandbox.transport.request import Request, whole
 from envhub_sandbox.transport.values.tensors import to_tensor
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
-from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
 
 HISTORY_BYTES = 8 << 20

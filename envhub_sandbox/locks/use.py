@@ -12,7 +12,7 @@ from envhub_sandbox.hub.snapshot import Snapshot
 if TYPE_CHECKING:  # they cost time, and mostly there is no lock
     from envhub_sandbox.dependencies.environments import Environment
     from envhub_sandbox.locks.lockfile import LockFile
-    from envhub_worker.protocol.manifest import Manifest
+    from envhub_worker.protocol.manifest.manifest import Manifest
 
 
 def opened(

@@ -19,7 +19,7 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.shared_memory.sharding import bounds_for
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
-from envhub_worker.protocol.manifest import EnvManifest, Manifest
+from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest
 
 
 class Proxies:

@@ -31,7 +31,7 @@ from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.shared_memory.sharding import PaceBook
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
-from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.manifest.manifest import EnvManifest
 
 _GRACE_S = 2.0
 """How long ``reset`` waits for a late reply before it gives the jail up and starts another."""

@@ -23,7 +23,7 @@ from envhub_sandbox.transport.values.generators import generator
 from envhub_worker import protocol
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import encode
-from envhub_worker.protocol.manifest import Manifest, decode_manifest
+from envhub_worker.protocol.manifest.manifest import Manifest, decode_manifest
 from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.protocol.stream import PacketReader, pack_packet
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_worker.protocol.manifest import Manifest
+from envhub_worker.protocol.manifest.manifest import Manifest
 from envhub_worker.protocol.messages import VERSION
 
 

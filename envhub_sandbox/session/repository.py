@@ -32,7 +32,7 @@ from envhub_sandbox.transport.warned import Heard
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import LACKS_PACKAGES
 from envhub_worker.protocol.limits import WireLimits
-from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.protocol.text import printable
 

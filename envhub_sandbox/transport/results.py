@@ -12,7 +12,7 @@ from envhub_sandbox.transport.replies import check, typed
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
-from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.untrusted import FAULTS
 

@@ -17,7 +17,7 @@ from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from envhub_sandbox.vector.infos import of_one
-from envhub_worker.protocol.names import is_servable
+from envhub_worker.protocol.manifest.names import is_servable
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _PLAIN = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)

@@ -17,7 +17,7 @@ from envhub_sandbox.transport.replies import typed
 from envhub_sandbox.transport.values import generators
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject
-from envhub_worker.protocol.names import is_servable
+from envhub_worker.protocol.manifest.names import is_servable
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.untrusted import UNTRUSTED
 

@@ -27,7 +27,7 @@ from envhub_sandbox.vector.shown import environment_html
 from envhub_sandbox.vector.sub_environment import MessageFor as OneMessageFor
 from envhub_sandbox.vector.sub_environment import SubEnvironment
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.names import is_servable
+from envhub_worker.protocol.manifest.names import is_servable
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _NOT_CALLED = frozenset({"reset", "step", "close"})

@@ -25,7 +25,12 @@ from gymnasium.vector.utils import batch_space
 
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
-from envhub_worker.protocol.manifest import EnvManifest, Manifest, encode_env, encode_manifest
+from envhub_worker.protocol.manifest.manifest import (
+    EnvManifest,
+    Manifest,
+    encode_env,
+    encode_manifest,
+)
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 Frames = list[Buffer]

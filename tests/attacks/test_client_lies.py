@@ -25,7 +25,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerError, WorkerTimeoutError
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.manifest import encode_env
+from envhub_worker.protocol.manifest.manifest import encode_env
 from envhub_worker.protocol.spaces.opaque import MAX_SPACE_DEPTH
 from envhub_worker.protocol.spaces.spaces import decode_space, encode_space
 from tests.attacks.lying_server import (

@@ -13,7 +13,12 @@ from gymnasium import spaces
 
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_sandbox.transport.values.generators import generator
-from envhub_worker.protocol.manifest import EnvManifest, Manifest, decode_manifest, encode_manifest
+from envhub_worker.protocol.manifest.manifest import (
+    EnvManifest,
+    Manifest,
+    decode_manifest,
+    encode_manifest,
+)
 from tests.attacks.lying_server import env_manifest
 
 ELEMENTS = 100_000

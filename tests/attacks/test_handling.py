@@ -29,7 +29,7 @@ from envhub_sandbox.transport import results
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol import untrusted
-from envhub_worker.protocol.manifest import Manifest, encode_env, encode_manifest
+from envhub_worker.protocol.manifest.manifest import Manifest, encode_env, encode_manifest
 from envhub_worker.protocol.spaces import batches
 from tests.attacks.lying_server import (
     NUM_ENVS,

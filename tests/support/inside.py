@@ -42,7 +42,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol import warned
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.lifecycle import Lifecycle, State
-from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.messages import packing
 from envhub_worker.spawn.spawner import Spawner
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from envhub_sandbox.cli.rollout.zero_action import zero_action
 from envhub_sandbox.errors import EnvHubError
-from envhub_worker.protocol.manifest import AUTORESET_MODES
+from envhub_worker.protocol.manifest.manifest import AUTORESET_MODES
 
 MAX_COMPONENTS = 64
 """Components of a vector reward: more cannot be reported one by one."""

@@ -33,7 +33,7 @@ from envhub_sandbox.transport.output import OutputFollower, Wanted
 from envhub_sandbox.transport.replies import expect, typed
 from envhub_sandbox.transport.values.generators import generator
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.manifest import EnvManifest, decode_manifest
+from envhub_worker.protocol.manifest.manifest import EnvManifest, decode_manifest
 from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.protocol.untrusted import UNTRUSTED
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from envhub_sandbox.sandboxes.base import WorkerServer
 from envhub_sandbox.transport.jail import JailHandle
-from envhub_worker.protocol.manifest import EnvManifest, Manifest
+from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest
 
 
 @dataclass(frozen=True)

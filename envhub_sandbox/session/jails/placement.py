@@ -17,7 +17,7 @@ from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
 from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.manifest import EnvManifest, decode_env
+from envhub_worker.protocol.manifest.manifest import EnvManifest, decode_env
 
 _numbers = itertools.count(1)
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from statistics import median
 
 from envhub_sandbox.transport.shared_memory.affinity import CPUS
-from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces.batches import even_bounds
 
 ASK_NS = 10_000.0

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from envhub_worker.protocol.codec.codec import Buffer
-from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.shared_memory import slabs
 
 _FRAME_BYTES = 8

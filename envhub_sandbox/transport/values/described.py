@@ -13,8 +13,8 @@ from envhub_sandbox.transport.values.generators import generator
 from envhub_sandbox.transport.values.specs import spec_of
 from envhub_worker.protocol.codec.inert import RemoteObject, one_line
 from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
-from envhub_worker.protocol.facts import read_spec
 from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.manifest.facts import read_spec
 from envhub_worker.protocol.spaces.reader import (
     ELEMENT_BYTES,
     GENERATOR_BYTES,

@@ -22,7 +22,7 @@ from envhub_sandbox.transport.shared_memory.sharding import (
     bounds_for,
     pace_of,
 )
-from envhub_worker.protocol.manifest import EnvManifest
+from envhub_worker.protocol.manifest.manifest import EnvManifest
 
 SHORT = Pace(Cost(10_000, 3_000), Cost(25_000, 3_000))
 LONG = Pace(Cost(10_000, 2e6), Cost(25_000, 2e6))

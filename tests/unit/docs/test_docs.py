@@ -17,8 +17,8 @@ import pytest
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import TABLE, Event, State
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, MAX_NUM_ENVS
-from envhub_worker.protocol.manifest import MAX_ENVS
-from envhub_worker.protocol.names import MAX_NAME
+from envhub_worker.protocol.manifest.manifest import MAX_ENVS
+from envhub_worker.protocol.manifest.names import MAX_NAME
 from tests.support import settings
 from tests.unit.docs.test_imports import folder
 

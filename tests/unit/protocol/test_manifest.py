@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from envhub_worker.protocol.codec.codec import decode, encode
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import MAX_NUM_ENVS
-from envhub_worker.protocol.manifest import (
+from envhub_worker.protocol.manifest.manifest import (
     MAX_ENVS,
     EnvManifest,
     Manifest,
@@ -23,7 +23,7 @@ from envhub_worker.protocol.manifest import (
     encode_env,
     encode_manifest,
 )
-from envhub_worker.protocol.names import MAX_NAME, MAX_NAMES
+from envhub_worker.protocol.manifest.names import MAX_NAME, MAX_NAMES
 
 ELEMENTS = 40_000
 OBSERVATION = spaces.Dict({"b": spaces.Box(-1, 1, (3,)), "a": spaces.Text(4)})

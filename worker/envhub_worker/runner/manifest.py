@@ -10,8 +10,8 @@ from typing import Any
 from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from envhub_worker.protocol.manifest import EnvManifest, Manifest
-from envhub_worker.protocol.names import MAX_NAMES
+from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest
+from envhub_worker.protocol.manifest.names import MAX_NAMES
 from envhub_worker.runner import gymnasium_compat as compat
 from envhub_worker.runner.described import facts_of
 from envhub_worker.runner.tasks import Task

@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from envhub_worker.protocol.manifest import TaskId
+from envhub_worker.protocol.manifest.manifest import TaskId
 from envhub_worker.runner.deferred import Recording, recording
 from envhub_worker.runner.sync_envs import SubEnvs
 

@@ -13,9 +13,9 @@ from typing import Any
 import gymnasium as gym
 
 from envhub_worker.protocol.errors import RemoteProtocolError
-from envhub_worker.protocol.facts import read_metadata, read_spec
 from envhub_worker.protocol.limits import MAX_NUM_ENVS
-from envhub_worker.protocol.names import (
+from envhub_worker.protocol.manifest.facts import read_metadata, read_spec
+from envhub_worker.protocol.manifest.names import (
     MAX_NAMES,
     checked_key,
     checked_name,

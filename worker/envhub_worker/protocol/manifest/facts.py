@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from envhub_worker.protocol.errors import RemoteProtocolError
-from envhub_worker.protocol.names import optional_name, string_keys
+from envhub_worker.protocol.manifest.names import optional_name, string_keys
 
 MAX_METADATA = 4096
 """Values in an environment's metadata, those in lists, mappings and arrays included."""
