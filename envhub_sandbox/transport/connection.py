@@ -20,10 +20,10 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.forks import Owner, foreign
 from envhub_sandbox.transport.replies import expect
 from envhub_sandbox.transport.tcp import Far, Link
-from envhub_worker.protocol import compression
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimits
+from envhub_worker.protocol.messages import compression
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _NOW = int(zmq.NOBLOCK)

@@ -23,9 +23,9 @@ from envhub_sandbox.errors import (
     remote_error,
 )
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.busy import ERROR, Busy
 from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.confinement import Reason
+from envhub_worker.protocol.messages.busy import ERROR, Busy
 from envhub_worker.protocol.text import printable
 
 # --- what was asked for ------------------------------------------------------------------------

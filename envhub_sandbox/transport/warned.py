@@ -12,9 +12,9 @@ from collections import deque
 from collections.abc import Sequence
 
 from envhub_sandbox.errors import RemoteEnvWarning
-from envhub_worker.protocol import warned
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.codec.inert import one_line
+from envhub_worker.protocol.messages import warned
 from envhub_worker.protocol.text import printable
 from envhub_worker.protocol.untrusted import UNTRUSTED
 

@@ -16,7 +16,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError, RemoteEnvWarning, RemoteProtocolError
 from envhub_sandbox.transport.warned import MOST
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol import warned
+from envhub_worker.protocol.messages import warned
 from tests.attacks.lying_server import NUM_ENVS, Asked, Frames, LyingSandbox, lying, step_done
 from tests.attacks.test_terminal import ESCAPES, paints
 from tests.support.repositories import write_repository

@@ -30,12 +30,12 @@ from envhub_sandbox.transport.values.generators import generator
 from envhub_sandbox.transport.warned import MOST, Heard
 from envhub_sandbox.vector import from_manifest
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol import warned
 from envhub_worker.protocol.codec.codec import decode
 from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
-from envhub_worker.protocol.compression import pack_frames, unpack_frames
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.manifest.manifest import decode_env, decode_manifest
+from envhub_worker.protocol.messages import warned
+from envhub_worker.protocol.messages.compression import pack_frames, unpack_frames
 from envhub_worker.protocol.shared_memory import columns
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import OpaqueSpace, encode_space

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_worker.protocol import compression
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
 from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.messages import compression
 from tests.remote.listening import Listening
 from tests.remote.relay import relay
 

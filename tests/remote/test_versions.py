@@ -20,8 +20,8 @@ from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.tcp import Far
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol import warned
 from envhub_worker.protocol.codec.inert import RemoteObject
+from envhub_worker.protocol.messages import warned
 from tests.support.repositories import CARTPOLES, write_repository
 from tests.support.samples import SAMPLES
 

@@ -19,7 +19,7 @@ from envhub_sandbox.transport.deadline import StartupDeadline
 from envhub_worker.access import keys
 from envhub_worker.access.line import Line
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.busy import LONGEST_S, Busy
+from envhub_worker.protocol.messages.busy import LONGEST_S, Busy
 from tests.remote.listening import Listening, listening
 from tests.remote.test_clients import peer
 from tests.support.processes import eventually

@@ -39,11 +39,10 @@ from envhub_worker.access.telling.rate_limited_log import Log
 from envhub_worker.cli import listen
 from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol import warned
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.lifecycle import Lifecycle, State
 from envhub_worker.protocol.manifest.manifest import EnvManifest
-from envhub_worker.protocol.messages import packing
+from envhub_worker.protocol.messages import packing, warned
 from envhub_worker.spawn.spawner import Spawner
 
 Spot = tuple[Any, str]

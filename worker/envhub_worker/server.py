@@ -20,11 +20,11 @@ from envhub_worker.access.quotas import RefusedError
 from envhub_worker.access.sessions import Sessions
 from envhub_worker.lockdown.mechanisms.scratch import remove_tree
 from envhub_worker.loop import Loop
-from envhub_worker.protocol import compression
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimits
+from envhub_worker.protocol.messages import compression
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from envhub_worker.supervisor.jails import Jails
 from envhub_worker.supervisor.records import Asker

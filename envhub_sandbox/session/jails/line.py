@@ -10,7 +10,7 @@ from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerDiedError
 from envhub_sandbox.log import WORKER
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.tcp import UnreachableError
-from envhub_worker.protocol.busy import DRAINING
+from envhub_worker.protocol.messages.busy import DRAINING
 
 _SOON_S = 0.1
 _SLICE_S = 0.1

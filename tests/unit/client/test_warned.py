@@ -12,7 +12,7 @@ import pytest
 from envhub_sandbox.errors import RemoteEnvWarning
 from envhub_sandbox.transport.warned import MOST, Heard
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol import warned
+from envhub_worker.protocol.messages import warned
 
 REPLY = m.pack(m.Value(1))
 

@@ -34,7 +34,7 @@ CLIENTS_OWN = {
 }
 # used where they are installed, and only there
 OPTIONAL = {
-    "envhub_worker.protocol.compression": {"lz4"},
+    "envhub_worker.protocol.messages.compression": {"lz4"},
     "envhub_sandbox.integrations.sb3": {"stable_baselines3"},
     "envhub_sandbox.integrations.lerobot.config": {"draccus", "lerobot"},
     "envhub_sandbox.integrations.lerobot.features": {"lerobot"},

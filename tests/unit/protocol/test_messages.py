@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envhub_worker.protocol import compression
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import encode
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
+from envhub_worker.protocol.messages import compression
 from tests.support.compare import assert_same
 from tests.support.wire import deep
 

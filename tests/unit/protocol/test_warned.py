@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol import warned
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
+from envhub_worker.protocol.messages import warned
 
 REPLY = m.pack(m.Value(1))
 TOLD = ("UserWarning", "slow")

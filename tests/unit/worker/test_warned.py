@@ -11,7 +11,7 @@ import gymnasium as gym
 import pytest
 
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol import warned
+from envhub_worker.protocol.messages import warned
 from envhub_worker.runner.warned import Warned
 
 REPLY = m.pack(m.Value(1))

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from envhub_worker.access.line import RETRY_S
 from envhub_worker.access.quotas import BusyError
 from envhub_worker.access.telling.rate_limited_log import Log
-from envhub_worker.protocol.busy import DRAINING, Busy
+from envhub_worker.protocol.messages.busy import DRAINING, Busy
 
 _QUIET_S = 1.0
 """Between the end of the last jail and the server's own: its client hears why from this one."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass as mutable_dataclass
 from dataclasses import field
 
 from envhub_worker.access.line import RETRY_S
-from envhub_worker.protocol import busy as busy_words
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.busy import Busy
 from envhub_worker.protocol.confinement import GIB, MIB, PROFILES, Confinement
+from envhub_worker.protocol.messages import busy as busy_words
+from envhub_worker.protocol.messages.busy import Busy
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.supervisor.records import Asker
 

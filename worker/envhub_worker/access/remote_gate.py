@@ -33,9 +33,9 @@ from envhub_worker.access.telling.usage import Usage
 from envhub_worker.lockdown.spec import confinement_from_wire
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.busy import Busy
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.keys import KEY_BYTES, key_text
+from envhub_worker.protocol.messages.busy import Busy
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.supervisor.jails import Jails
 from envhub_worker.supervisor.records import Asker, JailEntry

@@ -20,9 +20,9 @@ import numpy as np
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import encode_env, encode_manifest
+from envhub_worker.protocol.messages.warned import FIRST_VERSION
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
-from envhub_worker.protocol.warned import FIRST_VERSION
 from envhub_worker.runner import loader, manifest
 from envhub_worker.runner.deferred import standing_in
 from envhub_worker.runner.described import described

@@ -10,10 +10,10 @@ import re
 import warnings
 from typing import Any
 
-from envhub_worker.protocol import warned
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.codec.inert import type_name
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
+from envhub_worker.protocol.messages import warned
 from envhub_worker.protocol.text import printable
 
 _MOST = 256

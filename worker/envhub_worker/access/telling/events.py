@@ -8,10 +8,10 @@ from time import monotonic
 
 from envhub_worker.access.sessions import WATCHER, Session
 from envhub_worker.access.telling.rate_limited_log import Log
-from envhub_worker.protocol import busy
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.busy import Busy
 from envhub_worker.protocol.keys import KEY_BYTES, key_text
+from envhub_worker.protocol.messages import busy
+from envhub_worker.protocol.messages.busy import Busy
 from envhub_worker.supervisor.records import Asker, JailEntry
 
 
