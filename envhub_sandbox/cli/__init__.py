@@ -1,4 +1,4 @@
-"""The command line ``envhub``: one file per command. Importing this imports nothing heavy."""
+"""The command line ``envhub``, a file or a folder for each command. This imports nothing heavy."""
 
 from __future__ import annotations
 

@@ -9,18 +9,18 @@ import typer
 from envhub_sandbox.cli import (
     cache,
     check,
-    doctor,
     gc,
     image,
-    init,
     inspect,
     lock,
     prefetch,
     push,
     replay,
-    run,
     version,
 )
+from envhub_sandbox.cli.doctor.doctor import doctor
+from envhub_sandbox.cli.init.init import init
+from envhub_sandbox.cli.run.run import run
 from envhub_sandbox.cli.shared.exits import EXIT_CODES
 
 app = typer.Typer(
@@ -56,16 +56,16 @@ def envhub(
     """What stands before a command."""
 
 
-app.command("run", epilog=EXIT_CODES)(run.run)
+app.command("run", epilog=EXIT_CODES)(run)
 app.command("inspect", epilog=EXIT_CODES)(inspect.inspect)
 app.command("check", epilog=EXIT_CODES)(check.check)
 app.command("prefetch", epilog=EXIT_CODES)(prefetch.prefetch)
 app.command("lock", epilog=EXIT_CODES)(lock.lock)
 app.command("verify", epilog=EXIT_CODES)(lock.verify)
-app.command("init")(init.init)
+app.command("init")(init)
 app.command("push", epilog=EXIT_CODES)(push.push)
 app.command("replay", epilog=EXIT_CODES)(replay.replay)
-app.command("doctor")(doctor.doctor)
+app.command("doctor")(doctor)
 app.add_typer(cache.app, name="cache")
 app.add_typer(image.app, name="image")
 app.command("gc")(gc.gc)

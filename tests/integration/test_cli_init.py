@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.cli.app import app
-from envhub_sandbox.cli.init import repository_name
+from envhub_sandbox.cli.init.init import repository_name
+from envhub_sandbox.cli.init.starter import starter
 from envhub_sandbox.cli.shared.exits import UsageError
-from envhub_sandbox.cli.shared.starter import starter
 
 ENVHUB = [sys.executable, "-I", "-m", "envhub_sandbox"]
 PLUGIN = "envhub_sandbox.pytest_plugin"

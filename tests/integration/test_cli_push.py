@@ -11,7 +11,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.cli.app import app
-from envhub_sandbox.cli.shared.starter import starter
+from envhub_sandbox.cli.init.starter import starter
 from tests.hub.stub_hub import StubHub
 
 TOKEN = "hf_of_the_author"

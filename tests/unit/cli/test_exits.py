@@ -14,8 +14,8 @@ import pytest
 import typer
 
 from envhub_sandbox import errors
-from envhub_sandbox.cli.rollout.episodes import Episode, Rollout, RolloutError
-from envhub_sandbox.cli.rollout.video import VideoError
+from envhub_sandbox.cli.run.episodes import Episode, Rollout, RolloutError
+from envhub_sandbox.cli.run.video import VideoError
 from envhub_sandbox.cli.shared.console import plain, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import (
     EXIT_CODES,

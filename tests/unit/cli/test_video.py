@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envhub_sandbox.cli.rollout.video import (
+from envhub_sandbox.cli.run.video import (
     MAX_SIDE,
     VideoError,
     VideoWriter,

@@ -44,7 +44,7 @@ OPTIONAL = {
     "envhub_sandbox.metrics": {"prometheus_client"},
     "envhub_worker.cli.metrics": {"prometheus_client"},
     "envhub_sandbox.transport.values.tensors": {"torch"},
-    "envhub_sandbox.cli.rollout.video": {"imageio_ffmpeg"},
+    "envhub_sandbox.cli.run.video": {"imageio_ffmpeg"},
     "envhub_sandbox.pytest_plugin": {"pytest"},
 }
 DESERIALISERS = {"_pickle", "copyreg", "dill", "joblib", "marshal", "pickle", "shelve"}

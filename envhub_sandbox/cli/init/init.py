@@ -9,10 +9,10 @@ from typing import Annotated
 
 import typer
 
+from envhub_sandbox.cli.init.starter import starter
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import console, safe_line, say
 from envhub_sandbox.cli.shared.exits import UsageError, reported
-from envhub_sandbox.cli.shared.starter import starter
 
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,94}[A-Za-z0-9])?", re.ASCII)
 

@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
-from envhub_sandbox.cli.rollout.zero_action import zero_action
+from envhub_sandbox.cli.run.zero_action import zero_action
 from envhub_sandbox.errors import EnvHubError
 from envhub_worker.protocol.manifest.manifest import AUTORESET_MODES
 

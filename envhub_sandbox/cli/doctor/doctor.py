@@ -111,9 +111,9 @@ def doctor(
 
         Policy(profile=profile)  # refuses a name that there is not, before anything is tried
         if server is not None:
-            from envhub_sandbox.cli import remote_doctor
+            from envhub_sandbox.cli.doctor import remote
 
-            raise typer.Exit(remote_doctor.examine(server, server_key, profile, json=json))
+            raise typer.Exit(remote.examine(server, server_key, profile, json=json))
         if server_key is not None:
             raise UsageError("--server-key is of a server: envhub doctor tcp://HOST:PORT")
         with Bar(quiet=json) as bar, tempfile.TemporaryDirectory(prefix="envhub-doctor-") as folder:

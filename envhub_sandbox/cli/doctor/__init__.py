@@ -1,0 +1,1 @@
+"""``envhub doctor``: this host, and a server on another."""

@@ -1,0 +1,1 @@
+"""``envhub init``: the command, and the files that it writes."""

@@ -1,1 +1,0 @@
-"""Episodes played and filmed, for ``envhub run``."""

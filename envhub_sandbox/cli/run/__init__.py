@@ -1,0 +1,1 @@
+"""``envhub run``: episodes, how they are played, filmed and counted."""
