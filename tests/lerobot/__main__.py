@@ -30,7 +30,7 @@ WANTED = {
         *("imageio[ffmpeg]", "diffusers", "pynput"),
     ),
 }
-TESTS = ("tests/lerobot/test_pages.py", "tests/lerobot/evaluation.py")
+TESTS = tuple(f"tests/lerobot/{name}.py" for name in ("test_pages", "evaluation", "training"))
 
 
 def make(version: str, folder: Path) -> Path:

@@ -29,9 +29,10 @@ def run(program: str, olah: OlahServer, home: Path, *arguments: str) -> Any:
     own, overlay = os.environ.get(OWN), os.environ.get(OVERLAY)
     if not own and not overlay:
         pytest.skip("needs LeRobot")
-    plugin = Path(__file__).parents[2] / "plugins" / "lerobot_env_envhub_sandbox"
+    checkout = Path(__file__).parents[2]
+    plugin = checkout / "plugins" / "lerobot_env_envhub_sandbox"
     ours = [Path(module.__file__).parents[1] for module in (envhub_sandbox, envhub_worker)]
-    paths = [plugin, *ours] if own else [Path(str(overlay)), plugin]
+    paths = [plugin, *ours, checkout] if own else [Path(str(overlay)), plugin]
     environment = {
         **{
             name: text

@@ -1,0 +1,32 @@
+"""LeRobot's training, evaluated in the sandbox, is the same: by ``python -m tests.lerobot``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.hub.olah_server import OlahServer
+from tests.lerobot.kit import run
+from tests.lerobot.repositories import REACH
+
+
+def test_a_training_is_the_same(olah: OlahServer, tmp_path: Path) -> None:
+    """To its end: what it evaluates to, the bytes of videos, and the weights of checkpoints."""
+    commit = olah.repository("robots/trained").commit({"env.py": REACH})
+    file = tmp_path / "env.py"
+    file.write_text(REACH)
+    found = run("training_program.py", olah, tmp_path, "robots/trained", str(file))
+    if not found["asks configs"]:
+        pytest.skip("this LeRobot asks no configuration for its environments")
+    here = found["here"]
+    assert found["executed by LeRobot"]  # the control: that code was in that process
+    assert len(here["evaluations"]) == 2
+    assert len(here["weights"]) == 2
+    assert len(here["videos"]) == 8
+    assert found["sandboxed"] == here
+    assert found["saved"].endswith(f"robots/trained@{commit}")  # the branch, pinned
+    # resumed from the last checkpoint, by what was saved
+    assert len(found["resumed"]["evaluations"]) == 1
+    assert len(found["resumed"]["weights"]) == 3
+    assert not found["executed here"]
