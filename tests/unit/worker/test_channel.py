@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from envhub_worker.channel import MAX_MESSAGE_BYTES, Channel
+from envhub_worker.spawn.channel import MAX_MESSAGE_BYTES, Channel
 
 
 @pytest.fixture

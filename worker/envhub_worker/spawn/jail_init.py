@@ -30,7 +30,6 @@ import traceback
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
-from envhub_worker.channel import Channel, close_fds
 from envhub_worker.lockdown.context import Common, JailContext
 from envhub_worker.lockdown.limits.monitor import Guard
 from envhub_worker.lockdown.mechanisms import process, reap
@@ -41,6 +40,7 @@ from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.lockdown.stages import jail
 from envhub_worker.protocol.confinement import Reason
 from envhub_worker.spawn import runner_entry
+from envhub_worker.spawn.channel import Channel, close_fds
 
 
 def run(control: int, output: int, common: Common) -> NoReturn:

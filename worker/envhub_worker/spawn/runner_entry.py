@@ -17,7 +17,6 @@ import traceback
 from collections.abc import Callable
 from typing import NoReturn
 
-from envhub_worker.channel import Channel
 from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.lockdown.mechanisms import process, reap
@@ -27,6 +26,7 @@ from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.lockdown.stages import runner
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.spawn import blas, packages
+from envhub_worker.spawn.channel import Channel
 
 _SELF_TEST = Layer("self-test", True, "the denials above were tried and held")
 
@@ -114,7 +114,7 @@ def confine(order: Order, init: Channel) -> None:
     descriptors = {0, 1, 2, order.status, *order.fds}
     process.close_all_but(descriptors)
     _forget_the_zygote(order.jail)
-    runner.enter(order.jail, descriptors, init)
+    runner.enter(order.jail, descriptors, lambda listener: init.send({"broker": True}, [listener]))
 
 
 def _forget_the_zygote(jail: JailContext) -> None:

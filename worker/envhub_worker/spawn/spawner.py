@@ -16,7 +16,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from envhub_worker.channel import Channel, close_fds
 from envhub_worker.lockdown.context import ZygoteConfig
 from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.lockdown.mechanisms import process, user
@@ -27,6 +26,7 @@ from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import OWN, Runtime
+from envhub_worker.spawn.channel import Channel, close_fds
 from envhub_worker.spawn.events import (
     Failed,
     JailEvent,

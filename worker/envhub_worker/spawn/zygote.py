@@ -37,12 +37,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import cast
 
-from envhub_worker.channel import Channel, close_fds
 from envhub_worker.lockdown.context import Common, ZygoteConfig
 from envhub_worker.lockdown.mechanisms import namespaces, process, reap
 from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.stages import zygote
 from envhub_worker.spawn import blas, jail_init, packages
+from envhub_worker.spawn.channel import Channel, close_fds
 
 # What nearly every runner imports anyway. pyzmq is left out on purpose: a jail holds no ZeroMQ
 # socket, and a context started here would not survive the fork.

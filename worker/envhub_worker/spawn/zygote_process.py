@@ -13,9 +13,9 @@ import sys
 from pathlib import Path
 
 from envhub_worker import bootstrap
-from envhub_worker.channel import Channel
 from envhub_worker.lockdown.mechanisms.environment import zygote_environment
 from envhub_worker.protocol.runtime import OWN, Runtime
+from envhub_worker.spawn.channel import Channel
 
 _END_S = 8.0
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable
 
-from envhub_worker.channel import close_fds
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import ProtocolError
+from envhub_worker.spawn.channel import close_fds
 
 FDS = 5
 """Descriptors of one deposit: three slabs, the doorbell that the runner hears, the one it rings."""

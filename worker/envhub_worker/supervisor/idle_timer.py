@@ -11,8 +11,8 @@ import os
 from collections.abc import Sequence
 from time import monotonic
 
-from envhub_worker.channel import close_fds
 from envhub_worker.protocol.shared_memory.words import SEQUENCE
+from envhub_worker.spawn.channel import close_fds
 
 _WORD = 8
 

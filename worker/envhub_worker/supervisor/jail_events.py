@@ -11,11 +11,11 @@ from collections import Counter
 from collections.abc import Callable
 from time import monotonic
 
-from envhub_worker.channel import close_fds
 from envhub_worker.lockdown.limits import around
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import ProtocolError
+from envhub_worker.spawn.channel import close_fds
 from envhub_worker.spawn.spawner import (
     Failed,
     JailExited,

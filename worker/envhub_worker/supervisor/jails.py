@@ -11,11 +11,11 @@ import secrets
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from envhub_worker.channel import close_fds
 from envhub_worker.lockdown.spec import JailSpec, confinement_from_wire
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.spawn.channel import close_fds
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from envhub_worker.supervisor.fd_store import Deposits
 from envhub_worker.supervisor.idle_timer import Idleness

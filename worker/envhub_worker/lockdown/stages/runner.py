@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
-from envhub_worker.channel import Channel
 from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.limits import rlimits
 from envhub_worker.lockdown.mechanisms import capabilities, landlock, process
@@ -42,13 +41,15 @@ _OWN_FILES = """
 """
 
 
-def enter(jail: JailContext, descriptors: Iterable[int], init: Channel) -> None:
+def enter(
+    jail: JailContext, descriptors: Iterable[int], give_to_init: Callable[[int], None]
+) -> None:
     """Confine this single-threaded process for good, and test that it holds.
 
     Args:
         jail: The jail that it belongs to.
         descriptors: Every descriptor that may be open.
-        init: Takes the broker's listener, if there is one.
+        give_to_init: Takes the broker's listener, if there is one, before the descriptor is closed.
 
     Raises:
         LayerUnavailableError: A layer cannot be had, or a denial does not hold.
@@ -65,7 +66,7 @@ def enter(jail: JailContext, descriptors: Iterable[int], init: Channel) -> None:
     program = jail.common.programs[jail.plan.measured]
     listener = filter.install(program, brokered=jail.common.brokered)
     if listener >= 0:
-        init.send({"broker": True}, [listener])
+        give_to_init(listener)
         os.close(listener)  # whoever holds it may permit anything
     selftest.run(jail, descriptors)
 
