@@ -9,11 +9,11 @@ ARG BASE_IMAGE=python:3.12-slim
 FROM ${BASE_IMAGE} AS build
 # An environment of its own, where nothing of the base image's is seen.
 RUN python3 -m venv /opt/envhub-worker
-# What the worker imports is a group there, which pip can read since 25.1.
+# What the worker imports, and its --metrics, are a group there, which pip can read since 25.1.
 COPY pyproject.toml /build/
 RUN cd /build \
     && /opt/envhub-worker/bin/python -m pip install --no-cache-dir --quiet 'pip>=25.1' \
-    && /opt/envhub-worker/bin/python -m pip install --no-cache-dir --only-binary :all: --group worker \
+    && /opt/envhub-worker/bin/python -m pip install --no-cache-dir --only-binary :all: --group image \
     && find /opt/envhub-worker -type d -name tests -prune -exec rm -r {} +
 COPY worker/envhub_worker /build/envhub_worker
 # Compiled here: nobody can write bytecode into a read-only container.

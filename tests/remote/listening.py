@@ -93,15 +93,15 @@ class Listening:
         return int(psutil.Process(self.process.pid).memory_info().rss)
 
     def sessions(self) -> list[dict[str, Any]]:
-        """What ``envhub-worker status`` says, without the asker itself."""
+        """What ``envhub-worker status`` says; the asker is not among them."""
         done = subprocess.run(
             [*WORKER, "status", "--state-dir", str(self.state), "--json"],
             capture_output=True,
             check=True,
             timeout=60,
         )
-        told = json.loads(done.stdout)["sessions"]
-        return [one for one in told if one["client"] != "operator"]
+        found: list[dict[str, Any]] = json.loads(done.stdout)["sessions"]
+        return found
 
     def jails(self) -> int:
         """How many are open, of whomever."""

@@ -70,6 +70,17 @@ def test_who_is_not_let_in_is_told_why(server: Listening) -> None:
     assert RUNNER.invoke(app, ["doctor", server.endpoint, "--profile", "lax"]).exit_code == 2
 
 
+def test_a_server_without_keys_can_be_asked(tmp_path: Path) -> None:
+    """When it is said that it has none; a key beside that is a contradiction."""
+    with listening(tmp_path / "server", "--insecure-loopback") as server:
+        words = ["doctor", server.endpoint, "--insecure-loopback", "--profile", "container"]
+        done = RUNNER.invoke(app, [*words, "--json"])
+        assert json.loads(done.stdout)["server"]["protocol"] == m.VERSION
+        assert "it asks for no key" in RUNNER.invoke(app, words).stdout
+        assert RUNNER.invoke(app, [*words, "--server-key", "x"]).exit_code == 2
+        assert RUNNER.invoke(app, ["doctor", "--insecure-loopback"]).exit_code == 2
+
+
 def test_a_server_that_drains_is_no_place_to_go(tmp_path: Path, repository: Path) -> None:
     """It still answers whoever asks."""
     with (

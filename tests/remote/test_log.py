@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +24,9 @@ from tests.support.processes import eventually
 from tests.support.samples import sample
 
 LIVE, EXIT = 0, 1
+# under nohup all that we start ignores the end of a terminal
+_IGNORED = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+_HANGS_UP = signal.SIGINT if _IGNORED else signal.SIGHUP
 _TEXT = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z (\w+) (\w+)( \w+=(\"[ -~]*?\"|\S+))*")
 
 
@@ -30,9 +35,17 @@ def logging_server(folder: Path, names: dict[str, KeyPair], *options: str) -> It
     """A server whose clients have names."""
     folder.mkdir(exist_ok=True)
     listed = folder / "clients"
-    listed.write_text("".join(f"{key_text(p.public)} {name}\n" for name, p in names.items()))
+    lines = [f"{key_text(pair.public)} {name}\n" for name, pair in names.items()]
+    listed.write_text("".join(lines), "utf-8")
     with listening(folder / "server", "--authorized-clients", str(listed), *options) as server:
         yield server
+
+
+def replace(path: Path, text: str) -> None:
+    """At once: nobody reads half of it."""
+    new = path.with_suffix(".new")
+    new.write_text(text, "utf-8")
+    os.replace(new, path)
 
 
 def events(server: Listening) -> list[dict[str, Any]]:
@@ -106,6 +119,40 @@ def test_no_secret_is_in_a_log(tmp_path: Path) -> None:
     assert any(" jail_opened client=alice " in line for line in lines)
     own = (server.state / "server.key").read_text().strip()
     assert not any(key in server.said() for key in (secret, own))
+
+
+def test_the_end_of_a_server_is_the_end_of_what_it_has(tmp_path: Path) -> None:
+    """Of its jails, its clients and its note; also when its terminal is closed."""
+    alice = keys.generate()
+    with logging_server(tmp_path, {"alice": alice}, "--log-format", "json") as server:
+        remote = server.sandbox(client_key=key_text(alice.secret))
+        with make_env(sample("mortal"), sandbox=remote) as suites:
+            suites.env.reset(seed=1)
+            server.process.send_signal(_HANGS_UP)
+            assert server.process.wait(60) == 0
+    assert server.noted() == ""
+    [opened], [closed] = of(server, "jail_opened"), of(server, "jail_closed")
+    assert closed["jail"] == opened["jail"]
+    [left] = of(server, "client_left")
+    assert (left["session"], left["why"]) == (opened["session"], "the server ends")
+    assert events(server)[-1]["event"] == "stopped"
+
+
+def test_a_broken_list_of_clients_is_told_once(tmp_path: Path) -> None:
+    """And that it is read again, with what its owner calls them."""
+    alice = keys.generate()
+    with logging_server(tmp_path, {"Zoë": alice}, "--log-format", "json") as server:
+        line = f"{key_text(alice.public)} Zoë\n"
+        replace(tmp_path / "clients", f"{line}no key\n")
+        assert eventually(lambda: of(server, "clients_kept_as_they_were"))
+        remote = server.sandbox(client_key=key_text(alice.secret))
+        with make_env(sample("mortal"), sandbox=remote) as suites:  # takes a while: seconds pass
+            suites.env.reset(seed=1)
+        replace(tmp_path / "clients", line)
+        assert eventually(lambda: of(server, "clients_read", clients=1))
+    [wrong] = of(server, "clients_kept_as_they_were")
+    assert "line 2" in wrong["why"]
+    assert {one["client"] for one in of(server, "client_connected")} == {"Zoë"}
 
 
 def test_less_can_be_asked_for(tmp_path: Path) -> None:

@@ -396,7 +396,7 @@ def test_what_clients_say_cannot_make_a_label() -> None:
     assert tally.requests[figures.OTHERS]["other"] == 1000 - figures.MAX_CLIENTS
     assert tally.refusals == {"other": 1000}
     clients = figures.Clients()
-    clients.add_past(tally, usage.Usage())
+    clients.add_past(tally, usage.Usage(lambda _: None))
     assert len(clients.told()) <= figures.MAX_CLIENTS + 1
     assert figures.client_name("a\n\x1b[2J" * 100, insecure=False).isprintable()
     assert len(figures.client_name("a" * 1000, insecure=False)) == 64
@@ -419,7 +419,7 @@ def test_usage_is_of_all_processes_of_a_jail() -> None:
     with subprocess.Popen([sys.executable, "-c", program], stdin=pipe, stdout=pipe) as jail:
         assert jail.stdout is not None
         jail.stdout.readline()
-        seen = usage.Usage()
+        seen = usage.Usage(lambda _: None)
         seen.close()  # no thread: it looks when it is told to
         seen.watch({jail.pid: "alice"})
         seen.look()

@@ -35,6 +35,7 @@ from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import key_text
 from envhub_worker.supervisor.records import Asker
+from envhub_worker.supervisor.witness import Nobody
 from tests.remote.listening import Listening, listening
 from tests.remote.relay import relay
 from tests.support import inside
@@ -151,8 +152,8 @@ def test_nobody_comes_in_while_nobody_can_be_asked(tmp_path: Path) -> None:
         gate, pair = _gate(tmp_path), keys.generate()
         with zmq.Context() as context:
             router, peer = context.socket(zmq.ROUTER), context.socket(zmq.DEALER)
-            gate.secure(router, Loop())
-            gate.close()
+            gate.secure(router, Loop(Nobody().failed))
+            gate.close(Sessions())
             if not enforced:
                 router.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 0)
             port = router.bind_to_random_port("tcp://127.0.0.1")
@@ -290,7 +291,7 @@ def test_a_door_that_cannot_be_shut_ends_nothing(monkeypatch: pytest.MonkeyPatch
     """Without a descriptor left the server goes on, says so, and tries again."""
     said = list[str]()
     with zmq.Context() as context, context.socket(zmq.ROUTER) as router:
-        doorman = Doorman(router, Loop(), Log(said.append), 1)
+        doorman = Doorman(router, Loop(Nobody().failed), Log(said.append), 1)
         router.bind("tcp://127.0.0.1:*")
         for broken in ("os.listdir", "os.dup"):
             with monkeypatch.context() as patch:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
-import traceback
 from collections.abc import Callable, Mapping
 from time import monotonic
 from typing import Any
@@ -20,9 +18,14 @@ _MAX_FAILURES = 100
 
 
 class Loop:
-    """Calls back when a descriptor or a ZeroMQ socket is ready, until ``stop``."""
+    """Calls back when a descriptor or a ZeroMQ socket is ready, until ``stop``.
 
-    def __init__(self) -> None:
+    Args:
+        failed: Is told what a callback raised. It must not raise.
+    """
+
+    def __init__(self, failed: Callable[[Exception], None]) -> None:
+        self._failed = failed
         self._poller = zmq.Poller()
         self._callbacks: dict[Any, Callable[[], None]] = {}
         self._stopped = False
@@ -81,11 +84,10 @@ class Loop:
         """One client's misfortune is not everybody's; what fails again and again is the end."""
         try:
             callback()
-        except Exception:
+        except Exception as error:
             self._failures += 1
             if self._failures >= _MAX_FAILURES:
                 raise
-            with contextlib.suppress(OSError, ValueError):  # nobody may read stderr any more
-                traceback.print_exc()
+            self._failed(error)
         else:
             self._failures = 0

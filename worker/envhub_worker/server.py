@@ -56,7 +56,7 @@ class Server:
         self._limits = limits
         self._gate: Gate = gate or LocalGate()
         self._sessions = Sessions()
-        self._loop = Loop()
+        self._loop = Loop(self._gate.witness.failed)
         # ROUTER's own routing ids come from rand(), which libzmq does not seed: who can tell the
         # next one can claim it, and that ends the process
         ctypes.CDLL(None).srand(int.from_bytes(os.urandom(4), "little"))
@@ -123,7 +123,7 @@ class Server:
         if self._gate.drained(self._jails):  # those who were refused last shall hear it
             self._router.setsockopt(zmq.LINGER, _LAST_WORDS_MS)
         self._jails.close()
-        self._gate.close()
+        self._gate.close(self._sessions)
         self._router.close()
         self._context.term()
         remove_tree(str(self._runtime_dir))  # its owner may not be there any more
@@ -156,6 +156,8 @@ class Server:
         except RefusedError as refused:
             self.refuse(asker, refused.error, refused.message, refused.layer, refused.fix)
         except Exception as error:
+            if not isinstance(error, ProtocolError):  # that is the client's mistake
+                self._gate.witness.failed(error)
             self.refuse(asker, "WorkerError", f"{type(error).__name__}: {error}")
 
     def _refuse_unread(self, identity: bytes, key: bytes, frame: Any, error: Exception) -> None:

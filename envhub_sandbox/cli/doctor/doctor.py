@@ -99,6 +99,12 @@ def doctor(
             help="That server's public key; else $ENVHUB_SERVER_KEY, or what known_hosts says.",
         ),
     ] = None,
+    insecure_loopback: Annotated[
+        bool,
+        typer.Option(
+            "--insecure-loopback", help="Without keys, of a server of this machine that has none."
+        ),
+    ] = False,
 ) -> None:
     """Try what this host can enforce, say what is missing and how to get it.
 
@@ -112,10 +118,19 @@ def doctor(
         Policy(profile=profile)  # refuses a name that there is not, before anything is tried
         if server is not None:
             from envhub_sandbox.cli.doctor import remote
+            from envhub_sandbox.sandboxes.remote import RemoteSandbox
 
-            raise typer.Exit(remote.examine(server, server_key, profile, json=json))
-        if server_key is not None:
-            raise UsageError("--server-key is of a server: envhub doctor tcp://HOST:PORT")
+            if insecure_loopback and server_key is not None:
+                raise UsageError("--server-key is of a server with keys: not --insecure-loopback")
+            place = RemoteSandbox(
+                server, server_key=server_key, insecure_loopback=insecure_loopback
+            )
+            raise typer.Exit(remote.examine(place, profile, json=json))
+        if server_key is not None or insecure_loopback:
+            raise UsageError(
+                "--server-key and --insecure-loopback are of a server: envhub doctor "
+                "tcp://HOST:PORT"
+            )
         with Bar(quiet=json) as bar, tempfile.TemporaryDirectory(prefix="envhub-doctor-") as folder:
             (Path(folder) / "env.py").write_text(_ENV_PY)
             findings = []

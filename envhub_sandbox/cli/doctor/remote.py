@@ -21,19 +21,19 @@ _USED = {
 """Quotas, and what is used of them, by their names in the figures."""
 
 
-def examine(endpoint: str, server_key: str | None, profile: str, *, json: bool) -> Exit:
+def examine(server: RemoteSandbox, profile: str, *, json: bool) -> Exit:
     """Ask a server and print what it says; the exit code is that of the profile.
 
     Raises:
         EnvHubError: It is not reached, or does not let us in.
     """
-    facts = ask(RemoteSandbox(endpoint, server_key=server_key))
+    facts = ask(server)
     code, problem = _verdict(facts, profile)
     if json:
-        told = {**asdict(facts), "endpoint": endpoint}
+        told = {**asdict(facts), "endpoint": server.endpoint}
         print_json({"server": told, "profile": profile, "problem": problem, "code": code})
     else:
-        _print(endpoint, facts, problem)
+        _print(server, facts, problem)
     return code
 
 
@@ -48,11 +48,12 @@ def _verdict(facts: ServerFacts, profile: str) -> tuple[Exit, str | None]:
     )
 
 
-def _print(endpoint: str, facts: ServerFacts, problem: str | None) -> None:
+def _print(server: RemoteSandbox, facts: ServerFacts, problem: str | None) -> None:
     out = console()
+    let_in = "asks for no key" if server.insecure_loopback else "knows our key"
     out.print(
-        f"{safe_line(endpoint)}: envhub-worker {facts.version}, protocol {facts.protocol}; it "
-        f"knows our key, and answered after {facts.answered_s:.2f} s"
+        f"{safe_line(server.endpoint)}: envhub-worker {facts.version}, protocol {facts.protocol}; "
+        f"it {let_in}, and answered after {facts.answered_s:.2f} s"
     )
     if not facts.told:
         out.print("It is older than this client, and does not say what it can enforce.")

@@ -41,6 +41,17 @@ def test_the_workers_group_is_what_the_worker_imports(project: dict[str, Any]) -
     assert {_IMPORTED_AS.get(name, name) for name in names} == WORKERS_OWN - {"envhub_worker"}
 
 
+def test_the_image_can_be_watched(project: dict[str, Any]) -> None:
+    """It installs what the worker imports, and what its figures need, word for word."""
+    installed = re.findall(r"--group (\S+)", (CHECKOUT / "Dockerfile").read_text())
+    group = project["dependency-groups"]["image"]
+    assert installed == ["image"]
+    assert {"include-group": "worker"} in group
+    assert set(project["project"]["optional-dependencies"]["metrics"]) <= {
+        one for one in group if isinstance(one, str)
+    }
+
+
 def test_the_image_carries_the_projects_version(project: dict[str, Any]) -> None:
     """The label says which worker it is."""
     text = (CHECKOUT / "Dockerfile").read_text()

@@ -41,7 +41,7 @@ class Departures:
                 why = f"nothing was heard of its client for {self._idle_s} s"
                 self.end(session, sessions, jails, why)
             elif not jails.open_ones(session.owner):
-                self._drop(session, sessions, "nothing was heard of it for long")
+                self.drop(session, sessions, "nothing was heard of it for long")
         if self._idle_s:
             self._end_unheld(sessions, jails)
 
@@ -54,7 +54,7 @@ class Departures:
         self.disconnect(sessions)
         for session in sessions.all():
             if not session.connections and not jails.open_ones(session.owner):
-                self._drop(session, sessions, "its connections have ended")
+                self.drop(session, sessions, "its connections have ended")
 
     def disconnect(self, sessions: Sessions) -> None:
         """Forget the connections that have gone."""
@@ -72,9 +72,10 @@ class Departures:
         """End a session and its jails."""
         for entry in jails.open_ones(session.owner):
             jails.end(entry, why)
-        self._drop(session, sessions, why)
+        self.drop(session, sessions, why)
 
-    def _drop(self, session: Session, sessions: Sessions, why: str) -> None:
+    def drop(self, session: Session, sessions: Sessions, why: str) -> None:
+        """Forget a session."""
         self._uploads.forget(session.owner)
         sessions.drop(session)
         self._events.left(session, why)

@@ -104,8 +104,8 @@ class Gate(Protocol):
     def drained(self, jails: Jails) -> bool:
         """Whether that has been said, and nothing runs any more."""
 
-    def close(self) -> None:
-        """Close what ``secure`` opened."""
+    def close(self, sessions: Sessions) -> None:
+        """Everybody has to go; close what ``secure`` opened."""
 
 
 class LocalGate:
@@ -150,5 +150,5 @@ class LocalGate:
         """Never."""
         return False
 
-    def close(self) -> None:
+    def close(self, sessions: Sessions) -> None:
         """There is nothing to close."""

@@ -69,7 +69,8 @@ def _write(path: Path, text: str, mode: int) -> None:
 
 
 def _read(path: Path) -> str:
-    with path.open(encoding="ascii", errors="replace") as file:
+    # names have umlauts, and some editors begin with a mark
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
         return file.read(_MAX_FILE_BYTES)
 
 
@@ -89,30 +90,51 @@ class AuthorizedClients:
         self._path = path
         self._most = most
         self._known = known
-        self._stamp: tuple[int, int] | None = None
+        self._stamp: tuple[int, ...] | None = None
+        self._wrong = ""
         self._names = dict(known)
         self.refresh()
 
-    def refresh(self) -> None:
-        """Read the file if it has changed.
+    def refresh(self) -> bool:
+        """Read the file if it has changed; whether it was read.
 
         Raises:
             OSError: It cannot be read.
-            ValueError: A line of it is none, or there are too many; the text says which.
+            ValueError: A line of it is none, or there are too many; the text says which, and is
+                the same until it changes again.
         """
         if self._path is None:
-            return
+            return False
         found = self._path.stat()
-        if (found.st_mtime_ns, found.st_size) != self._stamp:
-            names = {**_parse(_read(self._path), self._path), **self._known}
-            if self._most is not None and len(names) > self._most:
-                raise ValueError(
-                    f"{self._path}: {len(names)} clients, and without Landlock a jail of the "
-                    "profile 'container' could read the files of all of them: leave one on the "
-                    "list (one server for each), or use --weakest-profile no-userns or strict"
-                )
-            self._names = names
-            self._stamp = (found.st_mtime_ns, found.st_size)
+        stamp = found.st_ino, found.st_mtime_ns, found.st_size
+        if stamp == self._stamp:
+            if self._wrong:
+                raise ValueError(self._wrong)
+            return False
+        text = _read(self._path)
+        self._stamp = stamp  # from here on it has been read: not every second anew, if it is wrong
+        try:
+            self._names = self._checked(text, self._path)
+        except ValueError as error:
+            self._wrong = str(error)
+            raise
+        self._wrong = ""
+        return True
+
+    def _checked(self, text: str, path: Path) -> dict[bytes, str]:
+        names = {**_parse(text, path), **self._known}
+        if self._most is not None and len(names) > self._most:
+            raise ValueError(
+                f"{path}: {len(names)} clients, and without Landlock a jail of the "
+                "profile 'container' could read the files of all of them: leave one on the "
+                "list (one server for each), or use --weakest-profile no-userns or strict"
+            )
+        return names
+
+    @property
+    def count(self) -> int:
+        """How many keys may come in."""
+        return len(self._names)
 
     def name_of(self, key: bytes) -> str | None:
         """What the owner of a key is called, or None if it may not come in."""

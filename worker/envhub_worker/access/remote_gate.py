@@ -87,13 +87,14 @@ class RemoteGate:
         self._rules = rules
         self._uploads = uploads
         self._log = log
-        self._events = Events(log, self._name_of)
+        self._events = Events(log, self._name_of, self._count_opened)
         self.witness: Witness = self._events
         self._in_flight = InFlight()
         self._lines = {"sessions": Line(), "jails": Line()}
         self._drain = Drain(rules.drain_s)
         self._publish = publish
-        self._tally, self._usage = Tally(), Usage()
+        self._unread = ""
+        self._tally, self._usage = Tally(), Usage(self._events.failed)
         self._facts = Facts(
             profile=rules.profile,
             permissions=rules.permissions,
@@ -232,7 +233,6 @@ class RemoteGate:
             raise RefusedError("PolicyError", f"the entry file {wrong}")
         self._find_place(asked, Use(confinement.limits.memory_bytes, request.runners))
         tree = self._uploads.tree(asked.asker.key, request.snapshot)
-        self._tally.open(self._label_of(asked.asker.key))
         return m.OpenJail(
             request.name[:512], "", tree, request.entry, request.confinement, request.runners
         )
@@ -281,6 +281,9 @@ class RemoteGate:
         self._tally.refused(error, layer)
         self._events.refused(asker, error, message, layer, fix)
 
+    def _count_opened(self, key: bytes) -> None:
+        self._tally.open(self._label_of(key))
+
     def _label_of(self, key: bytes) -> str:
         return client_name(self._rules.authorized.name_of(key), self._rules.keys is None)
 
@@ -300,10 +303,11 @@ class RemoteGate:
         told = {**self._facts.for_clients(), "draining_s": self._drain.left_s}
         if key is not None and key not in self._rules.operators:
             return {**told, "clients": clients.told(self._label_of(key))}
+        looking = sum(len(one.connections) for one in sessions.all() if one.name == WATCHER)
         return {
             **told,
             **self._facts.for_operators(),
-            "connections": len(self._port.open_wires() or ()),
+            "connections": max(0, len(self._port.open_wires() or ()) - looking),
             "waiting": {quota: line.waiting for quota, line in self._lines.items()},
             "refusals": dict(self._tally.refusals),
             "deaths": dict(jails.deaths),
@@ -313,7 +317,8 @@ class RemoteGate:
     def _sessions_of(self, key: bytes, sessions: Sessions, jails: Jails) -> list[dict[str, Any]]:
         rules = self._rules
         self._departures.end_deserted(sessions, jails)
-        seen = sessions.all() if key in rules.operators else sessions.of_key(key)
+        found = sessions.all() if key in rules.operators else sessions.of_key(key)
+        seen = [one for one in found if one.name != WATCHER]  # whoever asks, above all
         used = {key: self._uploads.used_bytes(key) for key in {one.key for one in seen}}
         return [
             {
@@ -335,10 +340,7 @@ class RemoteGate:
         """End the jails of clients that are not heard from, and what clients no longer hold."""
         self._log.tick()
         self._port.tick()
-        try:
-            self._rules.authorized.refresh()
-        except (OSError, ValueError) as error:
-            self._log.say("clients_kept_as_they_were", why=str(error))
+        self._read_clients()
         for session in sessions.all():
             if not self._is_known(session.key):
                 self._departures.end(session, sessions, jails, "its key is not authorised any more")
@@ -356,6 +358,18 @@ class RemoteGate:
             for entry in jails.open_ones():
                 jails.end(entry, f"the server ends, {self._rules.drain_s} s after it was told to")
 
+    def _read_clients(self) -> None:
+        """Once a second; what is wrong with the list is said once, until it is another."""
+        try:
+            changed, why = self._rules.authorized.refresh(), ""
+        except (OSError, ValueError) as error:
+            changed, why = False, str(error)
+        if why and why != self._unread:
+            self._log.say("clients_kept_as_they_were", why=why)
+        elif changed:
+            self._log.say("clients_read", "info", clients=self._rules.authorized.count)
+        self._unread = why
+
     def drain(self) -> bool:
         """Refuse new sessions and jails; those that run have ``drain_s``."""
         return self._drain.begin(self._log)
@@ -364,8 +378,10 @@ class RemoteGate:
         """Whether it may end: no jail is left, and everybody had a moment to hear so."""
         return self._drain.begun and self._drain.quiet(bool(jails.open_ones()))
 
-    def close(self) -> None:
-        """Close the sockets of the handshakes."""
+    def close(self, sessions: Sessions) -> None:
+        """Everybody has to go; close the sockets of the handshakes."""
+        for session in sessions.all():
+            self._departures.drop(session, sessions, "the server ends")
         self._usage.close()
         self._port.close()
 

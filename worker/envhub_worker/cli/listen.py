@@ -34,6 +34,7 @@ from envhub_worker.access.remote_gate import RemoteGate, Rules
 from envhub_worker.access.store.uploads import Uploads
 from envhub_worker.access.telling.log_lines import FORMS, LEVELS
 from envhub_worker.access.telling.rate_limited_log import Log
+from envhub_worker.cli.note import Note, Noted
 from envhub_worker.lockdown import probe, surroundings
 from envhub_worker.lockdown.mechanisms import landlock, locked_folder
 from envhub_worker.lockdown.mechanisms.locked_folder import LockedFolder
@@ -200,27 +201,35 @@ def _serve(
         gate = _gate(arguments, state, identity, log, publish)
         store = state / "store"
         server = Server(arguments.bind, runtime.path, [str(store)], gate=gate)
+        key_file = (arguments.key or state / "server.key").absolute()
+        note = Note(state, Noted(server.endpoint, identity.public, str(key_file)))
     except zmq.ZMQError as error:
         runtime.remove()
         raise UsageError(f"--bind {arguments.bind}: {error.strerror}") from None
     except BaseException:
         runtime.remove()
         raise
-    server.stop_on(signal.SIGINT, gently=(signal.SIGTERM,))
-    note = state / "endpoint"
-    key_file = (arguments.key or state / "server.key").absolute()
+    server.stop_on(*_ends(), gently=(signal.SIGTERM,))
     began = time.monotonic()
     try:
-        note.write_text(f"{server.endpoint} {identity.public} {key_file}\n")
         if arguments.log_format == "text" or identity.authorized is None:  # a client needs it
             print(announcement(server.endpoint, identity), flush=True)
         _log_start(log, server.endpoint, identity, arguments.weakest_profile)
         server.run()
+    except Exception as error:  # not what it was told to do: see ``run`` for what is
+        gate.witness.failed(error)
+        return 1
     finally:
         log.say("stopped", "info", seconds=time.monotonic() - began)
-        note.unlink(missing_ok=True)
+        note.remove()
         runtime.remove()
     return 0
+
+
+def _ends() -> list[signal.Signals]:
+    """What ends the server at once; under ``nohup`` the end of a terminal does not."""
+    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return [signal.SIGINT] if ignored else [signal.SIGINT, signal.SIGHUP]
 
 
 def _log_start(log: Log, endpoint: str, identity: Identity, weakest: str) -> None:

@@ -14,6 +14,7 @@ import zmq
 
 from envhub_worker.access import keys
 from envhub_worker.access.sessions import WATCHER
+from envhub_worker.cli import note
 from envhub_worker.cli.listen import reachable, state_dir
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import MIB
@@ -77,15 +78,12 @@ def address_here(chosen: Path | None) -> tuple[str, bytes | None, keys.KeyPair]:
 def _noted(chosen: Path | None) -> tuple[str, bytes | None, keys.KeyPair] | None:
     """What a server of this user wrote down when it started; None if there is none."""
     state = state_dir(chosen, create=False)
-    try:
-        if state is None:
-            return None
-        endpoint, public, key_file = (state / "endpoint").read_text().rstrip("\n").split(" ", 2)
-    except FileNotFoundError:
+    noted = None if state is None else note.read(state)
+    if noted is None:
         return None
-    if public == "insecure":
-        return endpoint, None, keys.generate()
-    return reachable(endpoint), parse_key(public), keys.load(Path(key_file))
+    if noted.public == "insecure":
+        return noted.endpoint, None, keys.generate()
+    return reachable(noted.endpoint), parse_key(noted.public), keys.load(Path(noted.key_file))
 
 
 def is_healthy(chosen: Path | None) -> bool | None:

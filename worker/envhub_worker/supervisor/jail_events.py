@@ -182,6 +182,12 @@ class JailEvents:
             return m.replace(death, reason="out-of-memory", detail=around.WHY)
         return death
 
+    def ended_with_the_server(self) -> None:
+        """Nothing is left of any jail."""
+        for entry in self._jails.values():
+            if entry.death is None and not entry.released:
+                self._witness.closed(entry)
+
     def close(self) -> None:
         """Nothing happens any more."""
         self._around.close()

@@ -83,6 +83,7 @@ class Jails:
         for entry in self._jails.values():
             self._events.kill(entry)
         self._zygotes.close()
+        self._events.ended_with_the_server()
         self._deposits.close()
         self._events.close()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import traceback
 from typing import Protocol
 
@@ -22,7 +23,7 @@ class Witness(Protocol):
         """A jail is dead: ``entry.death`` says how."""
 
     def closed(self, entry: JailEntry) -> None:
-        """Nothing is left of a jail that its client has closed."""
+        """Nothing is left of a jail that its client has closed, or that the server ends with."""
 
     def failed(self, error: Exception) -> None:
         """The server itself has met an error, of which it does not die."""
@@ -45,4 +46,5 @@ class Nobody:
 
     def failed(self, error: Exception) -> None:
         """On stderr, which its client keeps."""
-        traceback.print_exception(error)
+        with contextlib.suppress(OSError, ValueError):  # nobody may read it any more
+            traceback.print_exception(error)

@@ -21,11 +21,18 @@ class Events:
     Args:
         log: Takes them.
         name_of: The name that stands beside a key in the list of clients.
+        count_opened: Called with the key whose jail has come up.
     """
 
-    def __init__(self, log: Log, name_of: Callable[[bytes], str | None]) -> None:
+    def __init__(
+        self,
+        log: Log,
+        name_of: Callable[[bytes], str | None],
+        count_opened: Callable[[bytes], None],
+    ) -> None:
         self._log = log
         self._name_of = name_of
+        self._count_opened = count_opened
         self._in_line: set[tuple[bytes, str]] = set()
 
     # --- clients -------------------------------------------------------------------------------
@@ -71,6 +78,7 @@ class Events:
         if entry.opened:
             self._client(entry.session, "runners_started", "info", **told)
             return
+        self._count_opened(entry.session[:KEY_BYTES])
         told |= {
             "environment": entry.name,
             "snapshot": spec.snapshot.rpartition("/")[2],
@@ -92,7 +100,7 @@ class Events:
             self._client(entry.session, "jail_died", "warning", **told)
 
     def closed(self, entry: JailEntry) -> None:
-        """Nothing is left of a jail that its client has closed."""
+        """Nothing is left of a jail that its client has closed, or that the server ends with."""
         told = {**_jail(entry), "environment": entry.name, **_use(entry)}
         self._client(entry.session, "jail_closed", "info", **told)
 

@@ -58,7 +58,7 @@ class Tally:
         self.requests.setdefault(self._known(client), Counter())[word] += 1
 
     def open(self, client: str) -> None:
-        """A client opens a jail."""
+        """A client's jail has come up."""
         self.opened[self._known(client)] += 1
 
     def _known(self, client: str) -> str:

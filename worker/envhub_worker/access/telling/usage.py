@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import threading
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,12 +41,16 @@ class Process:
 class Usage:
     """Memory, and processor time so far, of each client's jails.
 
+    Args:
+        failed: Is told what a look has raised.
+
     Attributes:
         memory_bytes: By client, at the last look; replaced, never changed.
         cpu_s: By client, since the start; likewise.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, failed: Callable[[Exception], None]) -> None:
+        self._failed = failed
         self.memory_bytes: Mapping[str, int] = {}
         self.cpu_s: Mapping[str, float] = {}
         self._jails: Mapping[int, str] = {}
@@ -62,7 +66,10 @@ class Usage:
 
     def _watch(self) -> None:
         while not self._stop.wait(EVERY_S):
-            self.look()
+            try:
+                self.look()
+            except Exception as error:
+                self._failed(error)
 
     def look(self) -> None:
         """Look once."""
