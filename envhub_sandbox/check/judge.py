@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from envhub_sandbox.api import make_env
-from envhub_sandbox.check import parsing, source, traces
+from envhub_sandbox.check import leaks, parsing, settings, source, traces
 from envhub_sandbox.check.findings import Report
+from envhub_sandbox.check.settings import Asks
 from envhub_sandbox.check.table import CHECKS
 from envhub_sandbox.check.traces import Trace
 from envhub_sandbox.dependencies.choice import chosen
@@ -30,6 +31,7 @@ from envhub_sandbox.errors import (
     RemoteProtocolError,
     RequirementError,
     ResolutionError,
+    SnapshotError,
     WorkerDiedError,
     WorkerTimeoutError,
 )
@@ -52,6 +54,7 @@ class Asked:
         reference: The repository.
         arguments: Of ``make_env``, beyond the reference.
         seed, steps: Of each play.
+        resets: In a row, four times: what they leave behind is counted. 0 asks nothing.
         tasks: Chooses ``(suite, task)`` pairs of the environments.
         tell: Is told what is done next.
     """
@@ -60,6 +63,7 @@ class Asked:
     arguments: Mapping[str, Any]
     seed: int = 0
     steps: int = 200
+    resets: int = 8
     tasks: Callable[[EnvSuites], list[tuple[str, Any]]] = field(
         default=lambda suites: [(suite, task) for suite in suites for task in suites[suite]]
     )
@@ -85,6 +89,7 @@ class _Judge:
     def __init__(self, asked: Asked, snapshot: Snapshot, report: Report) -> None:
         self._asked, self._snapshot, self._report = asked, snapshot, report
         self._files = parsing.read(snapshot)
+        self._asks = settings.of_the_author(snapshot, asked.steps, asked.resets)
 
     def ask(self) -> None:
         self._read()
@@ -103,6 +108,7 @@ class _Judge:
         found = source.look(self._snapshot, self._files)
         for finding in found:
             self._report.add(finding)
+        self._report.judged("settings", self._asks.refused)
         read = [check for check in CHECKS if check.startswith(("licence", "card", "source-"))]
         for check in set(read) - {one.id for one in found}:
             self._report.judged(check, [])
@@ -135,13 +141,19 @@ class _Judge:
     def _is_here(self) -> bool:
         return bool(self._asked.arguments.get("sandbox", "process") == "process")
 
-    def _make(self, **changes: Any) -> EnvSuites:
-        return make_env(**{**self._asked.arguments, "cfg": self._report.reference, **changes})
+    def make(self, **changes: Any) -> EnvSuites:
+        """Its environments; of the very files that were read, or it cannot be judged."""
+        given = {**self._asked.arguments, "cfg": self._report.reference, **changes}
+        suites = make_env(**given)
+        if suites.provenance["commit"] != self._snapshot.commit:  # a folder of this machine
+            suites.close()
+            raise SnapshotError(f"{self._asked.reference} changed while it was judged; judge again")
+        return suites
 
     def _load(self) -> None:
         self._asked.tell("loading it")
         try:
-            suites = self._make(num_workers=1, validate=True)
+            suites = self.make(num_workers=1, validate=True)
         except LoadError as error:
             self._report.judged("loads", [str(error)])
             raise _StoppedError from error
@@ -160,7 +172,7 @@ class _Judge:
             for suite, task in self._asked.tasks(suites):
                 self._asked.tell(f"{suite} / {task}")
                 with self._stopping(f"{suite} / {task}"):
-                    _Task(self, suites, suite, task).ask()
+                    _Task(self, self._asks, suites, suite, task).ask()
                 suites[suite][task].close()
             self._report.provenance = suites.provenance
 
@@ -187,9 +199,9 @@ class _Judge:
 class _Task:
     """The questions to one environment."""
 
-    def __init__(self, judge: _Judge, suites: EnvSuites, suite: str, task: Any) -> None:
+    def __init__(self, judge: _Judge, asks: Asks, suites: EnvSuites, suite: str, task: Any) -> None:
         self._judge, self._report = judge, judge._report
-        self._asked = judge._asked
+        self._asked, self._asks = judge._asked, asks
         self._env = suites[suite][task]
         self._suite, self._task = suite, task
         self._name = f"{suite} / {task}"
@@ -198,30 +210,42 @@ class _Task:
         mode = getattr(self._env.metadata.get("autoreset_mode"), "value", None)
         stated = mode in _MODES
         self._say("autoreset-stated", [] if stated else ["the metadata does not say"])
-        first = traces.play(self._env, mode, seed=self._asked.seed, steps=self._asked.steps)
+        first = traces.play(self._env, mode, seed=self._asked.seed, steps=self._asks.steps)
         self._say("rewards", first.bad_rewards)
         if stated:
             self._say("autoreset", first.autoreset)
         self._say("render", list(self._frames()))
         self._say("observation-dtype", list(self._uncast()))
         self._compare(first, mode)
+        self._leaks()
+
+    def _leaks(self) -> None:
+        usage = getattr(self._env, "jail_usage", None)
+        if usage is None or not self._asks.resets:
+            return
+        seen = leaks.watch(lambda: self._env.reset(seed=self._asked.seed), usage, self._asks.resets)
+        if not seen:
+            return  # a server on another host that does not count
+        self._report.figures[self._name] |= {name: float(n) for name, n in seen[-1].items()}
+        found = dict(leaks.grown(seen, self._asks.resets))
+        for check in leaks.checks():
+            self._say(check, [found[check]] if check in found else [])
 
     def _say(self, check: str, found: list[str]) -> None:
         self._report.judged(check, found, self._name)
 
     def _again(self, mode: str | None, **changes: Any) -> Trace:
         """The same play in fresh processes."""
-        with self._judge._make(**changes) as suites:
+        with self._judge.make(**changes) as suites:
             env = suites[self._suite][self._task]
-            return traces.play(env, mode, seed=self._asked.seed, steps=self._asked.steps)
+            return traces.play(env, mode, seed=self._asked.seed, steps=self._asks.steps)
 
     def _compare(self, first: Trace, mode: str | None) -> None:
         second = self._again(mode, num_workers=1)
         self._report.figures[self._name] = {
             "steps": len(second.steps) - 1,
             "episodes": second.episodes,
-            "step_mean_s": second.mean_s,
-            "step_slowest_s": second.slowest_s,
+            **second.times,
         }
         at = first.differs_from(second)
         self._say("seeding", [] if at is None else [_first_difference(at, "in two processes")])

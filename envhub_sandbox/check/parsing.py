@@ -66,15 +66,18 @@ def read(snapshot: Snapshot) -> dict[str, Parsed | None]:
     found: dict[str, Parsed | None] = dict.fromkeys(names)
     left, texts = MOST_BYTES_IN_ALL, {}
     for name in names:
-        data = _bytes(snapshot.root / name)
+        data = content(snapshot.root / name, MOST_BYTES)
         if data is not None and len(data) <= left:
             left -= len(data)
             texts[name] = data
     return {**found, **parsed(texts)}
 
 
-def _bytes(path: Path) -> bytes | None:
-    """A regular file's content; looked at and read by one and the same descriptor."""
+def content(path: Path, most: int) -> bytes | None:
+    """A regular file's bytes; None if they are more, or it is none.
+
+    It is opened once: what was looked at is what is read, and a link is not followed.
+    """
     try:
         fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError:
@@ -83,10 +86,10 @@ def _bytes(path: Path) -> bytes | None:
         try:
             if not stat.S_ISREG(os.fstat(fd).st_mode):
                 return None
-            data = file.read(MOST_BYTES + 1)
+            data = file.read(most + 1)
         except OSError:
             return None
-    return data if len(data) <= MOST_BYTES else None
+    return data if len(data) <= most else None
 
 
 def parsed(texts: Mapping[str, bytes]) -> dict[str, Parsed | None]:

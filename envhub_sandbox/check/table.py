@@ -125,10 +125,34 @@ CHECKS: dict[str, Check] = {
             "Return such an array from render(), or declare no rgb_array.",
         ),
         Check(
+            "leaks-processes",
+            _W,
+            "Resets leave no processes behind.",
+            "End what an episode started before the next one begins, and wait for it.",
+        ),
+        Check(
+            "leaks-threads",
+            _W,
+            "Resets leave no threads behind.",
+            "Join what an episode started, or start it once.",
+        ),
+        Check(
+            "leaks-memory",
+            _W,
+            "Resets leave no memory behind.",
+            "Keep nothing of past episodes: no lists that grow, no caches without an end.",
+        ),
+        Check(
             "pinned",
             _N,
             "The reference names a commit, so that what was judged is what will run.",
             "Write org/repo@COMMIT; the report says which one was judged.",
+        ),
+        Check(
+            "settings",
+            _N,
+            "Its envhub.toml asks for nothing that is not an author's to say.",
+            "Let [check] hold steps and resets alone: how much the judge shall play at least.",
         ),
         Check(
             "licence",

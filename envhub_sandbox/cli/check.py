@@ -8,6 +8,7 @@ import secrets
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 _PANEL = "What it says"
 _FILE = "FILE"
+_MAY = "What it may do"
 _STYLES = {"error": "red", "warning": "yellow", "note": "dim"}
 
 
@@ -33,6 +35,12 @@ def check(
     steps: Annotated[
         int, typer.Option(min=1, help="Vector steps of each play; there are up to three.")
     ] = 200,
+    resets: Annotated[
+        int,
+        typer.Option(
+            min=0, help="In a row, four times: what they leave behind is counted. 0 asks nothing."
+        ),
+    ] = 8,
     seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="Of each play.")] = 0,
     fail_on: Annotated[
         str,
@@ -68,6 +76,14 @@ def check(
     dependencies: opt.Dependencies = "auto",
     sandbox: opt.SandboxName = "process",
     server_key: opt.ServerKey = None,
+    policy: Annotated[
+        Path | None,
+        typer.Option(
+            metavar=_FILE,
+            help="TOML with fields of Policy, and [limits]; options say otherwise.",
+            rich_help_panel=_MAY,
+        ),
+    ] = None,
     profile: opt.Profile = None,
     memory: opt.Memory = None,
     disk: opt.Disk = None,
@@ -114,7 +130,8 @@ def check(
             hub_cache_dir=hub_cache_dir,
         )
         least, allowed = _level(fail_on), _known(allow or ())
-        report = _judge(make, seed, steps, suite, task, quiet=json or github)
+        play = _Play(seed, steps, resets, suite, task)
+        report = _judge(make, policy, play, quiet=json or github)
         failures = report.failures(least, allowed)
         _write(report, failures, junit=junit, sarif=sarif)
         if github:
@@ -173,26 +190,39 @@ def _known(names: Sequence[str]) -> Sequence[str]:
     return names
 
 
-def _judge(
-    make: opt.MakeOptions,
-    seed: int,
-    steps: int,
-    suites: list[str] | None,
-    tasks: list[str] | None,
-    *,
-    quiet: bool,
-) -> Report:
+@dataclass(frozen=True)
+class _Play:
+    """How much is played, and of which tasks."""
+
+    seed: int
+    steps: int
+    resets: int
+    suites: list[str] | None
+    tasks: list[str] | None
+
+
+def _judge(make: opt.MakeOptions, policy: Path | None, play: _Play, *, quiet: bool) -> Report:
     arguments = make.arguments()
     del arguments["cfg"], arguments["validate"], arguments["num_workers"]
+    from envhub_sandbox.check import settings
     from envhub_sandbox.check.judge import Asked, judge
 
+    if policy is not None:
+        arguments["policy"] = settings.merged(settings.policy(policy), arguments["policy"])
+
     def chosen(envs: Any) -> list[tuple[str, Any]]:
-        return [(suite, task) for suite, task, _ in select(envs, suites, tasks)]
+        return [(suite, task) for suite, task, _ in select(envs, play.suites, play.tasks)]
 
     with Bar(quiet=quiet) as bar:
         tell: Callable[[str], None] = bar.begin
         asked = Asked(
-            reference=make.ref, arguments=arguments, seed=seed, steps=steps, tasks=chosen, tell=tell
+            reference=make.ref,
+            arguments=arguments,
+            seed=play.seed,
+            steps=play.steps,
+            resets=play.resets,
+            tasks=chosen,
+            tell=tell,
         )
         return judge(asked)
 

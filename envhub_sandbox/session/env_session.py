@@ -93,6 +93,13 @@ class EnvSession:
         """The layers of the jail that it lives in; none where it does not live in any."""
         return self.lease.report()
 
+    def usage(self) -> dict[str, int]:
+        """What its jail holds, as its server counts it; empty where nobody says."""
+        told = self.lease.status()
+        named = ("processes", "threads", "memory_bytes")
+        found = {name: told[name] for name in named if type(told.get(name)) is int}
+        return found if len(found) == len(named) else {}
+
     def stats(self) -> dict[str, Any]:
         """Counters, and where it is in its life."""
         found = self.counters.snapshot()

@@ -302,6 +302,15 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         """One mapping per layer: ``layer``, ``enforced``, ``detail``. None unless it runs."""
         return [dict(layer) for layer in self._session.report()]
 
+    def jail_usage(self) -> dict[str, int]:
+        """What its jail holds right now, counted from outside of it by the worker server.
+
+        Returns:
+            ``processes`` and ``threads`` (beyond one for each process), and ``memory_bytes``: of
+            the processes that run environments, what is theirs alone. Empty unless it runs.
+        """
+        return self._session.usage()
+
     def stats(self) -> dict[str, Any]:
         """Counters, at any moment, from any thread; asks nothing of the worker.
 

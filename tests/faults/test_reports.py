@@ -12,8 +12,11 @@ def test_a_task_that_does_not_run_is_not_confined() -> None:
     """Others of its repository may run, and may have run; the provenance still says how."""
     with make_env(sample("many_tasks"), prewarm=0) as suites:
         [first, second, *_] = [env for tasks in suites.values() for env in tasks.values()]
-        assert first.sandbox_report == []
+        assert (first.sandbox_report, first.jail_usage()) == ([], {})
         first.reset()
+        held = first.jail_usage()
+        assert held["processes"] >= 1
+        assert held["memory_bytes"] > 0
         assert {layer["layer"] for layer in first.sandbox_report} >= {"seccomp", "rlimits"}
         assert second.sandbox_report == []
         first.close()

@@ -10,6 +10,7 @@ import pytest
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.judge import Asked, judge
 from envhub_sandbox.check.table import CHECKS, Severity
+from envhub_sandbox.errors import SnapshotError
 from tests.integration.test_cli_run import envhub
 from tests.support import checks
 from tests.support.repositories import write_repository
@@ -55,6 +56,18 @@ class Twice(gym.vector.SyncVectorEnv):
 def make_env(n_envs=1, use_async_envs=False):
     return Twice([Walk] * n_envs)
 """
+_STAYING = """self.count = 0
+        import threading
+        threading.Thread(target=threading.Event().wait, daemon=True).start()
+        return"""
+_FORKED = """self.count = 0
+        import os, time
+        if getattr(os, "fork")() == 0:
+            time.sleep(3600)
+        return"""
+_KEPT = """self.count = 0
+        gym.kept = [*getattr(gym, "kept", ()), np.ones(1 << 18)]
+        return"""
 _FAULTS = {
     "observation-dtype": ("self.count], np.float32)", "self.count], np.float64)"),
     "observation-space": ("self.count], np.float32)", "self.count * 30], np.float32)"),
@@ -66,6 +79,9 @@ _FAULTS = {
     "runs": ("self.count += 1", "raise RuntimeError('it broke')"),
     "survives": ("self.count += 1", "import os; os._exit(3)"),
     "loads": ("return gym.vector.SyncVectorEnv([Walk] * n_envs)", "return 3"),
+    "leaks-threads": ("self.count = 0\n        return", _STAYING),
+    "leaks-processes": ("self.count = 0\n        return", _FORKED),
+    "leaks-memory": ("self.count = 0\n        return", _KEPT),
     "imports": ("import numpy as np", "import numpy as np\nimport not_to_be_had"),
     "source-dynamic": ("self.count += 1", "self.count = eval('self.count + 1')"),
     "source-process": ("import numpy as np", "import numpy as np\nimport subprocess"),
@@ -129,6 +145,30 @@ def test_what_cannot_be_installed_is_told(tmp_path: Path) -> None:
     assert "requirements.txt" in report.findings[0].message
 
 
+def test_an_author_who_asks_for_what_is_not_his_is_told(tmp_path: Path) -> None:
+    """And judged as everybody is: what he would allow himself fails."""
+    text = _HONEST.replace("self.count += 1", "raise RuntimeError('it broke')")
+    says = '[check]\nallow = ["runs"]\n'
+    report = judged(repository(tmp_path / "walk", text, envhub__toml=says))
+    assert {one.id for one in report.findings} == {"runs", "settings"}
+    assert [one.id for one in report.failures(Severity.ERROR)] == ["runs"]
+
+
+def test_what_changes_meanwhile_is_not_judged(tmp_path: Path) -> None:
+    """What was read is what is played, from the first play to the last, or there is no verdict."""
+    folder = repository(tmp_path / "walk")
+    plays = []
+
+    def change(what: str) -> None:
+        plays.append(what)
+        if what == "hub_env / 0":
+            (folder / "LICENSE").write_text("another")
+
+    with pytest.raises(SnapshotError, match="changed while it was judged"):
+        judge(Asked(reference=str(folder), arguments={"n_envs": 2}, steps=5, tell=change))
+    assert "hub_env / 0" in plays
+
+
 def test_missing_papers_are_told(tmp_path: Path) -> None:
     """Notes, which fail nothing unless one asks for it; the head of a card may name a licence."""
     report = judged(write_repository(tmp_path / "bare", _HONEST))
@@ -156,6 +196,10 @@ def test_the_command_line_judges(tmp_path: Path) -> None:
     assert 'failures="1"' in (tmp_path / "junit").read_text()
     [result] = json.loads((tmp_path / "sarif").read_text())["runs"][0]["results"]
     assert result["ruleId"] == "runs"
+    policy = tmp_path / "policy.toml"
+    policy.write_text('profile = "nothing"')
+    refused = envhub("check", folder, "--policy", policy)
+    assert (refused.returncode, "'nothing'" in refused.stderr) == (2, True), refused.stderr
     allowed = envhub("check", folder, "--steps", "5", "--allow", "runs", "--github")
     assert allowed.returncode == 0, allowed.stderr
     [command] = obeyed(allowed.stdout.splitlines())

@@ -23,8 +23,17 @@ not be judged, because it could not be had, a server was full, or this host cann
 
 A check passes because a comparison of ours found nothing, never because the repository says so.
 What is found in source is a hint for a person: who wants to hide a call can, and the walls are the
-sandbox's. Not asked yet: what the layers denied, what remains of threads and memory after many
-episodes, and how long a step may take.
+sandbox's. Not asked yet: what the layers denied. Files are parsed in a child whose time and memory
+the kernel bounds; one that ends it is not read.
+
+How long resets and steps take, and what the jail holds in the end, are figures of the report and
+no checks: they say as much of the machine. What resets leave behind is counted by the worker
+server, from outside of the jail, after each of four rounds of `--resets`; what grows from each
+round to the next is told, processes before threads before memory.
+
+`--policy FILE` is TOML with the fields of `Policy`, and a table `[limits]`. An author's
+`envhub.toml` can ask in `[check]` for more `steps` and `resets` than the judge would take, up to
+2000 and 100; anything else there is refused, and told.
 
 `--json` prints everything; `--junit FILE` has one test case for each check of each task, `--sarif
 FILE` is SARIF 2.1.0, and `--github` prints annotations and appends to `$GITHUB_STEP_SUMMARY`.

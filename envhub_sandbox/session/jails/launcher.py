@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 from envhub_sandbox.errors import (
     EnvHubError,
@@ -265,7 +266,14 @@ class Launcher:
         return self._hold.partings.settle()
 
     def states(self, loaded: LoadedJail) -> tuple[str, ...]:
-        """What a jail's runners are doing, one word each; asked over a connection of its own.
+        """What a jail's runners are doing, one word each."""
+        states = self.status(loaded).get("states", ())
+        if not isinstance(states, tuple):
+            return ()
+        return tuple(state for state in states if isinstance(state, str))
+
+    def status(self, loaded: LoadedJail) -> dict[str, Any]:
+        """What its server says of a jail; asked over a connection of its own. Empty if it cannot.
 
         The late reply may come at any moment on the jail's own connection, and would be dropped.
         """
@@ -275,16 +283,15 @@ class Launcher:
             client.hello(deadline)
             status, _ = client.request(m.GetStatus(), deadline=deadline)
         except EnvHubError:
-            return ()
+            return {}
         finally:
             client.close()
         try:
             with UNTRUSTED:
                 jails = [one for one in expect(status, m.Status).jails if isinstance(one, dict)]
-                mine = next((one for one in jails if one.get("jail") == loaded.jail.number), {})
-                return tuple(state for state in mine.get("states", ()) if isinstance(state, str))
-        except EnvHubError:  # it is for the text of another error
-            return ()
+                return next((one for one in jails if one.get("jail") == loaded.jail.number), {})
+        except EnvHubError:  # it is for a text, or a figure that may be missing
+            return {}
 
     def interrupt(self, loaded: LoadedJail) -> None:
         """End a jail over a connection of its own, while another thread waits on the first."""

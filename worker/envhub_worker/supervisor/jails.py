@@ -33,6 +33,7 @@ from envhub_worker.supervisor.records import (
     whole_jail,
 )
 from envhub_worker.supervisor.runner_stream import MAX_PENDING, RunnerLink
+from envhub_worker.supervisor.usage import usage_of
 from envhub_worker.supervisor.witness import Nobody, Witness
 from envhub_worker.supervisor.zygotes import Zygotes
 
@@ -251,9 +252,10 @@ class Jails:
         self._answers.reply(asker, m.OutputBytes(*entry.output.since(request.offset)))
 
     def status(self, asker: Asker, request: m.GetStatus) -> None:
-        """Tell what the asker's jails are doing."""
+        """Tell what the asker's jails are doing, and what they hold."""
         mine = [entry for entry in self._jails.values() if entry.session == asker.session]
-        self._answers.reply(asker, m.Status(tuple(status_of(entry) for entry in mine)))
+        rows = tuple({**status_of(one), **_held(one)} for one in mine)
+        self._answers.reply(asker, m.Status(rows))
 
     # --- for the gate --------------------------------------------------------------------------
 
@@ -277,6 +279,10 @@ class Jails:
     def end(self, entry: JailEntry, why: str) -> None:
         """End a jail that nobody closes; its client is told why if it comes back."""
         self._events.end(entry, whole_jail("idle", detail=why))
+
+
+def _held(entry: JailEntry) -> dict[str, object]:
+    return {**usage_of(entry.jail.pid, entry.pids.values())} if entry.death is None else {}
 
 
 def _targets(

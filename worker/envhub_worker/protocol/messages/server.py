@@ -136,7 +136,11 @@ class GetStatus(Message, kind=14):
 
 
 class Status(Message, kind=15):
-    """One mapping per jail: ``jail``, ``name``, ``pids``, ``states``, ``busy_s``, ``operation``."""
+    """One mapping per jail: ``jail``, ``name``, ``pids``, ``states``, ``busy_s``, ``operation``.
+
+    Of one that lives also ``processes``, ``threads`` and ``memory_bytes``, counted from outside;
+    an older server does not say.
+    """
 
     jails: tuple[object, ...]
 

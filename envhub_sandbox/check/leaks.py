@@ -1,0 +1,57 @@
+"""What resets leave behind: processes, threads and memory, counted by the server from outside."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+_ROUNDS = 3
+_LEAST = {"processes": 2, "threads": 2, "memory_bytes": 1 << 20}
+"""What a round has to add. Pools that are filled once, and the allocator, add less or once."""
+_CHECKS = {
+    "processes": "leaks-processes",
+    "threads": "leaks-threads",
+    "memory_bytes": "leaks-memory",
+}
+
+Usage = dict[str, int]
+
+
+def watch(reset: Callable[[], Any], usage: Callable[[], Usage], resets: int) -> list[Usage]:
+    """What is held after each round of resets; a first round warms up. Empty if nobody counts.
+
+    Args:
+        reset: Resets all sub-environments.
+        usage: What its jail holds.
+        resets: Of each round.
+    """
+    seen = []
+    for _ in range(_ROUNDS + 1):
+        for _ in range(resets):
+            reset()
+        seen.append(usage())
+    return seen if all(seen) else []
+
+
+def grown(seen: Sequence[Usage], resets: int) -> Iterator[tuple[str, str]]:
+    """The check of each thing that grew in every round, and in what words.
+
+    A process that was left has threads and memory of its own, and a thread has a stack: what is
+    told is the first of the three alone.
+    """
+    told = False
+    for what, check in _CHECKS.items():
+        counts = [one[what] for one in seen]
+        steps = [after - before for before, after in itertools.pairwise(counts)]
+        grows = bool(steps) and min(steps) >= _LEAST[what]
+        if grows and not told:
+            unit = "bytes of memory" if what == "memory_bytes" else what
+            each = ", ".join(map(str, counts))
+            yield check, f"{unit} after each {resets} resets: {each}"
+        told = told or grows
+
+
+def checks() -> tuple[str, ...]:
+    """What can be found."""
+    return tuple(_CHECKS.values())

@@ -1,0 +1,48 @@
+"""What counts as left behind: what every round adds."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from envhub_sandbox.check import leaks
+
+_MIB = 1 << 20
+
+
+def seen(*rows: tuple[int, int, int]) -> list[leaks.Usage]:
+    """One count after each round."""
+    return [{"processes": p, "threads": t, "memory_bytes": m} for p, t, m in rows]
+
+
+@pytest.mark.parametrize(
+    ("counts", "found"),
+    [
+        (seen((1, 0, 0), (1, 0, 0), (1, 0, 0), (1, 0, 0)), []),
+        (seen((1, 0, 0), (9, 8, 90 * _MIB), (9, 8, 90 * _MIB), (9, 8, 90 * _MIB)), []),
+        (seen((1, 0, 0), (2, 1, 1000), (3, 2, 2000), (4, 3, 3000)), []),
+        (seen((1, 0, 0), (9, 0, 0), (17, 0, 0), (25, 0, 0)), ["leaks-processes"]),
+        (seen((1, 0, 0), (1, 8, 0), (1, 16, 0), (1, 24, 0)), ["leaks-threads"]),
+        (
+            seen((1, 0, 0), (1, 0, 2 * _MIB), (1, 0, 4 * _MIB), (1, 0, 6 * _MIB)),
+            ["leaks-memory"],
+        ),
+        (
+            seen((1, 0, 0), (9, 8, 90 * _MIB), (17, 16, 190 * _MIB), (25, 24, 290 * _MIB)),
+            ["leaks-processes"],
+        ),
+        ([], []),
+    ],
+    ids=["level", "filled once", "jitter", "processes", "threads", "memory", "all", "uncounted"],
+)
+def test_what_grows_in_every_round_is_told(counts: list[leaks.Usage], found: list[str]) -> None:
+    """And of what comes with it nothing: a process has threads and memory of its own."""
+    assert [check for check, _ in leaks.grown(counts, 8)] == found
+
+
+def test_nobody_who_counts_is_no_count() -> None:
+    """A server on another host may be an older one: then nothing is said, not that all is well."""
+    numbers = itertools.count()
+    assert leaks.watch(lambda: next(numbers), dict, 2) == []
+    assert next(numbers) == 8

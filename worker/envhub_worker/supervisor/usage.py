@@ -1,0 +1,42 @@
+"""What a jail holds of this machine right now, counted from outside: by what the kernel says."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from envhub_worker.lockdown.mechanisms import reap
+
+_KIB = 1024
+
+
+def usage_of(init: int, runners: Collection[int]) -> dict[str, int]:
+    """Processes, threads and memory of a jail; empty where it has gone, or has not begun.
+
+    Args:
+        init: The pid of its first process, which adopts whatever is orphaned in it.
+        runners: The pids of its runners.
+
+    Returns:
+        ``processes``: all that live or wait to be reaped, without init. ``threads``: theirs, beyond
+        one each. ``memory_bytes``: of the runners, what is theirs alone and not a file's.
+    """
+    if init <= 0:
+        return {}
+    processes = reap.descendants(init)
+    threads = sum(max(_fields(pid).get("Threads", 1), 1) - 1 for pid in processes)
+    memory = 0
+    for pid in runners:
+        fields = _fields(pid)
+        memory += _KIB * (fields.get("RssAnon", 0) + fields.get("VmSwap", 0))
+    return {"processes": len(processes), "threads": threads, "memory_bytes": memory}
+
+
+def _fields(pid: int) -> dict[str, int]:
+    """The numbers of ``/proc/PID/status``; none of a process that has gone."""
+    try:
+        with open(f"/proc/{pid}/status", encoding="utf-8", errors="replace") as file:
+            lines = file.read().splitlines()
+    except OSError:
+        return {}
+    words = (line.split() for line in lines)
+    return {row[0].rstrip(":"): int(row[1]) for row in words if len(row) > 1 and row[1].isdecimal()}
