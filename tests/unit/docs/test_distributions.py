@@ -1,0 +1,99 @@
+"""Both distributions are fit for an index: what PyPI looks at, and that the plugin can be built.
+
+``python -m tests.distributions`` builds, checks and installs both; this is what needs no network.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tarfile
+import zipfile
+from email.message import Message
+from email.parser import Parser
+from importlib import metadata
+from pathlib import Path
+from typing import cast
+
+import pytest
+
+NAME = "lerobot_env_envhub_sandbox"
+BUILD = """
+import sys
+from setuptools import build_meta
+print(getattr(build_meta, sys.argv[1])(sys.argv[2]))
+"""
+
+
+def built(kind: str, source: Path, into: Path) -> Path:
+    """What the build backend makes of a folder, in an interpreter of its own."""
+    into.mkdir(exist_ok=True)
+    command = [sys.executable, "-c", BUILD, f"build_{kind}", str(into)]
+    done = subprocess.run(
+        command, cwd=source, capture_output=True, text=True, timeout=250, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return into / done.stdout.splitlines()[-1]
+
+
+@pytest.fixture(scope="module")
+def plugin(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The plugin's wheel, built of its unpacked source distribution, as an index would have it."""
+    folder = tmp_path_factory.mktemp("plugin")
+    source = folder / "source"
+    for path in (checkout / "plugins" / NAME).rglob("*"):
+        if path.is_file() and path.suffix in ("", ".md", ".py", ".toml"):
+            copy = source / path.relative_to(checkout / "plugins" / NAME)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(path.read_bytes())
+    archive = built("sdist", source, folder / "sdist")
+    with tarfile.open(archive) as packed:
+        for member in packed.getmembers():
+            if member.isfile():
+                unpacked = folder / "again" / member.name
+                unpacked.parent.mkdir(parents=True, exist_ok=True)
+                extracted = packed.extractfile(member)
+                assert extracted is not None
+                unpacked.write_bytes(extracted.read())
+    [root] = (folder / "again").iterdir()
+    return built("wheel", root, folder / "wheel")
+
+
+def told_by(wheel: Path) -> Message:
+    """A wheel's metadata."""
+    with zipfile.ZipFile(wheel) as archive:
+        [name] = [one for one in archive.namelist() if one.endswith(".dist-info/METADATA")]
+        return Parser().parsestr(archive.read(name).decode())
+
+
+def assert_fit(told: Message) -> None:
+    """A page that an index can show, and a licence."""
+    assert told["Description-Content-Type"] == "text/markdown"
+    assert len(str(told.get_payload() or told["Description"])) > 300
+    assert told["License-Expression"] == "Apache-2.0"
+    assert told.get_all("License-File") == ["LICENSE"]
+    assert told["Requires-Python"] == ">=3.10"
+
+
+def test_the_package_is_fit_for_an_index() -> None:
+    """As it is installed here."""
+    assert_fit(cast("Message", metadata.metadata("envhub-sandbox")))
+
+
+def test_the_plugin_is_fit_for_an_index(plugin: Path) -> None:
+    """Under the name by which LeRobot finds it, with the module of that name, and our version."""
+    told = told_by(plugin)
+    assert_fit(told)
+    assert told["Name"] == NAME
+    with zipfile.ZipFile(plugin) as archive:
+        modules = [name for name in archive.namelist() if name.endswith(".py")]
+    assert modules == [f"{NAME}/__init__.py"]
+    ours = metadata.version("envhub-sandbox")
+    assert told["Version"] == ours
+    assert told.get_all("Requires-Dist") == [f"envhub-sandbox>={ours}"]
+
+
+def test_the_plugin_has_the_licence_of_all(checkout: Path) -> None:
+    """A copy, because nothing outside of its folder gets into a distribution."""
+    copy = checkout / "plugins" / NAME / "LICENSE"
+    assert copy.read_bytes() == (checkout / "LICENSE").read_bytes()
