@@ -17,6 +17,7 @@ from envhub_sandbox.api import make_env
 from envhub_sandbox.check import leaks, parsing, settings, source, traces
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.settings import Asks
+from envhub_sandbox.check.survey import survey
 from envhub_sandbox.check.table import CHECKS
 from envhub_sandbox.check.traces import Trace
 from envhub_sandbox.dependencies.choice import chosen
@@ -105,7 +106,7 @@ class _Judge:
         )
         moving = [f"{self._asked.reference} may mean another commit tomorrow"] if is_moving else []
         self._report.judged("pinned", moving)
-        found = source.look(self._snapshot, self._files)
+        found = survey(self._snapshot, self._files).findings
         for finding in found:
             self._report.add(finding)
         self._report.judged("settings", self._asks.refused)

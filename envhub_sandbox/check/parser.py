@@ -2,13 +2,15 @@
 
 ``parsing.py`` runs this file by its path, alone in a fresh interpreter: it imports the standard
 library and nothing else. Stdin has each file behind its length (four bytes, big endian), stdout
-gets one line of JSON for each, in the same order: what it imports and calls, or ``null``.
+gets one line of JSON for each, in the same order: what it imports, calls, uses and names, or
+``null``. Names are followed to what they were imported as in that file, and no further.
 """
 
 from __future__ import annotations
 
 import ast
 import json
+import re
 import resource
 import signal
 import sys
@@ -22,9 +24,17 @@ CPU_S = 20.0
 """For one file; 256 KiB that a person wrote take less than one."""
 OUTPUT = 64 << 20
 MOST = 10_000
-"""Imports and calls that are told of one file."""
+"""Of each kind that are told of one file."""
 LONGEST = 1024
 """Of a module, as a path of a file can be."""
+_LONGEST_TEXT = 200
+_DEEPEST = 8
+_OUTSIDE = re.compile(
+    r"~/.*|/(etc|home|proc|root|sys|boot|run|var)(/.*)?|(.*/)?\.(ssh|aws|netrc|kube|gnupg)(/.*)?"
+    r"|(HF|HUGGING|GITHUB|GH|GITLAB|AWS|AZURE|GOOGLE|OPENAI|ANTHROPIC|WANDB)[A-Z_]*"
+    r"_(TOKEN|SECRET|PASSWORD|KEY)[A-Z_]*"
+)
+_WORDLESS = re.compile(r"(?<![A-Za-z0-9+/=_\\-])[A-Za-z0-9+/=_\\-]{1000,}")
 
 
 def bound() -> None:
@@ -42,20 +52,85 @@ def bound() -> None:
 
 
 def described(data: bytes) -> dict[str, Any] | None:
-    """What a file imports and calls; None of what is no Python (of this version)."""
+    """What a file says; None of what is no Python (of this version)."""
     try:
         # as text: of bytes, a stranger's own first line would choose the codec, and some take hours
         tree = ast.parse(data.decode("utf-8-sig"))
+        return {kind: rows[:MOST] for kind, rows in _rows(tree).items()}
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         return None
+
+
+def _rows(tree: ast.Module) -> dict[str, list[Any]]:
     unguarded = {id(node) for node in _unguarded(tree)}
-    found: dict[str, Any] = {"imports": [], "calls": []}
+    aliases = _aliases(tree)
+    found: dict[str, list[Any]] = {
+        kind: [] for kind in ("imports", "calls", "uses", "fetches", "texts", "entries")
+    }
     for node in ast.walk(tree):
         if isinstance(node, (ast.Import, ast.ImportFrom)):
             found["imports"].append([*_import(node), id(node) in unguarded, node.lineno])
-        elif isinstance(node, ast.Call) and (name := _dotted(node.func)):
-            found["calls"].append([name[:LONGEST], node.lineno])
-    return {kind: rows[:MOST] for kind, rows in found.items()}
+        elif isinstance(node, ast.Call) and (name := _meant(node.func, aliases)):
+            found["calls"].append([name, node.lineno])
+            found["fetches"] += _fetched(name, node, aliases)
+        elif isinstance(node, (ast.Name, ast.Attribute)):
+            if (name := _meant(node, aliases)) and "." in name:
+                found["uses"].append([name, node.lineno])
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            found["texts"] += _text(node)
+    found["entries"] += [
+        [ast.unparse(node.args)[:LONGEST], node.lineno]
+        for node in tree.body
+        if isinstance(node, ast.FunctionDef) and node.name == "make_env"
+    ]
+    return found
+
+
+def _aliases(tree: ast.Module) -> dict[str, str]:
+    """What names mean that were imported anywhere in a file: ``{"np": "numpy"}``."""
+    found = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                if alias.asname:
+                    found[alias.asname] = alias.name[:_LONGEST_TEXT]
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            for alias in node.names:
+                whole = f"{(node.module or '')[:_LONGEST_TEXT]}.{alias.name[:_LONGEST_TEXT]}"
+                found[alias.asname or alias.name] = whole
+    return found
+
+
+def _meant(node: ast.expr, aliases: dict[str, str]) -> str:
+    first, dot, rest = _dotted(node).partition(".")
+    return f"{aliases.get(first, first)}{dot}{rest}"[:LONGEST]
+
+
+def _fetched(called: str, node: ast.Call, aliases: dict[str, str]) -> list[list[Any]]:
+    """``getattr(module, name)``: the name is null where it is computed."""
+    if called == "numpy.load":
+        pickles = [one for one in node.keywords if one.arg == "allow_pickle" and _may_be(one.value)]
+        return [["numpy.load", "allow_pickle", node.lineno] for _ in pickles[:1]]
+    if called != "getattr" or len(node.args) < 2:
+        return []
+    name = node.args[1]
+    text = name.value if isinstance(name, ast.Constant) and isinstance(name.value, str) else None
+    if isinstance(name, ast.Constant) and text is None:
+        return []
+    return [[_meant(node.args[0], aliases), text and text[:_LONGEST_TEXT], node.lineno]]
+
+
+def _may_be(node: ast.expr) -> bool:
+    """Whether a value may be true."""
+    return not isinstance(node, ast.Constant) or bool(node.value)
+
+
+def _text(node: ast.Constant) -> list[list[Any]]:
+    """Of texts that name places beyond the repository, or that nobody can read."""
+    text = str(node.value)
+    if len(text) <= _LONGEST_TEXT and _OUTSIDE.fullmatch(text):
+        return [["outside", text, len(text), node.lineno]]
+    return [["wordless", "", len(text), node.lineno]] if _WORDLESS.search(text) else []
 
 
 def _import(node: ast.Import | ast.ImportFrom) -> list[Any]:
@@ -80,11 +155,12 @@ def _is_for_types(node: ast.AST) -> bool:
 
 
 def _dotted(node: ast.expr) -> str:
-    if isinstance(node, ast.Name):
-        return node.id
-    if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
-        return f"{node.value.id}.{node.attr}"
-    return ""
+    """``a.b.c`` as a text; empty for what is no chain of names, or a very long one."""
+    parts: list[str] = []
+    while isinstance(node, ast.Attribute) and len(parts) < _DEEPEST:
+        parts.append(node.attr)
+        node = node.value
+    return ".".join([node.id, *reversed(parts)]) if isinstance(node, ast.Name) else ""
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""What a snapshot's Python files import and call, each read once and parsed in a bounded child.
+"""What a snapshot's Python files say, each read once and parsed in a bounded child.
 
 A text can take hours of Python's parser, gigabytes, or its process. What becomes of the child is
 no matter of ours: the file that ended it is one that cannot be read.
@@ -48,12 +48,25 @@ class Named:
     line: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Parsed:
-    """What a file imports and calls; ``calls`` are dotted names and lines."""
+    """What a file says; each with its line at the end. Names are followed to their imports.
+
+    Attributes:
+        imports: In the order of a walk.
+        calls: Dotted names.
+        uses: Dotted names, whether they are called or not.
+        fetches: Of ``getattr``: of what, and by which name; None for one that is computed.
+        texts: ``"outside"`` with a text that names a place beyond, or ``"wordless"``; its length.
+        entries: The arguments of each ``make_env``.
+    """
 
     imports: tuple[Named, ...]
-    calls: tuple[tuple[str, int], ...]
+    calls: tuple[tuple[str, int], ...] = ()
+    uses: tuple[tuple[str, int], ...] = ()
+    fetches: tuple[tuple[str, str | None, int], ...] = ()
+    texts: tuple[tuple[str, str, int, int], ...] = ()
+    entries: tuple[tuple[str, int], ...] = ()
 
 
 def read(snapshot: Snapshot) -> dict[str, Parsed | None]:
@@ -142,4 +155,7 @@ def _answer(row: Any) -> Parsed | None:
         Named(level, module, tuple(names), unguarded, line)
         for level, module, names, unguarded, line in row["imports"]
     )
-    return Parsed(tuple(imports), tuple((name, line) for name, line in row["calls"]))
+    rest: dict[str, Any] = {
+        kind: tuple(map(tuple, rows)) for kind, rows in row.items() if kind != "imports"
+    }
+    return Parsed(imports=tuple(imports), **rest)

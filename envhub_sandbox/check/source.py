@@ -1,4 +1,4 @@
-"""What a repository's files say, read as data: imports, licence, and what is worth a look.
+"""What a repository's code imports, read as data, and whether that is declared.
 
 Nothing is imported or run. What is found in code is a hint for a person and no wall: who wants to
 hide a call can. The walls are the sandbox's.
@@ -6,7 +6,6 @@ hide a call can. The walls are the sandbox's.
 
 from __future__ import annotations
 
-import itertools
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -22,23 +21,6 @@ from envhub_sandbox.dependencies.resolve import WORKERS
 from envhub_sandbox.hub.snapshot import Snapshot
 
 Files = Mapping[str, Parsed | None]
-_MOST_CONSTRUCTS = 100
-"""Of one file."""
-_NATIVE = (".so", ".dylib", ".dll", ".pyd", ".o", ".a")
-_MODULES = {
-    **dict.fromkeys(
-        ("socket", "ssl", "http", "urllib", "requests", "httpx", "aiohttp", "ftplib", "smtplib"),
-        "source-network",
-    ),
-    **dict.fromkeys(("subprocess", "pty"), "source-process"),
-    **dict.fromkeys(("pickle", "dill", "joblib", "cloudpickle", "marshal"), "source-pickle"),
-    **dict.fromkeys(("ctypes", "cffi"), "source-native"),
-}
-_CALLS = {
-    **dict.fromkeys(("eval", "exec", "compile", "__import__"), "source-dynamic"),
-    **dict.fromkeys(("os.system", "os.popen", "os.execv", "os.fork"), "source-process"),
-    "torch.load": "source-pickle",
-}
 
 
 @dataclass(frozen=True)
@@ -48,64 +30,6 @@ class Import:
     name: str
     file: str
     line: int
-
-
-def look(snapshot: Snapshot, files: Files) -> list[Finding]:
-    """What is worth a look before anything is run.
-
-    Args:
-        snapshot: The repository.
-        files: What ``parsing.read`` read of it.
-    """
-    names = {record.path for record in snapshot.files}
-    found = [*_papers(snapshot, names)]
-    for name in sorted(names):
-        if name.endswith(_NATIVE):
-            found.append(Finding("source-native", "a file of machine code", file=name))
-        else:
-            constructs = _constructs(name, files.get(name))
-            found += itertools.islice(constructs, _MOST_CONSTRUCTS)
-    return found
-
-
-def _papers(snapshot: Snapshot, names: set[str]) -> Iterator[Finding]:
-    top = {name.lower() for name in names if "/" not in name}
-    if "readme.md" not in top:
-        yield Finding("card", "there is no README.md")
-    licensed = any(name.startswith(("license", "licence", "copying")) for name in top)
-    if not licensed and not _card_names_a_licence(snapshot.root):
-        yield Finding("licence", "there is no LICENSE file, and README.md's head names none")
-
-
-def _card_names_a_licence(root: Path) -> bool:
-    try:
-        with (root / "README.md").open(encoding="utf-8", errors="replace") as file:
-            head = file.read(16_384)
-    except OSError:
-        return False
-    block = head.split("\n---", 1)[0] if head.startswith("---") else ""
-    return any(line.startswith("license:") for line in block.splitlines())
-
-
-def _constructs(file: str, parsed: Parsed | None) -> Iterator[Finding]:
-    if parsed is None:
-        return
-    for one in parsed.imports:
-        for name in _firsts(one):
-            if check := _MODULES.get(name):
-                yield Finding(check, f"imports {name}", file=file, line=one.line)
-    for called, line in parsed.calls:
-        if check := _CALLS.get(called):
-            yield Finding(check, f"calls {called}", file=file, line=line)
-
-
-def _firsts(one: Named) -> list[str]:
-    if one.level < 0:
-        return [name.partition(".")[0] for name in one.names]
-    return [] if one.level else [one.module.partition(".")[0]]
-
-
-# --- imports -----------------------------------------------------------------------------------
 
 
 def imports(snapshot: Snapshot, files: Files) -> list[Import]:

@@ -191,5 +191,36 @@ CHECKS: dict[str, Check] = {
             "It brings no machine code and calls none by address.",
             "Depend on a package that brings the library along.",
         ),
+        Check(
+            "source-outside",
+            _N,
+            "Its code names no places beyond its own: homes, /etc, /proc, other programs' tokens.",
+            "Keep to the repository's folder and to tempfile; take the rest as an argument.",
+        ),
+        Check(
+            "source-hidden",
+            _W,
+            "Its text is what one sees: no characters that are invisible, turn the order around, "
+            "or look like others.",
+            "Write them as escapes, such as \\u200b, or leave them out.",
+        ),
+        Check(
+            "source-obscure",
+            _N,
+            "Its code can be read: no lines of thousands of characters, no long texts of no words.",
+            "Put data into files, and code on lines.",
+        ),
+        Check(
+            "source-link",
+            _N,
+            "Each file is what its name says, and no link to another.",
+            "Put the file itself there.",
+        ),
+        Check(
+            "source-unread",
+            _N,
+            "All that could run of it has been read.",
+            "Write Python as UTF-8, in files of up to 256 KiB, and bring no archives.",
+        ),
     )
 }

@@ -1,0 +1,112 @@
+"""What the bytes of a repository's files are: text, Python, machine code, pickles, archives.
+
+Told by their beginnings and their names; nothing is opened in any other sense. Reading is bounded
+by file and in all.
+"""
+
+from __future__ import annotations
+
+import codecs
+import re
+import unicodedata
+from collections.abc import Iterator
+from pathlib import Path
+
+from envhub_sandbox.check.findings import Finding
+
+BEGINNING = 8192
+"""Bytes by which a file's kind is told."""
+LARGE = 10 << 20
+_MAGIC = (
+    (b"\x7fELF", "machine code"),
+    (b"MZ", "machine code"),
+    (b"!<arch>\n", "machine code"),
+    (b"\0asm", "machine code"),
+    *((magic, "machine code") for magic in (b"\xfe\xed\xfa\xce", b"\xfe\xed\xfa\xcf")),
+    *((magic, "machine code") for magic in (b"\xce\xfa\xed\xfe", b"\xcf\xfa\xed\xfe")),
+    (b"\xca\xfe\xba\xbe", "machine code"),
+    (b"version https://git-lfs.github.com/spec/", "LFS pointer"),
+)
+_ARCHIVES = (b"PK\x03\x04", b"\x1f\x8b", b"\xfd7zXZ\0", b"BZh", b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf")
+_SUFFIXES = {
+    **dict.fromkeys((".so", ".dylib", ".dll", ".pyd", ".o", ".a"), "machine code"),
+    **dict.fromkeys((".pyc", ".pyo"), "compiled Python"),
+    **dict.fromkeys((".pkl", ".pickle", ".joblib", ".pt", ".pth", ".ckpt"), "pickle"),
+}
+_PICKLE = re.compile(rb"\x80[\x02-\x05][\x95c}\](K\x8c]")
+_NO_ARCHIVES = (".npz", ".keras")
+"""Archives by their first bytes, which hold arrays."""
+_SAID = {
+    "machine code": ("source-native", "a file of machine code"),
+    "compiled Python": ("source-native", "compiled Python, which need not be what its source says"),
+    "pickle": ("source-pickle", "a file that is, or may hold, a pickle"),
+    "archive": ("source-unread", "an archive: nothing in it has been read"),
+    "LFS pointer": ("source-unread", "a pointer of git LFS, without the file that it means"),
+}
+_BIDI = "\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069"
+_INVISIBLE = (
+    "\u00ad\u115f\u1160\u180e\u200b\u2060-\u2064\u3164\ufeff\uffa0"
+    "\U000e0001\U000e0020-\U000e007f\U000e0100-\U000e01ef"
+)
+_CONTROL = "\0-\x08\x0b\x0e-\x1f\x7f-\x9f\u2028\u2029"
+_HIDDEN = re.compile(rf"[{_BIDI}{_INVISIBLE}{_CONTROL}]|\r(?!\n)")
+_OTHERS = "\u0400-\u052f\u0531-\u0587"
+_HIDDEN_IN_CODE = re.compile(
+    rf"{_HIDDEN.pattern}|[A-Za-z][{_OTHERS}]\w{{0,40}}|[{_OTHERS}][A-Za-z]\w{{0,40}}"
+)
+_MOST_HIDDEN = 20
+"""Of one file."""
+
+
+def kind_of(name: str, beginning: bytes) -> str:
+    """In a word or two: ``"Python"``, ``"text"``, ``"binary"``, or what is worth a look."""
+    suffix = Path(name).suffix.lower()
+    found = next((kind for magic, kind in _MAGIC if beginning.startswith(magic)), None)
+    if found or suffix in _SUFFIXES:
+        return found or _SUFFIXES[suffix]
+    if _PICKLE.match(beginning):
+        return "pickle"
+    if (beginning.startswith(_ARCHIVES) or beginning[257:262] == b"ustar") and (
+        suffix not in _NO_ARCHIVES
+    ):
+        return "archive"
+    if suffix == ".py":
+        return "Python"
+    return "text" if _is_text(beginning) else "binary"
+
+
+def _is_text(beginning: bytes) -> bool:
+    decoder = codecs.getincrementaldecoder("utf-8")()
+    try:
+        decoder.decode(beginning, final=len(beginning) < BEGINNING)
+    except UnicodeDecodeError:
+        return False
+    return b"\0" not in beginning
+
+
+def of_kind(name: str, kind: str) -> Iterator[Finding]:
+    """What a kind by itself gives reason to look at."""
+    if kind in _SAID:
+        check, message = _SAID[kind]
+        yield Finding(check, message, file=name)
+
+
+def hidden(name: str, text: str, *, is_code: bool) -> Iterator[Finding]:
+    """Characters that are shown as nothing, as another order, or as other letters."""
+    pattern = _HIDDEN_IN_CODE if is_code else _HIDDEN
+    line, counted, told = 1, 0, set()
+    for found in pattern.finditer(text):
+        line += text.count("\n", counted, found.start())
+        counted = found.start()
+        if (line, found[0]) not in told:
+            told.add((line, found[0]))
+            yield Finding("source-hidden", _called(found[0]), file=name, line=line)
+        if len(told) >= _MOST_HIDDEN:
+            return
+
+
+def _called(character: str) -> str:
+    if len(character) > 1:
+        return f"holds {character!r}, with Latin and other letters that look like them"
+    words = unicodedata.name(character, "a control character").lower()
+    return f"holds U+{ord(character):04X}, {words}"
