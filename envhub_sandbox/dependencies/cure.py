@@ -12,7 +12,6 @@ from envhub_sandbox.hub.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.declared import Declared
-    from envhub_sandbox.dependencies.environments import Environment
 
 _SHOWN = 20
 
@@ -22,7 +21,7 @@ def cure(
     place: str,
     choice: Choice,
     python: str | Path | None,
-    environment: Environment | None,
+    own: bool,
 ) -> str:
     """Two sentences: what the repository declares, and the one thing that helps.
 
@@ -31,7 +30,7 @@ def cure(
         place: The sandbox's name.
         choice: Where its packages were to come from.
         python: The interpreter that the caller named.
-        environment: The environment that was made for it, if it ran in one.
+        own: Whether it ran in an environment that was made for it.
     """
     from envhub_sandbox.dependencies.declared import declared
 
@@ -39,7 +38,7 @@ def cure(
         found = declared(snapshot.root, snapshot.path)
     except RequirementError as error:
         return f"What it declares cannot be taken: {error}"
-    return f"{_what(found)}. {_advice(place, choice, python, environment, found)}"
+    return f"{_what(found)}. {_advice(place, choice, python, own, found)}"
 
 
 def _what(found: Declared | None) -> str:
@@ -54,7 +53,7 @@ def _advice(
     place: str,
     choice: Choice,
     python: str | Path | None,
-    environment: Environment | None,
+    own: bool,
     found: Declared | None,
 ) -> str:
     extra = "dependencies={'extra': ['NAME-OF-THE-PACKAGE']}"
@@ -64,13 +63,19 @@ def _advice(
             "use that with sandbox='docker:IMAGE'"
         )
     if place == "remote":
+        if own:
+            return (
+                "It ran on another host, in an environment of its own; the package joins it with "
+                f"{extra}"
+            )
         return (
-            "It ran on another host: whoever runs the server installs the package into its "
-            "interpreter, or starts it in one that has it"
+            "It ran on another host, with the packages of its server: whoever runs that installs "
+            "the package into its interpreter, or starts it with --dependencies, and the package "
+            f"comes with {extra}"
         )
     if python is not None:
         return f"It ran in {python}: install the package there, or leave out that argument"
-    if environment is not None:
+    if own:
         return f"It ran in an environment of its own; the package joins it with {extra}"
     if choice.where == "host" and found is not None and found.wanted:
         return (

@@ -159,9 +159,14 @@ def remove(environment: Environment) -> None:
             lock.unlink()
 
 
+def half_made() -> list[Path]:
+    """What somebody makes now, or was killed over."""
+    return sorted(root().glob(f"{_BUILDING}*"))
+
+
 def remove_abandoned() -> None:
     """Remove what was left half-made by somebody who was killed."""
-    for path in root().glob(f"{_BUILDING}*"):
+    for path in half_made():
         key = path.name.removeprefix(_BUILDING).partition("-")[0]
         with contextlib.suppress(OSError), _taken(root() / f"{key}.lock") as descriptor:
             if descriptor is not None:

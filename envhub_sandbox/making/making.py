@@ -21,7 +21,7 @@ from envhub_sandbox.making.places import reference_of, sandbox_of
 from envhub_sandbox.making.proxies import Proxies
 from envhub_sandbox.policy import Policy, Timeouts, policy_from, timeouts_from
 from envhub_sandbox.sandboxes import inprocess
-from envhub_sandbox.sandboxes.base import Sandbox
+from envhub_sandbox.sandboxes.base import Provided, Provider, Sandbox
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.provenance import provenance_of
 from envhub_sandbox.session.recipe import Recipe, pinned
@@ -31,7 +31,6 @@ from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.runtime import Runtime
 
 if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.environments import Environment
     from envhub_sandbox.locks.lockfile import LockFile
 
 
@@ -91,14 +90,14 @@ def _wanted(sandbox: str | Sandbox, options: Options) -> _Wanted:
     if options.lock is not None:
         lock = locks.opened(options.lock, sandbox, options.python, options.dependencies)
     choice, python = chosen(options.dependencies, options.python)
-    if choice.where == "own" and sandbox != "process":
-        raise PolicyError(
-            "dependencies={...} is for sandbox='process'. For a container, build an image: envhub "
-            "image build REF; on another host, whoever runs the server chooses its packages"
-        )
     policy = policy_from(options.policy, options.limits)
     timeouts = timeouts_from(options.timeouts)
     place = sandbox_of(sandbox, options.server_key)
+    if choice.where == "own" and sandbox != "process" and not isinstance(place, Provider):
+        raise PolicyError(
+            "dependencies={...} is for sandbox='process' and for servers on other hosts. For a "
+            "container, build an image: envhub image build REF"
+        )
     runtime = Runtime(arguments.interpreter(python))
     if sandbox == "process":
         arguments.check_executable(runtime.python)
@@ -126,18 +125,21 @@ def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
     return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))
 
 
-def _environment(snapshot: Snapshot, wanted: _Wanted, options: Options) -> Environment | None:
+def _environment(snapshot: Snapshot, wanted: _Wanted, options: Options) -> Provided | None:
     """The packages that are made for it; None where its interpreter has them."""
     if wanted.lock is not None:
         return locks.provided(snapshot, wanted.lock)
-    return provided(snapshot, wanted.choice) if options.sandbox == "process" else None
+    if options.sandbox == "process":
+        return provided(snapshot, wanted.choice)
+    place = wanted.place
+    return place.provided(snapshot, wanted.choice) if isinstance(place, Provider) else None
 
 
 def _repository(
     snapshot: Snapshot,
     config: Any,
     wanted: _Wanted,
-    environment: Environment | None,
+    environment: Provided | None,
     options: Options,
 ) -> Repository:
     runtime = wanted.runtime
@@ -159,7 +161,7 @@ def _repository(
     )
     repository.installed = None if environment is None else environment.facts
     place, choice, python = wanted.place.name, wanted.choice, wanted.python
-    repository.cure = partial(cure, snapshot, place, choice, python, environment)
+    repository.cure = partial(cure, snapshot, place, choice, python, environment is not None)
     return repository
 
 

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 if TYPE_CHECKING:
+    from envhub_sandbox.dependencies.choice import Choice
+    from envhub_sandbox.hub.snapshot import Snapshot
     from envhub_sandbox.policy import Policy
     from envhub_sandbox.transport.connection import WorkerClient
     from envhub_sandbox.transport.deadline import Deadline
@@ -68,6 +70,8 @@ class EnclosedServer(WorkerServer, Protocol):
         profile: The profile of its jails, chosen among what can be had in there.
         snapshot: Where its jails find the repository's files.
         python: The interpreter of its jails; empty for the server's own.
+        packages: What it calls the packages that were made for the repository; empty for those
+            of the interpreter.
     """
 
     @property
@@ -78,6 +82,8 @@ class EnclosedServer(WorkerServer, Protocol):
     def snapshot(self) -> str: ...  # noqa: D102
     @property
     def python(self) -> str: ...  # noqa: D102
+    @property
+    def packages(self) -> str: ...  # noqa: D102
 
 
 @runtime_checkable
@@ -135,4 +141,34 @@ class PerRepository(Protocol):
         Raises:
             PolicyError: The place cannot permit what the policy does.
             SandboxUnavailableError: There is no such place here.
+        """
+
+
+class Provided(Protocol):
+    """Packages that were made for a repository.
+
+    Attributes:
+        python: The interpreter that they are for; empty where the place knows it.
+        packages: Their folder, or their name in that place.
+        facts: What is in it, as plain data.
+    """
+
+    @property
+    def python(self) -> str: ...  # noqa: D102
+    @property
+    def packages(self) -> str | Path: ...  # noqa: D102
+    @property
+    def facts(self) -> dict[str, Any]: ...  # noqa: D102
+
+
+@runtime_checkable
+class Provider(Protocol):
+    """A place that has packages made by itself, for what runs there."""
+
+    def provided(self, snapshot: Snapshot, choice: Choice) -> Provided | None:
+        """The packages of a repository; None for those that the place has.
+
+        Raises:
+            DependencyError: They cannot be made; the text says what to change.
+            PolicyError: The place makes none, and the choice asks for some.
         """

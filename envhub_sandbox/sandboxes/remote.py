@@ -18,11 +18,20 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from envhub_sandbox.errors import EnvHubError, PolicyError, SandboxUnavailableError
+from envhub_sandbox.dependencies import progress
+from envhub_sandbox.dependencies.choice import Choice
+from envhub_sandbox.errors import (
+    DependencyError,
+    EnvHubError,
+    PolicyError,
+    SandboxUnavailableError,
+)
 from envhub_sandbox.hub.logins import without_login
+from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes import upload
 from envhub_sandbox.sandboxes.base import WorkerServer
+from envhub_sandbox.sandboxes.far_packages import FarEnvironment, Order, order_of
 from envhub_sandbox.sandboxes.refcount import Sharing
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
@@ -39,6 +48,8 @@ _KEEP_ALIVE_S = 10.0
 _FIRST_S = 0.5
 _STOP_S = 1.0
 _CLOSE_S = 5.0
+_HELLO_S = 30.0
+_MAKE_S = 2 * 3600.0
 
 
 @dataclass
@@ -65,6 +76,7 @@ class RemoteSandbox:
     heartbeat_s: float = 30.0
     retry_s: float = 0.0
     name: str = field(default="remote", init=False)
+    _orders: dict[str, Order] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         address_of(self.endpoint)
@@ -81,7 +93,7 @@ class RemoteSandbox:
     def __getstate__(self) -> dict[str, Any]:
         """No secret key is in a pickle: its reader has one, or the file that is named."""
         kept = self.client_key if _is_file(self.client_key) else None
-        return {**self.__dict__, "client_key": kept}
+        return {**self.__dict__, "client_key": kept, "_orders": {}}
 
     def __copy__(self) -> RemoteSandbox:
         return replace(self)
@@ -97,7 +109,34 @@ class RemoteSandbox:
             SandboxUnavailableError: A key is missing.
         """
         check_policy(policy, runtime)
-        return RemoteRepository(self.endpoint, self.far(), snapshot, policy, self.retry_s)
+        needed = None
+        if runtime.packages:
+            needed = Needed(runtime.packages, self._orders[runtime.packages])
+        return RemoteRepository(self.endpoint, self.far(), snapshot, policy, self.retry_s, needed)
+
+    def provided(self, snapshot: Snapshot, choice: Choice) -> FarEnvironment | None:
+        """The packages that the server makes for a repository; None for those that it has.
+
+        Raises:
+            DependencyError: They cannot be made; the text says what to change.
+            PolicyError: The server's operator does not permit it.
+            ServerBusyError: Others of the same key are at it.
+        """
+        order = order_of(snapshot, choice)
+        if order is None:
+            return None
+        where = (self.endpoint, self.far())
+        host = HOSTS.acquire(where, partial(Host, *where))
+        try:
+            client = WorkerClient(self.endpoint, host.stopped, far=host.far)
+            with contextlib.closing(client), progress.shown("packages") as tell:
+                client.hello(Deadline(_HELLO_S))
+                made = order.bring(client, Deadline(_MAKE_S), tell)
+        finally:
+            HOSTS.release(host)
+        if made is not None:
+            self._orders[made.packages] = order
+        return made
 
     def far(self) -> Far:
         """The server's key and ours.
@@ -124,10 +163,10 @@ def check_policy(policy: Policy, runtime: Runtime) -> None:
     Raises:
         PolicyError: With what to do instead.
     """
-    if runtime.packages:
+    if os.sep in runtime.packages:
         raise PolicyError(
-            "dependencies: an environment of the repository's own is of this machine, and a remote "
-            "server uses its own: start it in the environment or image that the repository needs"
+            "dependencies: an environment of this machine is for this machine; a remote server "
+            "makes its own, where it was started with --dependencies"
         )
     if runtime.python:
         raise PolicyError(
@@ -241,6 +280,32 @@ def _parsed(text: str, what: str) -> bytes:
 # --- servers ---------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Needed:
+    """Packages that the server has made, and may have to make again.
+
+    Attributes:
+        name: What it called them.
+        order: What they were made of.
+    """
+
+    name: str
+    order: Order
+
+    def bring(self, client: WorkerClient, deadline: Deadline) -> None:
+        """See that they are there: the server may have been replaced, or have needed the room.
+
+        Raises:
+            DependencyError: It would make others today, or can make none.
+        """
+        made = self.order.bring(client, deadline)
+        if made is None or made.packages != self.name:
+            raise DependencyError(
+                f"{self.order.label}: the server has lost the packages that it had made, and would "
+                "make others now: make the environment again"
+            )
+
+
 class RemoteRepository:
     """The sandbox of one repository: its files on the other host.
 
@@ -252,10 +317,17 @@ class RemoteRepository:
     name = "remote"
 
     def __init__(
-        self, endpoint: str, far: Far, snapshot: Path, policy: Policy, retry_s: float
+        self,
+        endpoint: str,
+        far: Far,
+        snapshot: Path,
+        policy: Policy,
+        retry_s: float,
+        needed: Needed | None = None,
     ) -> None:
         key = "" if far.server_key is None else far.server_key.hex()
-        self.interpreter = f"{endpoint} {key}"
+        self.interpreter = f"{endpoint} {key}{'' if needed is None else f' {needed.name}'}"
+        self._needed = needed
         self.retry_s = retry_s
         self._endpoint, self._far = endpoint, far
         self._snapshot, self._policy = snapshot, policy
@@ -265,7 +337,8 @@ class RemoteRepository:
         """The server; nothing is sent before a jail is opened."""
         where = (self._endpoint, self._far)
         host = HOSTS.acquire(where, partial(Host, *where))
-        return RemoteServer(host, self, self._policy.profile)
+        packages = "" if self._needed is None else self._needed.name
+        return RemoteServer(host, self, self._policy.profile, packages)
 
     def release(self, server: WorkerServer, idle_s: float | None = 0.0) -> None:
         """Give it back; after the last one who does, nobody tells it that we live. It stays."""
@@ -274,6 +347,8 @@ class RemoteRepository:
 
     def bring(self, client: WorkerClient, deadline: Deadline) -> str:
         """Bring the files there; returns the server's name for them."""
+        if self._needed is not None:
+            self._needed.bring(client, deadline)
         self._files = self._files or upload.listing(self._snapshot)
         return upload.bring(client, self._snapshot, self._files, deadline)[0]
 
@@ -285,9 +360,12 @@ class RemoteServer:
     layers: Sequence[Mapping[str, Any]] = ()
     python = ""
 
-    def __init__(self, host: Host, repository: RemoteRepository, profile: str) -> None:
+    def __init__(
+        self, host: Host, repository: RemoteRepository, profile: str, packages: str
+    ) -> None:
         self.host = host
         self.profile = profile
+        self.packages = packages
         self.snapshot = ""
         self._repository = repository
 

@@ -9,10 +9,17 @@ from __future__ import annotations
 from typing import Any
 
 from envhub_sandbox.errors import (
+    DependencyError,
     EnvHubError,
+    IndexUnavailableError,
+    InterpreterUnavailableError,
     MissingModuleError,
+    PackageIntegrityError,
+    PackagesTooLargeError,
     PolicyError,
     RemoteProtocolError,
+    RequirementError,
+    ResolutionError,
     SandboxUnavailableError,
     ServerBusyError,
     SnapshotIntegrityError,
@@ -59,7 +66,7 @@ def check(reply: m.Message) -> None:
     """
     if isinstance(reply, m.Raised):
         raise raised(reply)
-    if reply.kind < m.FIRST_RUNNER_KIND:
+    if not m.is_of_runner(reply.kind):
         raise RemoteProtocolError(f"a runner sent {type(reply).__name__}")
 
 
@@ -100,6 +107,13 @@ _REFUSALS: dict[str, type[Exception]] = {
     "PolicyError": PolicyError,
     "SnapshotIntegrityError": SnapshotIntegrityError,
     "VersionMismatchError": VersionMismatchError,
+    "DependencyError": DependencyError,
+    "IndexUnavailableError": IndexUnavailableError,
+    "InterpreterUnavailableError": InterpreterUnavailableError,
+    "PackageIntegrityError": PackageIntegrityError,
+    "PackagesTooLargeError": PackagesTooLargeError,
+    "RequirementError": RequirementError,
+    "ResolutionError": ResolutionError,
 }
 
 

@@ -20,8 +20,14 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.dependencies import index as places
 from envhub_sandbox.dependencies import interpreters, uv
+from envhub_sandbox.dependencies.bounds import measured
 from envhub_sandbox.errors import DependencyError, EnvHubError
 from envhub_sandbox.sandboxes.process import BOOTSTRAP
+from envhub_worker.access.packages import Packages
+from envhub_worker.access.quotas import Quotas, RefusedError
+from envhub_worker.protocol import messages as m
+from tests.remote.listening import listening
+from tests.support.processes import eventually
 from tests.support.repositories import write_repository
 from tests.support.wheels import Index, make_wheel
 
@@ -305,3 +311,71 @@ def test_a_compiler_that_is_taken_over_has_only_the_folder(tmp_path: Path) -> No
     (outside / "written").unlink()
     assert escaped("confined", tmp_path / "folder", outside) == {"copied", "reached"}
     assert (tmp_path / "folder/copied").read_text() == ""
+
+
+# --- on another host ----------------------------------------------------------------------------
+
+
+def test_a_server_on_another_host_runs_none_of_it(
+    real_index: Index, tmp_path: Path, traces: Path
+) -> None:
+    """What it installs for a client lies where no interpreter of its own looks."""
+    wheel = what_starts_by_itself(real_index.folder, traces)
+    python = virtual_environment(tmp_path / "control", [wheel])
+    subprocess.run([str(python), "-c", "pass"], check=True)
+    assert "pth" in sprung(traces)
+    folder = write_repository(tmp_path / "repo", ENV, requirements__txt="bait==1.0\n")
+    with (
+        listening(tmp_path / "server", "--dependencies") as server,
+        make_env(folder, sandbox=server.sandbox()) as suites,
+    ):
+        suites.env.reset(seed=0)
+        assert suites.env.call("sprung") == (["trap_pth"],)  # in the jail it may
+    assert sprung(traces) == set()
+
+
+def ordered(folder: Path, line: str, quota: int = Quotas().packages_bytes) -> str:
+    """What a server's packages become for a client that checks nothing: a state, or an error."""
+    packages = Packages(folder, Quotas(packages_bytes=quota))
+    request = m.NeedPackages(((line, "line 1"),), "", "", "", True)
+    states: list[str] = []
+
+    def settled() -> bool:
+        try:
+            states.append(packages.need(b"key", request, ()).state)
+        except RefusedError as error:
+            states.append(error.error)
+        return states[-1] != "making"
+
+    try:
+        assert eventually(settled)
+    finally:
+        packages.close()
+    return states[-1]
+
+
+@pytest.mark.parametrize("kind", [editable, linked, relative, smuggled])
+def test_a_client_that_checks_nothing_has_nothing_built(
+    real_index: Index,
+    tmp_path: Path,
+    traces: Path,
+    kind: Callable[[Index, Path, Path], tuple[str, Callable[[], object]]],
+) -> None:
+    """The server reads an order as a stranger's file, whatever its client has made of it."""
+    line, control = kind(real_index, tmp_path, traces)
+    control()
+    assert sprung(traces), "the control builds nothing"
+    assert ordered(tmp_path / "packages", line) == "RequirementError"
+    assert sprung(traces) == set()
+
+
+def test_a_client_does_not_fill_the_servers_disk(index: Index, tmp_path: Path) -> None:
+    """One key has one quota for all of it, and nothing stays of what went over it."""
+    big = {"bulky/__init__.py": "", **{f"bulky/{n}.bin": bytes(2 << 20) for n in range(8)}}
+    make_wheel(index.folder, "bulky", "1.0", big)
+    roomy, tight = tmp_path / "roomy", tmp_path / "tight"
+    assert ordered(roomy, "bulky==1.0") == "made"  # the control: it is as large as that
+    assert measured(roomy)[0] > 16 << 20
+    assert ordered(tight, "bulky==1.0", quota=8 << 20) == "PackagesTooLargeError"
+    assert measured(tight)[0] < 1 << 20
+    assert not list(tight.glob("*/environments/*/packages"))

@@ -60,7 +60,7 @@ def lane(dice: Dice) -> None:
     words = ours.reply[: slabs.HEADER_BYTES].view(np.uint64)
     if rng.random() < 0.3:
         ours.batch[:] = np.frombuffer(rng.randbytes(ours.batch.nbytes), np.uint8)
-    message = rng.choice([one for one in dice.messages if one.kind >= m.FIRST_RUNNER_KIND])
+    message = rng.choice([one for one in dice.messages if m.is_of_runner(one.kind)])
     if rng.random() < 0.4:
         size = rng.choice((1, COUNT))
         message = m.Value({"a": np.ones(size), "_a": np.ones(size, bool), "n": np.ones((size, 2))})

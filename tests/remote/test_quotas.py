@@ -66,10 +66,10 @@ def test_packages_of_the_repositorys_own_are_not_for_other_hosts() -> None:
     """A folder there cannot be named, however it is asked for; the text says what to do."""
     asked, confinement = order()
     wanted = m.OpenJailWith("x", "", asked.snapshot, "env.py", asked.confinement, 1, "/packages")
-    with pytest.raises(RefusedError, match="start it in the environment or image") as caught:
+    with pytest.raises(RefusedError, match="folders of the remote server") as caught:
         check_policy(wanted, confinement, Permissions())
     assert caught.value.error == "PolicyError"
-    with pytest.raises(PolicyError, match="start it in the environment or image"):
+    with pytest.raises(PolicyError, match="--dependencies"):
         check_place(Policy(), Runtime("", "/packages"))
 
 

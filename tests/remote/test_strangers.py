@@ -24,6 +24,7 @@ from envhub_sandbox.transport.tcp import Link
 from envhub_worker.access import keys
 from envhub_worker.access.gate import Arrived, Asked, Greeting
 from envhub_worker.access.keys import AuthorizedClients
+from envhub_worker.access.packages import Packages
 from envhub_worker.access.port.connection_limit import Doorman
 from envhub_worker.access.quotas import Permissions, Quotas, RefusedError
 from envhub_worker.access.remote_gate import RemoteGate, Rules
@@ -143,7 +144,7 @@ def _gate(folder: Path) -> RemoteGate:
         permissions=Permissions(),
         idle_s=0,
     )
-    return RemoteGate(rules, Uploads(folder, Quotas()), Log())
+    return RemoteGate(rules, Uploads(folder, Quotas()), Packages(None, Quotas()), Log())
 
 
 def test_nobody_comes_in_while_nobody_can_be_asked(tmp_path: Path) -> None:

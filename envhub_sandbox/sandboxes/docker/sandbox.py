@@ -154,6 +154,7 @@ class ContainerServer:
     owner: Owner = field(default_factory=Owner)
     users: int = 0
     snapshot: str = run_arguments.SNAPSHOT
+    packages: str = ""
 
     @property
     def endpoint(self) -> str:

@@ -152,7 +152,7 @@ class Launcher:
         confinement = self.repository.policy.confinement()
         snapshot, runtime = str(self.repository.snapshot.root), self.repository.runtime
         if isinstance(server, EnclosedServer):
-            snapshot, runtime = server.snapshot, Runtime(server.python)
+            snapshot, runtime = server.snapshot, Runtime(server.python, server.packages)
             confinement = replace(confinement, profile=server.profile)
         entry, permitted = self.repository.snapshot.path, asdict(confinement)
         order = (self.repository.label, runtime.python, snapshot, entry, permitted, runners)

@@ -16,7 +16,6 @@ from envhub_sandbox.dependencies import host, interpreters
 from envhub_sandbox.dependencies.choice import AUTO, HOST, chosen
 from envhub_sandbox.dependencies.cure import cure
 from envhub_sandbox.dependencies.declared import Declared, one
-from envhub_sandbox.dependencies.environments import Environment
 from envhub_sandbox.dependencies.prepare import needs
 from envhub_sandbox.errors import InterpreterUnavailableError, PolicyError, RequirementError
 from envhub_sandbox.hub.snapshot import Snapshot, local
@@ -194,25 +193,24 @@ def test_an_interpreter_by_its_path(tmp_path: Path) -> None:
         interpreters.find(str(tmp_path / "python"))
 
 
-ENVIRONMENT = Environment("k", "/usr/bin/python3", "3.11.2", "0", (), 0, 0.0, Path("/cache"))
-
-
 @pytest.mark.parametrize(
-    ("place", "choice", "python", "environment", "said"),
+    ("place", "choice", "python", "own", "said"),
     [
-        ("process", AUTO, None, None, "{'extra': ['NAME-OF-THE-PACKAGE']}"),
-        ("process", AUTO, None, ENVIRONMENT, "{'extra': ['NAME-OF-THE-PACKAGE']}"),
-        ("process", HOST, None, None, "leave that out"),
-        ("process", HOST, "/opt/python", None, "/opt/python"),
-        ("docker", AUTO, None, None, "envhub image build"),
-        ("remote", AUTO, None, None, "whoever runs the server"),
+        ("process", AUTO, None, False, "{'extra': ['NAME-OF-THE-PACKAGE']}"),
+        ("process", AUTO, None, True, "{'extra': ['NAME-OF-THE-PACKAGE']}"),
+        ("process", HOST, None, False, "leave that out"),
+        ("process", HOST, "/opt/python", False, "/opt/python"),
+        ("docker", AUTO, None, False, "envhub image build"),
+        ("remote", AUTO, None, False, "whoever runs that"),
+        ("remote", AUTO, None, False, "--dependencies"),
+        ("remote", AUTO, None, True, "{'extra': ['NAME-OF-THE-PACKAGE']}"),
     ],
 )
 def test_a_missing_module_has_one_cure(
-    tmp_path: Path, place: str, choice: Any, python: Any, environment: Any, said: str
+    tmp_path: Path, place: str, choice: Any, python: Any, own: bool, said: str
 ) -> None:
     """It depends on the place, and what the repository declares is told."""
-    text = cure(snapshot(tmp_path, "numpy>=1\n"), place, choice, python, environment)
+    text = cure(snapshot(tmp_path, "numpy>=1\n"), place, choice, python, own)
     assert said in text
     assert place == "process" or "python=" not in text  # which is refused elsewhere
     assert "Its requirements.txt declares numpy>=1" in text
@@ -220,6 +218,6 @@ def test_a_missing_module_has_one_cure(
 
 def test_a_repository_that_declares_nothing_is_said_to(tmp_path: Path) -> None:
     """And one whose file cannot be taken, why."""
-    assert "declares no packages" in cure(snapshot(tmp_path), "process", AUTO, None, None)
-    said = cure(snapshot(tmp_path, "-e .\n"), "docker", AUTO, None, None)
+    assert "declares no packages" in cure(snapshot(tmp_path), "process", AUTO, None, False)
+    said = cure(snapshot(tmp_path, "-e .\n"), "docker", AUTO, None, False)
     assert "line 1 of requirements.txt" in said

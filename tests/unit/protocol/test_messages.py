@@ -52,6 +52,8 @@ SAMPLES: list[m.Message] = [
     m.ExpireIdle(3, 60_000),
     m.KeepJail(3),
     m.OpenJailWith("a/b@c:env.py", "/usr/bin/python3", "/s", "env.py", {"gpu": False}, 1, "/p"),
+    m.NeedPackages((("scipy>=1.11", "line 1 of requirements.txt"),), ">=3.10", "3.12", "", True),
+    m.Packages("made", "00" * 20, {"lock": "sha256:00", "packages": ("scipy==1.11",)}, "made"),
     m.RelayedPartly((2, 1), (1,)),
     m.Load(4, True, {"task": "pick"}, {"seed": 1}),
     m.LoadTask(4, True, {"task": "pick"}, {"seed": 1}, "suite", "task"),

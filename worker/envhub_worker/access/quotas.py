@@ -45,6 +45,8 @@ class Quotas:
         memory_bytes: The sum of its open jails' memory limits.
         upload_bytes: Files of snapshots that it has brought here; the longest unused go first.
         upload_files: Files of one snapshot.
+        packages_bytes: Environments of its repositories' packages, and what was downloaded for
+            them; the longest unused go first.
         inflight_bytes: Requests that its jails have not answered yet.
         sessions: Processes of the client.
     """
@@ -54,6 +56,7 @@ class Quotas:
     memory_bytes: int = 512 * GIB
     upload_bytes: int = 8 * GIB
     upload_files: int = 20_000
+    packages_bytes: int = 16 * GIB
     inflight_bytes: int = 512 * MIB
     sessions: int = 64
 
@@ -66,11 +69,13 @@ class Permissions:
         weakest_profile: ``"strict"``, ``"no-userns"`` or ``"container"``.
         network: Whether jails may have this host's network.
         gpu: Whether jails may have its GPU.
+        dependencies: Whether packages that repositories declare are installed here.
     """
 
     weakest_profile: str = "strict"
     network: bool = False
     gpu: bool = False
+    dependencies: bool = False
 
 
 @dataclass(frozen=True)
@@ -87,11 +92,11 @@ def check_policy(request: m.OpenJail, confinement: Confinement, permitted: Permi
     Raises:
         RefusedError: With what to do instead.
     """
-    if request.runtime.packages:
+    if "/" in request.runtime.packages:
         raise RefusedError(
             "PolicyError",
-            "dependencies: this server uses no environment of a repository's own; start it in the "
-            "environment or image that the repository needs",
+            "dependencies: folders of the remote server cannot be named; it makes a repository's "
+            "packages itself, where it was started with --dependencies",
         )
     if request.python:
         raise RefusedError("PolicyError", "python: the interpreter is the remote server's own")

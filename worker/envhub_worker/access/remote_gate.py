@@ -12,6 +12,7 @@ from envhub_worker.access.drain import Drain
 from envhub_worker.access.gate import Arrived, Asked, Greeting, Handler
 from envhub_worker.access.keys import AuthorizedClients, KeyPair
 from envhub_worker.access.line import RETRY_S, Line
+from envhub_worker.access.packages import Packages
 from envhub_worker.access.port.connection_limit import MAX_CONNECTIONS
 from envhub_worker.access.port.curve_port import CurvePort
 from envhub_worker.access.quotas import (
@@ -37,6 +38,7 @@ from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.keys import KEY_BYTES, key_text
 from envhub_worker.protocol.messages.busy import Busy
 from envhub_worker.protocol.records import dataclass
+from envhub_worker.protocol.runtime import OWN
 from envhub_worker.supervisor.jails import Jails
 from envhub_worker.supervisor.records import Asker, JailEntry
 from envhub_worker.supervisor.witness import Witness
@@ -80,12 +82,14 @@ class RemoteGate:
         self,
         rules: Rules,
         uploads: Uploads,
+        packages: Packages,
         log: Log,
         publish: Callable[[Mapping[str, Any]], None] | None = None,
     ) -> None:
         self.idle_s = rules.idle_s
         self._rules = rules
         self._uploads = uploads
+        self._packages = packages
         self._log = log
         self._events = Events(log, self._name_of, self._count_opened)
         self.witness: Witness = self._events
@@ -109,6 +113,7 @@ class RemoteGate:
             m.PutBlob: self._put,
             m.KeepAlive: self._keep,
             m.GetSessions: self._tell_sessions,
+            m.NeedPackages: self._need,
         }
 
     # --- the socket ----------------------------------------------------------------------------
@@ -163,7 +168,7 @@ class RemoteGate:
         """Hold a request against keys and quotas."""
         asker, request = asked.asker, asked.request
         self._refuse_unless_authorized(asker.key)
-        if isinstance(request, (m.OpenJail, m.OfferSnapshot)):
+        if isinstance(request, (m.OpenJail, m.OfferSnapshot, m.NeedPackages)):
             self._drain.refuse_new()
         if isinstance(request, m.OpenJail):
             return self._authorize_open(asked, request)
@@ -231,11 +236,19 @@ class RemoteGate:
         wrong = wrong_with_path(request.entry)
         if wrong:
             raise RefusedError("PolicyError", f"the entry file {wrong}")
+        packages = request.runtime.packages
+        runtime = self._packages.runtime(asked.asker.key, packages) if packages else OWN
         self._find_place(asked, Use(confinement.limits.memory_bytes, request.runners))
         tree = self._uploads.tree(asked.asker.key, request.snapshot)
-        return m.OpenJail(
-            request.name[:512], "", tree, request.entry, request.confinement, request.runners
-        )
+        order = (request.name[:512], runtime.python, tree, request.entry, request.confinement)
+        if not packages:
+            return m.OpenJail(*order, request.runners)
+        return m.OpenJailWith(*order, request.runners, runtime.packages)
+
+    def _need(self, asked: Asked) -> m.Message:
+        request = asked.request
+        assert isinstance(request, m.NeedPackages)
+        return self._packages.need(asked.asker.key, request, asked.jails.packages)
 
     def _offer(self, asked: Asked) -> m.Message:
         asker, request = asked.asker, asked.request
@@ -345,6 +358,7 @@ class RemoteGate:
             if not self._is_known(session.key):
                 self._departures.end(session, sessions, jails, "its key is not authorised any more")
         self._departures.tick(sessions, jails)
+        self._packages.look(jails.packages)
         if self._publish is not None:
             self._publish(self.figures(sessions, jails))
         self._usage.watch(
@@ -382,6 +396,7 @@ class RemoteGate:
         """Everybody has to go; close the sockets of the handshakes."""
         for session in sessions.all():
             self._departures.drop(session, sessions, "the server ends")
+        self._packages.close()
         self._usage.close()
         self._port.close()
 

@@ -28,6 +28,7 @@ import zmq
 from envhub_worker import __version__
 from envhub_worker.access import keys
 from envhub_worker.access.keys import AuthorizedClients, KeyPair
+from envhub_worker.access.packages import Packages, why_impossible
 from envhub_worker.access.port.connection_limit import MAX_CONNECTIONS
 from envhub_worker.access.quotas import Permissions, Quotas
 from envhub_worker.access.remote_gate import RemoteGate, Rules
@@ -107,6 +108,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--allow-network", action="store_true", help="permit network='host'")
     parser.add_argument("--allow-gpu", action="store_true", help="permit gpu=True")
     parser.add_argument(
+        "--dependencies",
+        action="store_true",
+        help="install the packages that repositories declare; needs envhub-sandbox beside this",
+    )
+    parser.add_argument(
         "--log-format",
         choices=tuple(FORMS),
         default="text",
@@ -130,6 +136,7 @@ def _add_quotas(parser: argparse.ArgumentParser) -> None:
         (("--max-upload-files",), "files of a snapshot", quotas.upload_files, ""),
         (("--max-memory",), "memory limits of jails", quotas.memory_bytes // GIB, " GiB"),
         (("--max-upload",), "snapshots", quotas.upload_bytes // MIB, " MiB"),
+        (("--max-packages",), "installed packages", quotas.packages_bytes // MIB, " MiB"),
         (("--max-inflight",), "unanswered requests", quotas.inflight_bytes // MIB, " MiB"),
     ):
         parser.add_argument(
@@ -176,6 +183,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _listen(arguments: argparse.Namespace, state: Path) -> int:
     check_bind(arguments.bind, arguments.insecure_loopback)
+    if arguments.dependencies and (why := why_impossible()):
+        raise UsageError(f"--dependencies: {why}")
     strongest = surroundings.profiles(probe.probe()["layers"], landlock.version())
     identity = replace(_identity(arguments, state), profile=(*strongest, "strict")[0])
     log = Log(form=FORMS[arguments.log_format], level=arguments.log_level)
@@ -434,6 +443,7 @@ def _gate(
         memory_bytes=arguments.max_memory * GIB,
         upload_bytes=arguments.max_upload * MIB,
         upload_files=arguments.max_upload_files,
+        packages_bytes=arguments.max_packages * MIB,
         inflight_bytes=arguments.max_inflight * MIB,
         sessions=arguments.max_sessions,
     )
@@ -446,13 +456,15 @@ def _gate(
             weakest_profile=arguments.weakest_profile,
             network=arguments.allow_network,
             gpu=arguments.allow_gpu,
+            dependencies=arguments.dependencies,
         ),
         idle_s=arguments.idle_s,
         max_connections=most_connections(arguments.max_connections),
         drain_s=arguments.drain_s,
         profile=identity.profile,
     )
-    return RemoteGate(rules, Uploads(state / "store", quotas), log, publish)
+    packages = Packages(state / "packages" if arguments.dependencies else None, quotas)
+    return RemoteGate(rules, Uploads(state / "store", quotas), packages, log, publish)
 
 
 def _most_clients(arguments: argparse.Namespace) -> int | None:

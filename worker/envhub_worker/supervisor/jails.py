@@ -267,6 +267,11 @@ class Jails:
             if entry.death is None and not entry.closing and entry.session.startswith(owner)
         ]
 
+    @property
+    def packages(self) -> frozenset[str]:
+        """Folders of packages that a jail, or a zygote that waits for one, has mounted."""
+        return self._zygotes.packages
+
     def statuses(self, owner: bytes) -> list[dict[str, object]]:
         """What the jails of a session are doing."""
         return [status_of(entry) for entry in self.open_ones(owner)]

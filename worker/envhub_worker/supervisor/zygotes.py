@@ -57,6 +57,12 @@ class Zygotes:
         if self._ahead is not None:
             self._ahead.discard()
 
+    @property
+    def packages(self) -> frozenset[str]:
+        """The folders of packages that they are for."""
+        runtimes = (key[0] for key in self._spawners)
+        return frozenset(one.packages for one in runtimes if isinstance(one, Runtime))
+
     def fork(self, runtime: Runtime, confinement: Confinement, spec: JailSpec) -> tuple[Key, Jail]:
         """A jail, and the name of the zygote that it is a fork of."""
         # a zygote is one environment's: not even what it has not imported is shared with another

@@ -30,7 +30,7 @@ OTHERS = "(others)"
 OPERATIONS = ("make_env", "reset", "step", "call", "get_attr", "set_attr", "render", "close")
 """What requests are counted by; a client may call its own anything."""
 REFUSALS = (
-    *("sessions", "jails", "runners", "memory", "inflight", "draining"),
+    *("sessions", "jails", "runners", "memory", "inflight", "draining", "packages"),
     *("PolicyError", "SandboxUnavailableError", "SnapshotIntegrityError", "VersionMismatchError"),
     *("LocalProtocolError", "WorkerError", "WorkerDiedError", "HelloError"),
 )
@@ -96,6 +96,7 @@ class Facts:
             "weakest_profile": permitted.weakest_profile,
             "network": permitted.network,
             "gpu": permitted.gpu,
+            "dependencies": permitted.dependencies,
             "quotas": asdict(self.quotas),
         }
 

@@ -287,3 +287,32 @@ class OpenJailWith(OpenJail, kind=31):
     def runtime(self) -> Runtime:
         """What runs the repository."""
         return Runtime(self.python, self.packages)
+
+
+class NeedPackages(Message, kind=58):
+    """Ask a server on another host for a repository's packages. Reply: ``Packages`` or ``Refused``.
+
+    It makes them in its own time, and says at once how far it is: whoever wants them asks again.
+    ``requirements`` has pairs, a plain requirement and where it stands; ``supports`` are the
+    versions of Python that the repository runs in, ``python`` the version that the caller asks for.
+    Where ``always`` is not set, the server's own packages do if they meet all of it.
+    """
+
+    requirements: tuple[object, ...]
+    supports: str
+    python: str
+    exclude_newer: str
+    always: bool
+
+
+class Packages(Message, kind=59):
+    """How far they are. ``state`` is ``"making"``, ``"made"``, or ``"own"`` for the server's own.
+
+    ``name`` is what ``OpenJailWith`` may call them, ``told`` a line for people. ``facts`` are the
+    lock's hash and the pins.
+    """
+
+    state: str
+    name: str
+    facts: dict[str, object]
+    told: str

@@ -1,0 +1,242 @@
+"""The program by which ``envhub-worker listen --dependencies`` makes clients' packages.
+
+``python -I -m envhub_sandbox.dependencies.for_a_server``: stdin is one order as JSON, stdout a
+file that holds what there is to say at any time, as one object of JSON: ``told``, a line of
+progress; and at the end ``own``, ``made``, or ``error`` and ``said``. With the word ``check`` it
+only says whether it could work.
+
+Whoever orders is a client on another host, so nothing of an order is believed: requirements are
+read as a stranger's file is. What is made lies in a folder of that client's key, uv's cache
+included, and all of it has one bound. So two processes are at it: one works, and this one measures,
+ends it, and leaves nothing of what was not finished.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from envhub_sandbox.dependencies import bounds, environments, host, interpreters, uv
+from envhub_sandbox.dependencies.choice import DATE, Choice
+from envhub_sandbox.dependencies.declared import Declared, one
+from envhub_sandbox.dependencies.prepare import Needs, prepare
+from envhub_sandbox.errors import DependencyError, PackagesTooLargeError, RequirementError
+from envhub_sandbox.hub.store import CACHE_VARIABLE, remove_tree
+from envhub_worker.protocol.text import printable
+
+BLOCK_BYTES = 4096
+"""What the smallest file is charged: it takes disk, too."""
+_LOOK_S = 0.5
+_WAIT_S = 60.0
+_WHERE_CHARS = 200
+_SAID_CHARS = 3800
+_NICE = 10
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Carry out an order; the exit code is 0 if something was said that can be read."""
+    words = sys.argv[1:] if words is None else words
+    try:
+        if "check" in words:
+            uv.command()
+            return 0
+        order = json.load(sys.stdin)
+        os.environ[CACHE_VARIABLE] = order["folder"]
+        os.environ["UV_CACHE_DIR"] = str(_uv_cache(order))
+        os.environ[bounds.BYTES_VARIABLE] = str(order["bytes"])
+        said = _made(order) if "make" in words else _watched(order)
+    except DependencyError as error:
+        if "check" in words:
+            sys.stderr.write(f"{error}\n")
+            return 1
+        said = {"error": type(error).__name__, "said": str(error)[:_SAID_CHARS]}
+    if said:
+        _say(said)
+    return 0
+
+
+def _say(what: Mapping[str, Any]) -> None:
+    os.ftruncate(1, 0)
+    os.pwrite(1, json.dumps(what).encode(), 0)
+
+
+# --- who works ----------------------------------------------------------------------------------
+
+
+def _made(order: Mapping[str, Any]) -> dict[str, Any]:
+    os.nice(_NICE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (order["bytes"], order["bytes"]))
+    needed = _needed(order)
+    assert needed.declared is not None
+    if not order["always"] and host.lacks(needed.declared) is None:
+        return {"own": True}
+    made = prepare(needed, lambda line: _say({"told": line[:_WHERE_CHARS]}))
+    return {
+        "made": {
+            "name": made.key,
+            "python": made.python,
+            "packages": str(made.packages),
+            "bytes": made.size,
+            "facts": made.facts,
+        }
+    }
+
+
+def _needed(order: Mapping[str, Any]) -> Needs:
+    """What is asked for. Trust: input from a client."""
+    wanted = tuple(
+        one(text, printable(where, _WHERE_CHARS)) for text, where in order["requirements"]
+    )
+    python, until = order["python"], order["exclude_newer"]
+    try:
+        interpreters.check_versions(python or ">=3")
+        interpreters.check_versions(order["supports"] or ">=3")
+        if os.sep in python + order["supports"] or (until and not DATE.fullmatch(until)):
+            raise ValueError("a path, or no date")
+    except ValueError as error:
+        raise RequirementError(
+            "the client asks for versions of Python that are none, for an interpreter by its path, "
+            "or for a date that is none"
+        ) from error
+    declared = Declared("what the client asks for", wanted, order["supports"])
+    return Needs(declared, Choice("own", (), python, until or None))
+
+
+# --- who watches --------------------------------------------------------------------------------
+
+
+def _watched(order: Mapping[str, Any]) -> dict[str, Any]:
+    """Have it made, within bounds; empty where whoever made it has said what there is to say."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    with _alone(Path(order["folder"])) as held:
+        unfinished = Path(order["folder"], "unfinished")
+        if unfinished.exists():
+            _clean(order)  # whoever was at it was killed
+        _make_room(order)
+        unfinished.touch()
+        try:
+            finished = _worked(order, held)
+        except BaseException:
+            _clean(order)
+            unfinished.unlink()
+            raise
+        if not finished or _charged(_uv_cache(order)) > order["bytes"] // 4:
+            _clean(order)
+        unfinished.unlink()
+    return {}
+
+
+def _worked(order: Mapping[str, Any], held: int) -> bool:
+    """Whether it has come to an end that leaves nothing half-made."""
+    process = subprocess.Popen(
+        [sys.executable, "-I", "-m", "envhub_sandbox.dependencies.for_a_server", "make"],
+        stdin=subprocess.PIPE,
+        pass_fds=(held,),
+        start_new_session=True,  # uv is in it, too
+    )
+    try:
+        assert process.stdin is not None
+        with contextlib.suppress(BrokenPipeError), process.stdin as stdin:
+            stdin.write(json.dumps(order).encode())
+        while process.poll() is None:
+            _look(order)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(_LOOK_S)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    if process.returncode != 0:
+        raise DependencyError(f"the program that makes packages ended with {process.returncode}")
+    return "error" not in json.loads(os.pread(1, 1 << 20, 0) or b"{}")
+
+
+def _look(order: Mapping[str, Any]) -> None:
+    charged = _charged(Path(order["folder"]))
+    if charged > order["bytes"]:
+        raise PackagesTooLargeError(
+            f"the packages of your key have {charged / 2**20:,.0f} MiB there, what is downloaded "
+            f"for them included; the server's quota is {order['bytes'] / 2**20:,.0f} MiB "
+            "(--max-packages). None were made"
+        )
+
+
+def _charged(folder: Path) -> int:
+    """Bytes of all that is below a folder, a block at least for each file."""
+    total = 0
+    for path in bounds.walk(folder):
+        with contextlib.suppress(OSError):
+            total += max(path.lstat().st_size, BLOCK_BYTES)
+    return total
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[int]:
+    """Nobody else makes packages in this folder: a server that was killed may have left one."""
+    folder.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        until = time.monotonic() + _WAIT_S
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() > until:
+                    raise DependencyError("another process makes packages there; ask again") from (
+                        None
+                    )
+                time.sleep(_LOOK_S)
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def _uv_cache(order: Mapping[str, Any]) -> Path:
+    return Path(order["folder"], "uv")
+
+
+def _clean(order: Mapping[str, Any]) -> None:
+    """Remove what was not finished, and all that uv has unpacked: some of it may be what broke.
+
+    A uv that was killed a moment ago still holds its lock until the kernel has ended it.
+    """
+    until = time.monotonic() + _WAIT_S
+    while True:
+        environments.remove_abandoned()
+        shutil.rmtree(_uv_cache(order), ignore_errors=True)
+        left = environments.half_made() or _uv_cache(order).exists()
+        if not left or time.monotonic() > until:
+            return
+        time.sleep(_LOOK_S)
+
+
+def _make_room(order: Mapping[str, Any]) -> None:
+    """Half of the bound at least is for what comes: what was not used for longest goes."""
+    folder, keep = Path(order["folder"]), frozenset[str](order["keep"])
+    if _charged(folder) > order["bytes"] // 2:
+        shutil.rmtree(_uv_cache(order), ignore_errors=True)
+        remove_tree(folder / "resolutions")
+    for environment in _removable(keep):
+        if _charged(folder) <= order["bytes"] // 2:
+            return
+        environments.remove(environment)
+
+
+def _removable(keep: Collection[str]) -> list[environments.Environment]:
+    return [one for one in reversed(environments.every()) if one.key not in keep]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,180 @@
+"""Packages that a server on another host installs, where its operator permits that."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import MissingModuleError, PolicyError, ResolutionError
+from envhub_worker.access import packages as server_side
+from envhub_worker.access.packages import Packages
+from envhub_worker.access.quotas import BusyError, Quotas, RefusedError
+from envhub_worker.protocol import messages as m
+from tests.remote.listening import Listening, listening
+from tests.support.processes import eventually
+from tests.support.repositories import write_repository
+from tests.support.wheels import Index, make_wheel
+
+ENV = """
+import sys
+import gymnasium as gym
+import wanted
+
+class Told(gym.Wrapper):
+    def version(self):
+        return wanted.VERSION
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([lambda: Told(gym.make("CartPole-v1"))] * n_envs)
+"""
+
+
+@pytest.fixture(scope="module")
+def permitting(real_index: Index, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Listening]:
+    """A server whose operator permits it, with an index of its own."""
+    make_wheel(real_index.folder, "wanted", "1.0")
+    folder = tmp_path_factory.mktemp("permitting")
+    with listening(folder, "--dependencies", "--max-packages", "512") as found:
+        yield found
+
+
+def test_a_server_makes_what_the_repository_declares(
+    permitting: Listening, real_index: Index, tmp_path: Path
+) -> None:
+    """On its side, once; the client is told what there is, and has none of it."""
+    folder = write_repository(tmp_path / "repo", ENV, requirements__txt="wanted==1.0\n")
+    asked = []
+    for _ in range(2):
+        with make_env(folder, sandbox=permitting.sandbox()) as suites:
+            suites.env.reset(seed=0)
+            assert suites.env.call("version") == ("1.0",)
+            assert "wanted==1.0" in suites.provenance["installed"]["packages"]
+        asked.append(len(real_index.asked))
+    assert 0 < asked[0] == asked[1]
+    assert not (Path(os.environ["ENVHUB_CACHE"]) / "environments").exists()
+    [made] = (permitting.state / "packages").glob("*/environments/*/packages")
+    assert (made / "wanted").is_dir()
+
+
+def test_what_cannot_be_made_is_told_here(
+    permitting: Listening, real_index: Index, tmp_path: Path
+) -> None:
+    """With the lines of the repository that it is about; and a version is asked for, not a path."""
+    folder = write_repository(tmp_path / "repo", ENV, requirements__txt="wanted==3.0\n")
+    with pytest.raises(ResolutionError, match=r"line 1 of requirements\.txt") as caught:
+        make_env(folder, sandbox=permitting.sandbox())
+    assert "repo" in str(caught.value)
+    with pytest.raises(PolicyError, match="name a version"):
+        make_env(folder, sandbox=permitting.sandbox(), dependencies={"python": sys.executable})
+
+
+def test_a_server_that_makes_none_says_so(server: Listening, tmp_path: Path) -> None:
+    """Its own packages are used; who asks for others, or lacks one, hears of the option."""
+    folder = write_repository(tmp_path / "repo", ENV, requirements__txt="wanted==1.0\n")
+    with pytest.raises(MissingModuleError, match="--dependencies"):
+        make_env(folder, sandbox=server.sandbox())
+    with pytest.raises(PolicyError, match="--dependencies"):
+        make_env(folder, sandbox=server.sandbox(), dependencies={"extra": ["wanted"]})
+    assert not (server.state / "packages").exists()
+
+
+def test_without_the_program_that_makes_them_it_does_not_start(tmp_path: Path) -> None:
+    """An interpreter that has the worker and not the client is told what to install."""
+    lacking = tmp_path / "lacking.py"
+    lacking.write_text(
+        "import runpy, sys\nfrom envhub_worker.access import packages\n"
+        "packages.PROGRAM = 'no_such_package'\n"
+        "from envhub_worker.__main__ import main\nsys.exit(main())\n"
+    )
+    words = ("listen", "--bind", "tcp://127.0.0.1:*", "--insecure-loopback", "--dependencies")
+    done = subprocess.run(
+        [sys.executable, "-I", str(lacking), *words, "--state-dir", str(tmp_path / "state")],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 2
+    assert "pip install envhub-sandbox" in done.stderr
+
+
+def order(*requirements: str, always: bool = True) -> m.NeedPackages:
+    """What a client that checks nothing sends."""
+    return m.NeedPackages(tuple((one, "line 1") for one in requirements), "", "", "", always)
+
+
+@pytest.fixture
+def idle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Packages]:
+    """A server's packages, whose program never says anything."""
+    monkeypatch.setattr(
+        server_side, "command", lambda: [sys.executable, "-I", "-c", "import time; time.sleep(600)"]
+    )
+    found = Packages(tmp_path / "packages", Quotas())
+    yield found
+    found.close()
+
+
+def test_orders_are_bounded(idle: Packages, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One key has so many at once, and so many in an hour; another has its own."""
+    for number in range(server_side.MAX_WAITING):
+        assert idle.need(b"a", order(f"p{number}"), ()).state == "making"
+        assert idle.need(b"a", order(f"p{number}"), ()).state == "making"
+    with pytest.raises(BusyError, match="wait already") as caught:
+        idle.need(b"a", order("another"), ())
+    assert caught.value.layer == "packages"
+    assert idle.need(b"b", order("another"), ()).state == "making"
+    monkeypatch.setattr(server_side, "MAX_PER_HOUR", 1)
+    monkeypatch.setattr(server_side, "MAX_WAITING", 100)
+    with pytest.raises(BusyError, match="last hour"):
+        idle.need(b"a", order("another"), ())
+
+
+def test_what_nobody_asks_for_any_more_is_given_up(
+    idle: Packages, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The program ends, and the next in line has its turn."""
+    clock = [1000.0]
+    monkeypatch.setattr(server_side, "monotonic", lambda: clock[0])
+    assert idle.need(b"a", order("first"), ()).state == "making"
+    clock[0] += 40
+    assert idle.need(b"b", order("second"), ()).state == "making"
+    clock[0] += 40
+
+    def begun() -> bool:
+        idle.need(b"b", order("second"), ())
+        try:
+            return idle.need(b"a", order("first"), ()).state != "making"
+        except RefusedError as error:
+            return error.error == "IndexUnavailableError"
+
+    idle.look(())
+    assert eventually(begun)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda: order(*["p"] * (server_side.MAX_REQUIREMENTS + 1)),
+        lambda: order("p" * (server_side.MAX_TEXT + 1)),
+        lambda: m.NeedPackages(("p",), "", "", "", True),
+        lambda: m.NeedPackages((("p", 1),), "", "", "", True),
+        lambda: m.NeedPackages((), "", "3" * (server_side.MAX_TEXT + 1), "", True),
+    ],
+)
+def test_an_order_has_bounds(idle: Packages, wrong: Callable[[], m.NeedPackages]) -> None:
+    """Before anything is begun for it."""
+    with pytest.raises(RefusedError) as caught:
+        idle.need(b"a", wrong(), ())
+    assert caught.value.error == "LocalProtocolError"
+
+
+def test_packages_have_names_that_were_given(idle: Packages) -> None:
+    """Neither a guess nor a path is one."""
+    for name in ("0" * 40, "/usr", "../..", ""):
+        with pytest.raises(RefusedError):
+            idle.runtime(b"a", name)

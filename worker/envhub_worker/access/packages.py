@@ -1,0 +1,353 @@
+"""Packages that clients' repositories need, where the operator permits that (``--dependencies``).
+
+They are made by another program, which the operator has installed beside this one: the client's
+own, with its bounds. It chooses versions, installs wheels by their hashes, runs nothing of them,
+and says what it did. One of them is at work at a time, each client key has a folder of its own, and
+whatever nobody asks for any more is given up.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections import OrderedDict, deque
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass as mutable_dataclass
+from dataclasses import field
+from pathlib import Path
+from time import monotonic
+from typing import IO, Any
+
+from envhub_worker.access.quotas import BusyError, Quotas, RefusedError
+from envhub_worker.access.store.blob_store import make_passable
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.messages.busy import Busy
+from envhub_worker.protocol.records import dataclass
+from envhub_worker.protocol.runtime import Runtime
+
+PROGRAM = "envhub_sandbox.dependencies.for_a_server"
+MAX_REQUIREMENTS = 1000
+MAX_TEXT = 2000
+MAX_WAITING = 2
+"""Orders of one key that wait or are at work."""
+MAX_IN_LINE = 64
+"""Of everybody."""
+MAX_PER_HOUR = 60
+"""Of one key: each asks the index."""
+_REMEMBERED = 512
+_RESULT_BYTES = 1 << 20
+_HOUR_S = 3600.0
+_MAKE_S = 3600.0
+_FORGOTTEN_S = 60.0
+"""What nobody has asked for in so long, nobody waits for."""
+_FAILED_S = 30.0
+"""For so long an order that failed is not tried again."""
+_HANDED_S = 600.0
+_RETRY_S = 10.0
+_STOP_S = 30.0
+_CHECK_S = 60.0
+
+Place = tuple[str, str]
+"""Whose an order is, and its hash."""
+
+
+@mutable_dataclass
+class Order:
+    """What somebody waits for.
+
+    Attributes:
+        plain: For the program.
+        asked: When it was asked for last.
+        told: What the program has said last.
+    """
+
+    plain: dict[str, Any]
+    asked: float = field(default_factory=monotonic)
+    told: str = "waiting for others' packages"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of an order: the program's own words, and when."""
+
+    said: Mapping[str, Any]
+    when: float
+
+
+@mutable_dataclass
+class Work:
+    """The program, at work."""
+
+    place: Place
+    process: subprocess.Popen[bytes]
+    said: IO[bytes]
+    since: float = field(default_factory=monotonic)
+    told_to_end: float | None = None
+
+
+class Packages:
+    """The packages of all clients.
+
+    Args:
+        folder: Where they lie; None where the operator does not permit any.
+        quotas: How much of them each key may have.
+    """
+
+    def __init__(self, folder: Path | None, quotas: Quotas) -> None:
+        self._folder = folder
+        self._quotas = quotas
+        self._line: OrderedDict[Place, Order] = OrderedDict()
+        self._outcomes: OrderedDict[Place, Outcome] = OrderedDict()
+        self._handed: dict[Place, tuple[Runtime, float]] = {}
+        self._begun: dict[str, deque[float]] = {}
+        self._work: Work | None = None
+        if folder is not None:
+            make_passable(folder)
+
+    def need(self, key: bytes, request: m.NeedPackages, in_use: Collection[str]) -> m.Packages:
+        """How far they are; begins, or goes on, to make them.
+
+        Args:
+            key: The client's key.
+            request: Trust: input from a client.
+            in_use: Folders of packages that must stay.
+
+        Raises:
+            RefusedError: They cannot be made, or not now.
+        """
+        if self._folder is None:
+            return _not_here(request)
+        plain = checked(request)
+        home = key.hex()[:32] or "local"
+        place = home, hashlib.sha256(json.dumps(plain).encode()).hexdigest()
+        self.look(in_use)
+        found = self._outcomes.get(place)
+        if found is not None:
+            reply = self._answer(place, found)
+            if reply is not None:
+                return reply
+        order = self._line.get(place)
+        if order is None:
+            order = self._take(place, plain)
+            self.look(in_use)
+        order.asked = monotonic()
+        return m.Packages("making", "", {}, order.told)
+
+    def runtime(self, key: bytes, name: str) -> Runtime:
+        """What a client's packages are, and their interpreter.
+
+        Raises:
+            RefusedError: It has not been given any of that name.
+        """
+        found = self._handed.get((key.hex()[:32] or "local", name))
+        if found is None or not os.path.isdir(found[0].packages):
+            raise RefusedError(
+                "WorkerError", "this server has no such packages; ask for them first"
+            )
+        return found[0]
+
+    def look(self, in_use: Collection[str]) -> None:
+        """Take what is done, give up what nobody waits for, and begin the next."""
+        now = monotonic()
+        if self._work is not None:
+            self._follow(self._work, now)
+        deserted = [
+            place
+            for place, order in self._line.items()
+            if now - order.asked > _FORGOTTEN_S and not self._is_at(place)
+        ]
+        for place in deserted:
+            del self._line[place]
+        if self._work is None and self._line:
+            self._begin(min(self._line, key=lambda place: self._last(place[0])), in_use)
+
+    def close(self) -> None:
+        """End the program; it leaves nothing half-made, or the next one removes it."""
+        if self._work is not None:
+            self._work.process.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._work.process.wait(_STOP_S)
+            _kill(self._work)
+            self._work = None
+
+    # --- orders --------------------------------------------------------------------------------
+
+    def _answer(self, place: Place, found: Outcome) -> m.Packages | None:
+        said = found.said
+        if "own" in said:
+            return m.Packages("own", "", {}, "this server's interpreter has all of it")
+        made = said.get("made")
+        if made is not None and os.path.isdir(made["packages"]):
+            home, name = place[0], made["name"]
+            self._handed[home, name] = Runtime(made["python"], made["packages"]), monotonic()
+            with contextlib.suppress(OSError):
+                os.utime(Path(made["packages"]).with_name("environment.json"))
+            return m.Packages("made", name, made["facts"], "")
+        if made is None and monotonic() - found.when < _FAILED_S:
+            raise RefusedError(str(said["error"]), str(said["said"]))
+        del self._outcomes[place]
+        return None
+
+    def _take(self, place: Place, plain: dict[str, Any]) -> Order:
+        mine = sum(1 for home, _ in self._line if home == place[0])
+        hour = self._begun.setdefault(place[0], deque(maxlen=MAX_PER_HOUR))
+        while hour and monotonic() - hour[0] > _HOUR_S:
+            hour.popleft()
+        for used, limit, what in (
+            (mine, MAX_WAITING, "orders of your key for packages wait already"),
+            (
+                len(hour),
+                MAX_PER_HOUR,
+                "orders of your key for packages were begun in the last hour",
+            ),
+            (len(self._line), MAX_IN_LINE, "orders for packages wait already"),
+        ):
+            if used >= limit:
+                busy = Busy("packages", used, limit, _RETRY_S)
+                raise BusyError(busy, f"packages: {used} {what}, and the server takes {limit}")
+        self._line[place] = order = Order(plain)
+        return order
+
+    # --- the program ---------------------------------------------------------------------------
+
+    def _last(self, home: str) -> float:
+        """When something was begun for a key: who has waited longest for a turn is next."""
+        begun = self._begun.get(home)
+        return begun[-1] if begun else 0.0
+
+    def _is_at(self, place: Place) -> bool:
+        return self._work is not None and self._work.place == place
+
+    def _begin(self, place: Place, in_use: Collection[str]) -> None:
+        assert self._folder is not None
+        folder = self._folder / place[0]
+        make_passable(folder)
+        now = monotonic()
+        self._handed = {
+            at: held for at, held in self._handed.items() if self._is_live(held, now, in_use)
+        }
+        keep = [name for home, name in self._handed if home == place[0]]
+        order = self._line[place].plain | {
+            "folder": str(folder.absolute()),
+            "bytes": self._quotas.packages_bytes,
+            "keep": keep,
+        }
+        said = tempfile.TemporaryFile()  # noqa: SIM115 - it lasts as long as the program
+        with tempfile.TemporaryFile() as given:
+            given.write(json.dumps(order).encode())
+            given.seek(0)
+            process = subprocess.Popen(
+                command(), stdin=given, stdout=said, cwd="/", start_new_session=True
+            )
+        self._begun.setdefault(place[0], deque(maxlen=MAX_PER_HOUR)).append(now)
+        self._work = Work(place, process, said)
+
+    def _is_live(self, held: tuple[Runtime, float], now: float, in_use: Collection[str]) -> bool:
+        return held[0].packages in in_use or now - held[1] < _HANDED_S
+
+    def _follow(self, work: Work, now: float) -> None:
+        order = self._line[work.place]
+        said = _said(work)
+        if work.process.poll() is None:
+            order.told = str(said.get("told", order.told))
+            late = now - work.since > _MAKE_S
+            if work.told_to_end is None and (late or now - order.asked > _FORGOTTEN_S):
+                work.process.terminate()
+                work.told_to_end = now
+            elif work.told_to_end is not None and now - work.told_to_end > _STOP_S:
+                _kill(work)
+            return
+        self._work = None
+        work.said.close()
+        del self._line[work.place]
+        if work.told_to_end is not None:
+            said = {"error": "IndexUnavailableError", "said": "they were not made in time"}
+        elif not said.keys() & {"own", "made", "error"}:
+            code = work.process.returncode
+            text = f"the program that makes packages ended with {code}; its server's log says why"
+            said = {"error": "DependencyError", "said": text}
+        self._outcomes[work.place] = Outcome(said, now)
+        while len(self._outcomes) > _REMEMBERED:
+            self._outcomes.popitem(last=False)
+
+
+def command() -> list[str]:
+    """The program, in the interpreter that this one runs in."""
+    return [sys.executable, "-I", "-m", PROGRAM]
+
+
+def why_impossible() -> str:
+    """What hinders the program here; empty for nothing."""
+    try:
+        done = subprocess.run(
+            [*command(), "check"], stdin=subprocess.DEVNULL, capture_output=True, timeout=_CHECK_S
+        )
+    except subprocess.TimeoutExpired:
+        return f"the program that makes packages did not answer in {_CHECK_S:.0f} s"
+    if done.returncode == 0:
+        return ""
+    said = done.stderr.decode(errors="replace").strip().splitlines() or ["no word"]
+    return (
+        f"packages are made by envhub-sandbox itself, which is not ready beside this worker "
+        f"({sys.executable}): {said[-1][:500]}. Run: {sys.executable} -m pip install envhub-sandbox"
+    )
+
+
+def checked(request: m.NeedPackages) -> dict[str, Any]:
+    """An order as plain values, within bounds; what they mean, the program looks at.
+
+    Trust: input from a client.
+
+    Raises:
+        RefusedError: It is none.
+    """
+    rows = request.requirements
+    good = len(rows) <= MAX_REQUIREMENTS and all(
+        type(row) is tuple and [type(part) for part in row] == [str, str] for row in rows
+    )
+    texts = [request.supports, request.python, request.exclude_newer]
+    if good:
+        texts += [text for row in rows if isinstance(row, tuple) for text in row]
+    if not good or max(map(len, texts)) > MAX_TEXT:
+        raise RefusedError(
+            "LocalProtocolError",
+            f"an order has at most {MAX_REQUIREMENTS} pairs of texts of {MAX_TEXT} characters",
+        )
+    return {
+        "requirements": [list(row) for row in rows if isinstance(row, tuple)],
+        "supports": request.supports,
+        "python": request.python,
+        "exclude_newer": request.exclude_newer,
+        "always": request.always,
+    }
+
+
+def _not_here(request: m.NeedPackages) -> m.Packages:
+    if request.always:
+        raise RefusedError(
+            "PolicyError",
+            "dependencies: this server makes no environments of a repository's own; whoever runs "
+            "it starts it with --dependencies, or in an interpreter that has the packages",
+        )
+    return m.Packages("own", "", {}, "this server makes no environments (--dependencies)")
+
+
+def _said(work: Work) -> Mapping[str, Any]:
+    """What the program has said; nothing while it writes."""
+    try:
+        found = json.loads(os.pread(work.said.fileno(), _RESULT_BYTES, 0))
+        return found if isinstance(found, dict) else {}
+    except ValueError:
+        return {}
+
+
+def _kill(work: Work) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(work.process.pid, signal.SIGKILL)
+    work.process.wait()
