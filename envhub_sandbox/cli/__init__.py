@@ -10,6 +10,9 @@ def main() -> None:
     import signal
     import sys
 
+    from envhub_sandbox import std_streams
+
+    std_streams.replace_missing()
     # its bars would get into ours, and into the stderr of scripts
     os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
     for stream in (sys.stdout, sys.stderr):

@@ -51,7 +51,8 @@ def shown(title: str) -> Iterator[Callable[[str], None]]:
 
 def _console() -> Console | None:
     """A console that somebody looks at."""
-    if os.environ.get("CI") or not (sys.stderr.isatty() or _is_notebook()):
+    looked_at = sys.stderr is not None and sys.stderr.isatty()
+    if os.environ.get("CI") or not (looked_at or _is_notebook()):
         return None
     from rich.console import Console
 

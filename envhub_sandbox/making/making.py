@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from envhub_sandbox import std_streams
 from envhub_sandbox.dependencies.choice import Choice, chosen
 from envhub_sandbox.dependencies.cure import cure
 from envhub_sandbox.dependencies.prepare import provided
@@ -46,6 +47,7 @@ def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSui
     options = given.checked()
     if options.sandbox is None:
         return _make_here(reference, config, options)
+    std_streams.occupy()  # before anything of ours is opened
     wanted = _wanted(options.sandbox, options)
     snapshot = _snapshot(reference, options)
     environment = _environment(snapshot, wanted, options)

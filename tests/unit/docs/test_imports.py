@@ -57,11 +57,12 @@ MAY_IMPORT = {
     "envhub_sandbox.__main__": {"cli"},
     "envhub_sandbox.cli": {
         *("", "api", "check", "crash", "dependencies", "hub", "locks", "policy"),
-        *("sandboxes", "session"),
+        *("sandboxes", "session", "std_streams"),
     },
     "envhub_sandbox.api": {"making", "policy", "sandboxes", "vector"},
     "envhub_sandbox.making": {
-        *("dependencies", "hub", "locks", "policy", "sandboxes", "session", "transport", "vector"),
+        *("dependencies", "hub", "locks", "policy", "sandboxes", "session", "std_streams"),
+        *("transport", "vector"),
     },
     "envhub_sandbox.check": {"api", "dependencies", "hub", "session", "vector"},
     "envhub_sandbox.gym": {"api", "vector"},
@@ -79,6 +80,7 @@ MAY_IMPORT = {
     "envhub_sandbox.policy": set(),
     "envhub_sandbox.folders": set(),
     "envhub_sandbox.log": set(),
+    "envhub_sandbox.std_streams": set(),
     "envhub_sandbox.errors": set(),
     "envhub_worker.__main__": {"access", "cli", "lockdown", "server", "spawn"},
     "envhub_worker.cli": {"", "access", "lockdown", "server"},
