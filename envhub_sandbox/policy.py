@@ -75,7 +75,8 @@ class Policy:
             ``"container"`` are weaker and must be asked for by name (``docs/threat-model.md``).
         network: ``"none"``, ``"loopback"`` (its own, empty one) or ``"host"``.
         readable: Further absolute paths that the jail may read.
-        gpu: Grant the render and NVIDIA device nodes and the driver's libraries.
+        gpu: Grant the render, NVIDIA's and AMD's device nodes and the driver's libraries; where
+            there are none, no jail can be had.
         environment: Names of environment variables whose values the jail may see.
         limits: Hard caps.
         restart: What happens after the worker has died: ``"never"``; a fresh one at the next

@@ -14,6 +14,7 @@ from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.doctor import doctor as doctor_command
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.policy import PROFILES
+from envhub_worker.lockdown.root_plan import gpu_devices, real_host
 
 RUNNER = CliRunner()
 
@@ -50,9 +51,11 @@ def test_what_else_explains_a_host_is_told(monkeypatch: pytest.MonkeyPatch) -> N
 def test_each_layer_is_tried_by_itself() -> None:
     """So that all that are missing can be named, where a jail stops at the first."""
     done = RUNNER.invoke(app, ["doctor", "--json"])
-    layers = {layer["layer"]: layer for layer in json.loads(done.stdout)["layers"]}
+    told = json.loads(done.stdout)
+    layers = {layer["layer"]: layer for layer in told["layers"]}
     assert {"user-namespace", "mount-namespace", "landlock", "seccomp"} <= set(layers)
     assert layers["seccomp"]["available"]
+    assert told["gpu"] == list(gpu_devices(real_host()))
 
 
 def test_all_missing_layers_are_named_with_their_fixes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -62,14 +65,16 @@ def test_all_missing_layers_are_named_with_their_fixes(monkeypatch: pytest.Monke
         {"layer": "landlock", "available": False, "detail": "none\x1b[2J", "fix": "Linux 5.13"},
         {"layer": "seccomp", "available": True, "detail": "", "fix": ""},
     ]
-    probed = {"layers": layers, "apparmor_profile": "profile x [/usr/bin/python3] { userns, }"}
+    profile = "profile x [/usr/bin/python3] { userns, }"
+    probed = {"layers": layers, "apparmor_profile": profile, "gpu": ["/dev/dri/\x1b[2J"]}
     monkeypatch.setattr(doctor_command, "probe", lambda: probed)
     fail_with(monkeypatch, {})
     printed = RUNNER.invoke(app, ["doctor"]).stdout
     assert "  user-namespace: denied\n    sysctl -w x=1\n" in printed
     assert "  landlock: none\\x1b[2J\n    Linux 5.13\n" in printed
     assert "  seccomp" not in printed
-    assert "profile x [/usr/bin/python3] { userns, }" in printed
+    assert profile in printed
+    assert "GPU: /dev/dri/\\x1b[2J\n" in printed
 
 
 def fail_with(monkeypatch: pytest.MonkeyPatch, errors: dict[str, Exception]) -> None:

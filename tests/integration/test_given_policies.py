@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import PolicyError
+from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
+from envhub_worker.lockdown.root_plan import gpu_devices, real_host
 
 REPOSITORY = """
 import os
@@ -44,3 +45,16 @@ def test_a_path_that_is_not_there_is_refused(folder: Path) -> None:
     with pytest.raises(PolicyError, match="there is no such file or folder"):
         make_env(folder, policy={"readable": (missing,)})
     make_env(folder, policy={"readable": (str(folder),)}).close()
+
+
+def test_a_gpu_that_is_not_there_is_told(folder: Path) -> None:
+    """With what to do; where there is one it is handed in."""
+    make_env(folder).close()  # the control
+    if gpu_devices(real_host()):
+        with make_env(folder, policy={"gpu": True}) as suites:
+            suites.env.reset(seed=1)
+        return
+    with pytest.raises(
+        SandboxUnavailableError, match=r"there is none here.*\n.*leave gpu=True out"
+    ):
+        make_env(folder, policy={"gpu": True})

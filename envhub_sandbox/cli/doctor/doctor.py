@@ -190,7 +190,10 @@ def _available(meminfo: Path) -> int | None:
 
 
 def probe() -> dict[str, Any]:
-    """What came of each layer by itself: ``layers``, and an ``apparmor_profile`` or None."""
+    """What came of each layer by itself: ``layers``, an ``apparmor_profile`` or None, and ``gpu``.
+
+    ``gpu`` are the device nodes that ``gpu=True`` grants, or None where nobody could look.
+    """
     from envhub_sandbox.sandboxes.process import BOOTSTRAP
 
     command = [sys.executable, "-I", str(BOOTSTRAP), "probe"]
@@ -198,8 +201,10 @@ def probe() -> dict[str, Any]:
         done = subprocess.run(command, capture_output=True, timeout=_PROBE_S, check=True, cwd="/")
         found = json_format.loads(done.stdout)
     except (OSError, subprocess.SubprocessError, ValueError):
-        return {"layers": [], "apparmor_profile": None}  # what the profiles say still stands
-    return {name: found[name] for name in ("layers", "apparmor_profile")}
+        # what the profiles say still stands
+        return {"layers": [], "apparmor_profile": None, "gpu": None}
+    told = {name: found[name] for name in ("layers", "apparmor_profile")}
+    return {**told, "gpu": found["host"]["gpu"]}
 
 
 def examine(folder: str, profile: str) -> Finding:
@@ -269,6 +274,10 @@ def _print(findings: list[Finding]) -> None:
 
 def _print_missing(probed: dict[str, Any]) -> None:
     out = console()
+    if probed["gpu"] is not None:
+        nodes = ", ".join(map(safe_line, probed["gpu"]))
+        out.print()
+        out.print(f"GPU: {nodes or 'none here, and a policy with gpu=True is refused'}")
     missing = [layer for layer in probed["layers"] if not layer["available"]]
     if missing:
         out.print()

@@ -35,6 +35,8 @@ def enter(config: ZygoteConfig) -> Common:
     """
     if config.refusal is not None:
         raise LayerUnavailableError(**config.refusal)
+    if config.gpu:
+        _check_gpu()
     namespaced = config.profile == "strict"
     plan = _plan_root(config)
     if namespaced:
@@ -73,6 +75,18 @@ def enter(config: ZygoteConfig) -> Common:
         brokered=brokered,
         programs=programs,
     )
+
+
+def _check_gpu() -> None:
+    """What is granted and is not there would be missed later, and only by some."""
+    if not root_plan.gpu_devices(root_plan.real_host()):
+        raise LayerUnavailableError(
+            "gpu",
+            "the policy grants the GPU, and there is none here: no /dev/dri/renderD*, /dev/nvidia* "
+            "or /dev/kfd",
+            "Install its driver, or in a container hand it in (docker run --gpus all); or leave "
+            "gpu=True out.",
+        )
 
 
 def _plan_root(config: ZygoteConfig) -> root_plan.RootPlan:
