@@ -1,1 +1,1 @@
-"""Unit tests of the client, one module at a time."""
+"""Unit tests of the client, one module at a time, in the folders of its packages."""

@@ -30,7 +30,7 @@ from tests.support.processes import eventually
 from tests.support.wheels import Index, make_wheel
 
 OWN = chosen({}, None)[0]
-CHECKOUT = Path(__file__).resolve().parents[3]
+CHECKOUT = Path(__file__).resolve().parents[4]
 
 
 def repository(folder: Path, *lines: str) -> Path:
@@ -177,7 +177,7 @@ def test_many_threads_make_it_once(index: Index, tmp_path: Path) -> None:
 
 MAKER = """\
 import sys
-from tests.unit.client.test_environments import made
+from tests.unit.client.dependencies.test_environments import made
 from pathlib import Path
 print(made(Path(sys.argv[1])).home, flush=True)
 """
@@ -218,7 +218,7 @@ KILLED = """\
 import sys, time
 from pathlib import Path
 from tests.support import inside
-from tests.unit.client.test_environments import made
+from tests.unit.client.dependencies.test_environments import made
 
 def stop(*given, **named):
     Path(sys.argv[3]).touch()
