@@ -57,7 +57,12 @@ class Sharing(Generic[S]):
             shared = self._shared.get(mine)
             if shared is not None:
                 shared.users += 1  # at once: nobody may end it from here on
-                if shared.runs:
+                try:
+                    runs = shared.runs
+                except BaseException:  # Ctrl-C, while it is looked at
+                    self.release(shared)
+                    raise
+                if runs:
                     return shared
                 self.release(shared)
             lingering = None if self._lingering is None else self._lingering.take(mine)

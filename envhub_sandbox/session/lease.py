@@ -16,7 +16,7 @@ from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerError
 from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.jails.line import of_a_lost_server, of_a_server_that_ends, wait_in_line
 from envhub_sandbox.session.jails.loaded import LoadedJail
-from envhub_sandbox.session.jails.placement import Builder, Place
+from envhub_sandbox.session.jails.placement import Builder
 from envhub_sandbox.session.jails.sources import JailSource, SharedJail
 from envhub_sandbox.session.refusals import closed_during
 from envhub_sandbox.session.repository import Repository
@@ -121,12 +121,12 @@ class Lease:
             WorkerError: The jail did not come up, died, took too long, or nobody wants it any more.
         """
         self.give_back()  # of an attempt that was interrupted when all was built
-        self._start(deadline, lambda: self._build(self._take(deadline), deadline))
+        self._start(deadline, lambda: self._move_in(lambda: self._take(deadline), deadline))
 
     def adopt(self, loaded: LoadedJail, deadline: Deadline) -> None:
         """Use a jail that is already loaded, instead of taking one."""
         with self.repository.starting(deadline):
-            self._build(loaded, deadline)
+            self._move_in(lambda: loaded, deadline)
 
     def replace(self, deadline: StartupDeadline) -> None:
         """Give the jail up, and take another in the same server; raises as ``acquire`` does."""
@@ -134,10 +134,10 @@ class Lease:
 
     def rebuild(self, dead: list[int], deadline: StartupDeadline) -> None:
         """Build some shards again, in fresh runners of this jail; raises as ``acquire`` does."""
-        assert self.loaded is not None
-        assert self.lane is not None
-        place = Place(self.loaded, self.lane)
-        self._start(deadline, lambda: self._builder.rebuild(place, dead, deadline))
+        loaded, lane = self.loaded, self.lane
+        assert loaded is not None
+        assert lane is not None
+        self._start(deadline, lambda: self._builder.rebuild(loaded, lane, dead, deadline))
 
     def _start(self, deadline: StartupDeadline, start: Callable[[], None]) -> None:
         self._startup = deadline
@@ -175,22 +175,25 @@ class Lease:
 
     def _move(self, deadline: Deadline) -> None:
         self.leave()
-        self._build(self._take(deadline), deadline)
+        self._move_in(lambda: self._take(deadline), deadline)
 
-    def _build(self, loaded: LoadedJail, deadline: Deadline) -> None:
+    def _move_in(self, take: Callable[[], LoadedJail], deadline: Deadline) -> None:
+        """Build the environment in a jail; a Ctrl-C leaves none behind.
+
+        Python looks for signals where something is called. So nothing is, neither between the
+        taking and the ``try``, nor between the building and the noting.
+        """
+        loaded = take()
         try:
-            place = self._builder.build(loaded, deadline)
+            lane = self._builder.build(loaded, deadline)
+            self.loaded, self.lane = loaded, lane
         except BaseException:
             self._jails.give_back(loaded)
             raise
-        self._settle(place)
+        self._was_loaded = True
+        self._counters.connected(lane)
         if self.lifecycle.closed:  # only now: who closes from here on sees the jail
             raise closed_during("make_env")
-
-    def _settle(self, place: Place) -> None:
-        self.loaded, self.lane = place.loaded, place.lane
-        self._was_loaded = True
-        self._counters.connected(place.lane)
 
     # --- moving out ----------------------------------------------------------------------------
 

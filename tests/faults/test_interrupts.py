@@ -274,15 +274,16 @@ def test_a_jail_that_comes_up_after_close_is_given_back(
         suites["suite"][0].reset()
         env = suites["suite"][1]
         assert inside.state(env) is State.IDLE
-        places: list[Any] = []
-        owner, name = inside.settling(env)
-        settle = getattr(owner, name)
-        monkeypatch.setattr(owner, name, lambda at: places.append(at) or settle(at))
+        taken: list[Any] = []
+        owner, name = inside.taking(env)
+        take = getattr(owner, name)
+        monkeypatch.setattr(owner, name, lambda deadline: taken.append(take(deadline)) or taken[-1])
         owner, name = (inside.building if moment == "built" else inside.started)(env)
         coming = Inside(getattr(owner, name))
         monkeypatch.setattr(owner, name, coming)
         close_during_reset(env, coming)
-        assert all(place.loaded.closed for place in places)
+        assert taken
+        assert all(loaded.closed for loaded in taken)
         assert inside.lane(env) is None
 
 

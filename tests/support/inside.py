@@ -240,9 +240,9 @@ def building(env: Any) -> Spot:
     return session(env).lease._builder, "build"
 
 
-def settling(env: Any) -> Spot:
-    """Where it takes up what was built."""
-    return session(env).lease, "_settle"
+def taking(env: Any) -> Spot:
+    """Where it takes a jail."""
+    return session(env).lease._jails, "take"
 
 
 def started(env: Any) -> Spot:

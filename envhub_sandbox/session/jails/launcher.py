@@ -100,7 +100,7 @@ class Launcher:
         server = self._acquire()
         try:
             if self.repository.timeouts.server_idle_s != 0 and not isinstance(server, FarServer):
-                self._hold.keep()
+                self._hold.keep(server)
             with self.repository.starting(deadline):
                 return self._open(server, deadline, known)
         except BaseException:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, NoReturn
 
 from envhub_sandbox.errors import LoadError
@@ -20,19 +19,6 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import EnvManifest, decode_env
 
 _numbers = itertools.count(1)
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where an environment lives.
-
-    Attributes:
-        loaded: Its jail.
-        lane: The way to its runners there.
-    """
-
-    loaded: LoadedJail
-    lane: Lane
 
 
 class Builder:
@@ -56,8 +42,8 @@ class Builder:
         self._keeps = own and jails.launcher.repository.policy.restart == "transparent"
         self._number = next(_numbers)  # in every jail: what was packed for one, another understands
 
-    def build(self, loaded: LoadedJail, deadline: Deadline) -> Place:
-        """Build all of it in a loaded jail.
+    def build(self, loaded: LoadedJail, deadline: Deadline) -> Lane:
+        """Build all of it in a loaded jail; returns the way to its runners there.
 
         Raises:
             LoadError: ``make_env`` returned something else than before.
@@ -73,16 +59,17 @@ class Builder:
         self._check_manifest(loaded)
         relay = RelayLane(loaded.jail, runners, self._number, self._results)
         self._build(relay, range(len(runners)), deadline)
-        return Place(loaded, self._fast_lane(relay, loaded, deadline) or relay)
+        return self._fast_lane(relay, loaded, deadline) or relay
 
-    def rebuild(self, place: Place, dead: Sequence[int], deadline: Deadline) -> None:
+    def rebuild(
+        self, loaded: LoadedJail, lane: Lane, dead: Sequence[int], deadline: Deadline
+    ) -> None:
         """Build some shards again, each in a fresh runner in the same jail.
 
         Raises:
             LoadError, RemoteEnvError: The repository failed this time.
             WorkerError: They died again, or took too long.
         """
-        loaded, lane = place.loaded, place.lane
         gone = [lane.runners[index] for index in dead]
         fresh = loaded.jail.replace_runners(gone, deadline)
         loaded.loaded.difference_update(gone)

@@ -42,16 +42,16 @@ class ServerHold:
             self._open.add(ticket)
         return lambda: self._leave(ticket)
 
-    def keep(self) -> None:
-        """A jail has been opened: keep its server, if there are environments to come."""
+    def keep(self, used: WorkerServer) -> None:
+        """A jail is opened in a server: keep that, if there are environments to come."""
         before = None
         with self._lock:
-            if not self._open:
+            if not self._open or self._server is used:
                 return
             server = self._acquire()
             before, self._server = self._server, server
         if before is not None:
-            self._release(before)  # the same, mostly; or one that has died
+            self._release(before)  # it has died
 
     def goes_on(self, server: WorkerServer) -> bool:
         """Whether this one is kept for more than the one who asks."""

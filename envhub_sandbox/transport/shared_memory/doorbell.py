@@ -20,6 +20,7 @@ Followed: ``eventfd(2)``, ``epoll(7)``, ``unix(7)``, ``send(2)``.
 
 from __future__ import annotations
 
+import io
 import os
 import select
 import socket
@@ -64,15 +65,16 @@ class OwnBell:
     """The doorbell that a runner rings and we hear. It is watched, and neither read nor written."""
 
     def __init__(self) -> None:
-        self._fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        # as a file it is closed with its last owner, whatever interrupts that one
+        self._file = io.FileIO(os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK), "r+")
 
     def fileno(self) -> int:
         """Its descriptor, for the runner and for ``Watch``."""
-        return self._fd
+        return self._file.fileno()
 
     def close(self) -> None:
         """Close our copy."""
-        os.close(self._fd)
+        self._file.close()
 
 
 class Watch:

@@ -6,6 +6,7 @@ Followed: ``memfd_create(2)``, ``fcntl(2)`` on sealing.
 from __future__ import annotations
 
 import fcntl
+import io
 import mmap
 import os
 
@@ -17,13 +18,14 @@ _SIZE_SEALS = 0x1 | 0x2 | 0x4
 this file too."""
 
 
-def slab(name: str, size: int, further_seals: int = 0) -> tuple[mmap.mmap, int]:
-    """A sealed memfd of a fixed size, mapped here, and its descriptor.
+def slab(name: str, size: int, further_seals: int = 0) -> tuple[mmap.mmap, io.FileIO]:
+    """A sealed memfd of a fixed size, mapped here, and its file.
 
-    Without the seals a jail could cut the memory, and the next look at it would be a SIGBUS.
+    Without the seals a jail could cut the memory, and the next look at it would be a SIGBUS. It is
+    a file and no number, so that an interrupt leaves no descriptor open that nobody knows.
     """
-    fd = os.memfd_create(f"envhub-{name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-    os.ftruncate(fd, size)
-    mapped = mmap.mmap(fd, size)
-    fcntl.fcntl(fd, _ADD_SEALS, _SIZE_SEALS | further_seals)
-    return mapped, fd
+    file = io.FileIO(os.memfd_create(f"envhub-{name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING), "r+")
+    file.truncate(size)
+    mapped = mmap.mmap(file.fileno(), size)
+    fcntl.fcntl(file, _ADD_SEALS, _SIZE_SEALS | further_seals)
+    return mapped, file

@@ -12,7 +12,6 @@ Trust: a borrowed batch lies in memory that the jail can still write.
 from __future__ import annotations
 
 import mmap
-import os
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -44,7 +43,8 @@ class ObservationSlab:
 
     def __init__(self, space: gym.Space[Any], layout: slabs.ObservationLayout) -> None:
         self.layout = layout
-        self._memory, self.fd = slab("observations", layout.total_bytes)
+        self._memory, self._file = slab("observations", layout.total_bytes)
+        self.fd = self._file.fileno()
         self._assemble = slabs.assembler(space)
         if layout.slots == 1:
             self._slots = [self._memory]
@@ -92,7 +92,7 @@ class ObservationSlab:
 
     def close(self) -> None:
         """Give the descriptor back; the memory goes with the last array over it."""
-        os.close(self.fd)
+        self._file.close()
 
 
 def _copier(slot: mmap.mmap, leaf: slabs.Leaf) -> Callable[[], Any]:

@@ -8,7 +8,6 @@ a SIGBUS).
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from time import perf_counter_ns
 from typing import Any
@@ -52,13 +51,13 @@ class LaneShard:
     def __init__(self, layout: slabs.Layout, observations: int, *, lists: bool = True) -> None:
         self.layout = layout
         self._listed = slabs.LISTED if lists else 0
-        self._request, request_fd = slab("request", layout.request_bytes, SEAL_FUTURE_WRITE)
-        self._reply, reply_fd = slab("reply", layout.reply_bytes)
+        self._request, request = slab("request", layout.request_bytes, SEAL_FUTURE_WRITE)
+        self._reply, reply = slab("reply", layout.reply_bytes)
         self._runner_bell, self.bell = RunnerBell(), OwnBell()
         self._ring = self._runner_bell.ring
-        self._slab_fds = [request_fd, reply_fd]
+        self._slab_files = [request, reply]
         bells = [self._runner_bell.theirs, self.bell.fileno()]
-        self.fds = [request_fd, reply_fd, observations, *bells]
+        self.fds = [request.fileno(), reply.fileno(), observations, *bells]
         self._asks = slabs.words(self._request)
         self._tells = slabs.words(self._reply)
         self._columns: list[tuple[Column, Any]] = []
@@ -70,8 +69,8 @@ class LaneShard:
 
     def handed_over(self) -> None:
         """The runner has its copies of the descriptors; the maps keep ours alive."""
-        while self._slab_fds:
-            os.close(self._slab_fds.pop())
+        while self._slab_files:
+            self._slab_files.pop().close()
         self._runner_bell.handed_over()
 
     def ask(self, leaves: Sequence[Any], slot: int, spin_ns: int, cpu: int = 0) -> None:

@@ -7,11 +7,12 @@ import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from envhub_sandbox.policy import Policy, timeouts_from
+from envhub_sandbox.sandboxes.base import WorkerServer
 from envhub_sandbox.sandboxes.docker import sandbox as docker
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.lingering import Lingering
@@ -205,7 +206,7 @@ def test_a_hold_lasts_from_the_first_jail_to_the_last_environment(
     leave_one, leave_two = hold.enter(), hold.enter()
     server = sharing.acquire("key", Server)
     for _ in range(3):
-        hold.keep()
+        hold.keep(cast("WorkerServer", server))
     sharing.release(server)
     assert server.users == 1
     leave_one()
@@ -213,7 +214,7 @@ def test_a_hold_lasts_from_the_first_jail_to_the_last_environment(
     assert not server.ends
     leave_two()
     assert server.ends
-    hold.keep()  # nobody is left who could need it
+    hold.keep(cast("WorkerServer", server))  # nobody is left who could need it
     assert server.users == 0
 
 
@@ -224,13 +225,13 @@ def test_a_hold_moves_on_from_a_server_that_has_died(sharing: Sharing[Server]) -
         sharing.release,  # type: ignore[arg-type]
     )
     leave = hold.enter()
-    hold.keep()
     dead = sharing.acquire("key", Server)
+    hold.keep(cast("WorkerServer", dead))
     sharing.release(dead)
     dead.runs = False
-    hold.keep()
-    assert dead.ends
     fresh = sharing.acquire("key", Server)
+    hold.keep(cast("WorkerServer", fresh))
+    assert dead.ends
     assert fresh.users == 2
     sharing.release(fresh)
     leave()
