@@ -33,7 +33,7 @@ from typing import Any
 
 import envhub_worker.protocol
 from envhub_sandbox import folders
-from envhub_sandbox.dependencies import index, uv
+from envhub_sandbox.dependencies import index, uv, uv_cache
 from envhub_sandbox.dependencies.bounds import Bounds, Watch, checked, walk
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.resolve import Lock
@@ -237,8 +237,9 @@ def _made(
     try:
         packages = building / "packages"
         watch = Watch(Bounds.set(), building, [index.uv_cache()])
-        _install(lock, interpreter, building, held, watch, tell)
-        size = _size(packages, watch.bounds)
+        with uv_cache.cleared_after_refusal(lock.packages):
+            _install(lock, interpreter, building, held, watch, tell)
+            size = _size(packages, watch.bounds)
         tell(f"compiling {size / 2**20:.0f} MiB")
         _compile(interpreter, packages, held)
         checked(packages)  # again: a compiler with a fault may leave a link, which chmod follows

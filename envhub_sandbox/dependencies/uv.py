@@ -128,8 +128,7 @@ def run(
                 process.kill()
     if process.returncode == -signal.SIGXFSZ:
         raise PackagesTooLargeError(
-            f"{what}: a file was about to have more than {file_bytes} bytes. 'uv cache prune' "
-            "removes what uv keeps of it"
+            f"{what}: a file was about to have more than {file_bytes} bytes"
         )
     if process.returncode != 0:
         raise _error(what, said.text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import importlib.util
 import os
@@ -15,7 +16,8 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.dependencies import bounds, environments, prepare
+from envhub_sandbox.dependencies import bounds, environments, prepare, uv_cache
+from envhub_sandbox.dependencies import index as index_settings
 from envhub_sandbox.dependencies.choice import chosen
 from envhub_sandbox.dependencies.environments import Environment
 from envhub_sandbox.errors import (
@@ -364,10 +366,40 @@ def test_what_is_too_large_is_not_made(
             made(folder)
         assert environments.every() == []
         assert left_behind() == []
+        unpacked = {path.name for path in bounds.walk(tmp_path / "uv")}
+        assert not unpacked & {Path(name).name for name in files}  # nor does uv keep it
         patch.setenv(bounds.BYTES_VARIABLE, "much")
         with pytest.raises(DependencyError, match=r"ENVHUB_ENVIRONMENT_BYTES is 'much'"):
             made(folder)
     assert (made(folder).packages / "wanted").is_dir()
+
+
+def test_what_another_uv_unpacks_is_left_to_it(
+    index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its temporary folders look like those of one that was ended; then nobody is at work."""
+    make_wheel(index.folder, "wanted")
+    (tmp_path / "uv/.tmpours").mkdir(parents=True)
+    monkeypatch.setattr(uv_cache, "WAIT_S", 0.0)
+    index.hold("/files/wanted")
+    with ThreadPoolExecutor(1) as pool:
+        making = pool.submit(made, repository(tmp_path / "repo", "wanted"))
+        try:
+            assert eventually(lambda: index.held() or making.done())
+            refused()
+            assert (tmp_path / "uv/.tmpours").is_dir()
+        finally:
+            index.let_go()
+        making.result(timeout=120)
+    refused()
+    assert not (tmp_path / "uv/.tmpours").exists()
+
+
+def refused() -> None:
+    """An installation of nothing, which is refused."""
+    with contextlib.suppress(PackageIntegrityError), uv_cache.cleared_after_refusal(["none==1"]):
+        (index_settings.uv_cache() / ".tmpours").touch()
+        raise PackageIntegrityError("another hash")
 
 
 def test_what_is_announced_counts_before_it_is_there(tmp_path: Path) -> None:
