@@ -199,16 +199,20 @@ def test_what_is_the_callers_own_passes(
 
 def test_what_a_signal_handler_raises_in_a_wait_passes(liar: LyingServer, tmp_path: Path) -> None:
     """Even where it is of a class that handling might raise: nobody had anything to handle."""
-    liar.lies[m.Step] = lambda asked: []
+    caller = threading.get_ident()
+
+    def lie(_: Asked) -> list[Frames]:
+        threading.Timer(0.3, signal.pthread_kill, (caller, signal.SIGALRM)).start()
+        return []
 
     def ring(*_: object) -> None:
         raise ValueError("the caller's own")
 
+    liar.lies[m.Step] = lie
     before = signal.signal(signal.SIGALRM, ring)
     try:
         with opened(liar, tmp_path / "it") as suites:
             suites.env.reset()
-            signal.setitimer(signal.ITIMER_REAL, 0.3)
             with pytest.raises(ValueError, match="own") as caught:
                 suites.env.step(ACTIONS)
             assert not isinstance(caught.value, EnvHubError)

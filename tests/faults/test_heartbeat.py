@@ -2,40 +2,57 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from envhub_sandbox import errors, make_env
 from tests.support import inside
+from tests.support.processes import eventually, halted
 from tests.support.samples import sample
 
 
 @pytest.mark.usefixtures("neighbour")
 @pytest.mark.parametrize("lane", ["auto", "frames"])
 @pytest.mark.parametrize(
-    ("fault", "state"), [("cpu", "running"), ("hang", "waiting"), ("stop", "stopped")]
+    ("fault", "state", "there"),
+    [
+        ("cpu", "running", {psutil.STATUS_RUNNING}),
+        ("hang", "waiting", {psutil.STATUS_SLEEPING}),
+        ("stop", "stopped", {psutil.STATUS_STOPPED}),
+    ],
 )
-def test_timeout_tells_what_the_worker_does(fault: str, state: str, lane: str) -> None:
+def test_timeout_tells_what_the_worker_does(
+    fault: str, state: str, there: set[str], lane: str, tmp_path: Path
+) -> None:
     """Busy, asleep and stopped are different things to whoever reads the error."""
     fails: dict[str, Any] = {"moment": "step", "fault": fault}
-    with make_env(sample("faulty"), n_envs=2, env_kwargs=fails, lane=lane) as suites:
+    output = tmp_path / "output"
+    policy = {"output": str(output)}
+    with make_env(sample("faulty"), n_envs=2, env_kwargs=fails, lane=lane, policy=policy) as suites:
         suites.env.reset()
+        [runner] = inside.pids(suites.env)
         suites.env.step_async([0, 1])
+        assert eventually(lambda: f"about to {fault}" in output.read_text())
+        assert eventually(lambda: psutil.Process(runner).status() in there)
         with pytest.raises(errors.WorkerTimeoutError, match=state) as caught:
-            suites.env.step_wait(timeout=2.0)
+            suites.env.step_wait(timeout=0.5)
         assert caught.value.worker == (state,)
 
 
 @pytest.mark.usefixtures("neighbour")
-def test_late_reply_survives_the_question() -> None:
+def test_late_reply_survives_the_question(monkeypatch: pytest.MonkeyPatch) -> None:
     """Asking how it is does not lose the reply: the same process is recovered by ``reset``."""
+    monkeypatch.setattr(*inside.LATE_REPLY_GRACE, 120.0)
     with make_env(sample("echo"), lane="frames") as suites:
         env = suites.env
         env.reset()
         before = inside.loaded(env)
-        env.step_async([[1.0, 0.3]])
-        with pytest.raises(errors.WorkerTimeoutError):
-            env.step_wait(timeout=0.05)
+        with halted(inside.pids(env)):
+            env.step_async([[1.0, 0.0]])
+            with pytest.raises(errors.WorkerTimeoutError):
+                env.step_wait(timeout=0.05)
         env.reset(options={"token": 2.0, "delay": 0.0})
         assert inside.loaded(env) is before

@@ -19,7 +19,8 @@ from tests.faults.conftest import Neighbour
 from tests.faults.document import DOCUMENT, document
 from tests.faults.table import CLOSED, LOADING, RESET, ROWS, USABLE, Cell, Row, cells
 from tests.faults.traces import Traces
-from tests.support.processes import eventually
+from tests.support import inside
+from tests.support.processes import eventually, is_stopped
 from tests.support.samples import sample
 
 MIB = 1 << 20
@@ -71,7 +72,7 @@ def _repository(row: Row, folder: Path) -> Path:
 
 def _make(cell: Cell, repository: Path) -> Any:
     row = cell.row
-    waits = row.fault in _HANGS
+    hangs = row.fault in _HANGS and row.moment in LOADING
     return make_env(
         repository,
         n_envs=2,
@@ -86,10 +87,10 @@ def _make(cell: Cell, repository: Path) -> Any:
         policy={"restart": "on_reset"},
         limits=_limits(row.fault),
         timeouts=Timeouts(
-            startup_s=5.0 if waits and row.moment in LOADING else _WAIT_S,
-            reset_s=1.0 if waits and row.moment == "reset" else _WAIT_S,
-            step_s=1.0 if waits and row.moment == "step" else _WAIT_S,
-            call_s=1.0 if waits and row.moment in ("render", "call") else _WAIT_S,
+            startup_s=5.0 if hangs else _WAIT_S,
+            reset_s=_WAIT_S,
+            step_s=_WAIT_S,
+            call_s=_WAIT_S,
             close_s=1.0,
         ),
     )
@@ -128,7 +129,21 @@ def _provoke(row: Row, suites: Any) -> tuple[Exception | None, float]:
         "call": lambda: env.call("trip"),
         "close": env.close,
     }
-    return _caught(triggers[row.moment])
+    if row.fault not in _HANGS:
+        return _caught(triggers[row.moment])
+    # what is asked before and after it is answered, however late a loaded machine does that
+    with inside.hurried(env, reset_s=1.0, step_s=1.0, call_s=1.0):
+        if row.fault == "stop" and row.moment == "step":
+            return _caught(lambda: _step_that_stops(env))
+        return _caught(triggers[row.moment])
+
+
+def _step_that_stops(env: Any) -> Any:
+    """Its time begins when somebody has been stopped: how that is told is what is asked here."""
+    runners = inside.pids(env)
+    env.step_async([0, 1])
+    assert eventually(lambda: any(map(is_stopped, runners)))
+    return env.step_wait()
 
 
 def _caught(action: Callable[[], Any]) -> tuple[Exception | None, float]:

@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -81,15 +80,16 @@ def test_nothing_remains_after(number: signal.Signals, moment: str, folder: Path
     assert is_clean(folder), left(folder)
 
 
-def test_ctrl_c_in_a_step_leaves_a_usable_client(folder: Path) -> None:
+def test_ctrl_c_in_a_step_leaves_a_usable_client(folder: Path, tmp_path: Path) -> None:
     """KeyboardInterrupt comes at once; then a step says what to do, and reset() does it."""
     client = start(
         folder,
-        """
+        f"""
         for lane in ("auto", "frames"):
-            suites = made("step", "hang", lane=lane)
+            output = {str(tmp_path)!r} + "/" + lane
+            suites = made("step", "hang", lane=lane, policy={{"output": output}})
             try:
-                say("there")
+                say(output)
                 suites.env.step([0, 1])
             except KeyboardInterrupt:
                 pass
@@ -103,8 +103,8 @@ def test_ctrl_c_in_a_step_leaves_a_usable_client(folder: Path) -> None:
         """,
     )
     for _ in range(2):
-        assert line(client) == "there"
-        time.sleep(0.5)  # into the wait; earlier would be as good
+        output = Path(line(client))
+        assert eventually(lambda: "about to hang" in output.read_text())  # noqa: B023
         client.send_signal(signal.SIGINT)
         assert line(client) == "True"
         assert line(client) == "[[1.0], [1.0]]"

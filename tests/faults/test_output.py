@@ -37,6 +37,7 @@ def test_the_last_words_are_in_the_file(tmp_path: Path) -> None:
         with made(path, fault) as suites:
             suites.env.reset()
             suites.env.step_async([0, 1])
+            assert eventually(lambda: "about to" in path.read_text())  # noqa: B023
             with pytest.raises(error):
                 suites.env.step_wait(timeout=1)
         assert path.read_text() == f"about to {fault}\n"
@@ -152,6 +153,7 @@ def test_the_log_tells_the_life_of_a_jail(caplog: pytest.LogCaptureFixture) -> N
     with made(None, "hang") as suites:
         suites.env.reset()
         suites.env.step_async([0, 1])
+        assert eventually(lambda: "about to hang" in caplog.text)
         with pytest.raises(errors.WorkerTimeoutError):
             suites.env.step_wait(timeout=0.3)
         suites.env.reset()

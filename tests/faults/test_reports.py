@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 
 from envhub_sandbox import errors, make_env
+from tests.support import inside
+from tests.support.processes import halted
 from tests.support.samples import sample
 
 
@@ -27,16 +29,17 @@ def test_a_task_that_does_not_run_is_not_confined() -> None:
 @pytest.mark.usefixtures("neighbour")
 @pytest.mark.parametrize("lane", ["auto", "frames"])
 def test_a_jail_that_was_lost_confines_nobody(lane: str) -> None:
-    """Until a reset has brought another; after a mere delay it is still the same one."""
+    """Until a reset has brought another; while it is merely late it is still the same one."""
     policy = {"restart": "on_reset"}
     with make_env(sample("echo"), lane=lane, policy=policy) as suites:
         env = suites.env
         env.reset()
         report = env.sandbox_report
         assert report
-        env.step_async([[1.0, 0.2]])
-        with pytest.raises(errors.WorkerTimeoutError):
-            env.step_wait(timeout=0.02)
+        with halted(inside.pids(env)):
+            env.step_async([[1.0, 0.0]])
+            with pytest.raises(errors.WorkerTimeoutError):
+                env.step_wait(timeout=0.02)
         assert env.sandbox_report == report
         env.reset()
         with pytest.raises(errors.WorkerDiedError):

@@ -6,22 +6,26 @@ import pytest
 
 from envhub_sandbox import errors, make_env
 from envhub_sandbox.session.counters import KEPT, Counters
+from tests.support import inside
+from tests.support.processes import halted
 from tests.support.samples import sample
 
 
 @pytest.mark.usefixtures("neighbour")
 @pytest.mark.parametrize("lane", ["auto", "frames"])
-def test_counters_follow_what_happens(lane: str) -> None:
+def test_counters_follow_what_happens(lane: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps, timeouts, deaths and restarts are counted once each, over both lanes."""
+    monkeypatch.setattr(*inside.LATE_REPLY_GRACE, 120.0)
     policy = {"restart": "on_reset"}
     with make_env(sample("echo"), lane=lane, policy=policy) as suites:
         env = suites.env
         env.reset()
         for _ in range(5):
             env.step([[1.0, 0.0]])
-        env.step_async([[1.0, 0.2]])
-        with pytest.raises(errors.WorkerTimeoutError):
-            env.step_wait(timeout=0.02)
+        with halted(inside.pids(env)):
+            env.step_async([[1.0, 0.0]])
+            with pytest.raises(errors.WorkerTimeoutError):
+                env.step_wait(timeout=0.02)
         assert env.stats()["state"] == "LATE"
         env.reset()
         with pytest.raises(errors.WorkerDiedError):

@@ -19,7 +19,7 @@ from envhub_sandbox.session.survival.reseed import derived_seed
 from envhub_sandbox.transport.shared_memory.sharding import bounds_for
 from envhub_worker.protocol.lifecycle import State
 from tests.support import inside
-from tests.support.processes import eventually
+from tests.support.processes import eventually, halted
 from tests.support.repositories import write_repository
 from tests.support.samples import reference, sample
 
@@ -481,9 +481,10 @@ def test_a_late_sibling_is_a_timeout_all_the_same(lane: str) -> None:
     with made(lane) as suites:
         env = suites.env
         env.reset(seed=SEED)
-        env.step_async([SLOW, LIVE, LIVE, EXIT])
-        with pytest.raises(errors.WorkerTimeoutError):
-            env.step_wait(timeout=0.1)
+        with halted(inside.pids(env)[:1]):
+            env.step_async([LIVE, LIVE, LIVE, EXIT])
+            with pytest.raises(errors.WorkerTimeoutError):
+                env.step_wait(timeout=0.1)
         assert inside.state(env) is State.LATE
         observation, _ = env.reset(seed=SEED)
         assert np.array_equal(observation, oracle().reset(seed=SEED)[0])
@@ -573,26 +574,36 @@ def test_close_does_not_wait_for_who_is_coming_back() -> None:
 
 def test_coming_back_has_a_deadline() -> None:
     """A fresh process that does not load in time is a timeout; a reset starts afresh."""
-    timeouts = {"startup_s": 5.0}
-    with made(env_kwargs={"form": "slow"}, shards=1, timeouts=timeouts) as suites:
+    with made(env_kwargs={"form": "slow"}, shards=1) as suites:
         env = suites.env
         env.reset(seed=SEED)
-        with pytest.raises(errors.WorkerTimeoutError, match="make_env"):
+        with (
+            inside.hurried(env, startup_s=2.0),
+            pytest.raises(errors.WorkerTimeoutError, match="make_env"),
+        ):
             env.step(LAST_DIES)
         assert inside.state(env) is State.LATE
         assert np.array_equal(env.reset(seed=SEED)[0], oracle().reset(seed=SEED)[0])
 
 
-def test_interrupted_in_coming_back_it_starts_afresh() -> None:
+def test_interrupted_in_coming_back_it_starts_afresh(tmp_path: Path) -> None:
     """Ctrl-C ends the wait at once; a reset brings it back in another jail."""
     before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    output, caller = tmp_path / "output", threading.get_ident()
+
+    def interrupt() -> None:
+        assert eventually(lambda: "slowly" in output.read_text())
+        signal.pthread_kill(caller, signal.SIGALRM)
+
     try:
-        with made(env_kwargs={"form": "slow"}, shards=1) as suites:
+        policy = {"output": str(output)}
+        with made(env_kwargs={"form": "slow"}, shards=1, policy=policy) as suites:
             env = suites.env
             env.reset(seed=SEED)
-            signal.setitimer(signal.ITIMER_REAL, 0.3)
+            coming = threading.Thread(target=interrupt)
             with pytest.raises(KeyboardInterrupt):
-                env.step(LAST_DIES)
+                coming.start(), env.step(LAST_DIES)
+            coming.join()
             assert inside.state(env) is State.LATE
             env.reset(seed=SEED)
             assert env.step(ALL_LIVE)[0][:, 1].tolist() == [1, 1, 1, 1]

@@ -9,8 +9,10 @@ here is added here: a function, or a *spot*, which is an owner and a name, for
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +99,17 @@ def bounds(env: Any) -> list[tuple[int, int]]:
 def repository(env: Any) -> Repository:
     """The repository that it comes from, with its policy and its servers."""
     return session(env).repository
+
+
+@contextlib.contextmanager
+def hurried(env: Any, **timeouts: float) -> Iterator[None]:
+    """What is asked of it meanwhile has these ``Timeouts``; it was made, and goes on, without."""
+    found, before = repository(env), repository(env).timeouts
+    env._timeouts = found.timeouts = replace(before, **timeouts)
+    try:
+        yield
+    finally:
+        env._timeouts = found.timeouts = before
 
 
 def launcher(env: Any) -> Launcher:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 
 import psutil
 
@@ -22,6 +24,26 @@ def descendants() -> set[int]:
             with contextlib.suppress(psutil.NoSuchProcess):
                 below.update(one.pid for one in child.children(recursive=True) if _alive(one))
     return below
+
+
+@contextlib.contextmanager
+def halted(pids: Iterable[int]) -> Iterator[None]:
+    """Processes are stopped meanwhile: what is asked of them is late, whoever is slow just now."""
+    held = list(pids)
+    try:
+        for pid in held:
+            os.kill(pid, signal.SIGSTOP)
+        assert eventually(lambda: all(is_stopped(pid) for pid in held))
+        yield
+    finally:
+        for pid in held:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGCONT)
+
+
+def is_stopped(pid: int) -> bool:
+    """Whether a process has been stopped by a signal."""
+    return bool(psutil.Process(pid).status() == psutil.STATUS_STOPPED)
 
 
 def eventually(claim: Callable[[], bool], deadline_s: float = 90.0) -> bool:

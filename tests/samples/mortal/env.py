@@ -110,6 +110,7 @@ class Whole(gym.vector.VectorEnv):
 
 def make_env(n_envs: int = 1, use_async_envs: bool = False, mode="NextStep", form="plain"):
     if form == "slow" and not _once("made"):
+        print("slowly", flush=True)
         time.sleep(3600)
     if form == "whole":
         return Whole(n_envs)
