@@ -11,9 +11,11 @@ from envhub_sandbox.making.making import make
 from envhub_sandbox.making.options import Options
 from envhub_sandbox.policy import Limits, Policy, Timeouts
 from envhub_sandbox.sandboxes.base import Sandbox
+from envhub_sandbox.vector.folding import folded
 from envhub_sandbox.vector.suites import EnvSuites
 
 
+@folded
 def make_env(
     cfg: Any,
     n_envs: int = 1,

@@ -15,6 +15,7 @@ import gymnasium
 from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.api import make_env
+from envhub_sandbox.vector.folding import folded
 from envhub_sandbox.vector.single_env import SingleEnv
 from envhub_sandbox.vector.suites import EnvSuites
 
@@ -36,6 +37,7 @@ class SandboxEnv(SingleEnv):
         EnvHubError: As ``make_env``.
     """
 
+    @folded
     def __init__(
         self,
         ref: Any,
@@ -53,6 +55,7 @@ class SandboxEnv(SingleEnv):
             raise
 
 
+@folded
 def make_vector(
     ref: Any,
     num_envs: int = 1,

@@ -3,7 +3,7 @@
 ``envhub_sandbox.worker`` tells of jails: opened, closed (DEBUG), died, timed out, restarted (INFO).
 ``envhub_sandbox.worker.output`` has every line that they print (DEBUG). ``envhub_sandbox.snapshot``
 tells of downloads, ``envhub_sandbox.dependencies`` of packages, ``envhub_sandbox.crashes`` of
-crash bundles.
+crash bundles. ``envhub_sandbox.errors`` has our own frames of what is raised (DEBUG).
 """
 
 from __future__ import annotations
@@ -17,3 +17,4 @@ OUTPUT = WORKER.getChild("output")
 SNAPSHOT = ROOT.getChild("snapshot")
 DEPENDENCIES = ROOT.getChild("dependencies")
 CRASHES = ROOT.getChild("crashes")
+ERRORS = ROOT.getChild("errors")

@@ -16,6 +16,7 @@ from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
+from envhub_sandbox.vector.folding import folded, folds
 from envhub_sandbox.vector.infos import of_one
 from envhub_worker.protocol.manifest.names import is_servable
 from envhub_worker.protocol.untrusted import UNTRUSTED
@@ -69,6 +70,7 @@ class SingleEnv(gym.Env[Any, Any]):
         """The vector environment below, with ``stats``, ``sandbox_report`` and the rest."""
         return self._vector
 
+    @folded
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
@@ -99,7 +101,13 @@ class SingleEnv(gym.Env[Any, Any]):
                 ``SandboxVectorEnv.step``.
         """
         self._begun = None
-        result = self._vector.step(self._batch(action))
+        try:
+            result = self._vector.step(self._batch(action))
+        except BaseException as error:
+            if folds(error):
+                __tracebackhide__ = True  # of pytest and IPython
+                raise error  # ENVHUB_TRACEBACK=full shows where
+            raise
         with UNTRUSTED:  # of a repository's own class, nobody has declared what its results are
             return self._of_one(*result)
 
@@ -115,6 +123,7 @@ class SingleEnv(gym.Env[Any, Any]):
             observation, info = last, last_info
         return observation, float(rewards[0]), terminated, truncated, info
 
+    @folded
     def render(self) -> Any:
         """What the environment renders in its ``render_mode``."""
         frames = self._vector.render()
@@ -138,6 +147,7 @@ class SingleEnv(gym.Env[Any, Any]):
     _np_random = np_random
 
     @property
+    @folded
     def np_random_seed(self) -> int:
         """The seed of its generator, as Gymnasium has it: -1 if it is not known."""
         found: Any = self._vector.np_random_seed

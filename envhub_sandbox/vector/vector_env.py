@@ -23,6 +23,7 @@ from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.transport.values import generators
 from envhub_sandbox.vector import from_manifest
 from envhub_sandbox.vector.asking import Asking
+from envhub_sandbox.vector.folding import folded, folds
 from envhub_sandbox.vector.shown import environment_html
 from envhub_sandbox.vector.sub_environment import MessageFor as OneMessageFor
 from envhub_sandbox.vector.sub_environment import SubEnvironment
@@ -79,6 +80,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         """Whether ``close`` has been called."""
         return self._asking.closed
 
+    @folded
     def prewarm(self) -> None:
         """Start its processes now, in the background; returns at once.
 
@@ -92,6 +94,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
     # --- reset and step ------------------------------------------------------------------------
 
+    @folded
     def reset(
         self,
         *,
@@ -117,6 +120,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         self._send_reset(seed, options)
         return self._end_reset(self._timeouts.reset_s)
 
+    @folded
     def reset_async(
         self,
         seed: int | Sequence[int | None] | None = None,
@@ -144,6 +148,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
         self._asking.submit("reset", message)
 
+    @folded
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
         """The results of ``reset_async``; ``timeout`` in seconds, else ``Timeouts.reset_s``."""
         self._asking.end_wait("reset")
@@ -180,11 +185,15 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             asking.tell_beside_an_error()
             if isinstance(error, WorkerDiedError):
                 asking.refuse_if_closed()  # close() in another thread ended it under us
+            if folds(error):
+                __tracebackhide__ = True  # of pytest and IPython
+                raise error  # ENVHUB_TRACEBACK=full shows where
             raise
         if self._untold:
             asking.tell()
         return result
 
+    @folded
     def step_async(self, actions: Any) -> None:
         """Send the actions; ``step_wait`` returns the results."""
         self._asking.refuse_if_busy("step_async")
@@ -192,6 +201,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         self._asking.unwarned(self._exchange.submit_step, batch)
         self._asking.waiting = "step"
 
+    @folded
     def step_wait(self, timeout: float | None = None) -> StepResult:
         """The results of ``step_async``; ``timeout`` in seconds, else ``Timeouts.step_s``."""
         self._asking.end_wait("step")
@@ -200,12 +210,14 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
     # --- everything else -----------------------------------------------------------------------
 
+    @folded
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method, or read an attribute, of every sub-environment: a tuple of results."""
         self._asking.refuse_if_busy("call_async")
         self._send_call(name, args, kwargs)  # as reset
         return self._end_call(self._timeouts.call_s)
 
+    @folded
     def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
         """Send the call; ``call_wait`` returns its results."""
         self._asking.refuse_if_busy("call_async")
@@ -220,6 +232,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             )
         self._asking.submit("call", lambda number, _: m.Call(number, name, args, kwargs))
 
+    @folded
     def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
         """The results of ``call_async``; ``timeout`` in seconds, else ``Timeouts.call_s``."""
         self._asking.end_wait("call")
@@ -235,10 +248,12 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             with self._exchange.handling():
                 raise
 
+    @folded
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """An attribute of every sub-environment."""
         return self.call(name)
 
+    @folded
     def set_attr(self, name: str, values: Any) -> None:
         """Set an attribute of every sub-environment: one value each, or one for all."""
         _check_name(name)
@@ -253,6 +268,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             lambda number, bounds: m.SetAttr(number, name, tuple(each[bounds[0] : bounds[1]])),
         )
 
+    @folded
     def render(self) -> tuple[Any, ...] | None:
         """What each sub-environment renders; None where the environment gives None."""
         replies = self._asking.ask("render", lambda number, _: m.Render(number))
@@ -262,6 +278,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             return self._exchange.results.one_each("render", replies)
 
     @property  # type: ignore[misc]  # there is nothing to set, as in SyncVectorEnv
+    @folded
     def np_random(self) -> Any:
         """Copies of the generators: ``SyncVectorEnv`` has one for each sub-environment."""
         replies = self._asking.ask("np_random", lambda number, _: m.GetRandom(number))
@@ -272,6 +289,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             return tuple(generators.generator(state) for state in states)
 
     @property
+    @folded
     def np_random_seed(self) -> Any:
         """Their seeds."""
         name = "np_random_seed"
@@ -339,6 +357,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     def close_extras(self, **kwargs: Any) -> None:
         """There is nothing beyond ``close``."""
 
+    @folded
     def __getattr__(self, name: str) -> Any:
         """An attribute that the repository's vector environment has beyond Gymnasium's."""
         manifest = self.__dict__.get("_manifest")
@@ -354,6 +373,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         if not isinstance(reply, m.Method):
             raise RemoteProtocolError(f"the worker answered GetOwn with {type(reply).__name__}")
 
+        @folded
         def method(*args: Any, **kwargs: Any) -> Any:
             self._asking.refuse_if_busy(name)
             result = self._asking.own(name, m.CallOwn, name, args, kwargs)

@@ -8,11 +8,13 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox import make_env
+import envhub_sandbox
+from envhub_sandbox import SandboxEnv, make_env
 from envhub_sandbox.errors import EnvHubError, LoadError
 from tests.hub.stub_hub import StubHub
 from tests.support.repositories import write_repository
 
+PACKAGE = str(Path(envhub_sandbox.__file__).parent)
 ENV = """
 import gymnasium as gym
 from parts.motor import turn
@@ -51,6 +53,13 @@ def play(reference: str, **options: Any) -> None:
         suites.env.step([0])
 
 
+def play_one(reference: str, **options: Any) -> None:
+    """The same, of a ``gymnasium.Env``."""
+    with SandboxEnv(reference, **options) as env:
+        env.reset(seed=0)
+        env.step(0)
+
+
 @pytest.mark.parametrize(
     ("at", "lane"), [("step", "auto"), ("step", "frames"), ("make_env", "auto")]
 )
@@ -76,6 +85,26 @@ def test_the_line_in_a_repository_of_the_hub(stub_hub: StubHub, hub_cache: Path)
     place = f'"parts/motor.py" of org/motor@{made.commit[:12]}, line 2, in turn'
     assert f"File {place}\n" in str(error)
     assert str(hub_cache) not in str(error) + vars(error)["__notes__"][0]
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+@pytest.mark.parametrize("at", ["step", "single", "make_env"])
+@pytest.mark.parametrize("shown", ["folded", "full"])
+def test_a_traceback_has_one_frame_of_ours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str, lane: str, shown: str
+) -> None:
+    """Between the caller's last line and the author's; all of them, where that is asked for."""
+    monkeypatch.setenv("ENVHUB_TRACEBACK", shown)
+    folder = Path(write_repository(tmp_path / "mine", ENV))
+    (folder / "parts").mkdir()
+    (folder / "parts" / "motor.py").write_text(MOTOR)
+    broken = {"broken": True} if at == "make_env" else None
+    with pytest.raises(ZeroDivisionError) as caught:
+        (play_one if at == "single" else play)(str(folder), env_kwargs=broken, lane=lane)
+    files = [frame.filename for frame in traceback.extract_tb(caught.value.__traceback__)]
+    ours = [name for name in files if name.startswith(PACKAGE)]
+    assert files[: -len(ours)] == [__file__] * 2
+    assert len(ours) == 1 if shown == "folded" else len(ours) > 3, ours
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,139 @@
+"""Our own frames are left out of tracebacks that say without them where it comes from."""
+
+from __future__ import annotations
+
+import logging
+import traceback
+from collections.abc import Callable
+
+import pytest
+
+from envhub_sandbox.errors import (
+    EnvHubError,
+    LoadError,
+    LocalProtocolError,
+    PolicyError,
+    RemoteProtocolError,
+    WorkerDiedError,
+    remote_error,
+)
+from envhub_sandbox.vector.folding import folded
+
+WHOLE = ["asked", "ask", "deep", "deeper"]
+
+
+def deeper(error: BaseException, cause: BaseException | None) -> None:
+    """As something far inside."""
+    if cause is None:
+        raise error
+    raise error from cause
+
+
+def deep(error: BaseException, cause: BaseException | None) -> None:
+    """As something inside."""
+    deeper(error, cause)
+
+
+@folded
+def ask(error: BaseException, cause: BaseException | None = None) -> None:
+    """As a method of ours."""
+    deep(error, cause)
+
+
+@folded
+def ask_by_another(error: BaseException) -> None:
+    """As a method of ours that asks another one."""
+    ask(error)
+
+
+def frames(error: BaseException, asking: Callable[..., None] = ask) -> list[str]:
+    """The functions in the traceback that a caller sees, below his own."""
+    with pytest.raises(type(error)) as caught:
+        asking(error)
+    assert caught.value is error
+    _, *below = traceback.extract_tb(error.__traceback__)
+    return [frame.name for frame in below]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        remote_error("ValueError", "ValueError", "no"),
+        LoadError("no"),
+        PolicyError("no"),
+        LocalProtocolError("no"),
+        WorkerDiedError("no", reason="exit"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+@pytest.mark.parametrize("asking", [ask, ask_by_another])
+def test_one_frame_of_ours_is_left(error: EnvHubError, asking: Callable[..., None]) -> None:
+    """Which pytest and IPython hide, and whose line says how to see the others."""
+    assert frames(error, asking) == ["asked"]
+    assert error.__traceback__ is not None
+    last = error.__traceback__.tb_next
+    assert last is not None
+    assert last.tb_frame.f_locals["__tracebackhide__"] is True
+    [*_, shown] = traceback.extract_tb(error.__traceback__)
+    assert shown.line is not None
+    assert shown.line.endswith("# ENVHUB_TRACEBACK=full shows where")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [RemoteProtocolError("no"), KeyError("of ours"), KeyboardInterrupt()],
+    ids=lambda error: type(error).__name__,
+)
+def test_what_may_be_our_fault_keeps_its_frames(error: BaseException) -> None:
+    """There, they are what is known."""
+    assert frames(error) == WHOLE
+
+
+def test_a_variable_shows_them_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For whoever reports a bug."""
+    monkeypatch.setenv("ENVHUB_TRACEBACK", "full")
+    assert frames(LoadError("no")) == WHOLE
+
+
+def test_the_log_has_them_once(caplog: pytest.LogCaptureFixture) -> None:
+    """At DEBUG, however many methods of ours it comes through."""
+    with caplog.at_level(logging.DEBUG, "envhub_sandbox.errors"):
+        frames(LoadError("no"), ask_by_another)
+    [record] = [one for one in caplog.records if one.name == "envhub_sandbox.errors"]
+    assert record.exc_info is not None
+    assert [frame.name for frame in traceback.extract_tb(record.exc_info[2])] == WHOLE
+
+
+def test_what_the_caller_was_handling_is_still_told() -> None:
+    """With the frames that are his."""
+    error, mine = LoadError("no"), KeyError("mine")
+    try:
+        raise mine
+    except KeyError:
+        left = frames(error)
+    assert left == ["asked"]
+    assert error.__context__ is mine
+    assert mine.__traceback__ is not None
+    assert not error.__suppress_context__
+
+
+def test_of_causes_only_ours_are_folded() -> None:
+    """Another library's error keeps what it has to say."""
+    ours, theirs = LoadError("ours"), OSError("theirs")
+    for error, cause in ((ours, theirs), (PolicyError("on top"), ours)):
+        with pytest.raises(type(error)):
+            deeper(error, cause)
+    assert ours.__traceback__ is not None
+    with pytest.raises(OSError, match="theirs"):
+        deeper(theirs, None)
+    with pytest.raises(PolicyError) as caught:
+        ask(PolicyError("on top"), ours)
+    assert caught.value.__cause__ is ours
+    assert ours.__traceback__ is None
+    assert theirs.__traceback__ is not None
+
+
+def test_a_function_keeps_its_face() -> None:
+    """Its name, its text and what it takes."""
+    assert ask.__name__ == "ask"
+    assert ask.__doc__ == "As a method of ours."
