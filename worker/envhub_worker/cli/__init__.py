@@ -1,1 +1,1 @@
-"""Commands of ``envhub-worker``, one file each; ``serve`` and ``keygen`` are in ``__main__``."""
+"""Commands of ``envhub-worker``, one file each, and what ``listen`` needs besides."""

@@ -1,12 +1,28 @@
-"""Whether a server answers on an address: what a container's health check asks."""
+"""``envhub-worker health``: whether a server answers, which a container's health check asks."""
 
 from __future__ import annotations
 
+import argparse
 import socket
+from pathlib import Path
+
+from envhub_worker.cli.status import is_healthy
 
 # ZMTP 3: how both sides begin, unasked, before any key is needed (https://rfc.zeromq.org/spec/23).
 _GREETING = b"\xff"
 _WAIT_S = 5.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``health``."""
+    parser.add_argument("--port", type=int, default=5555)
+    parser.add_argument("--state-dir", type=Path, help="as for listen")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Say whether a server answers: one that listens by its key, any other by its greeting."""
+    healthy = is_healthy(arguments.state_dir)
+    return 0 if healthy or (healthy is None and answers("127.0.0.1", arguments.port)) else 1
 
 
 def answers(host: str, port: int) -> bool:

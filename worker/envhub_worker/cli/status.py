@@ -1,4 +1,4 @@
-"""``envhub-worker status`` and ``health``: ask a running ``listen``, as its operator."""
+"""``envhub-worker status``: ask a running ``listen``, as its operator."""
 
 from __future__ import annotations
 
