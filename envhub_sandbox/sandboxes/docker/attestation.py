@@ -8,38 +8,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
-from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
-from envhub_sandbox.policy import PROFILES
+from envhub_sandbox.errors import (
+    RemoteProtocolError,
+    SandboxUnavailableError,
+    WorkerStartupError,
+)
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
+from envhub_worker.protocol.messages.surroundings import Surroundings
+from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _MIB = 1024 * 1024
 _NATIVE_RUNTIMES = (None, "runc", "crun", "io.containerd.runc.v2")
-
-
-@dataclass(frozen=True)
-class Surroundings:
-    """What ``envhub_worker.lockdown.surroundings.surroundings`` returns, checked.
-
-    Attributes:
-        profiles: Those that a jail can have in there, the strongest first.
-        landlock: Its ABI, or 0.
-    """
-
-    profiles: tuple[str, ...]
-    landlock: int
-    user: int
-    capabilities: int
-    no_new_privileges: bool
-    seccomp: bool
-    read_only: bool
-    devices: tuple[str, ...]
-    memory: int | None
-    pids: int | None
-    cpus: float | None
-    python: str
 
 
 def parse(line: bytes) -> Surroundings:
@@ -49,22 +30,9 @@ def parse(line: bytes) -> Surroundings:
         WorkerStartupError: It is something else.
     """
     try:
-        said = json.loads(line)
-        return Surroundings(
-            profiles=tuple(name for name in said["profiles"] if name in PROFILES),
-            landlock=int(said["landlock"]),
-            user=int(said["user"]),
-            capabilities=int(said["capabilities"]),
-            no_new_privileges=said["no_new_privileges"] is True,
-            seccomp=said["seccomp"] is True,
-            read_only=said["read_only"] is True,
-            devices=tuple(str(name)[:64] for name in said["devices"]),
-            memory=None if said["memory"] is None else int(said["memory"]),
-            pids=None if said["pids"] is None else int(said["pids"]),
-            cpus=None if said["cpus"] is None else float(said["cpus"]),
-            python=str(said["python"]),
-        )
-    except (ValueError, LookupError, TypeError) as error:
+        with UNTRUSTED:
+            return Surroundings.read(json.loads(line))
+    except RemoteProtocolError as error:
         raise WorkerStartupError(
             "the container's program is no envhub-worker of this version; build the image again"
         ) from error

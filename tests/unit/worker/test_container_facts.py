@@ -11,6 +11,7 @@ import pytest
 
 from envhub_worker.cli import health
 from envhub_worker.lockdown import surroundings
+from envhub_worker.protocol.messages.surroundings import Surroundings
 
 
 def layers(*names: str) -> list[dict[str, object]]:
@@ -83,10 +84,10 @@ def test_the_network_is_what_the_kernel_lists() -> None:
 
 
 def test_the_announcement_is_one_line_of_json() -> None:
-    """The client reads one line and no more."""
+    """The client reads one line and no more, and finds every field in it."""
     said = surroundings.announcement()
     assert "\n" not in said
-    assert {"envhub-worker", "profiles", "devices", "memory", "user"} <= set(json.loads(said))
+    assert set(json.loads(said)) == {"envhub-worker", *vars(Surroundings.read(json.loads(said)))}
 
 
 @pytest.mark.parametrize(("greeting", "healthy"), [(b"\xff", True), (b"H", False), (b"", False)])

@@ -16,6 +16,7 @@ from envhub_worker import __version__
 from envhub_worker.lockdown import probe
 from envhub_worker.lockdown.mechanisms import landlock
 from envhub_worker.protocol.confinement import LEAST_LANDLOCK
+from envhub_worker.protocol.messages.surroundings import Surroundings
 
 ENVIRONMENT = Path("/opt/environment/bin/python")
 """The interpreter of jails in an image that was derived for a repository."""
@@ -25,34 +26,26 @@ _NAMESPACED = frozenset({"user-namespace", "namespaces", "mount-namespace", "lan
 
 def announcement() -> str:
     """One line of JSON for the client that started the container."""
-    return json.dumps({"envhub-worker": __version__, **surroundings()})
+    return json.dumps({"envhub-worker": __version__, **vars(surroundings())})
 
 
-def surroundings() -> dict[str, Any]:
-    """What holds around this process. Call it before it has threads.
-
-    Returns:
-        ``profiles``: those of a jail that can be had here, the strongest first; ``landlock``: its
-        ABI; ``user``: our id; ``capabilities``: what some set holds, as a number;
-        ``no_new_privileges``, ``seccomp``, ``read_only``: whether they hold; ``devices``: names
-        of network devices; ``memory``, ``pids`` and ``cpus``: limits, or None; ``python``: the
-        interpreter for jails, empty for this one.
-    """
+def surroundings() -> Surroundings:
+    """What holds around this process. Call it before it has threads."""
     status = _status()
-    return {
-        "profiles": profiles(probe.probe()["layers"], landlock.version()),
-        "landlock": landlock.version(),
-        "user": os.geteuid(),
-        "capabilities": _capabilities(status),
-        "no_new_privileges": status.get("NoNewPrivs") == "1",
-        "seccomp": status.get("Seccomp") == "2",
-        "read_only": bool(os.statvfs("/").f_flag & os.ST_RDONLY),
-        "devices": network_devices(Path("/proc/net/dev").read_text()),
-        "memory": memory_limit(_CGROUPS),
-        "pids": pids_limit(_CGROUPS),
-        "cpus": cpus_limit(_CGROUPS),
-        "python": str(ENVIRONMENT) if ENVIRONMENT.exists() else "",
-    }
+    return Surroundings(
+        profiles=tuple(profiles(probe.probe()["layers"], landlock.version())),
+        landlock=landlock.version(),
+        user=os.geteuid(),
+        capabilities=_capabilities(status),
+        no_new_privileges=status.get("NoNewPrivs") == "1",
+        seccomp=status.get("Seccomp") == "2",
+        read_only=bool(os.statvfs("/").f_flag & os.ST_RDONLY),
+        devices=tuple(network_devices(Path("/proc/net/dev").read_text())),
+        memory=memory_limit(_CGROUPS),
+        pids=pids_limit(_CGROUPS),
+        cpus=cpus_limit(_CGROUPS),
+        python=str(ENVIRONMENT) if ENVIRONMENT.exists() else "",
+    )
 
 
 def profiles(layers: list[dict[str, Any]], landlock_abi: int) -> list[str]:

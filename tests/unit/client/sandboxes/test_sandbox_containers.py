@@ -21,6 +21,7 @@ from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.docker.sandbox import ContainerServer, DockerSandbox
 from envhub_worker.lockdown.seccomp import policy as seccomp_policy
+from envhub_worker.protocol.messages.surroundings import Surroundings
 from envhub_worker.protocol.runtime import Runtime
 from tests.unit.docs.test_imports import folder, modules
 
@@ -60,7 +61,7 @@ SAID: dict[str, Any] = {
 }
 
 
-def found(**changes: Any) -> attestation.Surroundings:
+def found(**changes: Any) -> Surroundings:
     """What a container's server said, with changes."""
     return attestation.parse(json.dumps({**SAID, **changes}).encode())
 
@@ -214,7 +215,14 @@ def test_a_jail_that_nothing_parts_from_the_server_is_refused(
         attestation.profile_for(wanted, found(profiles=profiles, landlock=landlock))
 
 
-@pytest.mark.parametrize("line", [b"", b"{}", b"[]", b"hello", b'{"profiles": 3}'])
+@pytest.mark.parametrize(
+    "line",
+    [
+        *(b"", b"{}", b"[]", b"hello", b'{"profiles": 3}', b"[" * 100_000),
+        json.dumps({**SAID, "pids": float("inf")}).encode(),
+    ],
+    ids=["nothing", "no field", "a list", "a word", "a number", "too deep", "no number"],
+)
 def test_an_announcement_that_is_none_is_refused(line: bytes) -> None:
     """Another program, or another version."""
     with pytest.raises(WorkerStartupError, match="build the image"):
