@@ -40,7 +40,11 @@ class Candidate:
         return store.repository_folder(self.hub.public_endpoint, *self.repo)
 
     def stored(self) -> Snapshot | None:
-        """The pinned commit, if it is in the store. No request."""
+        """The pinned commit, if it is in the store. No request.
+
+        Raises:
+            HalfDeletedError: Parts of it are gone.
+        """
         slot = self._slot(self.ref.revision or "")
         files = store.load(slot)
         return None if files is None else self._finished(slot, files)
@@ -48,7 +52,7 @@ class Candidate:
     def fetched(self) -> Snapshot:
         """The revision as the Hub resolves it now, downloaded unless it is in the store."""
         slot = self._slot(self._resolved())
-        files = store.load(slot)
+        files = store.load_whole(slot)
         if files is None:
             self._bring(slot)
             files = store.load(slot)

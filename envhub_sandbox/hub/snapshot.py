@@ -94,6 +94,20 @@ def fetch(
         return _first_stored(candidates) or _first_fetched(candidates)
     except HubFailure as failure:
         raise _unavailable(candidates, [failure]) from failure.__cause__
+    except store.HalfDeletedError as half:
+        return _fetched_again(candidates, half)
+
+
+def _fetched_again(candidates: list[Candidate], half: store.HalfDeletedError) -> Snapshot:
+    """What is left of it stays, until there is all of it."""
+    try:
+        return _first_fetched(candidates)
+    except HubFailure as failure:
+        error, cause = _unavailable(candidates, [failure]), failure.__cause__
+    except RepositoryUnavailableError as unavailable:
+        error, cause = unavailable, unavailable.__cause__
+    error.args = (f"{half}\nThat was tried: {error}",)
+    raise error from cause
 
 
 def _first_stored(candidates: list[Candidate]) -> Snapshot | None:
@@ -173,7 +187,7 @@ def local(
         what, advice = missing_entry(path, files)
         raise RepositoryUnavailableError(f"{title} {what}. {advice}")
     slot = store.Slot(store.local_folder(), content_commit(files), title)
-    if store.load(slot) is None:
+    if store.load_whole(slot) is None:
         store.publish(slot, files, copier(found, title), {"repo_type": "local"})
         # Every edit leaves a copy; a Hub commit, in contrast, is kept until somebody removes it.
         store.remove_unused(slot.folder, days=_LOCAL_COPIES_DAYS)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import hashlib
 import json
 import os
@@ -32,6 +33,7 @@ from envhub_sandbox import folders
 from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
 from envhub_sandbox.hub.hashing import Mismatch, digest_of
 from envhub_sandbox.hub.listing import FileRecord
+from envhub_sandbox.log import SNAPSHOT
 
 CACHE_VARIABLE = "ENVHUB_CACHE"
 _FORMAT = 1
@@ -72,6 +74,10 @@ class StoredCommit(NamedTuple):
     commit: str
     revision: str | None
     fetched: str
+
+
+class HalfDeletedError(SnapshotIntegrityError):
+    """Parts of a snapshot are gone, and what is left is what was verified: ``publish`` heals it."""
 
 
 class _Entry(NamedTuple):
@@ -123,26 +129,40 @@ def load(slot: Slot) -> tuple[FileRecord, ...] | None:
     verified, and it is hashed again where they differ. Extra and missing files are noticed.
 
     Raises:
+        HalfDeletedError: Some of it is gone.
         SnapshotIntegrityError: The tree is not what was verified; the text says how to remove it.
     """
     text = _record_of(slot)
     if text is None and os.path.lexists(slot.home):
         text = _record_of(slot)  # another may have put the whole of it there in between
         if text is None:
-            raise _damaged(slot, "its record.json is missing")
+            raise HalfDeletedError(_damage(slot, "its record.json is missing"))
     if text is None:
         return None
     with contextlib.suppress(FileNotFoundError):  # which is said below
         _refuse_shared_store(slot.tree)
     document, entries = _read_record(slot, text)
-    found = dict(_walk(slot, slot.tree, ""))
-    _compare_names(slot, entries, found)
-    changed = [entry for entry in entries if not entry.matches(found[entry.path])]
+    found = dict(_walk(slot, slot.tree, "")) if os.path.lexists(slot.tree) else {}
+    recorded = {entry.path for entry in entries}
+    if extra := sorted(found.keys() - recorded):
+        raise _damaged(slot, f"the file {extra[0]!r} is extra")
+    there = [entry for entry in entries if entry.path in found]
+    changed = [entry for entry in there if not entry.matches(found[entry.path])]
+    _verify_again(slot, changed)
+    if missing := sorted(recorded - found.keys()):
+        raise HalfDeletedError(_damage(slot, f"the file {missing[0]!r} is missing"))
     if changed:
-        _verify_again(slot, changed)
         with contextlib.suppress(OSError):  # A read-only store only stays slower.
             _write_record(slot.home, slot.tree, document, [_plain(entry) for entry in entries])
     return tuple(_plain(entry) for entry in entries)
+
+
+def load_whole(slot: Slot) -> tuple[FileRecord, ...] | None:
+    """The same, and None also where parts of it are gone: for who can ``publish`` it again."""
+    try:
+        return load(slot)
+    except HalfDeletedError:
+        return None
 
 
 def _record_of(slot: Slot) -> bytes | None:
@@ -187,13 +207,6 @@ def _walk(slot: Slot, folder: Path | str, prefix: str) -> Iterator[tuple[str, os
                 raise _damaged(slot, f"{prefix + item.name!r} is not a regular file")
 
 
-def _compare_names(slot: Slot, entries: list[_Entry], found: Mapping[str, os.stat_result]) -> None:
-    recorded = {entry.path for entry in entries}
-    for path in sorted(recorded ^ found.keys()):
-        state = "missing" if path in recorded else "extra"
-        raise _damaged(slot, f"the file {path!r} is {state}")
-
-
 def _verify_again(slot: Slot, changed: list[_Entry]) -> None:
     for entry in changed:
         path = slot.tree / entry.path
@@ -210,7 +223,11 @@ def _verify_again(slot: Slot, changed: list[_Entry]) -> None:
 
 
 def _damaged(slot: Slot, what: str) -> SnapshotIntegrityError:
-    return SnapshotIntegrityError(
+    return SnapshotIntegrityError(_damage(slot, what))
+
+
+def _damage(slot: Slot, what: str) -> str:
+    return (
         f"{slot.title}: the copy in the store is not what was verified: {what}. Nothing of it was "
         f"used. Remove it, and it is fetched again: chmod -R u+w '{slot.home}' && "
         f"rm -r '{slot.home}'"
@@ -223,7 +240,7 @@ def publish(
     copy: Callable[[FileRecord, Path], None],
     note: Mapping[str, object],
 ) -> None:
-    """Lay out the files and rename them into place. A snapshot that is there already wins.
+    """Lay out the files and rename them into place. A snapshot that is there, whole, wins.
 
     ``copy(record, target)`` writes the target and must raise unless it wrote what the record
     says. ``note`` is kept in the record (where the snapshot is from). Nothing stays if it fails.
@@ -235,12 +252,39 @@ def publish(
         document = {"format": _FORMAT, **note, "fetched": time.strftime("%FT%TZ", time.gmtime())}
         _write_record(building, tree, document, list(files))
         building.chmod(folders.SHARED_MODE)
-        with _another_may_have_won():
-            os.rename(building, slot.home)
+        with _one_at_a_time(slot.folder):
+            _move_remains(slot)
+            with _another_may_have_won():
+                os.rename(building, slot.home)
     except OSError as error:
         raise _not_writable(slot.folder, error) from error
     finally:
         remove_tree(building)
+
+
+@contextlib.contextmanager
+def _one_at_a_time(folder: Path) -> Iterator[None]:
+    """So that nobody moves away what another has just put there."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        with contextlib.suppress(OSError):  # not every file system has locks
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _move_remains(slot: Slot) -> None:
+    """Make room, where a snapshot is half deleted. Jails that have it open keep what they have:
+    it is removed a day later, with what was never finished.
+    """
+    try:
+        load(slot)
+    except HalfDeletedError as error:
+        SNAPSHOT.warning("%s. It has been made again", str(error).partition(". Nothing of it")[0])
+        aside = tempfile.mkdtemp(prefix=_BUILDING, dir=slot.folder)
+        os.rename(slot.home, aside)
+        os.utime(aside)
 
 
 def _begin(slot: Slot) -> Path:

@@ -142,6 +142,19 @@ def test_edited_file_of_the_store_is_refused_until_removed(get: Fetch) -> None:
     assert (get().root / "env.py").read_bytes() == GOOD
 
 
+def test_half_deleted_snapshot_is_fetched_again(get: Fetch, stub_hub: StubHub) -> None:
+    """Where the Hub gives it; where it does not, the error says both."""
+    snapshot = get()
+    snapshot.root.chmod(0o755)
+    (snapshot.root / "env.py").unlink()
+    stub_hub.fail("/api/models/", 403)
+    with pytest.raises(RepositoryUnavailableError, match=r"'env\.py' is missing") as caught:
+        get()
+    assert "That was tried" in str(caught.value)
+    stub_hub.faults.clear()
+    assert (get().root / "env.py").read_bytes() == GOOD
+
+
 @pytest.mark.parametrize("fields", [{"size": 3}, {"oid": "a" * 40}, {"size": 10**6}])
 def test_listing_that_does_not_fit_the_content_is_refused(
     repository: StubRepository, get: Fetch, snapshot_store: Path, fields: dict[str, Any]

@@ -184,6 +184,15 @@ def test_edited_copy_is_refused(folder: Path) -> None:
         local(folder)
 
 
+def test_half_deleted_copy_is_made_again(folder: Path) -> None:
+    """Its source is at hand."""
+    snapshot = local(folder)
+    snapshot.root.chmod(0o755)
+    (snapshot.root / "env.py").unlink()
+    assert local(folder) == snapshot
+    assert (snapshot.root / "env.py").read_bytes() == (folder / "env.py").read_bytes()
+
+
 def test_forgotten_copies_are_removed_with_the_next_new_one(folder: Path) -> None:
     """Each edit makes a copy: those that nobody used for weeks do not pile up."""
     old = local(folder)

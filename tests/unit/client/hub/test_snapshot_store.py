@@ -181,6 +181,42 @@ def test_damage_is_refused_with_the_command_that_repairs(
     assert store.load(published) == records()
 
 
+def _empty(slot: store.Slot) -> None:
+    store.remove_tree(slot.tree)
+
+
+def _leave_a_name(slot: store.Slot) -> None:
+    store.remove_tree(slot.home)
+    slot.home.mkdir()
+
+
+@pytest.mark.parametrize("damage", [_remove, _lose_record, _empty, _leave_a_name])
+def test_what_is_half_deleted_is_made_again(
+    published: store.Slot, damage: Callable[[store.Slot], None]
+) -> None:
+    """By whoever has its source; a jail that has the rest of it open keeps that for a day."""
+    damage(published)
+    assert store.load_whole(published) is None
+    with pytest.raises(store.HalfDeletedError):
+        store.load(published)
+    store.publish(published, records(), write, {"revision": "main"})
+    assert store.load(published) == records()
+    [remains] = published.folder.glob(".building-*")
+    os.utime(remains, (0, 0))
+    store.publish(published, records(), write, {"revision": "main"})
+    assert not list(published.folder.glob(".building-*"))
+
+
+def test_what_was_changed_is_not_taken_for_half_deleted(published: store.Slot) -> None:
+    """Also where something is missing besides: somebody shall look at it."""
+    _edit(published)
+    _remove(published)
+    with pytest.raises(SnapshotIntegrityError, match=r"'env\.py' was changed"):
+        store.load_whole(published)
+    with pytest.raises(SnapshotIntegrityError, match=r"'env\.py' was changed"):
+        store.publish(published, records(), write, {})
+
+
 def test_touched_but_equal_file_is_hashed_once(
     published: store.Slot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
