@@ -9,8 +9,8 @@ shift
 mkdir -p "$home"
 chown -R "$uid:$uid" "$PWD" "$home"
 kept=()
-for name in "${!ENVHUB_CI@}" "${!PIP_@}"; do
-  kept+=("$name=${!name}")
+for name in "${!ENVHUB_CI@}" ENVHUB_TEST_RUNNER "${!PIP_@}"; do
+  [ -z "${!name+set}" ] || kept+=("$name=${!name}")
 done
 exec setpriv --reuid "$uid" --regid "$uid" --clear-groups --inh-caps=-all \
   env -i HOME="$home" TMPDIR="$home" PATH=/usr/bin:/bin LANG=C.UTF-8 CI=true "${kept[@]}" "$@"

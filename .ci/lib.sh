@@ -24,12 +24,16 @@ find_python() {
   return 1
 }
 
-# with_summary NAME COMMAND...: runs it, and keeps pytest's closing line for the end of the run.
+# with_summary NAME COMMAND...: runs it, and keeps pytest's closing line for the end of the run, and
+# what failed at first.
 with_summary() {
   local name=$1 log=$CI_WORK/$1.log
   shift
   "$@" 2>&1 | tee "$log"
-  grep -E '^=*.*[0-9]+ passed' "$log" | tail -1 | tr -d '=' >"$CI_WORK/$name.summary"
+  {
+    grep -E '^=*.*[0-9]+ passed' "$log" | head -1 | tr -d '='
+    grep '^FAILED ONCE' "$log" || true
+  } >"$CI_WORK/$name.summary"
 }
 
 # A skipped test fails, but for these, each with a reason that is said here.
@@ -78,7 +82,7 @@ smoke() {
   copy_tests "$CI_WORK/$name/checkout"
   (
     cd "$CI_WORK/$name/checkout"
-    with_summary "$name" "$CI_WORK/$name/bin/python" -m pytest -n 2 --dist worksteal \
+    with_summary "$name" bash "$CI_AGAIN" "$CI_WORK/$name/bin/python" -m pytest -n 2 --dist worksteal \
       tests/unit tests/integration/test_examples.py
   )
 }

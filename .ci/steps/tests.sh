@@ -11,4 +11,5 @@ export PYTHON
 permit_what_this_machine_lacks
 # The step "container" has those that need an engine.
 export PYTEST_ADDOPTS=--ignore=tests/containers
+export ENVHUB_TEST_RUNNER="bash $CI_AGAIN"
 with_summary tests ./test --full

@@ -26,17 +26,17 @@ done
 # too: it is the same interpreter.
 half() {
   local number=$1 made=$CI_WORK/tests
-  local as_user=(bash "$CI_STEPS/../as-user.sh" "$number")
+  local again=(bash "$CI_STEPS/../as-user.sh" "$number" bash "$CI_AGAIN")
   shift
   if [ -x "$made/venv/bin/python" ]; then
     cp -R "$made/checkout" "$CI_WORK/user-$number"
     cd "$CI_WORK/user-$number"
-    with_summary "user-$number" "${as_user[@]}" "$made/venv/bin/python" -m pytest -n 1 \
+    with_summary "user-$number" "${again[@]}" "$made/venv/bin/python" -m pytest -n 1 \
       "${elsewhere[@]}" "$@"
   else
     cp -R . "$CI_WORK/user-$number"
     cd "$CI_WORK/user-$number"
-    export ENVHUB_TEST_RUNNER="${as_user[*]}"
+    export ENVHUB_TEST_RUNNER="${again[*]}"
     with_summary "user-$number" ./test -n 1 "${elsewhere[@]}" "$@"
   fi
 }
