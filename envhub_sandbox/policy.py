@@ -88,6 +88,9 @@ class Policy:
         output: What becomes of what the worker prints: ``"tail"`` keeps the last lines for error
             messages; a path writes it to that file as well, a further file for each further jail;
             ``"stderr"`` or ``"-"`` to this program's stderr.
+        record_denials: Have the jail's first process, instead of the kernel alone, deny the system
+            calls that are denied, and write down which were tried: ``env.jail_denials()``. Each of
+            them takes longer then.
         crash_history: How many requests since the last seeded reset are kept for a crash bundle
             (``docs/crashes.md``), within 8 MiB; 0 keeps none and writes no bundles.
         crash_folder: Where crash bundles are written; ``crashes`` in the cache by default.
@@ -103,6 +106,7 @@ class Policy:
     restart_budget: int = 100
     restart_backoff_s: float = 0.1
     output: str = "tail"
+    record_denials: bool = False
     crash_history: int = 100_000
     crash_folder: str | None = None
 
@@ -118,6 +122,10 @@ class Policy:
             object.__setattr__(self, "crash_folder", _path("crash_folder", self.crash_folder))
         if not isinstance(self.gpu, bool):
             raise PolicyError(f"policy: gpu is {self.gpu!r}; it is True or False")
+        if not isinstance(self.record_denials, bool):
+            raise PolicyError(
+                f"policy: record_denials is {self.record_denials!r}; it is True or False"
+            )
         # frozen: this is how a field gets the form that the rest relies on
         object.__setattr__(self, "readable", _texts("readable", self.readable))
         object.__setattr__(self, "environment", _texts("environment", self.environment))
@@ -136,6 +144,7 @@ class Policy:
             gpu=self.gpu,
             environment=granted,
             limits=self.limits,
+            record_denials=self.record_denials,
         )
 
 

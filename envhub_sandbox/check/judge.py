@@ -6,15 +6,16 @@ our own comparison found nothing, never because the repository says so.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from envhub_sandbox.api import make_env
-from envhub_sandbox.check import leaks, parsing, settings, source, traces
+from envhub_sandbox.check import denials, leaks, parsing, settings, source, traces
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.settings import Asks
 from envhub_sandbox.check.survey import survey
@@ -32,11 +33,13 @@ from envhub_sandbox.errors import (
     RemoteProtocolError,
     RequirementError,
     ResolutionError,
+    SandboxUnavailableError,
     SnapshotError,
     WorkerDiedError,
     WorkerTimeoutError,
 )
 from envhub_sandbox.hub.snapshot import Snapshot, named
+from envhub_sandbox.policy import policy_from
 from envhub_sandbox.session.recipe import pinned
 from envhub_sandbox.vector.suites import EnvSuites
 
@@ -154,7 +157,7 @@ class _Judge:
     def _load(self) -> None:
         self._asked.tell("loading it")
         try:
-            suites = self.make(num_workers=1, validate=True)
+            suites = self._made_to_record()
         except LoadError as error:
             self._report.judged("loads", [str(error)])
             raise _StoppedError from error
@@ -172,10 +175,25 @@ class _Judge:
             self._report.judged("loads", [])
             for suite, task in self._asked.tasks(suites):
                 self._asked.tell(f"{suite} / {task}")
+                asking = _Task(self, self._asks, suites, suite, task)
                 with self._stopping(f"{suite} / {task}"):
-                    _Task(self, self._asks, suites, suite, task).ask()
+                    asking.ask()
+                asking.denied()
                 suites[suite][task].close()
             self._report.provenance = suites.provenance
+
+    def _made_to_record(self) -> EnvSuites:
+        """Of which what they are denied is recorded, where a kernel and its containers let it be.
+
+        With the longer steps that this costs nobody measures a time.
+        """
+        given = self._asked.arguments
+        if self._is_here:
+            policy = policy_from(given.get("policy"), given.get("limits"))
+            recording = {"policy": replace(policy, record_denials=True), "limits": None}
+            with contextlib.suppress(SandboxUnavailableError):
+                return self.make(num_workers=1, validate=True, **recording)
+        return self.make(num_workers=1, validate=True)
 
     @contextmanager
     def _stopping(self, task: str) -> Iterator[None]:
@@ -219,6 +237,14 @@ class _Task:
         self._say("observation-dtype", list(self._uncast()))
         self._compare(first, mode)
         self._leaks()
+
+    def denied(self) -> None:
+        """What was refused so far: also where it ended in an error."""
+        told = getattr(self._env, "jail_denials", None)
+        denied = None if told is None else told()
+        if denied is not None:
+            for check, found in denials.sorted_out(denied).items():
+                self._say(check, found)
 
     def _leaks(self) -> None:
         usage = getattr(self._env, "jail_usage", None)

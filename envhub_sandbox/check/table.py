@@ -125,6 +125,18 @@ CHECKS: dict[str, Check] = {
             "Return such an array from render(), or declare no rgb_array.",
         ),
         Check(
+            "denied-network",
+            _W,
+            "It tries to reach no network that the policy denies.",
+            "Bring data along in the repository, and report nothing to anybody.",
+        ),
+        Check(
+            "denied-kernel",
+            _W,
+            "It tries no system call that the policy denies.",
+            "Do without: no tracing, mounting or namespaces is needed to compute a step.",
+        ),
+        Check(
             "leaks-processes",
             _W,
             "Resets leave no processes behind.",

@@ -9,6 +9,7 @@ brought back before a reset, closed, and abandoned in a fork.
 from __future__ import annotations
 
 import os
+import re
 import weakref
 from collections.abc import Sequence
 from typing import Any
@@ -33,6 +34,7 @@ from envhub_sandbox.transport.shared_memory.sharding import PaceBook
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 
+_DENIAL = re.compile(r"[a-z0-9_]{1,40}( [A-Z0-9_]{1,40})?")
 _GRACE_S = 2.0
 """How long ``reset`` waits for a late reply before it gives the jail up and starts another."""
 
@@ -99,6 +101,13 @@ class EnvSession:
         named = ("processes", "threads", "memory_bytes")
         found = {name: told[name] for name in named if type(told.get(name)) is int}
         return found if len(found) == len(named) else {}
+
+    def denials(self) -> tuple[str, ...] | None:
+        """What its jail was denied, as its server says; None where nobody records it."""
+        told = self.lease.status().get("denied")
+        if not isinstance(told, tuple):
+            return None
+        return tuple(one for one in told[:64] if isinstance(one, str) and _DENIAL.fullmatch(one))
 
     def stats(self) -> dict[str, Any]:
         """Counters, and where it is in its life."""

@@ -329,6 +329,14 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         """
         return self._session.usage()
 
+    def jail_denials(self) -> tuple[str, ...] | None:
+        """Which system calls its jail has tried and was denied: ``("ptrace", "socket AF_INET")``.
+
+        By the word of its first process, which answers them, and not by the repository's. None
+        unless it runs under a policy with ``record_denials``.
+        """
+        return self._session.denials()
+
     def stats(self) -> dict[str, Any]:
         """Counters, at any moment, from any thread; asks nothing of the worker.
 

@@ -68,6 +68,17 @@ _FORKED = """self.count = 0
 _KEPT = """self.count = 0
         gym.kept = [*getattr(gym, "kept", ()), np.ones(1 << 18)]
         return"""
+_CALLING = """self.count = 0
+        import importlib
+        try:
+            importlib.import_module("socket").socket()
+        except OSError:
+            pass
+        return"""
+_UNSHARING = """self.count = 0
+        import importlib
+        importlib.import_module("ctypes").CDLL(None).unshare(0x10000000)
+        return"""
 _FAULTS = {
     "observation-dtype": ("self.count], np.float32)", "self.count], np.float64)"),
     "observation-space": ("self.count], np.float32)", "self.count * 30], np.float32)"),
@@ -79,6 +90,8 @@ _FAULTS = {
     "runs": ("self.count += 1", "raise RuntimeError('it broke')"),
     "survives": ("self.count += 1", "import os; os._exit(3)"),
     "loads": ("return gym.vector.SyncVectorEnv([Walk] * n_envs)", "return 3"),
+    "denied-network": ("self.count = 0\n        return", _CALLING),
+    "denied-kernel": ("self.count = 0\n        return", _UNSHARING),
     "leaks-threads": ("self.count = 0\n        return", _STAYING),
     "leaks-processes": ("self.count = 0\n        return", _FORKED),
     "leaks-memory": ("self.count = 0\n        return", _KEPT),

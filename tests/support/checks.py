@@ -23,13 +23,19 @@ not be judged, because it could not be had, a server was full, or this host cann
 
 A check passes because a comparison of ours found nothing, never because the repository says so.
 What is found in source is a hint for a person: who wants to hide a call can, and the walls are the
-sandbox's. Not asked yet: what the layers denied. Files are parsed in a child whose time and memory
+sandbox's. Files are parsed in a child whose time and memory
 the kernel bounds; one that ends it is not read.
 
 How long resets and steps take, and what the jail holds in the end, are figures of the report and
 no checks: they say as much of the machine. What resets leave behind is counted by the worker
 server, from outside of the jail, after each of four rounds of `--resets`; what grows from each
 round to the next is told, processes before threads before memory.
+
+What it tried and was denied is told by the first process of the jail, which the system call filter
+asks instead of refusing by itself (`Policy.record_denials`), with `sandbox="process"` alone. What
+allocators and the C library try on their way is left out. Files are not among it: in a private root
+what may not be read does not exist, and the kernel tells nobody who looked for it. Nor is what was
+tried in a jail that has ended since.
 
 `--policy FILE` is TOML with the fields of `Policy`, and a table `[limits]`. An author's
 `envhub.toml` can ask in `[check]` for more `steps` and `resets` than the judge would take, up to

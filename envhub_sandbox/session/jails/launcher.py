@@ -155,6 +155,8 @@ class Launcher:
             snapshot, runtime = server.snapshot, Runtime(server.python, server.packages)
             confinement = replace(confinement, profile=server.profile)
         entry, permitted = self.repository.snapshot.path, asdict(confinement)
+        if not confinement.record_denials:
+            del permitted["record_denials"]  # an older server has no such field
         order = (self.repository.label, runtime.python, snapshot, entry, permitted, runners)
         if not runtime.packages:
             return m.OpenJail(*order)

@@ -25,6 +25,16 @@ def test_an_ordinary_one_is_what_it_was() -> None:
     assert confinement_from_wire({**asdict(made), "readable": ["/data"]}) == made
 
 
+def test_an_older_client_does_not_say_everything() -> None:
+    """What came later is off for it; what there has always been it must say."""
+    older = wire()
+    del older["record_denials"]
+    assert confinement_from_wire(older) == Confinement()
+    del older["gpu"]
+    with pytest.raises(RemoteProtocolError):
+        confinement_from_wire(older)
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -32,6 +42,7 @@ def test_an_ordinary_one_is_what_it_was() -> None:
         {"network": "anything"},
         {"network": ["host"]},
         {"gpu": 1},
+        {"record_denials": 1},
         {"readable": "/etc"},
         {"readable": [b"/etc"]},
         {"readable": ["/a"] * 65},

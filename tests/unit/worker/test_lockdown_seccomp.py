@@ -21,6 +21,8 @@ from envhub_worker.lockdown.seccomp.policy import (
     PRETEND,
     SHARED_BYTES,
     ByArguments,
+    recorded,
+    refusal,
     table,
 )
 from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
@@ -326,6 +328,30 @@ def test_signals_are_handed_to_init_where_it_sends_them(machine: str) -> None:
         "rt_sigqueueinfo": EPERM,
         "pidfd_send_signal": ENOSYS,
     }
+
+
+@machines
+@pytest.mark.parametrize("network", ["none", "host"])
+@pytest.mark.parametrize("namespaced", [True, False])
+def test_what_is_recorded_is_denied_all_the_same(
+    machine: str, network: str, namespaced: bool
+) -> None:
+    """Whatever is asked of init is what would have been refused, and init refuses it likewise."""
+    plain = table(namespaced=namespaced, network=network)
+    asking = recorded(plain, NUMBERS[machine])
+    first, second = filter.program(machine, plain), filter.program(machine, asking)
+    refused = set()
+    for name, call in NUMBERS[machine].items():
+        for arguments in ((), (2,), (0x10000000, 3), (1, 8, 1)):
+            was = run(first, ARCH[machine], call, arguments)
+            now = run(second, ARCH[machine], call, arguments)
+            if now == ASK:
+                assert was & 0xFFFF == refusal(name)
+                refused.add(name)
+            else:
+                assert now == was
+    assert refused >= {"ptrace", "mount", "bpf", "unshare", "clone", "socket"}
+    assert "kill" not in refused
 
 
 @machines

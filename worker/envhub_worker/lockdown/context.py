@@ -28,6 +28,7 @@ class ZygoteConfig:
         place: An empty folder of the zygote's own.
         canary: A file that exists and that no jail may read.
         user: The user to become where the server is root, else None.
+        record: Whether init answers what the filter denies, and tells.
         refusal: Why no jail can be had (``LayerUnavailableError.to_wire``), if that is known.
     """
 
@@ -42,6 +43,7 @@ class ZygoteConfig:
     place: str
     canary: str
     user: int | None
+    record: bool
     refusal: dict[str, str] | None
 
     @classmethod
@@ -65,6 +67,7 @@ class Common:
         covered: (files, folders) of /proc to hide.
         landlock_abi: 0 where there is none.
         brokered: Whether init sends the jails' signals.
+        asks: Whether init is asked anything: signals, or what is denied.
         programs: The compiled system call filters: where memory is counted, where it is measured.
         set_blas_threads: Sets OpenBLAS's threads, if that is what numpy uses.
     """
@@ -78,6 +81,7 @@ class Common:
     covered: tuple[list[str], list[str]]
     landlock_abi: int
     brokered: bool
+    asks: bool
     programs: tuple[bytes, ...]
     set_blas_threads: Callable[[int], None] | None = None
 

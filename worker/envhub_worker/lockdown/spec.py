@@ -16,6 +16,8 @@ _MAX_OUTPUT_BYTES = 64 << 20
 _MAX_ENVIRONMENT_BYTES = 64 << 10
 """All granted variables together: they travel in one packet between our own processes."""
 _MAX_READABLE = 64
+_YOUNGER = frozenset({"record_denials"})
+"""What an older client does not say, and none says that does not want it."""
 _LIFTABLE = frozenset({"cpu_s", "file_bytes"})
 
 
@@ -55,12 +57,14 @@ def confinement_from_wire(data: dict[str, Any]) -> Confinement:
     Raises:
         RemoteProtocolError: A name, type or number that there cannot be.
     """
-    if set(data) != {item.name for item in fields(Confinement)}:
+    names = {item.name for item in fields(Confinement)}
+    if not names - _YOUNGER <= set(data) <= names:
         raise RemoteProtocolError("a confinement has other fields")
     made = Confinement(
         **{**data, "readable": tuple(_texts(data["readable"])), "limits": _limits(data["limits"])}
     )
     known = made.profile in PROFILES and made.network in NETWORKS and type(made.gpu) is bool
+    known = known and type(made.record_denials) is bool
     if not known or len(made.readable) > _MAX_READABLE or not _may_be_granted(made.environment):
         raise RemoteProtocolError("a confinement that there cannot be")
     return made

@@ -78,6 +78,7 @@ class Confinement:
         gpu: Grants the render and NVIDIA device nodes and the driver libraries.
         environment: Environment variables that the caller grants by name, with their values.
         limits: Hard caps.
+        record_denials: Init itself answers the system calls that are denied, and tells which.
     """
 
     profile: str = "strict"
@@ -86,3 +87,4 @@ class Confinement:
     gpu: bool = False
     environment: dict[str, str] = field(default_factory=dict)
     limits: Limits = field(default_factory=Limits)
+    record_denials: bool = False

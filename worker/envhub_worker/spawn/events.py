@@ -71,4 +71,17 @@ class RunnerExited:
     detail: str = ""
 
 
-JailEvent = Ready | Failed | RunnerStarted | RunnerExited
+@dataclass(frozen=True)
+class Denied:
+    """Something in the jail tried a system call that the policy denies, for the first time.
+
+    Attributes:
+        call: Its name.
+        detail: What is known of its arguments: a family of sockets, or nothing.
+    """
+
+    call: str
+    detail: str
+
+
+JailEvent = Ready | Failed | RunnerStarted | RunnerExited | Denied

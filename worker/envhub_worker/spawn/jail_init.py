@@ -14,6 +14,7 @@ Events::
     {"event": "runner_started", "runner": N, "report": [layer...]} + [the runner's pidfd]
     {"event": "runner_exited", "runner": N, "code": C | null, "signal": S | null, "reason": R,
      "detail": D}
+    {"event": "denied", "call": C, "detail": D}        where the jail records what it was denied
 
 The end of the channel ends the jail.
 """
@@ -87,6 +88,7 @@ class Init:
         self._common = common
         self._runners: dict[int, _Runner] = {}
         self._listeners: set[int] = set()
+        self._denials: set[tuple[str, str]] = set()
         self._running = True
         self._poller = select.poll()
         self._joins: list[int] = []
@@ -204,10 +206,24 @@ class Init:
                 os.kill(pid, signal.SIGKILL)
 
     def _answer(self, listener: int) -> None:
-        if not notify.serve(listener):
+        if not notify.serve(listener, self._note_denial):
             self._poller.unregister(listener)
             self._listeners.discard(listener)
             os.close(listener)
+
+    def _note_denial(self, request: notify.Request) -> None:
+        """Tell what was tried, each thing once; a runner's own test of its denials is none."""
+        runner = self._runners.get(request.caller)
+        if runner is not None and runner.status is not None:
+            # it may have reported a moment ago, and be a stranger's since
+            self._read_report(request.caller, runner, runner.status)
+            if runner.status is not None:
+                return
+        denial = notify.described(request)
+        if denial not in self._denials and len(self._denials) < notify.MOST_DENIALS:
+            self._denials.add(denial)
+            call, detail = denial
+            self._channel.send({"event": "denied", "call": call, "detail": detail})
 
     def _read_reports(self, fd: int) -> None:
         for pid, runner in self._runners.items():

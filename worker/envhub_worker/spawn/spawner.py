@@ -28,6 +28,7 @@ from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import OWN, Runtime
 from envhub_worker.spawn.channel import Channel, close_fds
 from envhub_worker.spawn.events import (
+    Denied,
     Failed,
     JailEvent,
     Ready,
@@ -39,6 +40,7 @@ from envhub_worker.spawn.zygote_process import ZygoteProcess, resolved
 
 __all__ = [
     "RUNNER_TARGET",
+    "Denied",
     "Failed",
     "Jail",
     "JailEvent",
@@ -124,6 +126,7 @@ class Spawner:
             place=str(place),
             canary=str(self._log),
             user=self._user,
+            record=confinement.record_denials,
             refusal=self._refusal,
         )
 
@@ -353,6 +356,8 @@ class Jail:
             self._runner_pidfds[message["runner"]] = fds[0]
             pid = process.pid_of(fds[0])
             return [Ready(report), RunnerStarted(message["runner"], pid, report)]
+        if kind == "denied":
+            return [Denied(message["call"], message["detail"])]
         self._close_runner_pidfds([message["runner"]])
         names = ("runner", "code", "signal", "reason", "detail")
         return [RunnerExited(*(message[name] for name in names))]

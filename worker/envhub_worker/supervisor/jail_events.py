@@ -17,6 +17,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.spawn.channel import close_fds
 from envhub_worker.spawn.spawner import (
+    Denied,
     Failed,
     JailExited,
     RunnerExited,
@@ -132,6 +133,11 @@ class JailEvents:
             self._loop.unwatch(entry.output.fileno())
             entry.output.close()
 
+    def catch_up(self, entry: JailEntry) -> None:
+        """Hear now what a jail has said, as its loop would in a moment."""
+        if entry.death is None and entry.jail.fileno() >= 0:
+            self._jail_events(entry)
+
     def _jail_events(self, entry: JailEntry) -> None:
         events = entry.jail.poll()
         if entry.jail.fileno() < 0:
@@ -143,6 +149,8 @@ class JailEvents:
                 self._failed(entry, event)
             elif isinstance(event, RunnerExited):
                 self._runner_exited(entry, event)
+            elif isinstance(event, Denied):
+                entry.denied.append(f"{event.call} {event.detail}".strip())
 
     def _runner_started(self, entry: JailEntry, event: RunnerStarted) -> None:
         entry.pids[event.runner_id] = event.pid

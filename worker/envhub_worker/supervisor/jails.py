@@ -254,6 +254,8 @@ class Jails:
     def status(self, asker: Asker, request: m.GetStatus) -> None:
         """Tell what the asker's jails are doing, and what they hold."""
         mine = [entry for entry in self._jails.values() if entry.session == asker.session]
+        for entry in mine:
+            self._events.catch_up(entry)  # it said so before it answered whoever asks now
         rows = tuple({**status_of(one), **_held(one)} for one in mine)
         self._answers.reply(asker, m.Status(rows))
 
@@ -287,7 +289,12 @@ class Jails:
 
 
 def _held(entry: JailEntry) -> dict[str, object]:
-    return {**usage_of(entry.jail.pid, entry.pids.values())} if entry.death is None else {}
+    held: dict[str, object] = {}
+    if entry.death is None:
+        held |= usage_of(entry.jail.pid, entry.pids.values())
+    if entry.jail.spec.confinement.record_denials:
+        held["denied"] = tuple(entry.denied)
+    return held
 
 
 def _targets(

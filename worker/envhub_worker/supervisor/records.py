@@ -66,6 +66,7 @@ class JailEntry:
         opened: Whether it has come up.
         since: When it was asked for.
         moved: Bytes to and from runners that it has lost.
+        denied: What was tried in it and is denied, where it records that.
     """
 
     number: int
@@ -87,6 +88,7 @@ class JailEntry:
     opened: bool = False
     since: float = field(default_factory=monotonic)
     moved: tuple[int, int] = (0, 0)
+    denied: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         # kept, because closing a descriptor makes it forget its number

@@ -16,7 +16,7 @@ from envhub_worker.supervisor.records import JailEntry
 
 MAX_IDLE_ZYGOTES = 2
 """Without a jail, when another is started. A client mostly has one policy, or two in turns."""
-_OF_POLICY = ("profile", "network", "readable", "gpu")
+_OF_POLICY = ("profile", "network", "readable", "gpu", "record_denials")
 
 Key = tuple[object, ...]
 

@@ -17,6 +17,7 @@ from envhub_worker.lockdown.seccomp.policy import (
     ByArguments,
     Check,
     Verdict,
+    recorded,
     table,
 )
 from envhub_worker.lockdown.seccomp.syscalls import NUMBERS, number
@@ -42,8 +43,9 @@ def compile_filter(
     brokered: bool = False,
     measured: bool = False,
     scoped: bool = True,
+    record: bool = False,
 ) -> bytes:
-    """The program for ``machine`` as bytes; see ``seccomp_policy.table``.
+    """The program for ``machine`` as bytes; see ``policy.table``, and ``recorded`` if ``record``.
 
     Raises:
         LayerUnavailableError: No table for this machine.
@@ -55,6 +57,8 @@ def compile_filter(
         measured=measured,
         scoped=scoped,
     )
+    if record:
+        verdicts = recorded(verdicts, NUMBERS.get(machine, ()))
     return bpf.to_bytes(program(machine, verdicts))
 
 

@@ -15,13 +15,15 @@ import fcntl
 import os
 import select
 import signal
+import socket
 import struct
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 from envhub_worker.lockdown.mechanisms import reap
 from envhub_worker.lockdown.mechanisms.kernel import syscall
-from envhub_worker.lockdown.seccomp.syscalls import number
+from envhub_worker.lockdown.seccomp.policy import refusal
+from envhub_worker.lockdown.seccomp.syscalls import name_of, number
 
 _RECEIVE = 0xC0502100
 _SEND = 0xC0182101
@@ -60,10 +62,16 @@ class Answer:
 
 _PROCEED = Answer(proceed=True)
 _Inside = Callable[[], Collection[int]]
+_SIGNALS = ("kill", "tkill", "tgkill")
 
 
-def serve(listener: int) -> bool:
-    """Answer one request that waits at ``listener``; False when nobody is left to ask."""
+def serve(listener: int, denied: Callable[[Request], None]) -> bool:
+    """Answer one request that waits at ``listener``; False when nobody is left to ask.
+
+    Args:
+        listener: Where calls arrive.
+        denied: Is told of what is no signal: the policy denies it, and it is only recorded.
+    """
     buffer = bytearray(_REQUEST.size)
     try:
         fcntl.ioctl(listener, _RECEIVE, buffer)
@@ -73,11 +81,31 @@ def serve(listener: int) -> bool:
     identity, thread, _, call, _, _, *words = _REQUEST.unpack(buffer)
     first, second, third = (_c_int(word) for word in words[:3])
     request = Request(thread, reap.process_of(thread), call, (first, second, third))
-    answer = decide(request, lambda: reap.descendants(os.getpid()))
+    if request.call in map(number, _SIGNALS):
+        answer = decide(request, lambda: reap.descendants(os.getpid()))
+    else:
+        denied(request)  # told before the caller goes on, so that nobody can look too early
+        answer = Answer(refusal(name_of(request.call)))
     flags = _CONTINUE if answer.proceed else 0
     with contextlib.suppress(OSError):
         fcntl.ioctl(listener, _SEND, _ANSWER.pack(identity, 0, -answer.error, flags))
     return True
+
+
+MOST_DENIALS = 64
+"""Different ones that are told of a jail."""
+
+
+def described(request: Request) -> tuple[str, str]:
+    """A call that is denied, and of its arguments what the kernel itself reads in a register."""
+    call = name_of(request.call)
+    if call not in ("socket", "socketpair"):
+        return call, ""
+    family = request.arguments[0]
+    try:
+        return call, socket.AddressFamily(family).name
+    except ValueError:
+        return call, "AF_UNKNOWN"
 
 
 def _has_callers(listener: int) -> bool:

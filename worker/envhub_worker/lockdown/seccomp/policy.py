@@ -7,6 +7,7 @@ EPERM; one that they do not name answers ENOSYS, so that programs fall back.
 from __future__ import annotations
 
 import errno
+from collections.abc import Iterable, Mapping
 
 from envhub_worker.protocol.records import dataclass
 
@@ -144,6 +145,35 @@ def table(
         verdicts |= dict.fromkeys(("rt_sigqueueinfo", "rt_tgsigqueueinfo"), EPERM)
         verdicts["pidfd_send_signal"] = ENOSYS
     return verdicts
+
+
+def recorded(verdicts: Mapping[str, Verdict], names: Iterable[str]) -> dict[str, Verdict]:
+    """The same, where init answers what is denied, and so knows that it was tried.
+
+    What is not there at all (ENOSYS), or only seems to work, is no attempt at anything: libraries
+    ask for it on their way to something else.
+
+    Args:
+        verdicts: Of ``table``.
+        names: Every call that there is.
+    """
+    return {name: _asking(verdicts.get(name, EPERM)) for name in names}
+
+
+def _asking(verdict: Verdict) -> Verdict:
+    if isinstance(verdict, ByArguments):
+        rules = tuple((checks, _asked(action)) for checks, action in verdict.rules)
+        return ByArguments(rules, _asked(verdict.otherwise))
+    return _asked(verdict)
+
+
+def _asked(verdict: int) -> int:
+    return ASK if verdict in (EPERM, _EAFNOSUPPORT) else verdict
+
+
+def refusal(call: str) -> int:
+    """The errno with which a call that is denied answers, whoever gives it."""
+    return errno.EAFNOSUPPORT if call in ("socket", "socketpair") else errno.EPERM
 
 
 def _filtered() -> dict[str, Verdict]:

@@ -109,3 +109,9 @@ def number(name: str) -> int:
         KeyError: The machine is neither x86-64 nor aarch64, or has no such call.
     """
     return NUMBERS[os.uname().machine][name]
+
+
+def name_of(call: int) -> str:
+    """The name of a call of this machine by its number."""
+    numbers = NUMBERS[os.uname().machine]
+    return next((name for name, one in numbers.items() if one == call), f"call {call}")

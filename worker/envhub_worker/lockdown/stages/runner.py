@@ -64,7 +64,7 @@ def enter(
         wanted = landlock.ruleset(jail.common.landlock_abi, jail.common.config.network)
         landlock.restrict(wanted, rules(jail, os.getpid()))
     program = jail.common.programs[jail.plan.measured]
-    listener = filter.install(program, brokered=jail.common.brokered)
+    listener = filter.install(program, brokered=jail.common.asks)
     if listener >= 0:
         give_to_init(listener)
         os.close(listener)  # whoever holds it may permit anything

@@ -60,6 +60,7 @@ def enter(config: ZygoteConfig) -> Common:
             brokered=brokered,
             measured=measured and not config.gpu,
             scoped=landlock.scopes(abi),
+            record=config.record,
         )
         for measured in (False, True)
     )
@@ -73,6 +74,7 @@ def enter(config: ZygoteConfig) -> Common:
         covered=covered,
         landlock_abi=abi,
         brokered=brokered,
+        asks=brokered or config.record,
         programs=programs,
     )
 

@@ -139,7 +139,7 @@ class Status(Message, kind=15):
     """One mapping per jail: ``jail``, ``name``, ``pids``, ``states``, ``busy_s``, ``operation``.
 
     Of one that lives also ``processes``, ``threads`` and ``memory_bytes``, counted from outside;
-    an older server does not say.
+    an older server does not say. Where denials are recorded: ``denied``, a tuple of texts.
     """
 
     jails: tuple[object, ...]

@@ -1,0 +1,24 @@
+"""What of a jail's denials is worth a finding."""
+
+from __future__ import annotations
+
+import pytest
+
+from envhub_sandbox.check.denials import sorted_out
+
+
+@pytest.mark.parametrize(
+    ("denied", "network", "kernel"),
+    [
+        ((), 0, 0),
+        (("setpriority", "mbind", "socket AF_NETLINK"), 0, 0),
+        (("socket AF_INET", "socket AF_INET6", "socket AF_PACKET"), 3, 0),
+        (("socket AF_UNIX", "ptrace", "mount"), 0, 3),
+        (("ptrace", "ptrace"), 0, 1),
+    ],
+    ids=["nothing", "harmless", "network", "kernel", "once"],
+)
+def test_attempts_are_sorted(denied: tuple[str, ...], network: int, kernel: int) -> None:
+    """By what they reach for; what libraries do without is none."""
+    found = sorted_out(denied)
+    assert (len(found["denied-network"]), len(found["denied-kernel"])) == (network, kernel)
