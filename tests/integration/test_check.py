@@ -61,23 +61,18 @@ _STAYING = """self.count = 0
         threading.Thread(target=threading.Event().wait, daemon=True).start()
         return"""
 _FORKED = """self.count = 0
-        import os, time
-        if getattr(os, "fork")() == 0:
+        if gym.vector.async_vector_env.sys.modules["os"].fork() == 0:
+            import time
             time.sleep(3600)
         return"""
 _KEPT = """self.count = 0
         gym.kept = [*getattr(gym, "kept", ()), np.ones(1 << 18)]
         return"""
 _CALLING = """self.count = 0
-        import importlib
-        try:
-            importlib.import_module("socket").socket()
-        except OSError:
-            pass
+        gym.vector.async_vector_env.sys.modules["ctypes"].CDLL(None).socket(2, 1, 0)
         return"""
 _UNSHARING = """self.count = 0
-        import importlib
-        importlib.import_module("ctypes").CDLL(None).unshare(0x10000000)
+        gym.vector.async_vector_env.sys.modules["ctypes"].CDLL(None).unshare(0x10000000)
         return"""
 _FAULTS = {
     "observation-dtype": ("self.count], np.float32)", "self.count], np.float64)"),
