@@ -58,9 +58,13 @@ def _advice(
 ) -> str:
     extra = "dependencies={'extra': ['NAME-OF-THE-PACKAGE']}"
     if place == "docker":
+        if own:
+            return (
+                f"It ran in a container, with packages of its own; this one joins them with {extra}"
+            )
         return (
-            "It ran in a container: build an image with its packages (envhub image build REF), and "
-            "use that with sandbox='docker:IMAGE'"
+            f"It ran in a container, with the image's packages: it gets others with {extra}, or "
+            "with an image that has them (envhub image build REF, then sandbox='docker:IMAGE')"
         )
     if place == "remote":
         if own:

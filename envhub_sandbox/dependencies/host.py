@@ -1,4 +1,4 @@
-"""Whether this interpreter has all that a repository declares, so that nothing is to be installed.
+"""Whether an interpreter has all that a repository declares, so that nothing is to be installed.
 
 The metadata of what is installed is read, and nothing is imported.
 """
@@ -6,7 +6,8 @@ The metadata of what is installed is read, and nothing is imported.
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from importlib import metadata
 
 from packaging.markers import default_environment
@@ -18,20 +19,42 @@ from packaging.version import InvalidVersion
 from envhub_sandbox.dependencies.declared import Declared
 
 
-def lacks(declared: Declared) -> str | None:
-    """The first requirement that this interpreter does not meet, of those declared or of theirs.
+@dataclass(frozen=True)
+class Described:
+    """A distribution of an interpreter elsewhere.
+
+    Attributes:
+        version: Its version.
+        requires: What it needs.
+    """
+
+    version: str
+    requires: Sequence[str]
+
+
+def lacks(
+    declared: Declared, there: Mapping[str, Described] | None = None, version: str | None = None
+) -> str | None:
+    """The first requirement that an interpreter does not meet, of those declared or of theirs.
 
     None if it meets them all. Where hashes are given it never does: nobody knows any more which
-    files the packages here were made of.
+    files its packages were made of.
+
+    Args:
+        declared: What is required.
+        there: What an interpreter elsewhere has; by default it is this one.
+        version: That one's version.
     """
     python = SpecifierSet(declared.python)
     # a Python that was built from a checkout has a plus at the end, which is no version
-    if not python.contains(platform.python_version().rstrip("+"), prereleases=True):
+    found = version or platform.python_version().rstrip("+")
+    if not python.contains(found, prereleases=True):
         return f"python{declared.python}"
     hashed = next((wanted for wanted in declared.wanted if wanted.hashes), None)
     if hashed is not None:
         return str(hashed.requirement)
-    for wanted, met_by in _Installed().reached(one.requirement for one in declared.wanted):
+    installed = _Installed() if there is None else _InstalledElsewhere(there, found)
+    for wanted, met_by in installed.reached(one.requirement for one in declared.wanted):
         if met_by is None or not _is_among(met_by, wanted.specifier):
             return str(wanted)
     return None
@@ -39,18 +62,19 @@ def lacks(declared: Declared) -> str | None:
 
 def brought(requirements: Iterable[Requirement]) -> list[metadata.Distribution]:
     """What this interpreter has of these, whichever version, and of all that they lead to."""
-    return [one for _, one in _Installed().reached(requirements) if one is not None]
+    found = (one for _, one in _Installed().reached(requirements))
+    return [one for one in found if isinstance(one, metadata.Distribution)]
 
 
 class _Installed:
     def __init__(self) -> None:
         self._met: set[tuple[str, frozenset[str]]] = set()
-        self._found: dict[str, metadata.Distribution | None] = {}
+        self._found: dict[str, metadata.Distribution | Described | None] = {}
         self._environment = {str(k): str(v) for k, v in default_environment().items()}
 
     def reached(
         self, requirements: Iterable[Requirement]
-    ) -> Iterator[tuple[Requirement, metadata.Distribution | None]]:
+    ) -> Iterator[tuple[Requirement, metadata.Distribution | Described | None]]:
         """Each that applies here, of all that they lead to, and what is here of that name."""
         waiting = [(one, frozenset[str]()) for one in requirements]
         while waiting:
@@ -74,7 +98,7 @@ class _Installed:
         each = ({**self._environment, "extra": extra} for extra in extras or ("",))
         return any(wanted.marker.evaluate(environment) for environment in each)
 
-    def _distribution(self, name: str) -> metadata.Distribution | None:
+    def _distribution(self, name: str) -> metadata.Distribution | Described | None:
         if name not in self._found:
             try:
                 self._found[name] = metadata.distribution(name)
@@ -83,14 +107,25 @@ class _Installed:
         return self._found[name]
 
 
-def _is_among(found: metadata.Distribution, versions: SpecifierSet) -> bool:
+class _InstalledElsewhere(_Installed):
+    def __init__(self, there: Mapping[str, Described], version: str) -> None:
+        super().__init__()
+        self._there = {canonicalize_name(name): one for name, one in there.items()}
+        minor = ".".join(version.split(".")[:2])
+        self._environment |= {"python_full_version": version, "python_version": minor}
+
+    def _distribution(self, name: str) -> Described | None:
+        return self._there.get(canonicalize_name(name))
+
+
+def _is_among(found: metadata.Distribution | Described, versions: SpecifierSet) -> bool:
     try:
         return versions.contains(found.version, prereleases=True)
     except (InvalidVersion, TypeError):
         return False
 
 
-def _needs(found: metadata.Distribution) -> list[Requirement]:
+def _needs(found: metadata.Distribution | Described) -> list[Requirement]:
     try:
         return [Requirement(text) for text in found.requires or ()]
     except InvalidRequirement:

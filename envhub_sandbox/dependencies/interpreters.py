@@ -86,11 +86,11 @@ def find(asked: str, declared: str = "") -> Interpreter:
     """
     if os.sep in asked:
         return _at(os.path.abspath(os.path.expanduser(asked)))
-    versions = _versions(asked) & SpecifierSet(declared) & _OLDEST
+    wanted = versions(asked) & SpecifierSet(declared) & _OLDEST
     ours = own()
-    if ours.fits(versions):
+    if ours.fits(wanted):
         return ours
-    found = [one for one in _others(versions) if one.fits(versions)]
+    found = [one for one in _others(wanted) if one.fits(wanted)]
     if found:
         return max(found, key=lambda one: Version(one.version))
     why = f"you ask for Python {asked!r}" if asked else f"it runs in Python {declared}"
@@ -108,10 +108,15 @@ def check_versions(asked: str) -> None:
         ValueError: It is none of these.
     """
     if os.sep not in asked:
-        _versions(asked)
+        versions(asked)
 
 
-def _versions(asked: str) -> SpecifierSet:
+def versions(asked: str) -> SpecifierSet:
+    """What a caller asks for: one version, or several.
+
+    Raises:
+        ValueError: It is neither.
+    """
     try:
         return SpecifierSet(f"=={Version(asked)}.*" if asked.count(".") < 2 else f"=={asked}")
     except (InvalidVersion, InvalidSpecifier):

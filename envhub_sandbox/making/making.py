@@ -97,8 +97,8 @@ def _wanted(sandbox: str | Sandbox, options: Options) -> _Wanted:
     place = sandbox_of(sandbox, options.server_key)
     if choice.where == "own" and sandbox != "process" and not isinstance(place, Provider):
         raise PolicyError(
-            "dependencies={...} is for sandbox='process' and for servers on other hosts. For a "
-            "container, build an image: envhub image build REF"
+            "dependencies={...} is for sandbox='process', for containers and for servers on other "
+            "hosts; this place has packages of its own"
         )
     runtime = Runtime(arguments.interpreter(python))
     if sandbox == "process":

@@ -126,7 +126,7 @@ def test_a_repositorys_packages_are_in_its_image(derived: dict[str, Any], engine
         assert suites.provenance["interpreter"]["executable"] == "/opt/environment/bin/python"
     plain = DockerSandbox(image=IMAGE, engine=engine.kind)
     with pytest.raises(DependencyError, match="minigrid"):
-        make_env(SAMPLES / "minigrid", sandbox=plain)
+        make_env(SAMPLES / "minigrid", sandbox=plain, dependencies="host")
 
 
 def test_every_package_is_pinned_and_the_image_bears_the_lock(

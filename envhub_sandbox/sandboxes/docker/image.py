@@ -20,7 +20,8 @@ from envhub_sandbox.errors import DependencyError, SandboxUnavailableError
 from envhub_sandbox.sandboxes.docker.engines import Engine, EngineError, environment, own_limits
 
 LOCK_LABEL = "dev.envhub.lock"
-_INTERPRETER = "/opt/envhub-worker/bin/python"
+INTERPRETER = "/opt/envhub-worker/bin/python"
+"""The server's, in every image."""
 _ASK = (
     "import json, os, sys; print(json.dumps(['%d.%d' % sys.version_info[:2], os.uname().machine]))"
 )
@@ -54,7 +55,7 @@ def target_of(engine: Engine, image: str) -> Target:
             *("--cap-drop", "ALL"),
             *("--security-opt", "no-new-privileges", "--pull", "never"),
             *(word for limit in own_limits(engine) for word in ("--ulimit", limit)),
-            *("--entrypoint", _INTERPRETER, image, "-I", "-c", _ASK),
+            *("--entrypoint", INTERPRETER, image, "-I", "-c", _ASK),
         )
         python, machine = json.loads(said)
     except (EngineError, ValueError) as error:

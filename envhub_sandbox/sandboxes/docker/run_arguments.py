@@ -18,6 +18,8 @@ SOCKETS = "/run/envhub"
 SNAPSHOTS = "/snapshots"
 SNAPSHOT = f"{SNAPSHOTS}/this"
 """Where the repository's files lie inside: their path outside is nobody's business."""
+PACKAGES = "/packages"
+"""Where packages lie inside that were made for the repository."""
 
 _MIB = 1024 * 1024
 _OVERHEAD_BYTES = 1024 * _MIB
@@ -26,8 +28,8 @@ _SHARED_MEMORY_BYTES = 1024 * _MIB
 # What a container has of its own. A path of the host over one of these would replace it.
 _OWN = frozenset(
     {
-        *("bin", "dev", "etc", "lib", "lib32", "lib64", "libx32", "opt", "proc", "root", "run"),
-        *("sbin", "snapshots", "sys", "tmp", "usr", "var"),
+        *("bin", "dev", "etc", "lib", "lib32", "lib64", "libx32", "opt", "packages", "proc"),
+        *("root", "run", "sbin", "snapshots", "sys", "tmp", "usr", "var"),
     }
 )
 
@@ -42,6 +44,7 @@ class Container:
         labels: Label to value.
         sockets: The host's folder that is mounted at ``SOCKETS``.
         snapshot: The host's folder that is mounted at ``SNAPSHOT``, read-only.
+        packages: The host's folder that is mounted at ``PACKAGES``, read-only, or empty.
         readable: Further paths of the host, read-only, at the same place.
         seccomp: The host's path of the system call profile.
         user: User and group of its processes.
@@ -71,6 +74,7 @@ class Container:
     runtime: str | None
     gpus: str | None
     ulimits: tuple[str, ...] = ()
+    packages: str = ""
 
 
 def run_arguments(engine: Engine, wanted: Container) -> list[str]:
@@ -127,6 +131,7 @@ def _files(wanted: Container) -> list[str]:
     mounts = [
         _mount(wanted.sockets, SOCKETS, read_only=False),
         _mount(wanted.snapshot, SNAPSHOT, read_only=True),
+        *([_mount(wanted.packages, PACKAGES, read_only=True)] if wanted.packages else []),
         *(_mount(path, path, read_only=True) for path in wanted.readable),
     ]
     scratch = f"rw,nosuid,nodev,size={wanted.scratch},mode=1777"

@@ -22,11 +22,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from envhub_sandbox.dependencies.choice import Choice
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
+from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.base import WorkerServer
-from envhub_sandbox.sandboxes.docker import attestation, run_arguments, seccomp_profile
+from envhub_sandbox.sandboxes.docker import attestation, packages, run_arguments, seccomp_profile
 from envhub_sandbox.sandboxes.docker.engines import (
     Engine,
     environment,
@@ -94,12 +96,6 @@ class DockerSandbox:
             PolicyError: A container cannot give what the policy permits.
             SandboxUnavailableError: There is no engine, no image, or no permission.
         """
-        if runtime.packages:
-            raise PolicyError(
-                "dependencies: an environment of the repository's own is of this machine, and a "
-                "container has its own: make an image with `envhub image build` and choose it, "
-                "with DockerSandbox(image=...)"
-            )
         if runtime.python:
             raise PolicyError(
                 f"python={runtime.python!r} is an interpreter of this machine, and a container has "
@@ -116,7 +112,20 @@ class DockerSandbox:
         run_arguments.check_readable(policy.readable)
         engine = find_engine(self.engine)
         _check_users(engine)
-        return RepositoryContainer(self, engine, find_image(engine, self.image), snapshot, policy)
+        image, packages = find_image(engine, self.image), runtime.packages
+        return RepositoryContainer(self, engine, image, snapshot, policy, packages)
+
+    def provided(self, snapshot: Snapshot, choice: Choice) -> packages.Mounted | None:
+        """The packages of a repository, for the image's Python; None where the image has them.
+
+        Raises:
+            DependencyError: They cannot be made, or not for that image.
+            SandboxUnavailableError: There is no engine, no image, or no permission.
+        """
+        if choice.where == "host":
+            return None
+        engine = find_engine(self.engine)
+        return packages.provided(snapshot, choice, engine, find_image(engine, self.image))
 
     def acquire(self, store: Path, runtime: Runtime = OWN) -> WorkerServer:
         """Not without a repository: a container sees the files of one only."""
@@ -142,6 +151,7 @@ class ContainerServer:
     Attributes:
         layers: What holds around it.
         profile: That of its jails.
+        packages: Where those lie in there that were made for the repository.
         python: Their interpreter; empty for the server's own.
     """
 
@@ -190,14 +200,21 @@ class RepositoryContainer:
     name = "docker"
 
     def __init__(
-        self, options: DockerSandbox, engine: Engine, image: str, snapshot: Path, policy: Policy
+        self,
+        options: DockerSandbox,
+        engine: Engine,
+        image: str,
+        snapshot: Path,
+        policy: Policy,
+        packages: str = "",
     ) -> None:
-        self.interpreter = f"{image} in {engine.kind}"
+        self.interpreter = f"{image} in {engine.kind}{f' with {packages}' if packages else ''}"
+        self._packages = packages
         self._options, self._engine, self._image = options, engine, image
         self._snapshot, self._policy = snapshot, policy
         # of one make_env, whose limits are for it alone; only one that nobody uses changes hands
         self._servers: Sharing[ContainerServer] = Sharing(_IDLE)
-        self._key = repr((options, engine, image, str(snapshot), policy))
+        self._key = repr((options, engine, image, str(snapshot), policy, packages))
 
     def acquire(self, store: Path, runtime: Runtime = OWN) -> ContainerServer:
         """The repository's container, started if there is none."""
@@ -246,7 +263,11 @@ class RepositoryContainer:
         layers = attestation.layers(wanted, found, title)
         profile = attestation.profile_for(self._policy.profile, found)
         fd = os.pidfd_open(process.pid)
-        return ContainerServer(folder, process, fd, [*layers], profile, found.python)
+        # with packages of its own it has no use for those of another environment in the image
+        python = "" if self._packages else found.python
+        server = ContainerServer(folder, process, fd, [*layers], profile, python)
+        server.packages = run_arguments.PACKAGES if self._packages else ""
+        return server
 
     def _wanted(self, folder: Path) -> Container:
         options, policy = self._options, self._policy
@@ -273,6 +294,7 @@ class RepositoryContainer:
             },
             sockets=str(sockets),
             snapshot=str(self._snapshot),
+            packages=self._packages,
             readable=policy.readable,
             seccomp=str(folder / "seccomp.json"),
             user=(user, group),

@@ -201,6 +201,7 @@ def test_an_interpreter_by_its_path(tmp_path: Path) -> None:
         ("process", HOST, None, False, "leave that out"),
         ("process", HOST, "/opt/python", False, "/opt/python"),
         ("docker", AUTO, None, False, "envhub image build"),
+        ("docker", AUTO, None, True, "{'extra': ['NAME-OF-THE-PACKAGE']}"),
         ("remote", AUTO, None, False, "whoever runs that"),
         ("remote", AUTO, None, False, "--dependencies"),
         ("remote", AUTO, None, True, "{'extra': ['NAME-OF-THE-PACKAGE']}"),

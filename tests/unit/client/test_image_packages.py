@@ -1,0 +1,77 @@
+"""Packages for a container: whether the image has them, and whether this machine's fit there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from envhub_sandbox.dependencies import host, interpreters
+from envhub_sandbox.dependencies.choice import AUTO, chosen
+from envhub_sandbox.dependencies.declared import Declared, one
+from envhub_sandbox.dependencies.host import Described
+from envhub_sandbox.errors import InterpreterUnavailableError
+from envhub_sandbox.sandboxes.docker.packages import fitting
+
+OURS = interpreters.own()
+NEWER = replace(OURS, path="/opt/envhub-worker/bin/python", libc="99.0")
+THERE = {
+    "Wanted_One": Described("1.5", ("deeper>=2; python_version >= '3.11'", "more; extra == 'x'")),
+    "deeper": Described("1.0", ()),
+}
+
+
+def declares(*lines: str, python: str = "") -> Declared:
+    """What a repository may declare."""
+    return Declared("requirements.txt", tuple(one(line, "a line") for line in lines), python)
+
+
+@pytest.mark.parametrize(
+    ("line", "python", "lacking"),
+    [
+        ("deeper", "3.12.1", None),
+        ("deeper>1", "3.12.1", "deeper>1"),
+        ("wanted-one>=1", "3.10.4", None),
+        ("wanted-one>=1", "3.12.1", 'deeper>=2; python_version >= "3.11"'),
+        ("pytest", "3.12.1", "pytest"),  # which is here, and not there
+    ],
+)
+def test_what_an_image_has_is_read_off_its_metadata(
+    line: str, python: str, lacking: str | None
+) -> None:
+    """With the markers of the image's Python, and nothing of this one."""
+    assert host.lacks(declares(line), THERE, python) == lacking
+
+
+def test_an_interpreter_of_its_kind_fits() -> None:
+    """Another patch release does; wheels that were chosen for an older glibc do."""
+    minor = ".".join(OURS.version.split(".")[:2])
+    assert fitting(replace(NEWER, version=f"{minor}.99"), AUTO, None).path == OURS.path
+
+
+@pytest.mark.parametrize(
+    ("theirs", "said"),
+    [
+        (replace(NEWER, libc="2.1"), "glibc 2.1"),
+        (replace(NEWER, libc=""), "glibc unknown"),
+        (replace(NEWER, machine="s390x"), "s390x"),
+        (replace(NEWER, implementation="pypy"), "cannot be used"),
+        (replace(NEWER, version="3.99.0"), "which has none"),
+    ],
+)
+def test_one_of_another_kind_does_not(theirs: interpreters.Interpreter, said: str) -> None:
+    """A wheel that was chosen for the one may crash in the other; the text has the other way."""
+    with pytest.raises(InterpreterUnavailableError, match=said) as caught:
+        fitting(theirs, AUTO, None)
+    assert "envhub image build" in str(caught.value)
+
+
+def test_the_images_python_is_the_one_that_there_is() -> None:
+    """Who asks for another one, or declares one, hears so."""
+    for choice, found in (
+        (chosen({"python": "3.99"}, None)[0], None),
+        (chosen({"python": "/usr/bin/python3"}, None)[0], None),
+        (AUTO, declares(python=">=3.99")),
+    ):
+        with pytest.raises(InterpreterUnavailableError, match="the image has"):
+            fitting(NEWER, choice, found)
