@@ -90,13 +90,13 @@ def refusal(reply: m.Refused) -> Exception:
     """The error for a refused request. Trust: text from the worker."""
     message = printable(reply.message)
     if reply.error == "SandboxUnavailableError":
-        layer = f"{printable(reply.layer)}: " if reply.layer else ""
+        layer = f"{printable(reply.missing)}: " if reply.missing else ""
         fix = f"\n{printable(reply.fix)}" if reply.fix else ""
         return SandboxUnavailableError(f"this host cannot enforce {layer}{message}{fix}")
     if reply.error == "WorkerDiedError":
         return WorkerDiedError(message, reason="gone")
     if reply.error == ERROR:
-        busy = Busy.read(reply.layer, reply.fix)
+        busy = Busy.read(reply.missing, reply.fix)
         return ServerBusyError(
             message, quota=busy.quota, used=busy.used, limit=busy.limit, retry_s=busy.retry_s
         )

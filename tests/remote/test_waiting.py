@@ -143,8 +143,8 @@ def test_a_session_is_waited_for_like_a_jail(tmp_path: Path) -> None:
             with peer(server, pair) as first:
                 assert isinstance(first.ask(m.Hello(1, 2, b"first")), m.Welcome)
                 refused = waiting.refused(m.Hello(1, 2, b"waiting"))
-                assert (refused.error, refused.layer) == ("ServerBusyError", "sessions")
-                assert Busy.read(refused.layer, refused.fix).used == 1
+                assert (refused.error, refused.missing) == ("ServerBusyError", "sessions")
+                assert Busy.read(refused.missing, refused.fix).used == 1
             hello = m.Hello(1, 2, b"waiting")
             assert eventually(lambda: isinstance(waiting.ask(hello), m.Welcome))
 

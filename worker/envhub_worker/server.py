@@ -154,7 +154,7 @@ class Server:
         try:
             self._dispatch(asker, header.message, arrived)
         except RefusedError as refused:
-            self.refuse(asker, refused.error, refused.message, refused.layer, refused.fix)
+            self.refuse(asker, refused.error, refused.message, refused.missing, refused.fix)
         except Exception as error:
             if not isinstance(error, ProtocolError):  # that is the client's mistake
                 self._gate.witness.failed(error)
@@ -207,12 +207,13 @@ class Server:
         return self._sessions.compression(identity, key) if self._gate.compresses else ""
 
     def refuse(
-        self, asker: Asker, error: str, message: str, layer: str = "", fix: str = ""
+        self, asker: Asker, error: str, message: str, missing: str = "", fix: str = ""
     ) -> None:
         """Answer that it is not done."""
         # what the client has sent may be quoted in it, at any length
-        self.reply(asker, m.Refused(error, message[:_MAX_SAID], layer, fix))
-        self._gate.refused(asker, error, message[:_MAX_SAID], layer, fix)
+        refused = m.Refused(error, message[:_MAX_SAID], missing, fix)
+        self.reply(asker, refused)
+        self._gate.refused(asker, refused)
 
     def _hello(self, asker: Asker, request: m.Hello, arrived: Arrived) -> None:
         version = min(m.VERSION, request.newest)

@@ -92,7 +92,7 @@ class Gate(Protocol):
     def answered(self, asker: Asker) -> None:
         """A request was answered."""
 
-    def refused(self, asker: Asker, error: str, message: str, layer: str, fix: str) -> None:
+    def refused(self, asker: Asker, refused: m.Refused) -> None:
         """A request was answered so."""
 
     def tick(self, sessions: Sessions, jails: Jails) -> None:
@@ -136,7 +136,7 @@ class LocalGate:
     def answered(self, asker: Asker) -> None:
         """Nothing is counted."""
 
-    def refused(self, asker: Asker, error: str, message: str, layer: str, fix: str) -> None:
+    def refused(self, asker: Asker, refused: m.Refused) -> None:
         """Its client says so."""
 
     def tick(self, sessions: Sessions, jails: Jails) -> None:

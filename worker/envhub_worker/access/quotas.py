@@ -18,7 +18,7 @@ from envhub_worker.supervisor.records import Asker
 class RefusedError(Exception):
     """A request is not done. ``error`` is a name out of the client's table."""
 
-    layer = ""
+    missing = ""
     fix = ""
 
     def __init__(self, error: str, message: str) -> None:
@@ -32,7 +32,7 @@ class BusyError(RefusedError):
 
     def __init__(self, busy: Busy, message: str) -> None:
         super().__init__(busy_words.ERROR, message)
-        self.layer, self.fix = busy.quota, busy.words()
+        self.missing, self.fix = busy.quota, busy.words()
 
 
 @dataclass(frozen=True, kw_only=True)

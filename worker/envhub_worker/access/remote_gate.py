@@ -289,10 +289,10 @@ class RemoteGate:
         """Its bytes are no longer in flight."""
         self._in_flight.answered(asker)
 
-    def refused(self, asker: Asker, error: str, message: str, layer: str, fix: str) -> None:
+    def refused(self, asker: Asker, refused: m.Refused) -> None:
         """The operator is told, and it is counted."""
-        self._tally.refused(error, layer)
-        self._events.refused(asker, error, message, layer, fix)
+        self._tally.refused(refused.error, refused.missing)
+        self._events.refused(asker, refused)
 
     def _count_opened(self, key: bytes) -> None:
         self._tally.open(self._label_of(key))

@@ -114,7 +114,7 @@ class Answers(Protocol):
         """Answer a request."""
 
     def refuse(
-        self, asker: Asker, error: str, message: str, layer: str = "", fix: str = ""
+        self, asker: Asker, error: str, message: str, missing: str = "", fix: str = ""
     ) -> None:
         """Answer that it is not done."""
 

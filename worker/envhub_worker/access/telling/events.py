@@ -55,17 +55,17 @@ class Events:
         told = {"snapshot": snapshot, "files": files, "bytes": size}
         self._client(owner, "upload", "info", **told)
 
-    def refused(self, asker: Asker, error: str, message: str, layer: str, fix: str) -> None:
+    def refused(self, asker: Asker, refused: m.Refused) -> None:
         """A request was not done. Who waits in line asks every second: that is said once."""
         owner, level = asker.session or asker.key, "warning"
-        told: dict[str, object] = {"error": error, "why": message}
-        if error == busy.ERROR:
-            found = Busy.read(layer, fix)
+        told: dict[str, object] = {"error": refused.error, "why": refused.message}
+        if refused.error == busy.ERROR:
+            found = Busy.read(refused.missing, refused.fix)
             told |= {"quota": found.quota, "used": found.used, "limit": found.limit}
             level = "debug" if (owner, found.quota) in self._in_line else level
             self._in_line.add((owner, found.quota))
-        elif layer:
-            told |= {"layer": layer, "fix": fix}
+        elif refused.missing:
+            told |= {"layer": refused.missing, "fix": refused.fix}
         self._client(owner, "refused", level, **told)
 
     # --- jails: the supervisor's witness -------------------------------------------------------

@@ -27,13 +27,14 @@ class Welcome(Message, kind=2):
 class Refused(Message, kind=3):
     """The server did not do it. ``error`` is a name out of a table in the client.
 
-    ``layer`` and ``fix`` are filled where a layer of the confinement is missing, and where there
-    is no room (``busy.py``).
+    ``missing`` is the layer of the confinement that cannot be had, or the quota under which there
+    is no room (``busy.py``), by name; ``fix`` how to get it, or when to ask again. Else both are
+    empty.
     """
 
     error: str
     message: str
-    layer: str
+    missing: str
     fix: str
 
 
