@@ -73,6 +73,7 @@ def survey(snapshot: Snapshot, parsed: Mapping[str, Parsed | None]) -> Survey:
         kind = contents.kind_of(record.path, _bytes(path, contents.BEGINNING))
         found.files.append(File(record, kind))
         found.add(contents.of_kind(record.path, kind))
+        found.add(_in_name(record))
         if kind == "Python" and record.path in parsed:
             found.add(_in_code(record, parsed[record.path]))
         if kind in ("Python", "text") and record.size <= min(left, _MOST_BYTES_OF_TEXT):
@@ -89,6 +90,11 @@ def _bytes(path: Path, most: int) -> bytes:
             return file.read(most)
     except OSError:
         return b""
+
+
+def _in_name(record: FileRecord) -> Iterator[Finding]:
+    for one in contents.hidden(record.path, record.path, is_code=True):
+        yield Finding(one.id, f"its name {one.message}", file=record.path)
 
 
 def _in_text(record: FileRecord, path: Path, *, is_code: bool) -> Iterator[Finding]:

@@ -9,9 +9,9 @@ import typer
 from envhub_sandbox.cli import (
     cache,
     check,
+    diff,
     gc,
     image,
-    inspect,
     lock,
     prefetch,
     push,
@@ -20,6 +20,7 @@ from envhub_sandbox.cli import (
 )
 from envhub_sandbox.cli.doctor.doctor import doctor
 from envhub_sandbox.cli.init.init import init
+from envhub_sandbox.cli.inspect.inspect import inspect
 from envhub_sandbox.cli.run.run import run
 from envhub_sandbox.cli.shared.exits import EXIT_CODES
 
@@ -57,8 +58,9 @@ def envhub(
 
 
 app.command("run", epilog=EXIT_CODES)(run)
-app.command("inspect", epilog=EXIT_CODES)(inspect.inspect)
+app.command("inspect", epilog=EXIT_CODES)(inspect)
 app.command("check", epilog=EXIT_CODES)(check.check)
+app.command("diff", epilog=EXIT_CODES)(diff.diff)
 app.command("prefetch", epilog=EXIT_CODES)(prefetch.prefetch)
 app.command("lock", epilog=EXIT_CODES)(lock.lock)
 app.command("verify", epilog=EXIT_CODES)(lock.verify)

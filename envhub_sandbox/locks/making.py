@@ -13,7 +13,7 @@ from envhub_sandbox.errors import LockError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.locks import lockfile, pylock
 from envhub_sandbox.locks.drift import with_files
-from envhub_sandbox.locks.fingerprint import task_of
+from envhub_sandbox.locks.fingerprint import Task, task_of
 from envhub_sandbox.locks.lockfile import LockFile, Runner, Spaces
 
 
@@ -71,15 +71,19 @@ def with_spaces(
     arguments = lockfile.arguments_text(env_kwargs)
     if arguments is None:
         raise LockError("env_kwargs have no plain form that a lock could hold")
-    tasks = [
+    return replace(lock, spaces=Spaces(arguments, tasks_of(suites)))
+
+
+def tasks_of(suites: Mapping[str, Mapping[Any, Any]]) -> tuple[Task, ...]:
+    """What a repository's ``make_env`` returned, in a form that can be compared."""
+    return tuple(
         task_of(
             *(suite, task, _mode(env)),
             *(env.single_observation_space, env.single_action_space),
         )
         for suite, tasks in suites.items()
         for task, env in tasks.items()
-    ]
-    return replace(lock, spaces=Spaces(arguments, tuple(tasks)))
+    )
 
 
 def _mode(env: Any) -> str | None:

@@ -42,8 +42,9 @@ EXIT_CODES = (
     "policy or limit; 3 the files could not be had, or are not what the commit says; 4 the "
     "repository did not load, or a package is missing; 5 the worker died, took too long, or has "
     "no room; 6 this host cannot enforce the policy; 7 a replay that ended in another way, or "
-    "elsewhere, or what is not as it was locked; 8 a replay in which nothing died; 9 a container "
-    "engine could not be asked; 70 a bug of ours; 130 interrupted; 141 broken pipe; 143 terminated."
+    "elsewhere, or what differs, or is not as it was locked; 8 a replay in which nothing died; 9 a "
+    "container engine could not be asked; 70 a bug of ours; 130 interrupted; 141 broken pipe; 143 "
+    "terminated."
 )
 
 _CODES: tuple[tuple[type[EnvHubError], Exit], ...] = (

@@ -64,7 +64,9 @@ MAY_IMPORT = {
         *("dependencies", "hub", "locks", "policy", "sandboxes", "session", "std_streams"),
         *("transport", "vector"),
     },
-    "envhub_sandbox.check": {"api", "dependencies", "hub", "policy", "session", "vector"},
+    "envhub_sandbox.check": {
+        *("api", "dependencies", "hub", "locks", "policy", "session", "vector"),
+    },
     "envhub_sandbox.gym": {"api", "vector"},
     "envhub_sandbox.pytest_plugin": {"api", "hub"},
     "envhub_sandbox.integrations": {"api", "hub", "vector"},

@@ -1,12 +1,17 @@
-"""``envhub inspect``: what a repository holds, without playing it."""
+"""What a repository holds, without playing it."""
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
+import typer
+
+from envhub_sandbox.cli.inspect.static import check_options, inspect_static
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import console, print_json, safe_line
 from envhub_sandbox.cli.shared.exits import reported
+from envhub_sandbox.cli.shared.findings import FailOn
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_sandbox.cli.shared.report import print_provenance
 from envhub_sandbox.cli.shared.select import select
@@ -16,7 +21,16 @@ _SPACE_TEXT = 2000
 
 
 def inspect(
+    context: typer.Context,
     ref: opt.Ref,
+    static: Annotated[
+        bool, typer.Option("--static", help="Read the repository instead, and run nothing of it.")
+    ] = False,
+    sarif: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="With --static: SARIF 2.1.0 of what is worth a look."),
+    ] = None,
+    fail_on: FailOn = None,
     json: opt.Json = False,
     suite: opt.Suite = None,
     task: opt.Task = None,
@@ -46,9 +60,22 @@ def inspect(
 ) -> None:
     """Print suites, tasks, spaces, metadata and provenance, without stepping anything.
 
-    The repository's make_env runs (in the sandbox) unless its answer is remembered.
+    The repository's make_env runs (in the sandbox) unless its answer is remembered. With --static
+    nothing runs: files, entry, packages, imports, and what is worth a look are read.
     """
     with reported(debug=debug):
+        check_options(context, static=static)
+        if static:
+            inspect_static(
+                ref,
+                as_json=json,
+                sarif=sarif,
+                fail_on=fail_on,
+                token=token,
+                endpoint=endpoint,
+                hub_cache_dir=hub_cache_dir,
+            )
+            return
         make = opt.MakeOptions(
             ref=ref,
             n_envs=n_envs,
@@ -85,7 +112,7 @@ def _inspect(
     from envhub_sandbox.api import make_env
 
     with Bar(quiet=as_json) as bar, make.explained():
-        bar.begin(f"loading {make.ref}")
+        bar.begin(f"loading {make.ref} in a sandbox")
         with make_env(**arguments) as envs:
             found = [describe_env(*item) for item in select(envs, suites, tasks)]
             provenance = envs.provenance

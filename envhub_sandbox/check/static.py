@@ -1,0 +1,131 @@
+"""What a repository would do, in one piece: its files, entry, imports, packages and findings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from envhub_sandbox.check import parsing, source
+from envhub_sandbox.check.findings import Finding
+from envhub_sandbox.check.source import Import
+from envhub_sandbox.check.survey import File, survey
+from envhub_sandbox.dependencies.declared import Declared, declared
+from envhub_sandbox.dependencies.resolve import WORKERS
+from envhub_sandbox.errors import RequirementError
+from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.session.recipe import pinned
+from envhub_worker.protocol.text import printable
+
+_LONGEST = 500
+
+
+@dataclass(frozen=True, kw_only=True)
+class Static:
+    """What was read; nothing of it ran.
+
+    Attributes:
+        snapshot: What was read.
+        files: Every file, sorted by path.
+        entries: The arguments of each ``make_env`` at the top of the entry file, and its line.
+        imports: What the entry file leads to and the repository does not have, by name.
+        declared: What it declares; None where it says nothing, or nothing that can be taken.
+        findings: What is worth a look.
+    """
+
+    snapshot: Snapshot
+    files: list[File]
+    entries: tuple[tuple[str, int], ...]
+    imports: list[Import]
+    declared: Declared | None
+    findings: list[Finding]
+
+    @property
+    def reference(self) -> str:
+        """What was read, pinned."""
+        return pinned(self.snapshot)
+
+    @property
+    def modules(self) -> dict[str, Import]:
+        """Each module that is imported, with the first place."""
+        return {one.name: one for one in reversed(self.imports)}
+
+    def is_brought(self, module: str) -> bool:
+        """Whether a package of a module's name is declared, or in every sandbox.
+
+        Some packages have another name than their modules.
+        """
+        wanted = [one.requirement for one in self.declared.wanted] if self.declared else []
+        names = {canonicalize_name(one.name) for one in [*wanted, *map(Requirement, WORKERS)]}
+        return canonicalize_name(module) in names
+
+
+def static(snapshot: Snapshot) -> Static:
+    """Read a repository."""
+    parsed = parsing.read(snapshot)
+    surveyed = survey(snapshot, parsed)
+    entry = parsed.get(snapshot.path)
+    findings, says = surveyed.findings, None
+    try:
+        says = declared(snapshot.root, snapshot.path)
+    except RequirementError as error:
+        findings = [Finding("requirements", str(error)), *findings]
+    return Static(
+        snapshot=snapshot,
+        files=surveyed.files,
+        entries=() if entry is None else entry.entries,
+        imports=source.imports(snapshot, parsed),
+        declared=says,
+        findings=[_printable(one) for one in findings],
+    )
+
+
+def _printable(one: Finding) -> Finding:
+    file, message = printable(one.file, _LONGEST), printable(one.message, _LONGEST)
+    return Finding(one.id, message, file=file, line=one.line)
+
+
+def document(read: Static) -> dict[str, Any]:
+    """All of it, as plain data."""
+    says = read.declared
+    return {
+        "reference": read.reference,
+        "entry": {
+            "file": read.snapshot.path,
+            "make_env": [{"arguments": text, "line": line} for text, line in read.entries],
+        },
+        "files": [
+            {
+                "path": one.record.path,
+                "bytes": one.record.size,
+                "hash": one.record.digest,
+                "kind": one.kind,
+            }
+            for one in read.files
+        ],
+        "declared": says
+        and {"source": says.source, "python": says.python, "packages": list(map(str, says.wanted))},
+        "imports": [
+            {
+                "name": one.name,
+                "file": one.file,
+                "line": one.line,
+                "brought": read.is_brought(name),
+            }
+            for name, one in sorted(read.modules.items())
+        ],
+        "findings": [of_finding(one) for one in read.findings],
+    }
+
+
+def of_finding(one: Finding) -> dict[str, Any]:
+    """A finding as plain data."""
+    return {
+        "check": one.id,
+        "severity": one.check.severity.value,
+        "message": one.message,
+        "file": one.file or None,
+        "line": one.line or None,
+    }

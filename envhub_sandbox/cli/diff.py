@@ -1,0 +1,97 @@
+"""``envhub diff``: what is different between two commits, for whoever approves a new pin."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from envhub_sandbox.cli.shared import options as opt
+from envhub_sandbox.cli.shared.console import print_json, say
+from envhub_sandbox.cli.shared.exits import Exit, reported
+from envhub_sandbox.cli.shared.findings import FailOn, level, show, show_finding
+from envhub_sandbox.cli.shared.progress import Bar
+
+if TYPE_CHECKING:
+    from envhub_sandbox.check.compare import Change
+    from envhub_sandbox.hub.snapshot import Snapshot
+    from envhub_sandbox.locks.fingerprint import Task
+
+_MARKS = {"new": "+", "gone": "-", "changed": "~", "renamed": ">"}
+
+
+def diff(
+    then: Annotated[
+        str,
+        typer.Argument(metavar="REF_A", help="What is known: org/repo@commit, or a folder."),
+    ],
+    now: Annotated[str, typer.Argument(metavar="REF_B", help="What is to be judged.")],
+    run: Annotated[
+        bool,
+        typer.Option("--run", help="Load both, each in a sandbox, and compare tasks and spaces."),
+    ] = False,
+    fail_on: FailOn = None,
+    env_kwargs: opt.EnvKwargs = None,
+    json: opt.Json = False,
+    token: opt.Token = None,
+    endpoint: opt.Endpoint = None,
+    hub_cache_dir: opt.HubCacheDir = None,
+    debug: opt.Debug = False,
+) -> None:
+    """Say what changed from one commit to another, in terms of what a repository would do.
+
+    Files, entry, declared packages, imports, and what is worth a look and was not there before.
+    Both are read, and nothing runs without --run. Exit code 7 if something differs; with --fail-on
+    only a new finding counts, and the exit code is 1.
+
+    [bold]envhub diff org/repo@<approved> org/repo@<new> --fail-on note[/bold]
+    """
+    hub = {"token": token, "endpoint": endpoint, "hub_cache_dir": hub_cache_dir}
+    with reported(debug=debug):
+        least = level(fail_on)
+        from envhub_sandbox.check import compare
+        from envhub_sandbox.check.static import static
+        from envhub_sandbox.hub.snapshot import named
+
+        with Bar(quiet=json) as bar:
+            read = []
+            for ref in (then, now):
+                bar.begin(f"reading {ref}")
+                read.append(static(named(ref, **hub)))
+            found = compare.changes(read[0], read[1])
+            if run:
+                kwargs = opt.read_env_kwargs(env_kwargs or ())
+                tasks = []
+                for one in read:
+                    bar.begin(f"loading {one.reference} in a sandbox")
+                    tasks.append(_tasks(one.snapshot, kwargs, hub))
+                found += compare.environments(tasks[0], tasks[1])
+        if json:
+            print_json(compare.document(read[0], read[1], found))
+        else:
+            _print(read[0].reference, read[1].reference, found)
+        if least is None and found:
+            raise typer.Exit(Exit.DIFFERENT)
+        if least and any(one.weighs(least) for one in found):
+            raise typer.Exit(Exit.ENVIRONMENT)
+
+
+def _tasks(snapshot: Snapshot, env_kwargs: dict[str, Any], hub: dict[str, Any]) -> tuple[Task, ...]:
+    from envhub_sandbox.api import make_env
+    from envhub_sandbox.locks.making import tasks_of
+    from envhub_sandbox.session.recipe import pinned
+
+    with make_env(pinned(snapshot), env_kwargs=env_kwargs, **hub) as suites:
+        return tasks_of(suites)
+
+
+def _print(then: str, now: str, found: list[Change]) -> None:
+    show("from", then, "bold")
+    show("to", now, "bold")
+    for one in found:
+        mark = f"{_MARKS[one.how]} "
+        if one.finding is None:
+            show(f"{mark}{one.what}", one.text)
+        else:
+            show_finding(one.finding, mark)
+    say(f"{len(found)} changes." if found else "Nothing differs.")

@@ -1,0 +1,216 @@
+"""``envhub inspect --static`` and ``envhub diff``: read and compared, and nothing runs."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from envhub_sandbox.check.compare import changes
+from envhub_sandbox.check.static import static
+from envhub_sandbox.cli.app import app
+from envhub_sandbox.hub.hashing import GIT_SHA1, digest_of
+from envhub_sandbox.hub.listing import FileRecord, Snapshot
+from envhub_sandbox.hub.snapshot import local
+from tests.support.repositories import write_repository
+
+_ENTRY = """import gymnasium as gym
+import yaml
+
+def make_env(n_envs=1, use_async_envs=False, size=8):
+    return eval("gym.make_vec('CartPole-v1')")
+"""
+_PAPERS = {"README__md": "# x", "LICENSE": "MIT"}
+
+
+def envhub(*arguments: str | Path) -> Result:
+    """Run a command in this process."""
+    return CliRunner().invoke(app, [*map(str, arguments)], prog_name="envhub")
+
+
+def document(*arguments: str | Path, code: int = 0) -> dict[str, Any]:
+    """What a command prints with ``--json``."""
+    done = envhub(*arguments, "--json")
+    assert done.exit_code == code, done.output
+    read: dict[str, Any] = json.loads(done.stdout)
+    return read
+
+
+def repository(folder: Path, entry: str = _ENTRY, **files: str) -> Path:
+    """A repository with its papers."""
+    return write_repository(folder, entry, **_PAPERS, **files)
+
+
+def test_a_repository_is_read(tmp_path: Path) -> None:
+    """Entry, files, packages, imports, and what is worth a look."""
+    folder = repository(tmp_path / "r", requirements__txt="PyYAML>=6\ngymnasium")
+    read = document("inspect", "--static", folder)
+    assert read["reference"] == f"{folder}:env.py"
+    arguments = "n_envs=1, use_async_envs=False, size=8"
+    assert read["entry"] == {"file": "env.py", "make_env": [{"arguments": arguments, "line": 4}]}
+    assert [one["path"] for one in read["files"]] == [
+        *("LICENSE", "README.md", "env.py", "requirements.txt")
+    ]
+    assert read["declared"]["packages"] == ["PyYAML>=6", "gymnasium"]
+    assert [(one["name"], one["brought"]) for one in read["imports"]] == [
+        *(("gymnasium", True), ("yaml", False))
+    ]
+    [finding] = read["findings"]
+    assert (finding["check"], finding["file"], finding["line"]) == ("source-dynamic", "env.py", 5)
+    shown = envhub("inspect", "--static", folder).stdout
+    assert "make_env(n_envs=1, use_async_envs=False, size=8)" in shown
+    assert "note        source-dynamic: env.py:5: calls eval" in shown
+
+
+def test_nothing_of_it_runs(tmp_path: Path) -> None:
+    """What leaves a trace when it is imported; the control imports it."""
+    trace = tmp_path / "trace"
+    text = f"open({str(trace)!r}, 'w').close()\ndef make_env(): pass\n"
+    folder = repository(tmp_path / "r", text, sitecustomize__py=text, conftest__py=text)
+    document("inspect", "--static", folder)
+    document("diff", folder, folder)
+    assert not trace.exists()
+    subprocess.run([sys.executable, "-I", folder / "env.py"], check=True, timeout=120)
+    assert trace.exists()
+
+
+def test_declarations_that_cannot_be_taken_are_found(tmp_path: Path) -> None:
+    """And are no reason not to read the rest."""
+    folder = repository(tmp_path / "r", requirements__txt="x @ https://example.com/x.whl")
+    read = document("inspect", "--static", folder)
+    assert read["declared"] is None
+    assert [one["check"] for one in read["findings"]] == ["requirements", "source-dynamic"]
+
+
+@pytest.mark.parametrize(("least", "code"), [("note", 1), ("warning", 0), ("error", 0)])
+def test_findings_fail_where_that_is_asked_for(least: str, code: int, tmp_path: Path) -> None:
+    """By how much they weigh; SARIF has them either way."""
+    folder, sarif = repository(tmp_path / "r"), tmp_path / "sarif"
+    done = envhub("inspect", "--static", folder, "--fail-on", least, "--sarif", sarif)
+    assert done.exit_code == code
+    [result] = json.loads(sarif.read_text())["runs"][0]["results"]
+    assert (result["ruleId"], result["properties"]["fails"]) == ("source-dynamic", code == 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--static", "--n-envs", "2"], "--n-envs means nothing here: with --static nothing runs"),
+        (["--static", "--sandbox", "process"], "--sandbox means nothing here"),
+        (["--fail-on", "note"], "--fail-on means nothing here: it needs --static"),
+        (["--static", "--fail-on", "never"], "it takes error, warning or note"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused(
+    options: list[str], says: str, tmp_path: Path
+) -> None:
+    """Before anything is read."""
+    done = envhub("inspect", tmp_path / "nowhere", *options)
+    assert (done.exit_code, says in " ".join(done.stderr.split())) == (2, True), done.stderr
+
+
+def obeyed(text: str) -> list[str]:
+    """The lines that GitHub's runner would obey."""
+    return [line for line in text.splitlines() if line.strip().startswith("::") or "##[" in line]
+
+
+def test_a_repository_paints_and_commands_nothing(tmp_path: Path) -> None:
+    """Neither a terminal nor GitHub's runner: not by names, not by texts, not by what differs."""
+    old = repository(tmp_path / "old")
+    text = "##[error]forged ::error::forged\x9b2J" + " " * 60
+    spoken = f"open('~/' + '\\x1b[2J')\nopen({'~/' + text!r})\ndef make_env(a={text!r}): pass\n"
+    new = repository(tmp_path / "new", spoken)
+    names = ("##[error]forged", "::error::forged", "::error::" + "a" * 200 + "::error::b")
+    for name in names:
+        (new / name).write_text("\x1b[2J")
+        assert obeyed(name), "the control: by themselves they are obeyed"
+    for done in (
+        envhub("inspect", "--static", new),
+        envhub("inspect", "--static", new, "--json"),
+        envhub("diff", old, new),
+        envhub("diff", old, new, "--json"),
+    ):
+        assert "forged" in done.stdout
+        assert obeyed(done.stdout) == []
+        assert not {"\x1b", "\x9b", "\r"} & set(done.output)
+    assert names[0] in {one["path"] for one in document("inspect", "--static", new)["files"]}
+
+
+def differing(tmp_path: Path, entry: str = _ENTRY, **files: str) -> list[tuple[str, str, str]]:
+    """How a changed repository differs from the first one: what, how, and in words."""
+    old = repository(tmp_path / "old", requirements__txt="numpy>=1\nscipy", data__txt="the same")
+    kept = {"requirements__txt": "numpy>=1\nscipy", "data__txt": "the same"}
+    new = repository(tmp_path / "new", entry, **{**kept, **files})
+    found = changes(static(local(old)), static(local(new)))
+    return [(one.what, one.how, one.text) for one in found]
+
+
+def test_what_is_the_same_differs_in_nothing(tmp_path: Path) -> None:
+    """Wherever it lies; lines that move are a changed file and no new findings."""
+    assert differing(tmp_path / "a") == []
+    moved = differing(tmp_path / "b", f"# a comment\n{_ENTRY}")
+    assert [row[:2] for row in moved] == [("file", "changed")]
+
+
+def test_each_change_is_told_as_what_it_is(tmp_path: Path) -> None:
+    """Files, the entry, packages, imports, and findings."""
+    entry = _ENTRY.replace("import yaml", "import socket, torch").replace("size=8", "size=9")
+    entry = entry.replace("'CartPole-v1'", "'Other-v1'")
+    found = differing(
+        tmp_path, entry, requirements__txt="numpy>=2\ntorch", data__txt="other", more__txt="1"
+    )
+    assert [row[:2] for row in found] == [
+        *(("file", "changed"), ("file", "changed"), ("file", "new"), ("file", "changed")),
+        ("entry", "changed"),
+        *(("package", "changed"), ("package", "gone"), ("package", "new")),
+        *(("import", "new"), ("import", "gone")),
+        *(("finding", "new"), ("finding", "new"), ("finding", "gone")),
+    ]
+    texts = [text for _, _, text in found]
+    assert "numpy>=1, now numpy>=2" in texts
+    assert "env.py:2: imports socket" in texts
+    assert texts.count("env.py:5: calls eval") == 2, "the line was changed: it is told again"
+
+
+def test_a_file_with_another_name_is_renamed(tmp_path: Path) -> None:
+    """By its content."""
+    old, new = repository(tmp_path / "old", a__txt="1"), repository(tmp_path / "new", b__txt="1")
+    [one] = changes(static(local(old)), static(local(new)))
+    assert (one.what, one.how, one.text) == ("file", "renamed", "b.txt: was a.txt")
+
+
+def test_a_folder_is_held_against_what_the_hub_has(tmp_path: Path) -> None:
+    """The Hub gives other hashes than a folder's; the same bytes are no change."""
+    folder = repository(tmp_path / "r")
+    there = local(folder)
+    records = [
+        FileRecord(one.path, one.size, digest_of(folder / one.path, GIT_SHA1, one.size))
+        for one in there.files
+    ]
+    hub = Snapshot("org/repo", "model", "0" * 40, "env.py", there.root, tuple(records))
+    assert changes(static(hub), static(there)) == []
+    assert changes(static(there), static(hub)) == []
+    (folder / "README.md").write_text("# y")
+    assert [one.text for one in changes(static(hub), static(local(folder)))] == [
+        "README.md: 3 bytes, now 3"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("options", "code"),
+    [([], 7), (["--fail-on", "note"], 1), (["--fail-on", "warning"], 0)],
+)
+def test_the_exit_code_says_whether_a_pin_may_move(
+    options: list[str], code: int, tmp_path: Path
+) -> None:
+    """7 if anything differs; 1 only for a new finding, where that is asked for."""
+    old, new = repository(tmp_path / "old"), repository(tmp_path / "new", "import pty\n" + _ENTRY)
+    assert envhub("diff", old, new, *options).exit_code == code
+    assert envhub("diff", old, old, *options).exit_code == 0
+    assert envhub("diff", new, old, *options).exit_code == (7 if not options else 0)
+    assert document("diff", old, new, *options, code=code)["same"] is False
