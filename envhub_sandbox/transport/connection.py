@@ -16,6 +16,7 @@ from envhub_sandbox.errors import (
     WorkerError,
     WorkerTimeoutError,
 )
+from envhub_sandbox.transport import ended
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.forks import Owner, foreign
 from envhub_sandbox.transport.replies import expect
@@ -209,11 +210,15 @@ class WorkerClient:
         """
         while not self._socket.poll(min(_LOOK_MS, deadline.left_ms() or 0), zmq.POLLOUT):
             if self._process_fd in dict(self._poller.poll(0)):
-                raise WorkerDiedError("the worker server has ended", reason="server")
+                raise self._has_ended()
             if self._link is not None:
                 self._link.check(self._link.next_number())
             if deadline.passed:
                 raise WorkerTimeoutError(f"the worker took no request for {_ROOM_S:.0f} s")
+
+    def _has_ended(self) -> WorkerDiedError:
+        text = f"the worker server has ended{ended.how(self._process_fd)}"
+        return WorkerDiedError(text, reason="server")
 
     def _take(self) -> list[Buffer]:
         """The message that is there. What is large stays in ZeroMQ's memory until it is decoded."""
@@ -236,7 +241,7 @@ class WorkerClient:
             if self._socket in ready:
                 return
             if self._process_fd in ready:
-                raise WorkerDiedError("the worker server has ended", reason="server")
+                raise self._has_ended()
             if self._link is not None and request_id in self._sent:
                 self._link.check(self._sent[request_id][0])
             if deadline.passed:

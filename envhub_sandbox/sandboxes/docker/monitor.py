@@ -119,4 +119,5 @@ class Keeper:
 
 
 if __name__ == "__main__":
-    sys.exit(min(main(sys.argv[1:]), 125) if len(sys.argv) > 6 else 2)
+    ended = main(sys.argv[1:]) if len(sys.argv) > 6 else 2
+    sys.exit(ended if ended >= 0 else 125)  # of the engine's command itself: as engines say it

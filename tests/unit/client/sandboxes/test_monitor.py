@@ -97,6 +97,14 @@ def test_the_monitor_ends_with_its_container(tmp_path: Path) -> None:
         assert made.ends()
 
 
+@pytest.mark.parametrize("code", [0, 1, 137])
+def test_the_monitor_ends_as_its_container_did(tmp_path: Path, code: int) -> None:
+    """So that the client can tell how that was: 137 is SIGKILL inside."""
+    with kept(tmp_path, f"{_ANNOUNCES}; exit {code}") as made:
+        assert made.ends()
+        assert made.monitor.returncode == code
+
+
 def test_the_lifeline_is_cut_when_the_monitor_is_killed(tmp_path: Path) -> None:
     """Nobody else holds the container's stdin."""
     with kept(tmp_path, _SERVES) as made:
