@@ -51,7 +51,7 @@ def folded(ask: Callable[P, T]) -> Callable[P, T]:
         except EnvHubError as error:
             if not folds(error):
                 raise
-            __tracebackhide__ = True  # of pytest and IPython
+            __tracebackhide__ = True  # pytest hides the frame then
             raise error  # ENVHUB_TRACEBACK=full shows where
 
     return asked

@@ -105,7 +105,7 @@ class SingleEnv(gym.Env[Any, Any]):
             result = self._vector.step(self._batch(action))
         except BaseException as error:
             if folds(error):
-                __tracebackhide__ = True  # of pytest and IPython
+                __tracebackhide__ = True  # pytest hides the frame then
                 raise error  # ENVHUB_TRACEBACK=full shows where
             raise
         with UNTRUSTED:  # of a repository's own class, nobody has declared what its results are

@@ -186,7 +186,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             if isinstance(error, WorkerDiedError):
                 asking.refuse_if_closed()  # close() in another thread ended it under us
             if folds(error):
-                __tracebackhide__ = True  # of pytest and IPython
+                __tracebackhide__ = True  # pytest hides the frame then
                 raise error  # ENVHUB_TRACEBACK=full shows where
             raise
         if self._untold:

@@ -68,7 +68,7 @@ def frames(error: BaseException, asking: Callable[..., None] = ask) -> list[str]
 )
 @pytest.mark.parametrize("asking", [ask, ask_by_another])
 def test_one_frame_of_ours_is_left(error: EnvHubError, asking: Callable[..., None]) -> None:
-    """Which pytest and IPython hide, and whose line says how to see the others."""
+    """Which pytest hides, and whose line says how to see the others."""
     assert frames(error, asking) == ["asked"]
     assert error.__traceback__ is not None
     last = error.__traceback__.tb_next
