@@ -59,6 +59,10 @@ def check(
     sarif: Annotated[
         Path | None, typer.Option(metavar=_FILE, help="SARIF 2.1.0.", rich_help_panel=_PANEL)
     ] = None,
+    html: Annotated[
+        Path | None,
+        typer.Option(metavar=_FILE, help="A page for people, in one file.", rich_help_panel=_PANEL),
+    ] = None,
     github: Annotated[
         bool,
         typer.Option(
@@ -133,7 +137,7 @@ def check(
         play = _Play(seed, steps, resets, suite, task)
         report = _judge(make, policy, play, quiet=json or github)
         failures = report.failures(least, allowed)
-        _write(report, failures, junit=junit, sarif=sarif)
+        _write(report, failures, junit=junit, sarif=sarif, html=html)
         if github:
             with heard():
                 _annotate(report, failures)
@@ -228,11 +232,16 @@ def _judge(make: opt.MakeOptions, policy: Path | None, play: _Play, *, quiet: bo
 
 
 def _write(
-    report: Report, failures: list[Finding], *, junit: Path | None, sarif: Path | None
+    report: Report,
+    failures: list[Finding],
+    *,
+    junit: Path | None,
+    sarif: Path | None,
+    html: Path | None,
 ) -> None:
-    from envhub_sandbox.check import reports
+    from envhub_sandbox.check import page, reports
 
-    for path, form in ((junit, reports.junit), (sarif, reports.sarif)):
+    for path, form in ((junit, reports.junit), (sarif, reports.sarif), (html, page.page)):
         if path is None:
             continue
         try:

@@ -197,10 +197,11 @@ def test_the_command_line_judges(tmp_path: Path) -> None:
     folder = repository(
         tmp_path / "walk", _HONEST.replace("1.0, self.count", "1.0, 1 / 0, self.count")
     )
-    files = [f"--{kind}={tmp_path / kind}" for kind in ("junit", "sarif")]
+    files = [f"--{kind}={tmp_path / kind}" for kind in ("junit", "sarif", "html")]
     bad = envhub("check", folder, "--steps", "5", *files)
     assert bad.returncode == 1, bad.stderr
     assert "ZeroDivisionError" in bad.stdout
+    assert "ZeroDivisionError" in (tmp_path / "html").read_text()
     assert 'failures="1"' in (tmp_path / "junit").read_text()
     [result] = json.loads((tmp_path / "sarif").read_text())["runs"][0]["results"]
     assert result["ruleId"] == "runs"

@@ -42,7 +42,8 @@ tried in a jail that has ended since.
 2000 and 100; anything else there is refused, and told.
 
 `--json` prints everything; `--junit FILE` has one test case for each check of each task, `--sarif
-FILE` is SARIF 2.1.0, and `--github` prints annotations and appends to `$GITHUB_STEP_SUMMARY`.
+FILE` is SARIF 2.1.0, `--html FILE` is one page that needs nothing else and runs no script, and
+`--github` prints annotations and appends to `$GITHUB_STEP_SUMMARY`.
 
 | Check | Severity | What holds where it passes | What cures it |
 | --- | --- | --- | --- |
