@@ -40,6 +40,7 @@ class ServerFacts:
         weakest_profile: That a policy may ask for.
         network: Whether a policy may ask for the server's network.
         gpu: Likewise.
+        dependencies: Whether it installs what repositories declare.
         draining: Whether it is about to end, and lets nothing new in.
         quotas: What our key may have.
         used: What it has of that, all its processes together.
@@ -56,6 +57,7 @@ class ServerFacts:
     weakest_profile: str = ""
     network: bool = False
     gpu: bool = False
+    dependencies: bool = False
     draining: bool = False
 
     def enforces(self, profile: str) -> bool:
@@ -114,6 +116,7 @@ def facts_of(welcome: m.Welcome, answered_s: float, told: dict[Any, Any]) -> Ser
         **words,
         network=told.get("network") is True,
         gpu=told.get("gpu") is True,
+        dependencies=told.get("dependencies") is True,
         draining=told.get("draining_s") is not None,
         quotas=_numbers(told.get("quotas")),
         used=_numbers(mine),

@@ -12,6 +12,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import MissingModuleError, PolicyError, ResolutionError
+from envhub_sandbox.sandboxes import server_facts
 from envhub_worker.access import packages as server_side
 from envhub_worker.access.packages import Packages
 from envhub_worker.access.quotas import BusyError, Quotas, RefusedError
@@ -60,6 +61,8 @@ def test_a_server_makes_what_the_repository_declares(
     assert not (Path(os.environ["ENVHUB_CACHE"]) / "environments").exists()
     [made] = (permitting.state / "packages").glob("*/environments/*/packages")
     assert (made / "wanted").is_dir()
+    assert eventually(lambda: f"name={made.parent.name}" in permitting.said())
+    assert server_facts.ask(permitting.sandbox()).dependencies
 
 
 def test_what_cannot_be_made_is_told_here(
@@ -126,7 +129,7 @@ def test_orders_are_bounded(idle: Packages, monkeypatch: pytest.MonkeyPatch) -> 
         assert idle.need(b"a", order(f"p{number}"), ()).state == "making"
     with pytest.raises(BusyError, match="wait already") as caught:
         idle.need(b"a", order("another"), ())
-    assert caught.value.layer == "packages"
+    assert caught.value.missing == "packages"
     assert idle.need(b"b", order("another"), ()).state == "making"
     monkeypatch.setattr(server_side, "MAX_PER_HOUR", 1)
     monkeypatch.setattr(server_side, "MAX_WAITING", 100)

@@ -63,6 +63,7 @@ def _print(server: RemoteSandbox, facts: ServerFacts, problem: str | None) -> No
             f"Python {facts.python}; jails there can have the profile {facts.profile} at most, and "
             f"a policy may ask for {facts.weakest_profile} at least"
             + (f", and for: {', '.join(granted)}" if granted else "")
+            + ("; it installs what repositories declare" if facts.dependencies else "")
         )
     for line in _quotas(facts):
         out.print(f"  {line}")

@@ -63,11 +63,13 @@ class Order:
 
     Attributes:
         plain: For the program.
+        owner: Whose session asked first.
         asked: When it was asked for last.
         told: What the program has said last.
     """
 
     plain: dict[str, Any]
+    owner: bytes = b""
     asked: float = field(default_factory=monotonic)
     told: str = "waiting for others' packages"
 
@@ -91,6 +93,21 @@ class Work:
     told_to_end: float | None = None
 
 
+@dataclass(frozen=True)
+class News:
+    """For the log: what became of an order.
+
+    Attributes:
+        owner: Whose session asked first.
+        seconds: How long the program was at it.
+        said: Its last words.
+    """
+
+    owner: bytes
+    seconds: float
+    said: Mapping[str, Any]
+
+
 class Packages:
     """The packages of all clients.
 
@@ -107,16 +124,20 @@ class Packages:
         self._handed: dict[Place, tuple[Runtime, float]] = {}
         self._begun: dict[str, deque[float]] = {}
         self._work: Work | None = None
+        self._news: list[News] = []
         if folder is not None:
             make_passable(folder)
 
-    def need(self, key: bytes, request: m.NeedPackages, in_use: Collection[str]) -> m.Packages:
+    def need(
+        self, key: bytes, request: m.NeedPackages, in_use: Collection[str], owner: bytes = b""
+    ) -> m.Packages:
         """How far they are; begins, or goes on, to make them.
 
         Args:
             key: The client's key.
             request: Trust: input from a client.
             in_use: Folders of packages that must stay.
+            owner: The client's session, for the log.
 
         Raises:
             RefusedError: They cannot be made, or not now.
@@ -135,6 +156,7 @@ class Packages:
         order = self._line.get(place)
         if order is None:
             order = self._take(place, plain)
+            order.owner = owner
             self.look(in_use)
         order.asked = monotonic()
         return m.Packages("making", "", {}, order.told)
@@ -166,6 +188,11 @@ class Packages:
             del self._line[place]
         if self._work is None and self._line:
             self._begin(min(self._line, key=lambda place: self._last(place[0])), in_use)
+
+    def news(self) -> list[News]:
+        """What became of orders since this was asked last."""
+        told, self._news = self._news, []
+        return told
 
     def close(self) -> None:
         """End the program; it leaves nothing half-made, or the next one removes it."""
@@ -273,6 +300,7 @@ class Packages:
             text = f"the program that makes packages ended with {code}; its server's log says why"
             said = {"error": "DependencyError", "said": text}
         self._outcomes[work.place] = Outcome(said, now)
+        self._news.append(News(order.owner, now - work.since, said))
         while len(self._outcomes) > _REMEMBERED:
             self._outcomes.popitem(last=False)
 

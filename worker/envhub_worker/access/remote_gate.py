@@ -248,7 +248,8 @@ class RemoteGate:
     def _need(self, asked: Asked) -> m.Message:
         request = asked.request
         assert isinstance(request, m.NeedPackages)
-        return self._packages.need(asked.asker.key, request, asked.jails.packages)
+        asker = asked.asker
+        return self._packages.need(asker.key, request, asked.jails.packages, asker.session)
 
     def _offer(self, asked: Asked) -> m.Message:
         asker, request = asked.asker, asked.request
@@ -359,6 +360,8 @@ class RemoteGate:
                 self._departures.end(session, sessions, jails, "its key is not authorised any more")
         self._departures.tick(sessions, jails)
         self._packages.look(jails.packages)
+        for news in self._packages.news():
+            self._events.packages(news.owner, news.seconds, news.said)
         if self._publish is not None:
             self._publish(self.figures(sessions, jails))
         self._usage.watch(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from time import monotonic
+from typing import Any
 
 from envhub_worker.access.sessions import WATCHER, Session
 from envhub_worker.access.telling.rate_limited_log import Log
@@ -54,6 +55,15 @@ class Events:
         """A client is to bring so many files and bytes, which the server lacks of a snapshot."""
         told = {"snapshot": snapshot, "files": files, "bytes": size}
         self._client(owner, "upload", "info", **told)
+
+    def packages(self, owner: bytes, seconds: float, said: Mapping[str, Any]) -> None:
+        """The program that makes packages has ended; what it says quotes a client."""
+        made = said.get("made")
+        told = {name: made[name] for name in ("name", "bytes")} if made else {}
+        if "error" in said:
+            told = {"error": said["error"], "why": said["said"]}
+        level = "warning" if "error" in said else "info"
+        self._client(owner, "packages", level, seconds=seconds, **told)
 
     def refused(self, asker: Asker, refused: m.Refused) -> None:
         """A request was not done. Who waits in line asks every second: that is said once."""
