@@ -15,6 +15,8 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerDiedError
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_worker.protocol import messages as m
 from tests.remote.conftest import IMPATIENT_S
 from tests.remote.hosts import OtherHost, other_host
 from tests.remote.listening import Listening, counting, listening
@@ -148,6 +150,9 @@ def test_a_client_that_was_silent_for_too_long_is_told_so(
     with make_env(repository, sandbox=impatient.sandbox()) as suites:
         suites.env.reset(seed=1)
         inside.fall_silent(suites.env)
+        # the last that is heard says what is held: else that could count as given up before
+        held = m.KeepAlive((inside.jail(suites.env).number,))
+        inside.client(suites.env).request(held, deadline=Deadline(60))
         assert eventually(lambda: impatient.jails() == 0)
         said = f"nothing was heard of its client for {IMPATIENT_S} s"
         with pytest.raises(WorkerDiedError, match=said):
