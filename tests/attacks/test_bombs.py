@@ -56,7 +56,7 @@ def test_fork_bomb_stops_at_the_limit(arena: Arena, title: str, payload: str) ->
 
 def stays(run: Run, over: Callable[[Run], bool]) -> bool:
     """Whether a run stays over a limit: what is only measured is noticed a moment later."""
-    return over(run) and not (run.inside and eventually(lambda: not over(run), 4.0))
+    return over(run) and not (run.inside and eventually(lambda: not over(run), 10.0))
 
 
 def tasks(run: Run) -> int:

@@ -74,13 +74,18 @@ def is_socket(fd):
     except OSError:
         return False
 
+BACK = Path(tempfile.gettempdir(), "back")
+
 def haunt(lane=None, first=0):
+    heard, told = os.pipe()
     if os.fork():
-        time.sleep(0.2)  # until it has a session of its own: else it ends with this one
+        os.read(heard, 1)  # until it has a session of its own: else it ends with this one
         os._exit(0)
     os.setsid()
     name_me()
-    time.sleep(0.5)  # what comes before the death is noticed is the runner's own lie
+    os.write(told, b"x")
+    while not BACK.exists():  # what comes before the death is noticed is the runner's own lie
+        time.sleep(0.005)
     for number in range(1, 100_000):
         try:
             if lane is None:
@@ -103,6 +108,8 @@ def lie(self, received):
     request_id, request = m.unpack(received.frames)
     if isinstance(request, m.Build):
         state["liar"] = request.start == 1
+        if state["liar"] and Path(tempfile.gettempdir(), "done").exists():
+            BACK.write_text("")
     if not state["liar"] or not isinstance(request, m.Step):
         return honest(self, received)
     number = received.request_id

@@ -246,7 +246,7 @@ def test_halves_out_of_order(halves: Make, asked: str, other: str) -> None:
 
 def test_a_late_reply(halves: Make) -> None:
     """What ``*_wait`` raises is caught as ``multiprocessing``'s error."""
-    env = halves([shown(UNIT, slow=2.0)] * 2)
+    env = halves([shown(UNIT, slow=20.0)] * 2)
     env.reset_async(seed=0)
     with pytest.raises(multiprocessing.TimeoutError):
         env.reset_wait(timeout=0.01)
