@@ -258,6 +258,28 @@ def test_snapshots_and_their_folders_are_counted(
         uploads.offer(OWNER, ALICE, m.OfferSnapshot(files), ())
 
 
+def test_what_is_half_deleted_is_made_again(uploads: Uploads) -> None:
+    """Of the files that are there, and of those that come again; the rest goes with a restart."""
+    files = ("env.py", b"one"), ("sub/more.py", b"two")
+    snapshot = bring(uploads, *files)
+    charged, tree = uploads.used_bytes(ALICE), Path(uploads.tree(ALICE, snapshot))
+    for folder in (tree, tree / "sub"):
+        folder.chmod(0o755)
+    (tree / "env.py").unlink()
+    assert bring(uploads, *files) == snapshot
+    assert (tree / "env.py").read_bytes() == b"one"
+    (tree / "sub").chmod(0o755)
+    (tree / "sub" / "more.py").unlink()
+    for blob in uploads.folder.glob("*/blobs/*"):
+        blob.unlink()
+    assert bring(uploads, *files) == snapshot
+    assert (tree / "sub" / "more.py").read_bytes() == b"two"
+    assert uploads.used_bytes(ALICE) == charged
+    assert len(list(tree.parent.iterdir())) == 3
+    Uploads(uploads.folder, Quotas())
+    assert list(tree.parent.iterdir()) == [tree]
+
+
 def test_a_restart_keeps_snapshots_and_drops_halves(uploads: Uploads) -> None:
     """The store is found again."""
     name = bring(uploads, ("env.py", b"x"))

@@ -6,6 +6,7 @@ import contextlib
 import operator
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Callable, Collection, Iterable
 from itertools import takewhile
@@ -75,6 +76,21 @@ class Store:
         """Where a snapshot lies, or would."""
         return self.home / "trees" / digest
 
+    def has_all(self, digest: str, files: Collection[Listed]) -> bool:
+        """Whether a snapshot lies there, whole."""
+        return all(_is_there(self.tree(digest) / file.path, file.size) for file in files)
+
+    def set_aside(self, digest: str) -> None:
+        """Make room for a tree of which somebody has deleted a part.
+
+        What is left of it stays until the next start: a jail may have it open.
+        """
+        tree = self.tree(digest)
+        aside = tempfile.mkdtemp(prefix=".building-", dir=tree.parent)
+        os.chmod(tree, 0o755)  # one that cannot be written cannot be moved
+        os.rename(tree, aside)
+        self.held -= self._trees.pop(digest, 0)
+
     def take(self, part: Path, sha256: bytes, size: int) -> None:
         """A file has arrived whole."""
         part.chmod(0o444)
@@ -128,6 +144,13 @@ class Store:
                 remove_tree(str(building))
         self._trees[digest] = _charge_on_disk(tree)
         self.held += self._trees[digest]
+
+
+def _is_there(path: Path, size: int) -> bool:
+    with contextlib.suppress(OSError):
+        found = path.lstat()
+        return stat.S_ISREG(found.st_mode) and found.st_size == size
+    return False
 
 
 def make_passable(folder: Path) -> None:

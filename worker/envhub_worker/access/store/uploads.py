@@ -110,8 +110,10 @@ class Uploads:
         store = self._store(key)
         self.forget(owner)  # it begins again
         if store.tree(digest).is_dir():
-            os.utime(store.tree(digest))
-            return m.Wanted(PREFIX + digest, ())
+            if store.has_all(digest, files):
+                os.utime(store.tree(digest))
+                return m.Wanted(PREFIX + digest, ())
+            store.set_aside(digest)
         sizes = {file.sha256: file.size for file in files}
         missing = {sha: size for sha, size in sizes.items() if not store.blob(sha).exists()}
         reserved = tree_charge(file.path for file in files)
