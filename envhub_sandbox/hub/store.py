@@ -394,7 +394,7 @@ def remove_tree(path: Path) -> None:
 def commits(folder: Path) -> list[StoredCommit]:
     """The commits of a repository in the store, the latest fetched first. Nothing is verified."""
     found = []
-    for record in folder.glob("*/record.json"):
+    for record in folder.glob("[!.]*/record.json"):
         with contextlib.suppress(OSError, ValueError):
             document = json.loads(record.read_bytes())
             revision, fetched = document.get("revision"), document.get("fetched", "")

@@ -202,6 +202,7 @@ def test_what_is_half_deleted_is_made_again(
     store.publish(published, records(), write, {"revision": "main"})
     assert store.load(published) == records()
     [remains] = published.folder.glob(".building-*")
+    assert [one.commit for one in store.commits(published.folder)] == [COMMIT]  # none of these
     os.utime(remains, (0, 0))
     store.publish(published, records(), write, {"revision": "main"})
     assert not list(published.folder.glob(".building-*"))
