@@ -159,6 +159,24 @@ def test_what_nobody_asks_for_any_more_is_given_up(
     assert eventually(begun)
 
 
+def test_a_program_that_cannot_be_started_is_not_tried_for_ever(
+    idle: Packages, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever asked hears it; the server, whose tick begins what waits, does not fail with it."""
+    tried = []
+
+    def missing() -> list[str]:
+        tried.append(True)
+        return ["/nowhere/at/all"]
+
+    monkeypatch.setattr(server_side, "command", missing)
+    for _ in range(2):
+        with pytest.raises(RefusedError, match="cannot be started"):
+            idle.need(b"a", order("first"), ())
+        idle.look(())
+    assert len(tried) == 1
+
+
 @pytest.mark.parametrize(
     "wrong",
     [

@@ -158,6 +158,8 @@ class Packages:
             order = self._take(place, plain)
             order.owner = owner
             self.look(in_use)
+            if place in self._outcomes:
+                return self.need(key, request, in_use, owner)
         order.asked = monotonic()
         return m.Packages("making", "", {}, order.told)
 
@@ -254,7 +256,6 @@ class Packages:
     def _begin(self, place: Place, in_use: Collection[str]) -> None:
         assert self._folder is not None
         folder = self._folder / place[0]
-        make_passable(folder)
         now = monotonic()
         self._handed = {
             at: held for at, held in self._handed.items() if self._is_live(held, now, in_use)
@@ -265,15 +266,13 @@ class Packages:
             "bytes": self._quotas.packages_bytes,
             "keep": keep,
         }
-        said = tempfile.TemporaryFile()  # noqa: SIM115 - it lasts as long as the program
-        with tempfile.TemporaryFile() as given:
-            given.write(json.dumps(order).encode())
-            given.seek(0)
-            process = subprocess.Popen(
-                command(), stdin=given, stdout=said, cwd="/", start_new_session=True
-            )
         self._begun.setdefault(place[0], deque(maxlen=MAX_PER_HOUR)).append(now)
-        self._work = Work(place, process, said)
+        try:
+            make_passable(folder)
+            self._work = _started(place, order)
+        except OSError as error:  # a full disk, no process left: whoever asked hears it, once
+            text = f"the program that makes packages cannot be started: {error.strerror}"
+            self._end(place, {"error": "DependencyError", "said": text}, now)
 
     def _is_live(self, held: tuple[Runtime, float], now: float, in_use: Collection[str]) -> bool:
         return held[0].packages in in_use or now - held[1] < _HANDED_S
@@ -292,17 +291,34 @@ class Packages:
             return
         self._work = None
         work.said.close()
-        del self._line[work.place]
         if work.told_to_end is not None:
             said = {"error": "IndexUnavailableError", "said": "they were not made in time"}
         elif not said.keys() & {"own", "made", "error"}:
             code = work.process.returncode
             text = f"the program that makes packages ended with {code}; its server's log says why"
             said = {"error": "DependencyError", "said": text}
-        self._outcomes[work.place] = Outcome(said, now)
-        self._news.append(News(order.owner, now - work.since, said))
+        self._end(work.place, said, work.since)
+
+    def _end(self, place: Place, said: Mapping[str, Any], since: float) -> None:
+        now = monotonic()
+        order = self._line.pop(place)
+        self._outcomes[place] = Outcome(said, now)
+        self._news.append(News(order.owner, now - since, said))
         while len(self._outcomes) > _REMEMBERED:
             self._outcomes.popitem(last=False)
+
+
+def _started(place: Place, order: Mapping[str, Any]) -> Work:
+    with contextlib.ExitStack() as undo:
+        said = undo.enter_context(tempfile.TemporaryFile())
+        with tempfile.TemporaryFile() as given:
+            given.write(json.dumps(order).encode())
+            given.seek(0)
+            process = subprocess.Popen(
+                command(), stdin=given, stdout=said, cwd="/", start_new_session=True
+            )
+        undo.pop_all()  # it lasts as long as the program
+    return Work(place, process, said)
 
 
 def command() -> list[str]:
