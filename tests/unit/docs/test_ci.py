@@ -1,0 +1,176 @@
+"""What others' CI runs of us: the very lines of the action, the job and the hooks are run here."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from envhub_sandbox.cli.app import app
+from tests.support.repositories import write_repository
+
+_RECORDS = """#!/bin/sh
+case "$1 $3" in
+"doctor strict") echo "no user namespaces"; exit 6 ;;
+"doctor "*) exit 0 ;;
+esac
+for one in "$@"; do echo "<$one>"; done
+exit ${ENVHUB_CODE:-0}
+"""
+
+
+def loaded(checkout: Path, name: str) -> Any:
+    """A file of YAML."""
+    return yaml.safe_load((checkout / name).read_text())
+
+
+def run(script: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run a script as GitHub's runner and GitLab's do."""
+    return subprocess.run(
+        ["bash", "--noprofile", "--norc", "-eo", "pipefail", "-c", script],
+        env={"PATH": os.environ["PATH"], **variables},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def program(path: Path, text: str) -> None:
+    """Write a program."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    path.chmod(0o755)
+
+
+def judged(checkout: Path, folder: Path, code: int = 0, **inputs: str) -> tuple[int, list[str]]:
+    """What the action calls ``envhub`` with, for these inputs, and its exit code."""
+    action = loaded(checkout, "action.yml")
+    step = action["runs"]["steps"][1]
+    given = {name: one["default"] for name, one in action["inputs"].items()}
+    given |= {name.replace("_", "-"): value for name, value in inputs.items()}
+    env = {
+        name: given[text.removeprefix("${{ inputs.").removesuffix(" }}")]
+        for name, text in step["env"].items()
+    }
+    program(folder / "envhub" / "bin" / "envhub", _RECORDS)
+    done = run(step["run"], RUNNER_TEMP=str(folder), ENVHUB_CODE=str(code), **env)
+    assert done.stderr == ""
+    return done.returncode, done.stdout.splitlines()
+
+
+def test_the_action_judges_with_its_inputs(checkout: Path, tmp_path: Path) -> None:
+    """Each becomes an option, and the exit code is that of the check."""
+    code, lines = judged(checkout, tmp_path, code=1, ref="./my env", allow="card licence")
+    assert code == 1
+    assert [line.strip("<>") for line in lines] == [
+        *("check", "--github", "--profile", "strict", "--fail-on", "error", "--steps", "200"),
+        *("--allow", "card", "--allow", "licence", "--", "./my env"),
+    ]
+    _, lines = judged(checkout, tmp_path, ref="--sandbox=none")
+    assert lines[-2:] == ["<-->", "<--sandbox=none>"]
+    _, lines = judged(checkout, tmp_path, sarif="a b.sarif")
+    assert lines[-4:] == ["<--sarif>", "<a b.sarif>", "<-->", "<./>"]
+
+
+@pytest.mark.parametrize("hostile", ["$(id)", "`id`", "; id", "'\"", "/*"])
+def test_no_input_of_the_action_is_a_script(hostile: str, checkout: Path, tmp_path: Path) -> None:
+    """It arrives as it is; the control is a script that it would be part of."""
+    _, lines = judged(checkout, tmp_path, ref=hostile)
+    assert lines[-2:] == ["<-->", f"<{hostile}>"]
+    scripts = [step["run"] for step in loaded(checkout, "action.yml")["runs"]["steps"]]
+    assert not [script for script in scripts if "${{" in script]
+    assert run(f"printf '<%s>\\n' {hostile}").stdout != f"<{hostile}>\n"
+
+
+def test_the_action_takes_a_weaker_profile_only_where_it_is_named(
+    checkout: Path, tmp_path: Path
+) -> None:
+    """And says why; the first of those that are named, and none where none can be had."""
+    code, lines = judged(checkout, tmp_path, profile="strict no-userns")
+    assert code == 0
+    assert lines[:3] == [
+        "this runner cannot enforce the profile strict:",
+        "no user namespaces",
+        "the profile is no-userns",
+    ]
+    assert lines[lines.index("<--profile>") + 1] == "<no-userns>"
+    code, lines = judged(checkout, tmp_path, profile="strict strict")
+    assert code == 6
+    assert "<check>" not in lines
+
+
+def test_the_action_installs_itself(checkout: Path, tmp_path: Path) -> None:
+    """From its own checkout, or what is named, into an environment of its own."""
+    step = loaded(checkout, "action.yml")["runs"]["steps"][0]
+    says = '#!/bin/sh\nfor one in "$@"; do echo "<$one>"; done\n'
+    program(tmp_path / "bin" / "python3", says)
+    program(tmp_path / "envhub" / "bin" / "python", says)
+    path = f"{tmp_path / 'bin'}:{os.environ['PATH']}"
+    for package, installed in (("", "/the/action"), ("envhub-sandbox==1", "envhub-sandbox==1")):
+        env = {"ENVHUB_PACKAGE": package, "ENVHUB_ACTION": "/the/action"}
+        done = run(step["run"], **env | {"PATH": path, "RUNNER_TEMP": str(tmp_path)})
+        venv = ["<-m>", "<venv>", f"<{tmp_path}/envhub>"]
+        pip = ["<-m>", "<pip>", "<install>", "<--quiet>", f"<{installed}>"]
+        assert done.stdout.split() == [*venv, *pip]
+
+
+def test_the_job_for_gitlab_judges_with_its_variables(checkout: Path, tmp_path: Path) -> None:
+    """Its last line is run; the report that it names is the one that GitLab collects."""
+    [job] = loaded(checkout, "examples/ci/gitlab.yml").values()
+    program(tmp_path / "bin" / "envhub", _RECORDS)
+    variables = {**job["variables"], "ENVHUB_VENV": str(tmp_path)}
+    done = run(job["script"][-1], **variables)
+    assert [line.strip("<>") for line in done.stdout.splitlines()] == [
+        *("check", "--profile", "strict", "--fail-on", "error"),
+        *("--junit", job["artifacts"]["reports"]["junit"], "--", "./"),
+    ]
+    assert run(job["script"][-1], ENVHUB_CODE="1", **variables).returncode == 1
+
+
+def words(checkout: Path, hook: str) -> list[str]:
+    """The command line of a hook of pre-commit, without the program."""
+    [found] = [one for one in loaded(checkout, ".pre-commit-hooks.yaml") if one["id"] == hook]
+    assert found["language"] == "python"
+    program_name, *words = [*shlex.split(found["entry"]), *found["args"]]
+    assert program_name == "envhub"
+    assert found["pass_filenames"] is False
+    return words
+
+
+@pytest.mark.parametrize(("text", "code"), [("x = 1", 0), ("x = 'a\u202eb'", 1)])
+def test_the_hook_that_reads_fails_for_what_hides(
+    text: str, code: int, checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the folder that pre-commit runs it in."""
+    write_repository(tmp_path, f"{text}\ndef make_env(n_envs=1, use_async_envs=False): pass\n")
+    monkeypatch.chdir(tmp_path)
+    assert CliRunner().invoke(app, words(checkout, "envhub-static")).exit_code == code
+
+
+def test_what_is_named_exists(checkout: Path) -> None:
+    """The options that all three pass are those of the commands, by their own help."""
+    texts = [
+        loaded(checkout, "action.yml")["runs"]["steps"][1]["run"],
+        loaded(checkout, "examples/ci/gitlab.yml")["envhub-check"]["script"][-1],
+        " ".join(words(checkout, "envhub-check")),
+    ]
+    done = subprocess.run(
+        [sys.executable, "-I", "-m", "envhub_sandbox", "check", "--help"],
+        capture_output=True,
+        text=True,
+        env={"COLUMNS": "200", "TERM": "dumb", "NO_COLOR": "1"},
+        check=True,
+        timeout=120,
+    )
+    used = {word for text in texts for word in re.findall(r"--[a-z][a-z-]+", text)}
+    assert {"--github", "--junit", "--fail-on"} <= used
+    assert [word for word in sorted(used) if word not in done.stdout] == []
