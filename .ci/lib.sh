@@ -90,7 +90,7 @@ smoke() {
 # copy_tests FOLDER: what the tests need of the checkout, without the packages.
 copy_tests() {
   mkdir -p "$1"
-  cp -R .ci benchmarks docs examples plugins tests ./*.md Dockerfile .dockerignore action.yml \
+  cp -R .ci benchmarks docs examples plugins tests ./*.md Dockerfile .dockerignore action.yml mkdocs.yml \
     .pre-commit-hooks.yaml LICENSE pyproject.toml \
     test "$1/"
 }

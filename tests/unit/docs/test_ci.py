@@ -156,6 +156,14 @@ def test_the_hook_that_reads_fails_for_what_hides(
     assert CliRunner().invoke(app, words(checkout, "envhub-static")).exit_code == code
 
 
+def test_the_site_has_every_document(checkout: Path) -> None:
+    """Its table of contents; whether links lead anywhere there, its strict build says."""
+    listed = re.findall(r"^ *- ([\w/-]+\.md)$", (checkout / "mkdocs.yml").read_text(), re.MULTILINE)
+    beside = ["index.md", "SECURITY.md", "CONTRIBUTING.md", "CHANGELOG.md", "benchmarks/README.md"]
+    documents = [str(path.relative_to(checkout / "docs")) for path in checkout.glob("docs/**/*.md")]
+    assert sorted(listed) == sorted(documents + beside)
+
+
 def test_what_is_named_exists(checkout: Path) -> None:
     """The options that all three pass are those of the commands, by their own help."""
     texts = [
