@@ -49,7 +49,7 @@ def line(client: subprocess.Popen[str]) -> str:
     return client.stdout.readline().strip()
 
 
-def finish(client: subprocess.Popen[str], timeout_s: float = 60.0) -> str:
+def finish(client: subprocess.Popen[str], timeout_s: float = 240.0) -> str:
     """Everything that a client said until its end, which must come."""
     out, errors = client.communicate(timeout=timeout_s)
     return out + errors
