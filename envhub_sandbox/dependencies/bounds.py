@@ -7,6 +7,7 @@ the kernel ends it at a single file over the bound.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import stat
@@ -140,9 +141,17 @@ def checked(folder: Path) -> tuple[int, int]:
 
 
 def walk(folder: Path) -> Iterator[Path]:
-    """All that is below a folder, links not followed."""
-    for above, below, files in os.walk(folder):
-        yield from (Path(above, name) for name in [*below, *files])
+    """All that is below a folder, links not followed.
+
+    Without recursion, as ``os.walk`` has it in older Pythons: a stranger chose how deep it is.
+    """
+    waiting = [str(folder)]
+    while waiting:
+        with contextlib.suppress(OSError), os.scandir(waiting.pop()) as items:
+            for item in items:
+                if item.is_dir(follow_symlinks=False):
+                    waiting.append(item.path)
+                yield Path(item.path)
 
 
 def _existing(place: Path) -> Path:

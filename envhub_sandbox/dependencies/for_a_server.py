@@ -18,7 +18,6 @@ import fcntl
 import json
 import os
 import resource
-import shutil
 import signal
 import subprocess
 import sys
@@ -215,7 +214,7 @@ def _clean(order: Mapping[str, Any]) -> None:
     until = time.monotonic() + _WAIT_S
     while True:
         environments.remove_abandoned()
-        shutil.rmtree(_uv_cache(order), ignore_errors=True)
+        remove_tree(_uv_cache(order))
         left = environments.half_made() or _uv_cache(order).exists()
         if not left or time.monotonic() > until:
             return
@@ -226,7 +225,7 @@ def _make_room(order: Mapping[str, Any]) -> None:
     """Half of the bound at least is for what comes: what was not used for longest goes."""
     folder, keep = Path(order["folder"]), frozenset[str](order["keep"])
     if _charged(folder) > order["bytes"] // 2:
-        shutil.rmtree(_uv_cache(order), ignore_errors=True)
+        remove_tree(_uv_cache(order))
         remove_tree(folder / "resolutions")
     for environment in _removable(keep):
         if _charged(folder) <= order["bytes"] // 2:

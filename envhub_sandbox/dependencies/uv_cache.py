@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import shutil
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from envhub_sandbox.dependencies import index, uv
 from envhub_sandbox.errors import DependencyError, IndexUnavailableError
+from envhub_sandbox.hub.store import remove_tree
 
 WAIT_S = 10.0
 """For how long to wait for others who use that cache."""
@@ -65,7 +65,7 @@ def _remove_unfinished(cache: Path, since: float) -> bool:
             time.sleep(_POLL_S)
         for path in cache.glob(".tmp*"):
             if path.lstat().st_mtime >= since:
-                shutil.rmtree(path, ignore_errors=True)
+                remove_tree(path)
         return True
     return False
 

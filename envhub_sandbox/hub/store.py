@@ -19,7 +19,6 @@ import hashlib
 import json
 import os
 import re
-import shutil
 import stat
 import tempfile
 import time
@@ -384,11 +383,22 @@ def _not_writable(folder: Path, error: OSError) -> SnapshotError:
 
 
 def remove_tree(path: Path) -> None:
-    """Remove a folder of the store, whose own folders are read-only; nothing if it is gone."""
-    for folder, _, _ in os.walk(path):
+    """Remove a folder of the store, whose own folders are read-only; nothing if it is gone.
+
+    Without recursion, as ``shutil.rmtree`` has it: of a package, a stranger chose how deep it is.
+    """
+    found = [] if path.is_symlink() else [str(path)]
+    for folder in found:  # which grows
         with contextlib.suppress(OSError):
             os.chmod(folder, 0o700)
-    shutil.rmtree(path, ignore_errors=True)
+            with os.scandir(folder) as items:
+                found += [item.path for item in items if item.is_dir(follow_symlinks=False)]
+    for folder in reversed(found):
+        with contextlib.suppress(OSError):
+            for name in os.listdir(folder):
+                with contextlib.suppress(OSError):
+                    os.unlink(os.path.join(folder, name))
+            os.rmdir(folder)
 
 
 def commits(folder: Path) -> list[StoredCommit]:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from envhub_sandbox.dependencies import bounds
 from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
 from envhub_sandbox.hub import store as store
 from envhub_sandbox.hub.hashing import Mismatch, copy_verified, digest_of
@@ -351,6 +352,24 @@ def test_unused_snapshots_are_removed(published: store.Slot) -> None:
     store.remove_unused(published.folder, days=7)
     assert store.load(published) is None
     assert store.load(other) == records()
+
+
+def test_a_tree_of_any_depth_is_walked_and_removed(tmp_path: Path) -> None:
+    """A wheel may have as many folders in one another as a path has room for."""
+    top = tmp_path / "top"
+    deepest = str(top)
+    for _ in range(1200):
+        os.mkdir(deepest)
+        deepest += "/d"
+    Path(deepest).write_bytes(b"12345")
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (top / "link").symlink_to(outside)
+    assert len(list(bounds.walk(top))) == 1201
+    top.chmod(0o555)
+    store.remove_tree(top)
+    assert not top.exists()
+    assert outside.exists()
 
 
 @pytest.mark.parametrize("kind", ["git-sha1", "sha256"])
