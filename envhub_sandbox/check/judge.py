@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 
 from envhub_sandbox.api import make_env
-from envhub_sandbox.check import denials, leaks, parsing, settings, source, traces
+from envhub_sandbox.check import denials, leaks, parsing, source, traces
 from envhub_sandbox.check.findings import Report
-from envhub_sandbox.check.settings import Asks
 from envhub_sandbox.check.survey import survey
 from envhub_sandbox.check.table import CHECKS
 from envhub_sandbox.check.traces import Trace
@@ -93,7 +92,6 @@ class _Judge:
     def __init__(self, asked: Asked, snapshot: Snapshot, report: Report) -> None:
         self._asked, self._snapshot, self._report = asked, snapshot, report
         self._files = parsing.read(snapshot)
-        self._asks = settings.of_the_author(snapshot, asked.steps, asked.resets)
 
     def ask(self) -> None:
         self._read()
@@ -112,7 +110,6 @@ class _Judge:
         found = survey(self._snapshot, self._files).findings
         for finding in found:
             self._report.add(finding)
-        self._report.judged("settings", self._asks.refused)
         read = [check for check in CHECKS if check.startswith(("licence", "card", "source-"))]
         for check in set(read) - {one.id for one in found}:
             self._report.judged(check, [])
@@ -175,7 +172,7 @@ class _Judge:
             self._report.judged("loads", [])
             for suite, task in self._asked.tasks(suites):
                 self._asked.tell(f"{suite} / {task}")
-                asking = _Task(self, self._asks, suites, suite, task)
+                asking = _Task(self, suites, suite, task)
                 with self._stopping(f"{suite} / {task}"):
                     asking.ask()
                 asking.denied()
@@ -218,9 +215,9 @@ class _Judge:
 class _Task:
     """The questions to one environment."""
 
-    def __init__(self, judge: _Judge, asks: Asks, suites: EnvSuites, suite: str, task: Any) -> None:
+    def __init__(self, judge: _Judge, suites: EnvSuites, suite: str, task: Any) -> None:
         self._judge, self._report = judge, judge._report
-        self._asked, self._asks = judge._asked, asks
+        self._asked = judge._asked
         self._env = suites[suite][task]
         self._suite, self._task = suite, task
         self._name = f"{suite} / {task}"
@@ -229,7 +226,7 @@ class _Task:
         mode = getattr(self._env.metadata.get("autoreset_mode"), "value", None)
         stated = mode in _MODES
         self._say("autoreset-stated", [] if stated else ["the metadata does not say"])
-        first = traces.play(self._env, mode, seed=self._asked.seed, steps=self._asks.steps)
+        first = traces.play(self._env, mode, seed=self._asked.seed, steps=self._asked.steps)
         self._say("rewards", first.bad_rewards)
         if stated:
             self._say("autoreset", first.autoreset)
@@ -248,13 +245,15 @@ class _Task:
 
     def _leaks(self) -> None:
         usage = getattr(self._env, "jail_usage", None)
-        if usage is None or not self._asks.resets:
+        if usage is None or not self._asked.resets:
             return
-        seen = leaks.watch(lambda: self._env.reset(seed=self._asked.seed), usage, self._asks.resets)
+        seen = leaks.watch(
+            lambda: self._env.reset(seed=self._asked.seed), usage, self._asked.resets
+        )
         if not seen:
             return  # a server on another host that does not count
         self._report.figures[self._name] |= {name: float(n) for name, n in seen[-1].items()}
-        found = dict(leaks.grown(seen, self._asks.resets))
+        found = dict(leaks.grown(seen, self._asked.resets))
         for check in leaks.checks():
             self._say(check, [found[check]] if check in found else [])
 
@@ -265,7 +264,7 @@ class _Task:
         """The same play in fresh processes."""
         with self._judge.make(**changes) as suites:
             env = suites[self._suite][self._task]
-            return traces.play(env, mode, seed=self._asked.seed, steps=self._asks.steps)
+            return traces.play(env, mode, seed=self._asked.seed, steps=self._asked.steps)
 
     def _compare(self, first: Trace, mode: str | None) -> None:
         second = self._again(mode, num_workers=1)

@@ -161,12 +161,6 @@ CHECKS: dict[str, Check] = {
             "Write org/repo@COMMIT; the report says which one was judged.",
         ),
         Check(
-            "settings",
-            _N,
-            "Its envhub.toml asks for nothing that is not an author's to say.",
-            "Let [check] hold steps and resets alone: how much the judge shall play at least.",
-        ),
-        Check(
             "licence",
             _N,
             "A file says what one may do with it.",

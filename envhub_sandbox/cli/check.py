@@ -17,21 +17,35 @@ import typer
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
+from envhub_sandbox.cli.shared.findings import STYLES, level
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_sandbox.cli.shared.select import select
 
 if TYPE_CHECKING:
     from envhub_sandbox.check.findings import Finding, Report
-    from envhub_sandbox.check.table import Severity
 
+_OPTIONS = (
+    *("steps", "resets", "seed", "fail_on", "allow", "policy", "n_envs"),
+    *("timeout", "memory", "disk", "processes", "cpu_time"),
+)
+"""What the caller's own file may say."""
 _PANEL = "What it says"
 _FILE = "FILE"
 _MAY = "What it may do"
-_STYLES = {"error": "red", "warning": "yellow", "note": "dim"}
+
+
+def _with_own_settings(ctx: typer.Context, ref: str) -> str:
+    """Let the options that are read after this have the defaults of the caller's file."""
+    if not ctx.resilient_parsing:  # as a completion is
+        from envhub_sandbox.check import settings
+
+        with reported(debug=False):
+            ctx.default_map = settings.of_the_caller(ref, _OPTIONS)
+    return ref
 
 
 def check(
-    ref: opt.Ref,
+    ref: Annotated[str, opt.ref(_with_own_settings)],
     steps: Annotated[
         int, typer.Option(min=1, help="Vector steps of each play; there are up to three.")
     ] = 200,
@@ -133,7 +147,7 @@ def check(
             endpoint=endpoint,
             hub_cache_dir=hub_cache_dir,
         )
-        least, allowed = _level(fail_on), _known(allow or ())
+        least, allowed = level(fail_on), _known(allow or ())
         play = _Play(seed, steps, resets, suite, task)
         report = _judge(make, policy, play, quiet=json or github)
         failures = report.failures(least, allowed)
@@ -175,14 +189,6 @@ def _unheard(github: bool) -> Iterator[Callable[[], AbstractContextManager[None]
             yield heard
         finally:
             typer.echo(f"\n::{token}::")
-
-
-def _level(name: str) -> Severity:
-    from envhub_sandbox.check.table import Severity
-
-    if name not in {one.value for one in Severity}:
-        raise UsageError(f"--fail-on is {name!r}; it takes error, warning or note")
-    return Severity(name)
 
 
 def _known(names: Sequence[str]) -> Sequence[str]:
@@ -273,7 +279,7 @@ def _print(report: Report, failures: list[Finding]) -> None:
         severity = one.check.severity.value
         where = f"{one.task}: " if one.task else ""
         text = safe_line(f"{where}{one.text}", 500)
-        grid.add_row(severity, one.id, text, style=_STYLES[severity])
+        grid.add_row(severity, one.id, text, style=STYLES[severity])
         if one in failures:
             grid.add_row("", "", one.check.cure, style="dim")
     if report.findings:

@@ -48,7 +48,7 @@ def diff(
     """
     hub = {"token": token, "endpoint": endpoint, "hub_cache_dir": hub_cache_dir}
     with reported(debug=debug):
-        least = level(fail_on)
+        least = None if fail_on is None else level(fail_on)
         from envhub_sandbox.check import compare
         from envhub_sandbox.check.static import static
         from envhub_sandbox.hub.snapshot import named

@@ -153,13 +153,24 @@ def test_what_cannot_be_installed_is_told(tmp_path: Path) -> None:
     assert "requirements.txt" in report.findings[0].message
 
 
-def test_an_author_who_asks_for_what_is_not_his_is_told(tmp_path: Path) -> None:
-    """And judged as everybody is: what he would allow himself fails."""
-    text = _HONEST.replace("self.count += 1", "raise RuntimeError('it broke')")
-    says = '[check]\nallow = ["runs"]\n'
-    report = judged(repository(tmp_path / "walk", text, envhub__toml=says))
-    assert {one.id for one in report.findings} == {"runs", "settings"}
-    assert [one.id for one in report.failures(Severity.ERROR)] == ["runs"]
+def test_an_author_does_not_say_how_he_is_judged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What he would allow himself fails; the caller's own file allows it."""
+    text, says = (
+        _HONEST.replace("self.count += 1", "raise RuntimeError('it broke')"),
+        "allow = ['runs']",
+    )
+    folder = repository(tmp_path / "walk", text, envhub__toml=f"[check]\n{says}\n")
+    monkeypatch.chdir(folder)
+    assert envhub("check", ".", "--steps", "5").returncode == 1
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "envhub.toml").write_text(f"[check]\nsteps = 5\n{says}\n")
+    allowed = envhub("check", folder)
+    assert allowed.returncode == 0, allowed.stderr
+    (tmp_path / "envhub.toml").write_text("[check]\nallwo = ['runs']\n")
+    misspelt = envhub("check", folder)
+    assert (misspelt.returncode, "knows no allwo" in misspelt.stderr) == (2, True), misspelt.stderr
 
 
 def test_what_changes_meanwhile_is_not_judged(tmp_path: Path) -> None:

@@ -37,9 +37,10 @@ allocators and the C library try on their way is left out. Files are not among i
 what may not be read does not exist, and the kernel tells nobody who looked for it. Nor is what was
 tried in a jail that has ended since.
 
-`--policy FILE` is TOML with the fields of `Policy`, and a table `[limits]`. An author's
-`envhub.toml` can ask in `[check]` for more `steps` and `resets` than the judge would take, up to
-2000 and 100; anything else there is refused, and told.
+`--policy FILE` is TOML with the fields of `Policy`, and a table `[limits]`. Where you judge often,
+the options `steps`, `resets`, `seed`, `fail-on`, `allow`, `policy`, `n-envs`, `timeout` and the
+limits can stand in `[check]` of an `envhub.toml` in the folder that you are in; what you type
+counts more. One in the folder that is judged is not read: no repository says how it is judged.
 
 `--json` prints everything; `--junit FILE` has one test case for each check of each task, `--sarif
 FILE` is SARIF 2.1.0, `--html FILE` is one page that needs nothing else and runs no script, and

@@ -56,7 +56,7 @@ def inspect_static(
     hub_cache_dir: str | None,
 ) -> None:
     """Read a repository, and say what is in it."""
-    least = level(fail_on)
+    least = None if fail_on is None else level(fail_on)
     with Bar(quiet=as_json) as bar:
         bar.begin(f"reading {ref}")
         from envhub_sandbox.check.static import document, static

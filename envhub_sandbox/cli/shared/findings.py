@@ -42,7 +42,7 @@ def show_finding(one: Finding, mark: str = "") -> None:
     show(f"{mark}{severity}", f"{one.id}: {one.text}", STYLES[severity])
 
 
-def level(name: str | None) -> Severity | None:
+def level(name: str) -> Severity:
     """What ``--fail-on`` says.
 
     Raises:
@@ -50,8 +50,6 @@ def level(name: str | None) -> Severity | None:
     """
     from envhub_sandbox.check.table import Severity
 
-    if name is None:
-        return None
     if name not in {one.value for one in Severity}:
         raise UsageError(f"--fail-on is {name!r}; it takes error, warning or note")
     return Severity(name)

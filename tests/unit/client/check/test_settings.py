@@ -1,4 +1,4 @@
-"""Files with settings of a judgement: a caller's policy, and what an author may ask for."""
+"""Files with settings of a judgement: a caller's policy, and his options."""
 
 from __future__ import annotations
 
@@ -7,11 +7,8 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.check import settings
-from envhub_sandbox.check.settings import Asks
 from envhub_sandbox.errors import PolicyError
-from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.policy import policy_from
-from tests.support.repositories import write_repository
 
 
 def test_a_policy_is_a_file(tmp_path: Path) -> None:
@@ -49,43 +46,56 @@ def test_a_policy_that_is_not_there_is_told(tmp_path: Path) -> None:
         settings.policy(tmp_path / "nowhere.toml")
 
 
-def asked(folder: Path, text: str) -> Asks:
-    """What an author's file comes to, where the judge plays 200 steps and 8 resets."""
-    repository = write_repository(folder, "", envhub__toml=text)
-    return settings.of_the_author(local(repository), 200, 8)
+def of_the_caller(folder: Path, text: str, reference: str = "org/repo") -> dict[str, object]:
+    """What a file in the folder that one is in comes to."""
+    (folder / settings.CALLERS).write_text(text)
+    return settings.of_the_caller(reference, ["steps", "fail_on"])
 
 
-def test_an_author_asks_for_more(tmp_path: Path) -> None:
-    """Of a play; with less, or none, the judge takes what it would have taken."""
-    assert asked(tmp_path / "a", "[check]\nsteps = 900\nresets = 20") == Asks(900, 20)
-    assert asked(tmp_path / "b", "[check]\nsteps = 1\nresets = 0") == Asks(200, 8)
-    assert asked(tmp_path / "c", "[other]\nsteps = 900") == Asks(200, 8)
-    assert settings.of_the_author(local(write_repository(tmp_path / "d", "")), 200, 8) == Asks(
-        200, 8
-    )
+def test_options_stand_in_a_file_of_the_callers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the names that they have on the command line."""
+    monkeypatch.chdir(tmp_path)
+    assert settings.of_the_caller("org/repo", ["steps"]) == {}
+    assert of_the_caller(tmp_path, '[check]\nsteps = 9\nfail-on = "note"') == {
+        "steps": 9,
+        "fail_on": "note",
+    }
+    assert of_the_caller(tmp_path, "[other]\nsteps = 9") == {}
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("text", "says"),
     [
-        '[check]\nallow = ["seeding"]',
-        '[check]\nfail_on = "error"',
-        '[check]\n[check.policy]\nnetwork = "host"',
-        "[check]\nsteps = 1000000000",
-        "[check]\nsteps = true",
-        "[check]\nresets = -1",
-        '[check]\nsteps = "\\u001b[2J"',
-        "check = 3",
-        "[check",
-        "x = " + "[" * 5_000,
-        "#" * 100_000,
-        '[check]\n"\\u009b" = 1',
+        ('[check]\ntrust = "me"', "knows no trust; there are fail-on, steps"),
+        ("check = 3", "a table"),
+        ("[check", "no TOML"),
+        ("x = " + "[" * 5_000, "no TOML"),
+        ("#" * 100_000, "larger than"),
     ],
 )
-def test_an_author_loosens_nothing(text: str, tmp_path: Path) -> None:
-    """What is not his to say is refused, told in one printable line, and changes nothing."""
-    found = asked(tmp_path / "r", text)
-    assert (found.steps, found.resets) == (200, 8)
-    [why] = found.refused
-    assert why.isprintable()
-    assert len(why) <= 310
+def test_a_file_that_says_nothing_is_refused(
+    text: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A misspelt option that did nothing would let something pass."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(PolicyError, match=says):
+        of_the_caller(tmp_path, text)
+
+
+@pytest.mark.parametrize("inside", [".", "sub"])
+def test_a_repository_does_not_say_how_it_is_judged(
+    inside: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever stands in it, or reaches it by a link; beside it his file counts."""
+    judged, link = tmp_path / "judged", tmp_path / "link"
+    (judged / "sub").mkdir(parents=True)
+    link.symlink_to(judged)
+    monkeypatch.chdir(judged / inside)
+    says = "[check]\nsteps = 1"
+    for reference in (str(judged), str(link)):
+        assert of_the_caller(Path.cwd(), says, reference) == {}
+    assert of_the_caller(Path.cwd(), says, str(tmp_path / "another")) == {"steps": 1}
+    monkeypatch.chdir(tmp_path)
+    assert of_the_caller(tmp_path, says, "judged") == {"steps": 1}
