@@ -236,9 +236,9 @@ def test_deposits_need_the_session(arena: Arena, monkeypatch: pytest.MonkeyPatch
     known: list[tuple[str, bytes, int, int]] = []
     deposit = attachment.deposit
 
-    def noted(path: str, session: bytes, jail: int, runner: int, fds: Any) -> int:
+    def noted(path: str, session: bytes, jail: int, runner: int, fds: Any, wait_s: float) -> int:
         known.append((path, session, jail, runner))
-        return deposit(path, session, jail, runner, fds)
+        return deposit(path, session, jail, runner, fds, wait_s)
 
     monkeypatch.setattr(attachment, "deposit", noted)
     with arena.environment() as env, ExitStack() as held:

@@ -15,7 +15,9 @@ from envhub_sandbox.transport.shared_memory.shard import LaneShard
 from envhub_worker.protocol import messages as m
 
 _RECHECK_MS = 2
-_CONNECT_S = 5.0
+_ANSWER_S = 20.0
+_LEAST_S = 0.1
+"""How long a server may take at most to take descriptors, and at least, so late as it is."""
 _TRIES = 3
 
 
@@ -38,7 +40,7 @@ class Attachment:
         self.watch = Watch()
         self.watch.death(process_fd)
 
-    def hand_over(self, index: int, runner: int, shard: LaneShard) -> None:
+    def hand_over(self, index: int, runner: int, shard: LaneShard, deadline: Deadline) -> None:
         """Give a shard's runner its ends.
 
         Raises:
@@ -46,7 +48,8 @@ class Attachment:
         """
         self.watch.bell(shard.bell)
         try:
-            pidfd = deposit(self._path, SESSION, self._jail, runner, shard.fds)
+            wait_s = _wait_s(deadline)
+            pidfd = deposit(self._path, SESSION, self._jail, runner, shard.fds, wait_s)
         except OSError as error:
             text = "the worker process died before its first request"
             raise WorkerDiedError(text, request="make_env") from error
@@ -102,7 +105,19 @@ def sleep_for(watch: Watch, shard: LaneShard, deadline: Deadline) -> bool:
         shard.park(0)
 
 
-def deposit(path: str, session: bytes, jail: int, runner: int, fds: Sequence[int]) -> int:
+def _wait_s(deadline: Deadline) -> float:
+    left = deadline.left_s()
+    return _ANSWER_S if left is None else min(_ANSWER_S, max(_LEAST_S, left))
+
+
+def deposit(
+    path: str,
+    session: bytes,
+    jail: int,
+    runner: int,
+    fds: Sequence[int],
+    wait_s: float = _ANSWER_S,
+) -> int:
     """Hand descriptors to the server for a runner; returns a pidfd of the jail, or of the runner.
 
     The server waits a second for what a connection brings, and for nothing else meanwhile. If the
@@ -116,13 +131,13 @@ def deposit(path: str, session: bytes, jail: int, runner: int, fds: Sequence[int
     [frame] = m.pack(m.Deposit(session, jail, runner), 0)
     for _ in range(_TRIES - 1):
         with contextlib.suppress(ConnectionError, TimeoutError):
-            return _deposit(path, frame, fds)
-    return _deposit(path, frame, fds)
+            return _deposit(path, frame, fds, wait_s)
+    return _deposit(path, frame, fds, wait_s)
 
 
-def _deposit(path: str, frame: bytes | memoryview, fds: Sequence[int]) -> int:
+def _deposit(path: str, frame: bytes | memoryview, fds: Sequence[int], wait_s: float) -> int:
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
-        connection.settimeout(_CONNECT_S)
+        connection.settimeout(wait_s)
         connection.connect(path)
         socket.send_fds(connection, [frame], list(fds))
         data, received, _, _ = socket.recv_fds(connection, 16, 1)

@@ -157,7 +157,7 @@ class SharedMemoryLane:
         layout, bounds = self.observations.layout, self._bounds
         messages: list[tuple[int, m.Message]] = []
         for index in shards:
-            self._attachment.hand_over(index, self.runners[index], self.shards[index])
+            self._attachment.hand_over(index, self.runners[index], self.shards[index], deadline)
             attach = m.Attach(self.number, bounds[index][0], layout.count, layout.slots)
             messages.append((self.runners[index], attach))
         replies = self.jail.exchange("attach", messages, deadline)
