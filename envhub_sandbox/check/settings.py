@@ -17,7 +17,6 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-CALLERS = "envhub.toml"
 _MOST_BYTES = 16 << 10
 
 
@@ -43,31 +42,35 @@ def merged(policy: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any
     return {**policy, **given, **({"limits": both} if both else {})}
 
 
-def of_the_caller(reference: str, options: Collection[str]) -> dict[str, Any]:
-    """The options of ``[check]`` in the ``envhub.toml`` of the folder that one is in.
+def options(path: Path, known: Collection[str]) -> dict[str, Any]:
+    """The options in ``[check]`` of a caller's file, by their names in Python.
 
-    None where that folder lies in the one that is judged: no repository says how it is judged.
+    It is named, and never looked for: the folder that one is in may be a stranger's clone, and a
+    file that lies there would let him say what he may do and what fails him.
 
     Args:
-        reference: What is judged.
-        options: The names that may stand there.
+        path: The file.
+        known: The names that may stand there.
 
     Raises:
         PolicyError: The file cannot be read, or says what there is not.
     """
-    here = Path.cwd()
-    file, judged = here / CALLERS, Path(reference).resolve()
-    if not file.is_file() or (judged.is_dir() and here.resolve().is_relative_to(judged)):
-        return {}
-    table = _read(file).get("check", {})
+    table = _read(path).get("check", {})
     if not isinstance(table, Mapping):
-        raise PolicyError(f"check in {file} is a table: [check], with a line for each option")
+        raise PolicyError(f"check in {path} is a table: [check], with a line for each option")
     asked = {name.replace("-", "_"): value for name, value in table.items()}
-    unknown = sorted(set(asked) - set(options))
+    unknown = sorted(set(asked) - set(known))
     if unknown:
-        names = ", ".join(name.replace("_", "-") for name in sorted(options))
-        raise PolicyError(f"[check] of {file} knows no {', '.join(unknown)}; there are {names}")
+        names = ", ".join(name.replace("_", "-") for name in sorted(known))
+        raise PolicyError(f"[check] of {path} knows no {', '.join(unknown)}; there are {names}")
     return asked
+
+
+def is_judged(path: Path, reference: str) -> bool:
+    """Whether a file lies in what is judged, by whatever links one gets there."""
+    judged = Path(reference.partition(":")[0]).resolve()
+    folder = judged if judged.is_dir() else judged.parent
+    return judged.exists() and path.resolve().is_relative_to(folder)
 
 
 def _read(path: Path) -> dict[str, Any]:

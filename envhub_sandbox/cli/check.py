@@ -28,24 +28,24 @@ _OPTIONS = (
     *("steps", "resets", "seed", "fail_on", "allow", "policy", "n_envs"),
     *("timeout", "memory", "disk", "processes", "cpu_time"),
 )
-"""What the caller's own file may say."""
+"""What may stand in the caller's own file."""
 _PANEL = "What it says"
 _FILE = "FILE"
 _MAY = "What it may do"
 
 
-def _with_own_settings(ctx: typer.Context, ref: str) -> str:
+def _with_settings(ctx: typer.Context, path: Path | None) -> Path | None:
     """Let the options that are read after this have the defaults of the caller's file."""
-    if not ctx.resilient_parsing:  # as a completion is
+    if path is not None and not ctx.resilient_parsing:  # as a completion is
         from envhub_sandbox.check import settings
 
         with reported(debug=False):
-            ctx.default_map = settings.of_the_caller(ref, _OPTIONS)
-    return ref
+            ctx.default_map = settings.options(path, _OPTIONS)
+    return path
 
 
 def check(
-    ref: Annotated[str, opt.ref(_with_own_settings)],
+    ref: opt.Ref,
     steps: Annotated[
         int, typer.Option(min=1, help="Vector steps of each play; there are up to three.")
     ] = 200,
@@ -60,6 +60,15 @@ def check(
         str,
         typer.Option(metavar="error|warning|note", help="The least finding that fails it."),
     ] = "error",
+    settings: Annotated[
+        Path | None,
+        typer.Option(
+            metavar=_FILE,
+            callback=_with_settings,
+            is_eager=True,
+            help="Your own TOML with these options in [check]; what you type counts more.",
+        ),
+    ] = None,
     allow: Annotated[
         list[str] | None,
         typer.Option(
@@ -148,6 +157,8 @@ def check(
             hub_cache_dir=hub_cache_dir,
         )
         least, allowed = level(fail_on), _known(allow or ())
+        if settings is not None:
+            _refuse_the_judged(settings, ref)
         play = _Play(seed, steps, resets, suite, task)
         report = _judge(make, policy, play, quiet=json or github)
         failures = report.failures(least, allowed)
@@ -189,6 +200,16 @@ def _unheard(github: bool) -> Iterator[Callable[[], AbstractContextManager[None]
             yield heard
         finally:
             typer.echo(f"\n::{token}::")
+
+
+def _refuse_the_judged(settings: Path, ref: str) -> None:
+    from envhub_sandbox.check.settings import is_judged
+
+    if is_judged(settings, ref):
+        raise UsageError(
+            f"--settings {settings} lies in what is judged, and no repository says how it is "
+            "judged: copy it elsewhere"
+        )
 
 
 def _known(names: Sequence[str]) -> Sequence[str]:

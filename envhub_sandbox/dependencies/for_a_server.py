@@ -75,7 +75,9 @@ def _say(what: Mapping[str, Any]) -> None:
 
 def _made(order: Mapping[str, Any]) -> dict[str, Any]:
     os.nice(_NICE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (order["bytes"], order["bytes"]))
+    _, most = resource.getrlimit(resource.RLIMIT_FSIZE)  # which a plain user cannot raise
+    bound = order["bytes"] if most == resource.RLIM_INFINITY else min(order["bytes"], most)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (bound, bound))
     needed = _needed(order)
     assert needed.declared is not None
     if not order["always"] and host.lacks(needed.declared) is None:

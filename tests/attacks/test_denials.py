@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from envhub_sandbox import make_env
+from tests.support import inside
 from tests.support.repositories import write_repository
 
 _ATTEMPTS = """
@@ -51,6 +53,12 @@ def make_env(n_envs=1, use_async_envs=False):
 """
 
 
+def attempts(denied: Sequence[str]) -> list[str]:
+    """Without what allocators and pools of threads try on their way."""
+    assert len(set(denied)) == len(denied)
+    return sorted(set(denied) - inside.HARMLESS_DENIALS)
+
+
 def test_a_recorded_jail_is_refused_the_same(tmp_path: Path) -> None:
     """With the same errors; each attempt is told once, however often, and only where it is asked.
 
@@ -64,11 +72,12 @@ def test_a_recorded_jail_is_refused_the_same(tmp_path: Path) -> None:
             env = suites.env
             assert env.jail_denials() is None, "it does not run"
             env.reset(seed=0)
-            assert env.jail_denials() == (() if recorded else None)
+            denied = env.jail_denials()
+            assert (attempts(denied) if recorded else denied) == ([] if recorded else None)
             answers[recorded] = env.step([1])[0].tolist()
             env.step([0])
             told = env.jail_denials()
     assert 0 not in answers[True][0]
     assert answers[True] == answers[False]
     assert told is not None
-    assert sorted(told) == ["mount", "ptrace", "socket AF_INET", "unshare"]
+    assert attempts(told) == ["mount", "ptrace", "socket AF_INET", "unshare"]

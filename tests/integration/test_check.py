@@ -156,20 +156,19 @@ def test_what_cannot_be_installed_is_told(tmp_path: Path) -> None:
 def test_an_author_does_not_say_how_he_is_judged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What he would allow himself fails; the caller's own file allows it."""
-    text, says = (
-        _HONEST.replace("self.count += 1", "raise RuntimeError('it broke')"),
-        "allow = ['runs']",
-    )
-    folder = repository(tmp_path / "walk", text, envhub__toml=f"[check]\n{says}\n")
+    """What he would allow himself fails, wherever one stands; the caller's own file allows it."""
+    text = _HONEST.replace("self.count += 1", "raise RuntimeError('it broke')")
+    says = "[check]\nsteps = 5\nallow = ['runs']\n"
+    folder = repository(tmp_path / "walk", text, envhub__toml=says)
     monkeypatch.chdir(folder)
-    assert envhub("check", ".", "--steps", "5").returncode == 1
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "envhub.toml").write_text(f"[check]\nsteps = 5\n{says}\n")
-    allowed = envhub("check", folder)
+    assert envhub("check", "env.py", "--steps", "5").returncode == 1
+    refused = envhub("check", "env.py", "--settings", "envhub.toml")
+    assert (refused.returncode, "lies in what is judged" in refused.stderr) == (2, True)
+    (tmp_path / "envhub.toml").write_text(says)
+    allowed = envhub("check", ".", "--settings", "../envhub.toml")
     assert allowed.returncode == 0, allowed.stderr
     (tmp_path / "envhub.toml").write_text("[check]\nallwo = ['runs']\n")
-    misspelt = envhub("check", folder)
+    misspelt = envhub("check", ".", "--settings", "../envhub.toml")
     assert (misspelt.returncode, "knows no allwo" in misspelt.stderr) == (2, True), misspelt.stderr
 
 

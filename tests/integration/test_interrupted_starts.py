@@ -18,6 +18,7 @@ import pytest
 import envhub_sandbox
 from envhub_sandbox import make_env
 from tests.support import inside
+from tests.support.processes import eventually
 from tests.support.samples import sample
 
 _OURS = str(Path(envhub_sandbox.__file__).parent)
@@ -77,5 +78,5 @@ def test_an_interrupted_start_leaves_nothing_behind(server: Any, lane: str) -> N
             assert observations.tolist() == [[5.0, 0.0]] * 2
         assert server.users == users, moment
         moment += _EVERY
-    assert _descriptors() <= before
+    assert eventually(lambda: _descriptors() <= before)
     assert moment > 5 * _EVERY

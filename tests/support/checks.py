@@ -38,9 +38,9 @@ what may not be read does not exist, and the kernel tells nobody who looked for 
 tried in a jail that has ended since.
 
 `--policy FILE` is TOML with the fields of `Policy`, and a table `[limits]`. Where you judge often,
-the options `steps`, `resets`, `seed`, `fail-on`, `allow`, `policy`, `n-envs`, `timeout` and the
-limits can stand in `[check]` of an `envhub.toml` in the folder that you are in; what you type
-counts more. One in the folder that is judged is not read: no repository says how it is judged.
+`--settings envhub.toml` has the options `steps`, `resets`, `seed`, `fail-on`, `allow`, `policy`,
+`n-envs`, `timeout` and the limits in `[check]`; what you type counts more. The file is yours: it is
+named, and never looked for, and one that lies in what is judged is refused.
 
 `--json` prints everything; `--junit FILE` has one test case for each check of each task, `--sarif
 FILE` is SARIF 2.1.0, `--html FILE` is one page that needs nothing else and runs no script, and

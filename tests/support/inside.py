@@ -19,6 +19,7 @@ from typing import Any
 import zmq
 
 from envhub_sandbox import folders
+from envhub_sandbox.check import denials
 from envhub_sandbox.crash import writer
 from envhub_sandbox.dependencies import environments
 from envhub_sandbox.making import making
@@ -190,6 +191,9 @@ def _running(env: Any) -> LoadedJail:
     assert found is not None, f"the environment has no jail: {state(env).name}"
     return found
 
+
+HARMLESS_DENIALS = denials._HARMLESS
+"""What a recorded jail is denied that is no attempt of the repository's."""
 
 # --- the connection to another host ------------------------------------------------------------
 

@@ -7,7 +7,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -20,19 +20,14 @@ from envhub_worker.protocol.limits import MAX_NUM_ENVS
 _CODE, _LIMITS, _HUB = "How it is built", "What it may do", "Where it comes from"
 _UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
 
-
-def ref(read: Callable[..., str] | None = None) -> Any:
-    """The argument REF; ``read`` gets it before any option is read."""
-    return typer.Argument(
+Ref = Annotated[
+    str,
+    typer.Argument(
         metavar="REF",
         help="A hub reference, 'org/repo@revision:path/env.py', or a folder, './my-env'.",
         show_default=False,
-        callback=read,
-        is_eager=read is not None,
-    )
-
-
-Ref = Annotated[str, ref()]
+    ),
+]
 NEnvs = Annotated[
     int,
     typer.Option(

@@ -11,6 +11,7 @@ import secrets
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from envhub_worker.lockdown.mechanisms.reap import Children
 from envhub_worker.lockdown.spec import JailSpec, confinement_from_wire
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
@@ -33,7 +34,7 @@ from envhub_worker.supervisor.records import (
     whole_jail,
 )
 from envhub_worker.supervisor.runner_stream import MAX_PENDING, RunnerLink
-from envhub_worker.supervisor.usage import usage_of
+from envhub_worker.supervisor.usage import Counting, usage_of
 from envhub_worker.supervisor.witness import Nobody, Witness
 from envhub_worker.supervisor.zygotes import Zygotes
 
@@ -74,6 +75,7 @@ class Jails:
         self._limits = limits
         self._jails: dict[int, JailEntry] = {}
         self._packet_ids = itertools.count(1)
+        self._counting = Counting()
         self._deposits = Deposits(str(fd_path), self._pidfd_for)
         loop.watch(self._deposits.fileno(), self._deposits.accept)
         self._events = JailEvents(loop, answers, self._jails, self._deposits, witness or Nobody())
@@ -256,7 +258,8 @@ class Jails:
         mine = [entry for entry in self._jails.values() if entry.session == asker.session]
         for entry in mine:
             self._events.catch_up(entry)  # it said so before it answered whoever asks now
-        rows = tuple({**status_of(one), **_held(one)} for one in mine)
+        children = self._counting.children() if mine else None
+        rows = tuple({**status_of(one), **_held(one, children)} for one in mine)
         self._answers.reply(asker, m.Status(rows))
 
     # --- for the gate --------------------------------------------------------------------------
@@ -288,10 +291,10 @@ class Jails:
         self._events.end(entry, whole_jail("idle", detail=why))
 
 
-def _held(entry: JailEntry) -> dict[str, object]:
+def _held(entry: JailEntry, children: Children | None) -> dict[str, object]:
     held: dict[str, object] = {}
-    if entry.death is None:
-        held |= usage_of(entry.jail.pid, entry.pids.values())
+    if entry.death is None and children is not None:
+        held |= usage_of(entry.jail.pid, entry.pids.values(), children)
     if entry.jail.spec.confinement.record_denials:
         held["denied"] = tuple(entry.denied)
     return held

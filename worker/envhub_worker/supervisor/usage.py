@@ -2,19 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from time import monotonic
 
 from envhub_worker.lockdown.mechanisms import reap
 
 _KIB = 1024
+_AT_ONCE = 64
+_A_SECOND = 16
 
 
-def usage_of(init: int, runners: Collection[int]) -> dict[str, int]:
+class Counting:
+    """How often is counted for whoever asks: each time takes the server's one thread some ms.
+
+    Args:
+        now: The time in seconds.
+    """
+
+    def __init__(self, now: Callable[[], float] = monotonic) -> None:
+        self._now = now
+        self._left = float(_AT_ONCE)
+        self._seen = now()
+
+    def children(self) -> reap.Children | None:
+        """Who is below whom on this machine; None for whoever asks too often."""
+        now = self._now()
+        self._left = min(_AT_ONCE, self._left + (now - self._seen) * _A_SECOND)
+        self._seen = now
+        if self._left < 1:
+            return None
+        self._left -= 1
+        return reap.all_children()
+
+
+def usage_of(init: int, runners: Collection[int], children: reap.Children) -> dict[str, int]:
     """Processes, threads and memory of a jail; empty where it has gone, or has not begun.
 
     Args:
         init: The pid of its first process, which adopts whatever is orphaned in it.
         runners: The pids of its runners.
+        children: Who is below whom on this machine.
 
     Returns:
         ``processes``: all that live or wait to be reaped, without init. ``threads``: theirs, beyond
@@ -22,7 +49,7 @@ def usage_of(init: int, runners: Collection[int]) -> dict[str, int]:
     """
     if init <= 0:
         return {}
-    processes = reap.descendants(init)
+    processes = reap.descendants(init, children=children)
     threads = sum(max(_fields(pid).get("Threads", 1), 1) - 1 for pid in processes)
     memory = 0
     for pid in runners:

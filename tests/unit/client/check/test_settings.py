@@ -46,23 +46,18 @@ def test_a_policy_that_is_not_there_is_told(tmp_path: Path) -> None:
         settings.policy(tmp_path / "nowhere.toml")
 
 
-def of_the_caller(folder: Path, text: str, reference: str = "org/repo") -> dict[str, object]:
-    """What a file in the folder that one is in comes to."""
-    (folder / settings.CALLERS).write_text(text)
-    return settings.of_the_caller(reference, ["steps", "fail_on"])
+def options(folder: Path, text: str) -> dict[str, object]:
+    """What a caller's file comes to."""
+    file = folder / "envhub.toml"
+    file.write_text(text)
+    return settings.options(file, ["steps", "fail_on"])
 
 
-def test_options_stand_in_a_file_of_the_callers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_options_stand_in_a_file(tmp_path: Path) -> None:
     """By the names that they have on the command line."""
-    monkeypatch.chdir(tmp_path)
-    assert settings.of_the_caller("org/repo", ["steps"]) == {}
-    assert of_the_caller(tmp_path, '[check]\nsteps = 9\nfail-on = "note"') == {
-        "steps": 9,
-        "fail_on": "note",
-    }
-    assert of_the_caller(tmp_path, "[other]\nsteps = 9") == {}
+    found = options(tmp_path, '[check]\nsteps = 9\nfail-on = "note"')
+    assert found == {"steps": 9, "fail_on": "note"}
+    assert options(tmp_path, "[other]\nsteps = 9") == {}
 
 
 @pytest.mark.parametrize(
@@ -75,27 +70,21 @@ def test_options_stand_in_a_file_of_the_callers(
         ("#" * 100_000, "larger than"),
     ],
 )
-def test_a_file_that_says_nothing_is_refused(
-    text: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_says_nothing_is_refused(text: str, says: str, tmp_path: Path) -> None:
     """A misspelt option that did nothing would let something pass."""
-    monkeypatch.chdir(tmp_path)
     with pytest.raises(PolicyError, match=says):
-        of_the_caller(tmp_path, text)
+        options(tmp_path, text)
 
 
-@pytest.mark.parametrize("inside", [".", "sub"])
-def test_a_repository_does_not_say_how_it_is_judged(
-    inside: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Whoever stands in it, or reaches it by a link; beside it his file counts."""
+def test_what_is_judged_has_no_say(tmp_path: Path) -> None:
+    """Whether a folder is judged or a file, and by whatever link one gets there."""
     judged, link = tmp_path / "judged", tmp_path / "link"
     (judged / "sub").mkdir(parents=True)
+    (judged / "env.py").touch()
     link.symlink_to(judged)
-    monkeypatch.chdir(judged / inside)
-    says = "[check]\nsteps = 1"
-    for reference in (str(judged), str(link)):
-        assert of_the_caller(Path.cwd(), says, reference) == {}
-    assert of_the_caller(Path.cwd(), says, str(tmp_path / "another")) == {"steps": 1}
-    monkeypatch.chdir(tmp_path)
-    assert of_the_caller(tmp_path, says, "judged") == {"steps": 1}
+    (tmp_path / "mine.toml").symlink_to(judged / "envhub.toml")
+    for file in (judged / "envhub.toml", judged / "sub/envhub.toml", tmp_path / "mine.toml"):
+        for reference in (str(judged), str(link), str(judged / "env.py"), f"{link}:env.py"):
+            assert settings.is_judged(file, reference), (file, reference)
+    assert not settings.is_judged(tmp_path / "envhub.toml", str(judged))
+    assert not settings.is_judged(judged / "envhub.toml", "org/repo@0123")

@@ -6,7 +6,7 @@ import contextlib
 import os
 import signal
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 _ROUNDS_S = 5.0
 
@@ -47,13 +47,21 @@ def reap(before: Callable[[int], None] = lambda pid: None) -> Iterator[tuple[int
             yield os.waitpid(ended.si_pid, 0)
 
 
-def descendants(root: int, keep: Collection[int] = ()) -> list[int]:
-    """Pids below ``root``, without those in ``keep`` and what is below them."""
-    children: dict[int, list[int]] = {}
-    for name in os.listdir("/proc"):
-        if name.isdigit():
-            with contextlib.suppress(OSError):
-                children.setdefault(_parent(int(name)), []).append(int(name))
+Children = Mapping[int, Sequence[int]]
+"""The children of every process that has some."""
+
+
+def descendants(
+    root: int, keep: Collection[int] = (), children: Children | None = None
+) -> list[int]:
+    """Pids below ``root``, without those in ``keep`` and what is below them.
+
+    Args:
+        root: The pid of a process.
+        keep: Pids to leave out.
+        children: What ``all_children`` gave a moment ago; looked up by default.
+    """
+    children = all_children() if children is None else children
     found: list[int] = []
     pending = [root]
     while pending:
@@ -61,6 +69,16 @@ def descendants(root: int, keep: Collection[int] = ()) -> list[int]:
         found += below
         pending += below
     return found
+
+
+def all_children() -> Children:
+    """Who is below whom on this machine: takes some 0.1 ms for each process that there is."""
+    children: dict[int, list[int]] = {}
+    for name in os.listdir("/proc"):
+        if name.isdigit():
+            with contextlib.suppress(OSError):
+                children.setdefault(_parent(int(name)), []).append(int(name))
+    return children
 
 
 def process_of(thread: int) -> int:
