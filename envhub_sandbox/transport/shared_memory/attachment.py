@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import socket
 from collections.abc import Sequence
+from time import monotonic, sleep
 
 from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
 from envhub_sandbox.transport.connection import SESSION
@@ -19,6 +19,8 @@ _ANSWER_S = 20.0
 _LEAST_S = 0.1
 """How long a server may take at most to take descriptors, and at least, so late as it is."""
 _TRIES = 3
+_AGAIN_S = 0.005
+_NOT_YET = b"w"
 
 
 class Attachment:
@@ -123,24 +125,38 @@ def deposit(
     The server waits a second for what a connection brings, and for nothing else meanwhile. If the
     garbage collector closes another environment between our connecting and our sending, it waits
     for that server in turn, and the connection is gone. So it is tried again: the same descriptors
-    for the same runner take the place of what was there.
+    for the same runner take the place of what was there. A server that has not heard of the jail
+    from its zygote, which may be held up, says so, and is asked again as well.
 
     Raises:
         OSError: The server did not take them.
     """
     [frame] = m.pack(m.Deposit(session, jail, runner), 0)
-    for _ in range(_TRIES - 1):
-        with contextlib.suppress(ConnectionError, TimeoutError):
-            return _deposit(path, frame, fds, wait_s)
-    return _deposit(path, frame, fds, wait_s)
+    until, tries = monotonic() + wait_s, 1
+    while True:
+        try:
+            pidfd = _deposit(path, frame, fds, wait_s)
+        except (ConnectionError, TimeoutError):
+            tries += 1
+            if tries > _TRIES:
+                raise
+            continue
+        if pidfd is not None:
+            return pidfd
+        if monotonic() > until:
+            raise TimeoutError("the worker server did not hear of the jail in time")
+        sleep(_AGAIN_S)
 
 
-def _deposit(path: str, frame: bytes | memoryview, fds: Sequence[int], wait_s: float) -> int:
+def _deposit(path: str, frame: bytes | memoryview, fds: Sequence[int], wait_s: float) -> int | None:
+    """One try; None if the server does not know yet."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
         connection.settimeout(wait_s)
         connection.connect(path)
         socket.send_fds(connection, [frame], list(fds))
         data, received, _, _ = socket.recv_fds(connection, 16, 1)
+    if data == _NOT_YET and not received:
+        return None
     if data != b"k" or len(received) != 1:
         raise ConnectionError("the worker server did not take the descriptors")
     return received[0]

@@ -157,7 +157,10 @@ class SharedMemoryLane:
         layout, bounds = self.observations.layout, self._bounds
         messages: list[tuple[int, m.Message]] = []
         for index in shards:
-            self._attachment.hand_over(index, self.runners[index], self.shards[index], deadline)
+            try:
+                self._attachment.hand_over(index, self.runners[index], self.shards[index], deadline)
+            except WorkerDiedError as error:  # why, the server knows
+                raise self.jail.cause_of_death("make_env") from error
             attach = m.Attach(self.number, bounds[index][0], layout.count, layout.slots)
             messages.append((self.runners[index], attach))
         replies = self.jail.exchange("attach", messages, deadline)

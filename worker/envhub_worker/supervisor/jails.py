@@ -208,8 +208,8 @@ class Jails:
             return None
         if request.runner not in entry.links:
             return None
-        pidfd = entry.jail.runner_pidfd(request.runner) if entry.kept else entry.jail.pidfd
-        return pidfd if pidfd >= 0 else None
+        # the zygote tells of the jail, and may do so only after that has told of itself
+        return entry.jail.runner_pidfd(request.runner) if entry.kept else entry.jail.pidfd
 
     def _owned(self, asker: Asker, number: int, operation: str = "") -> JailEntry | None:
         entry = self._jails.get(number)

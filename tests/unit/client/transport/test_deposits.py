@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import socket
 import threading
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.transport.shared_memory.attachment import deposit
+from envhub_worker.supervisor import fd_store
 
 
 def serving(path: Path, losses: int) -> threading.Thread:
@@ -48,6 +50,33 @@ def test_a_lost_connection_is_made_again(
     os.close(theirs)
     server.join(60)
     assert not server.is_alive()
+
+
+def test_a_server_that_has_not_heard_of_the_jail_is_asked_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More often than one that fails: its zygote may be held up for a while."""
+    monkeypatch.chdir(tmp_path)
+    ours, theirs = os.pipe()
+    fds = [os.dup(ours) for _ in range(fd_store.FDS)]
+    known = [-1] * 10 + [ours]
+    deposits = fd_store.Deposits("fds", lambda request: known.pop(0))
+
+    def serve() -> None:
+        while known:
+            select.select([deposits], [], [], 60)
+            deposits.accept()
+
+    thread = threading.Thread(target=serve, daemon=True)
+    thread.start()
+    os.close(deposit("fds", bytes(16), 1, 2, fds))
+    thread.join(60)
+    assert not thread.is_alive()
+    taken = deposits.take(1, 2)
+    assert len(taken) == len(fds)
+    for fd in (*fds, *taken, ours, theirs):
+        os.close(fd)
+    deposits.close()
 
 
 def test_a_server_that_takes_nothing_is_an_error(
