@@ -77,13 +77,20 @@ class Lingering(Generic[S]):
         return True
 
     def take(self, key: Hashable) -> S | None:
-        """The one with this key, if it lingers and still runs. It is the caller's from here on."""
+        """The one with this key, if it lingers and still runs. It is the caller's from here on.
+
+        For one that has died its time has come: whoever ends it waits until nothing of it is left.
+        """
         with self._changed:
             for entry in self._mine():
-                if entry.key == key and entry.shared.runs:
+                if entry.key != key:
+                    continue
+                if entry.shared.runs:
                     self._entries.remove(entry)
                     self._changed.notify_all()
                     return entry.shared
+                entry.until = 0.0
+                self._watch()
         return None
 
     def stop_all(self, *, for_good: bool = False) -> None:

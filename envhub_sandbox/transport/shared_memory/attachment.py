@@ -20,7 +20,6 @@ _LEAST_S = 0.1
 """How long a server may take at most to take descriptors, and at least, so late as it is."""
 _TRIES = 3
 _AGAIN_S = 0.005
-_NOT_YET = b"w"
 
 
 class Attachment:
@@ -155,8 +154,8 @@ def _deposit(path: str, frame: bytes | memoryview, fds: Sequence[int], wait_s: f
         connection.connect(path)
         socket.send_fds(connection, [frame], list(fds))
         data, received, _, _ = socket.recv_fds(connection, 16, 1)
-    if data == _NOT_YET and not received:
+    if data == m.NOT_YET and not received:
         return None
-    if data != b"k" or len(received) != 1:
+    if data != m.TAKEN or len(received) != 1:
         raise ConnectionError("the worker server did not take the descriptors")
     return received[0]

@@ -19,9 +19,6 @@ FDS = 5
 _REQUEST_BYTES = 4096
 _WAIT_S = 1.0
 
-TAKEN, NOT_YET = b"k", b"w"
-"""What a client is told: that they are here, with a pidfd; or to come again in a moment."""
-
 PidfdFor = Callable[[m.Deposit], int | None]
 """The pidfd of the jail that a deposit is for; negative before it is known, or None if the client
 may not have it."""
@@ -63,13 +60,13 @@ class Deposits:
             if pidfd is None or len(fds) != FDS:
                 return
             if pidfd < 0:
-                connection.send(NOT_YET)
+                connection.send(m.NOT_YET)
                 return
             assert isinstance(request, m.Deposit)
             key = request.jail, request.runner
             close_fds(self._waiting.pop(key, []))
             self._waiting[key], fds = fds, []
-            socket.send_fds(connection, [TAKEN], [pidfd])
+            socket.send_fds(connection, [m.TAKEN], [pidfd])
         finally:
             close_fds(fds)
 

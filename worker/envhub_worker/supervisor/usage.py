@@ -50,12 +50,10 @@ def usage_of(init: int, runners: Collection[int], children: reap.Children) -> di
     if init <= 0:
         return {}
     processes = reap.descendants(init, children=children)
-    threads = sum(max(_fields(pid).get("Threads", 1), 1) - 1 for pid in processes)
-    memory = 0
-    for pid in runners:
-        fields = _fields(pid)
-        memory += _KIB * (fields.get("RssAnon", 0) + fields.get("VmSwap", 0))
-    return {"processes": len(processes), "threads": threads, "memory_bytes": memory}
+    fields = {pid: _fields(pid) for pid in {*processes, *runners}}
+    threads = sum(max(fields[pid].get("Threads", 1), 1) - 1 for pid in processes)
+    kib = sum(fields[pid].get(name, 0) for pid in runners for name in ("RssAnon", "VmSwap"))
+    return {"processes": len(processes), "threads": threads, "memory_bytes": _KIB * kib}
 
 
 def _fields(pid: int) -> dict[str, int]:

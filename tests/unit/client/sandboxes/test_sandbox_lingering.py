@@ -134,6 +134,17 @@ def test_taken_or_ended_but_never_both(sharing: Sharing[Server]) -> None:
     assert eventually(lambda: not _waiting())
 
 
+def test_one_that_has_died_is_ended_by_whoever_asks_next(sharing: Sharing[Server]) -> None:
+    """And not when its time has come: until somebody waits for it, it is a zombie."""
+    dead = given_up(sharing, "key", 600)
+    dead.runs = False
+    fresh = sharing.acquire("key", Server)
+    assert fresh is not dead
+    assert eventually(lambda: bool(dead.ends))
+    assert not fresh.ends
+    sharing.release(fresh)
+
+
 def test_many_at_once_share_what_lingers(sharing: Sharing[Server]) -> None:
     """Threads that open and close with times around nothing never meet an ended one."""
     wrong: list[Server] = []

@@ -150,12 +150,16 @@ class Deposit(Message, kind=16):
     """Over the descriptor socket: descriptors for a runner, which the next request brings to it.
 
     That has to be an ``Attach``; the server, which decodes no such message, does not look.
-    Reply, over the same socket: one byte, with a pidfd of the jail.
+    Reply, over the same socket: ``TAKEN``, with a pidfd of the jail, or ``NOT_YET`` where the
+    server has not heard of the jail: to be asked again.
     """
 
     session: bytes
     jail: int
     runner: int
+
+
+TAKEN, NOT_YET = b"k", b"w"
 
 
 class KeepJail(Message, kind=17):
