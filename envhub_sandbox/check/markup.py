@@ -1,4 +1,4 @@
-"""What pages for people are made of: text that is no markup, tables, and one file that runs nothing.
+"""What pages for people are made of: text that is no markup, tables, one file that runs nothing.
 
 Whatever a stranger may have said goes through ``text``, which leaves no character that HTML gives a
 meaning to. The page's own policy forbids scripts, and everything that would come from elsewhere.

@@ -1,7 +1,6 @@
 """A report as one page for people: HTML that needs nothing else, and runs nothing.
 
-Its texts are partly a stranger's. All of them go through ``_text``, which leaves no character that
-HTML gives a meaning to, and the page's own policy forbids scripts, links to elsewhere, and forms.
+Its texts are partly a stranger's. All of them go through ``markup.text``.
 """
 
 from __future__ import annotations
