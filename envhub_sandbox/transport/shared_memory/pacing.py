@@ -9,7 +9,7 @@ from envhub_sandbox.transport.shared_memory.shard import LaneShard
 from envhub_sandbox.transport.shared_memory.sharding import ASK_NS, Cost, Pace, Sample, pace_of
 
 _PACE_STEPS = 256
-"""Steps after which what they took is worth remembering."""
+"""Steps after which what shards cost one another is worth remembering."""
 _SAMPLES = 64
 
 
@@ -34,11 +34,14 @@ class Pacing:
             self._samples.append(Sample(slept_ns, elapsed_ns, max(asleep), max(awake)))
 
     def pace(self, shards: Sequence[LaneShard]) -> Pace | None:
-        """What the steps took; None after too few of them."""
-        if shards[0].sequence < _PACE_STEPS:
-            return None
-        if self._samples:
+        """What the steps took; None where none was measured.
+
+        An evaluation plays each task of a suite for a few steps. After so few, what a wake-up costs
+        is not told from one or two of them, but how long a step is can be: the shard that was
+        disturbed least says so.
+        """
+        if self._samples and shards[0].sequence >= _PACE_STEPS:
             asleep, awake = self._sizes[self._awake :], self._sizes[: self._awake]
             return pace_of(self._samples, max(asleep), max(awake))
-        busy = sum(shard.busy_ns for shard in shards)
-        return Pace(Cost(ASK_NS, busy / sum(self._sizes)), None) if busy else None
+        each = [shard.busy_ns / size for shard, size in zip(shards, self._sizes, strict=True)]
+        return Pace(Cost(ASK_NS, min(each)), None) if all(each) else None

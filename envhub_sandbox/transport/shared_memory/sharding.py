@@ -3,8 +3,9 @@
 One core is the client's. The shards that get cores of their own wait for work awake; the others
 sleep, and run on cores that somebody else needs too, so each of their steps costs two wake-ups
 more. Where a sub-environment's step is short, that is worth several of them: such shards get
-fewer, or are not started at all. How long it takes is what the last use of the same pin took,
-so the first one is shared out evenly. Results never depend on any of this.
+fewer. One that would save less of each step than it is worth, with its memory and its start, is
+not started at all. How long a step takes is what the last use of the same pin took, so the first
+one is shared out evenly. Results never depend on any of this.
 """
 
 from __future__ import annotations
@@ -26,9 +27,14 @@ ASK_NS = 10_000.0
 """What it costs to ask a shard that waits awake, before it has been measured."""
 _WAKE_UP_NS = 15_000.0
 """How much more it costs to ask one that sleeps, before that has been measured."""
+_WORTH_NS = 15_000.0
+"""How much shorter each step must be for shards that sleep to be started: they take memory, and a
+start that a short life does not make up for."""
 _FORGETTING = 0.7
 """Per use without a sleeping shard: a busy machine must not be remembered for ever."""
 _WORST_NS = 1e12
+_RISE = 2.0
+"""Per use of which one step was measured, at most: another process may have run in its midst."""
 _NOTICED_NS = 2_000
 """A wait that is shorter is none: the answer was there already."""
 
@@ -122,7 +128,8 @@ def _weighted(
     head_start = awake * (slow.fixed_ns - quick.fixed_ns)
     each = awake * slow.step_ns + sleepers * quick.step_ns
     small = round((count * quick.step_ns - head_start) / each)
-    if small < 1 and may_drop:
+    saved_ns = small * sleepers * quick.step_ns / awake
+    if may_drop and (small < 1 or saved_ns < _WORTH_NS):
         return even_bounds(count, awake)
     small = min(max(1, small), (count - awake) // sleepers)
     large = count - sleepers * small
@@ -153,18 +160,15 @@ class PaceBook:
         """Remember it. A cache that cannot be written is no error."""
         if self._path is None:
             return
-        awake, asleep = pace.awake, pace.asleep or self._forgotten(env, pace.awake)
+        known = self.of(env)
+        awake, asleep = pace.awake, pace.asleep
+        if asleep is None:  # one step was measured, and no wake-up
+            step_ns = min(awake.step_ns, _RISE * known.awake.step_ns) if known else awake.step_ns
+            awake = Cost(awake.fixed_ns, step_ns)
+            asleep = _forgotten(known, awake)
         entry = [awake.fixed_ns, awake.step_ns, asleep.fixed_ns, asleep.step_ns]
         if all(map(_is_sane, entry)):
             self._write({**self._read(), _name(env): entry})
-
-    def _forgotten(self, env: EnvManifest, awake: Cost) -> Cost:
-        """What a sleeping shard takes, as far as is known from earlier uses."""
-        known = self.of(env)
-        least = awake.fixed_ns + _WAKE_UP_NS
-        if known is None or known.asleep is None:
-            return Cost(least, awake.step_ns)
-        return Cost(max(least, known.asleep.fixed_ns * _FORGETTING), awake.step_ns)
 
     def _read(self) -> dict[str, object]:
         try:
@@ -184,6 +188,14 @@ class PaceBook:
             except BaseException:
                 os.unlink(temporary)
                 raise
+
+
+def _forgotten(known: Pace | None, awake: Cost) -> Cost:
+    """What a sleeping shard takes, as far as is known from earlier uses."""
+    least = awake.fixed_ns + _WAKE_UP_NS
+    if known is None or known.asleep is None:
+        return Cost(least, awake.step_ns)
+    return Cost(max(least, known.asleep.fixed_ns * _FORGETTING), awake.step_ns)
 
 
 def _name(env: EnvManifest) -> str:

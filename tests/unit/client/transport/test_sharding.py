@@ -103,6 +103,14 @@ def test_a_shard_that_brings_nothing_is_not_started() -> None:
     assert sizes(environment(4), None, SHORT) == [4]
 
 
+def test_a_shard_that_saves_little_is_not_started() -> None:
+    """A process more has to be worth its memory and its start: these would save a step each."""
+    pace = Pace(Cost(10_000, 8_000), Cost(25_000, 8_000))
+    assert sizes(environment(4), 2, pace) == [3, 1]
+    assert sizes(environment(4), None, pace) == [4]
+    assert sizes(environment(16), None, pace) == [9, 7]
+
+
 def test_a_number_of_workers_is_kept() -> None:
     """Who asks for two gets two, if there are two sub-environments."""
     assert sizes(environment(4), 2, SHORT) == [3, 1]
@@ -153,6 +161,19 @@ def test_a_use_without_a_sleeping_shard_forgets_a_little(tmp_path: Path) -> None
     for _ in range(30):
         book.note(env, Pace(SHORT.awake, None))
     assert book.of(env) == SHORT
+
+
+def test_what_one_step_took_is_believed_in_part(tmp_path: Path) -> None:
+    """Another process may have run in its midst; what is as long each time is so in the end."""
+    book = PaceBook(tmp_path / "entry.pace")
+    env = environment(2)
+    noted = []
+    for step_ns in (3_000, 2e6, 4_000, 2e6, 2e6):
+        book.note(env, Pace(Cost(10_000, step_ns), None))
+        pace = book.of(env)
+        assert pace is not None
+        noted.append(pace.awake.step_ns)
+    assert noted == [3_000, 6_000, 4_000, 8_000, 16_000]
 
 
 _SPOILT = ([3_000, 15_000], [1, 1, 0, -1], [1, math.nan, 1, 1], [1, True, 1, 1], 7)
