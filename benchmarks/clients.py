@@ -36,7 +36,9 @@ _SLACK = {"server_pss_mib": 8.0, "descriptors": 8, "threads": 1}
 """By how much the server may differ between two looks; all else is to be as it was."""
 _SETTLE_S = 60.0
 _PAUSE_S = 1.0
-_MEMORY = {"limits": {"memory_bytes": 1 << 30}}
+_RETRY_S = 600.0
+MEMORY = {"limits": {"memory_bytes": 1 << 30}}
+"""A policy by which many are within the quota of one client."""
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -49,7 +51,7 @@ def main(words: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(words)
     if arguments.client:
         return _client(*arguments.client)
-    with tempfile.TemporaryDirectory(prefix="clients-") as folder, _Server(Path(folder)) as server:
+    with tempfile.TemporaryDirectory(prefix="clients-") as folder, Server(Path(folder)) as server:
         found: dict[str, Any] = {}
         if arguments.in_a_row:
             found["in_a_row"] = in_a_row(server, arguments.in_a_row)
@@ -72,7 +74,7 @@ def more(before: Mapping[str, float], after: Mapping[str, float]) -> list[str]:
     return [name for name, value in after.items() if value > before[name] + _SLACK.get(name, 0)]
 
 
-def in_a_row(server: _Server, count: int) -> dict[str, Any]:
+def in_a_row(server: Server, count: int) -> dict[str, Any]:
     """Short clients, one after the other."""
     begun, tenth = time.perf_counter(), max(1, count // 10)
     for _ in range(tenth):
@@ -85,7 +87,7 @@ def in_a_row(server: _Server, count: int) -> dict[str, Any]:
     return {**each, "after_a_tenth": before, "at_the_end": server.settled(before)}
 
 
-def at_once(server: _Server, clients: int, environments: int) -> dict[str, Any]:
+def at_once(server: Server, clients: int, environments: int) -> dict[str, Any]:
     """Clients that are all there, each with so many environments; and that they have gone."""
     server.settled()
     begun = time.perf_counter()
@@ -111,10 +113,10 @@ def at_once(server: _Server, clients: int, environments: int) -> dict[str, Any]:
 
 def _client(endpoint: str, server_key: str, environments: str, stays: str) -> int:
     """One client: its secret key is in its environment."""
-    sandbox = RemoteSandbox(endpoint, server_key, retry_s=600.0)
+    sandbox = RemoteSandbox(endpoint, server_key, retry_s=_RETRY_S)
     with contextlib.ExitStack() as stack:
         for number in range(int(environments)):
-            suites = make_env(_REPOSITORY, sandbox=sandbox, policy=_MEMORY)
+            suites = make_env(_REPOSITORY, sandbox=sandbox, policy=MEMORY)
             env = stack.enter_context(suites).env
             env.reset(seed=number)
             for _ in range(_STEPS):
@@ -125,7 +127,7 @@ def _client(endpoint: str, server_key: str, environments: str, stays: str) -> in
     return 0
 
 
-class _Server:
+class Server:
     """A server on loopback, with a temporary folder of its own."""
 
     def __init__(self, folder: Path) -> None:
@@ -158,12 +160,26 @@ class _Server:
             "ENVHUB_CACHE": str(folder / "cache"),
         }
 
-    def __enter__(self) -> _Server:
+    def __enter__(self) -> Server:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.process.terminate()
         self.process.wait(60)
+
+    @property
+    def place(self) -> Path:
+        """Its folder for temporary files."""
+        return self._place
+
+    def sandbox(self) -> RemoteSandbox:
+        """The way to it, for this process."""
+        return RemoteSandbox(
+            self._endpoint,
+            self._public,
+            (self._state / "client.key").read_text(),
+            retry_s=_RETRY_S,
+        )
 
     def _command(self, environments: int, *, stays: bool) -> list[str]:
         words = [self._endpoint, self._public, str(environments), str(int(stays))]
@@ -207,8 +223,8 @@ class _Server:
             "threads": process.num_threads(),
             "processes": len(process.children(recursive=True)),
             "jails": self._jails(),
-            "folders": _entries(self._place),
-            "stored_files": _entries(self._state / "store"),
+            "folders": entries(self._place),
+            "stored_files": entries(self._state / "store"),
         }
 
     def _jails(self) -> int:
@@ -226,7 +242,7 @@ def _below(process: subprocess.Popen[Any]) -> int:
     return found
 
 
-def _entries(folder: Path) -> int:
+def entries(folder: Path) -> int:
     """What is below a folder, of which some goes while one looks."""
     return sum(len(folders) + len(files) for _, folders, files in os.walk(folder))
 
