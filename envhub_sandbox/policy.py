@@ -89,8 +89,9 @@ class Policy:
             messages; a path writes it to that file as well, a further file for each further jail;
             ``"stderr"`` or ``"-"`` to this program's stderr.
         record_denials: Have the jail's first process, instead of the kernel alone, deny the system
-            calls that are denied, and write down which were tried: ``env.jail_denials()``. Each of
-            them takes longer then.
+            calls that are denied, and write down which were tried, and which files were asked for
+            that are not its own: ``env.jail_denials()``. Each of them takes longer then, and so
+            does opening a file.
         crash_history: How many requests since the last seeded reset are kept for a crash bundle
             (``docs/crashes.md``), within 8 MiB; 0 keeps none and writes no bundles.
         crash_folder: Where crash bundles are written; ``crashes`` in the cache by default.

@@ -1,7 +1,7 @@
 """What a jail was denied, by the word of its first process: attempts that say something.
 
-The system call filter asks that process, so that nothing is the repository's word. Files are not
-among it: in a private root what may not be read does not exist, and the kernel tells nobody.
+The system call filter asks that process, so that nothing is the repository's word; but a path is
+read out of the memory of whoever asks for it, who may change it meanwhile.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from collections.abc import Iterable
 
 _NETWORK = "socket AF_"
 _LOCAL = frozenset({"socket AF_UNIX", "socketpair AF_UNIX"})
+_DEEDS = {"connect": "connect to"}
 _HARMLESS = frozenset(
     {
         *("mbind", "set_mempolicy", "set_mempolicy_home_node", "migrate_pages", "move_pages"),
@@ -20,10 +21,21 @@ _HARMLESS = frozenset(
 
 
 def sorted_out(denied: Iterable[str]) -> dict[str, list[str]]:
-    """The findings of each check, of what was denied."""
-    found: dict[str, list[str]] = {"denied-network": [], "denied-kernel": []}
+    """The findings of each check, of what was denied. Trust: paths are a stranger's words."""
+    found: dict[str, list[str]] = {
+        "denied-network": [],
+        "denied-files": [],
+        "denied-kernel": [],
+    }
     for one in sorted(set(denied) - _HARMLESS):
-        is_network = one.startswith(_NETWORK) and one not in _LOCAL
-        text = f"tried {one}, and was refused"
-        found["denied-network" if is_network else "denied-kernel"].append(text)
+        check, text = _finding(one)
+        found[check].append(text)
     return found
+
+
+def _finding(one: str) -> tuple[str, str]:
+    deed, _, path = one.partition(" ")
+    if path.startswith("/"):
+        return "denied-files", f"asked to {_DEEDS.get(deed, deed)} {path}, which is not its own"
+    is_network = one.startswith(_NETWORK) and one not in _LOCAL
+    return "denied-network" if is_network else "denied-kernel", f"tried {one}, and was refused"

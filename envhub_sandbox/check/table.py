@@ -131,6 +131,12 @@ CHECKS: dict[str, Check] = {
             "Bring data along in the repository, and report nothing to anybody.",
         ),
         Check(
+            "denied-files",
+            _W,
+            "It asks to change no files but its own, and to read no homes, secrets or processes.",
+            "Keep to the repository's folder, to tempfile and to the home that it is given.",
+        ),
+        Check(
             "denied-kernel",
             _W,
             "It tries no system call that the policy denies.",

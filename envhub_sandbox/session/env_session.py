@@ -34,7 +34,7 @@ from envhub_sandbox.transport.shared_memory.sharding import PaceBook
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 
-_DENIAL = re.compile(r"[a-z0-9_]{1,40}( [A-Z0-9_]{1,40})?")
+_DENIAL = re.compile(r"[a-z0-9_]{1,40}( [A-Z0-9_]{1,40}| /.{0,400})?")
 _GRACE_S = 2.0
 """How long ``reset`` waits for a late reply before it gives the jail up and starts another."""
 
@@ -107,7 +107,8 @@ class EnvSession:
         told = self.lease.status().get("denied")
         if not isinstance(told, tuple):
             return None
-        return tuple(one for one in told[:64] if isinstance(one, str) and _DENIAL.fullmatch(one))
+        texts = (one for one in told[:64] if isinstance(one, str) and one.isprintable())
+        return tuple(one for one in texts if _DENIAL.fullmatch(one))
 
     def stats(self) -> dict[str, Any]:
         """Counters, and where it is in its life."""

@@ -332,7 +332,8 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     def jail_denials(self) -> tuple[str, ...] | None:
         """Which system calls its jail has tried and was denied: ``("ptrace", "socket AF_INET")``.
 
-        By the word of its first process, which answers them, and not by the repository's. None
+        And which files it has asked for that are not its own: ``"write /home/me/.profile"``. By the
+        word of its first process, which answers or sees them, and not by the repository's. None
         unless it runs under a policy with ``record_denials``.
         """
         return self._session.denials()

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import pytest
+
 from envhub_sandbox import make_env
 from tests.support import inside
+from tests.support.interpreter import profiles
 from tests.support.repositories import write_repository
 
 _ATTEMPTS = """
@@ -81,3 +86,122 @@ def test_a_recorded_jail_is_refused_the_same(tmp_path: Path) -> None:
     assert answers[True] == answers[False]
     assert told is not None
     assert attempts(told) == ["mount", "ptrace", "socket AF_INET", "unshare"]
+
+
+_FILES = """
+import ctypes, os, threading
+import gymnasium as gym
+import numpy as np
+
+LIBC = ctypes.CDLL(None, use_errno=True)
+
+def answer(act):
+    try:
+        act()
+    except OSError as error:
+        return error.errno
+    return 0
+
+def race(own, foreign, rounds):
+    \"\"\"Open what is its own while another thread writes another's name over it.\"\"\"
+    path = ctypes.create_string_buffer(4096)
+    going = True
+    def swap():
+        while going:
+            path.value = foreign.encode()
+            path.value = own.encode()
+    thread = threading.Thread(target=swap)
+    thread.start()
+    for _ in range(rounds):
+        fd = LIBC.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+        if fd >= 0:
+            os.write(fd, b"written")
+            os.close(fd)
+    going = False
+    thread.join()
+    return rounds
+
+class Files(gym.Env):
+    observation_space = gym.spaces.Box(0, 200, (4,), np.int64)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        with open("own", "w") as file:
+            file.write("x")
+        os.rename("own", "mine")
+        os.unlink("mine")
+        return np.zeros(4, np.int64), {}
+
+    def attempts(self, folder):
+        return [
+            answer(lambda: open(f"{folder}/x\\x1b", "a")),
+            answer(lambda: os.unlink(f"{folder}/y")),
+            answer(lambda: os.rename(f"{folder}/a", f"{folder}/b")),
+            answer(lambda: open("/root/.netrc")),
+        ]
+
+    def flood(self, folder):
+        for number in range(200):
+            answer(lambda: open(f"{folder}/{number}", "a"))
+        LIBC.unshare(0x10000000)
+
+    def race(self, folder, rounds):
+        return race(os.path.abspath("own"), f"{folder}/there", rounds)
+
+    def step(self, action):
+        return np.zeros(4, np.int64), 0.0, False, False, {}
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([Files] * n_envs)
+"""
+
+
+def test_files_that_are_asked_for_are_told(tmp_path: Path) -> None:
+    """As they are refused anyway; of a flood a few, and it hides nothing else.
+
+    The controls are the jail that records nothing, and what the repository does with its own.
+    """
+    folder = write_repository(tmp_path / "files", _FILES)
+    answers = {}
+    for recorded in (False, True):
+        with make_env(str(folder), policy={"record_denials": recorded}) as suites:
+            env = suites.env
+            env.reset(seed=0)
+            assert env.jail_denials() == (() if recorded else None)
+            answers[recorded] = env.call("attempts", "/home/other")
+            told = env.jail_denials()
+            env.call("flood", "/home/other")
+            after = env.jail_denials()
+    assert 0 not in answers[True][0]
+    assert answers[True] == answers[False]
+    assert told == (
+        "write /home/other/x\\x1b",
+        "unlink /home/other/y",
+        "rename /home/other/a",
+        "rename /home/other/b",
+        "read /root/.netrc",
+    )
+    assert after is not None
+    assert "unshare" in after
+    assert len([one for one in after if "/" in one]) == 32
+
+
+@pytest.mark.parametrize("profile", profiles("no-userns"))
+def test_who_is_seen_asking_gets_no_further(home: Path, profile: str) -> None:
+    """The name that is looked at may be another than the one that is opened; the kernel decides.
+
+    The control is the same race without a sandbox.
+    """
+    foreign = home / "there"
+    foreign.touch()
+    foreign.chmod(0o666)
+    folder = write_repository(home / "files", _FILES)
+    policy = {"profile": profile, "record_denials": True}
+    with make_env(str(folder), policy=policy) as suites:
+        suites.env.reset()
+        assert list(suites.env.call("race", str(home), 100)) == [100]
+    assert foreign.read_text() == ""
+    outside = f"{_FILES}\nwhile not os.path.getsize({str(foreign)!r}):\n"
+    outside += f"    race({str(home / 'own')!r}, {str(foreign)!r}, 100)\n"
+    subprocess.run([sys.executable, "-c", outside], check=True, timeout=300)

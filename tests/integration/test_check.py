@@ -74,6 +74,14 @@ _CALLING = """self.count = 0
 _UNSHARING = """self.count = 0
         gym.vector.async_vector_env.sys.modules["ctypes"].CDLL(None).unshare(0x10000000)
         return"""
+_REACHING = """self.count = 0
+        os = gym.vector.async_vector_env.sys.modules["os"]
+        if not os.access(os.path.join(os.sep, "srv", "walk"), 0):
+            try:
+                os.unlink(os.path.join(os.sep, "srv", "walk"))
+            except OSError:
+                pass
+        return"""
 _FAULTS = {
     "observation-dtype": ("self.count], np.float32)", "self.count], np.float64)"),
     "observation-space": ("self.count], np.float32)", "self.count * 30], np.float32)"),
@@ -86,6 +94,7 @@ _FAULTS = {
     "survives": ("self.count += 1", "import os; os._exit(3)"),
     "loads": ("return gym.vector.SyncVectorEnv([Walk] * n_envs)", "return 3"),
     "denied-network": ("self.count = 0\n        return", _CALLING),
+    "denied-files": ("self.count = 0\n        return", _REACHING),
     "denied-kernel": ("self.count = 0\n        return", _UNSHARING),
     "leaks-threads": ("self.count = 0\n        return", _STAYING),
     "leaks-processes": ("self.count = 0\n        return", _FORKED),

@@ -68,6 +68,7 @@ class Common:
         landlock_abi: 0 where there is none.
         brokered: Whether init sends the jails' signals.
         asks: Whether init is asked anything: signals, or what is denied.
+        watched: Calls that are permitted and ask init all the same, so that it sees them.
         programs: The compiled system call filters: where memory is counted, where it is measured.
         set_blas_threads: Sets OpenBLAS's threads, if that is what numpy uses.
     """
@@ -82,6 +83,7 @@ class Common:
     landlock_abi: int
     brokered: bool
     asks: bool
+    watched: frozenset[str]
     programs: tuple[bytes, ...]
     set_blas_threads: Callable[[int], None] | None = None
 

@@ -76,8 +76,8 @@ class Denied:
     """Something in the jail tried a system call that the policy denies, for the first time.
 
     Attributes:
-        call: Its name.
-        detail: What is known of its arguments: a family of sockets, or nothing.
+        call: Its name; of what is asked of a file also "read" or "write".
+        detail: What is known of its arguments: a family of sockets, a path, or nothing.
     """
 
     call: str

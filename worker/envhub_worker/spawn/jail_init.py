@@ -14,7 +14,8 @@ Events::
     {"event": "runner_started", "runner": N, "report": [layer...]} + [the runner's pidfd]
     {"event": "runner_exited", "runner": N, "code": C | null, "signal": S | null, "reason": R,
      "detail": D}
-    {"event": "denied", "call": C, "detail": D}        where the jail records what it was denied
+    {"event": "denied", "call": C, "detail": D}        where the jail records what it was denied,
+                                                       or what was asked of which file
 
 The end of the channel ends the jail.
 """
@@ -36,9 +37,11 @@ from envhub_worker.lockdown.limits.monitor import Guard
 from envhub_worker.lockdown.mechanisms import process, reap
 from envhub_worker.lockdown.plan import HostFacts, plan
 from envhub_worker.lockdown.report import Layer, LayerUnavailableError
-from envhub_worker.lockdown.seccomp import notify
+from envhub_worker.lockdown.seccomp import notify, paths
+from envhub_worker.lockdown.seccomp.syscalls import name_of
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.lockdown.stages import jail
+from envhub_worker.lockdown.stages.runner import own
 from envhub_worker.protocol.confinement import Reason
 from envhub_worker.spawn import runner_entry
 from envhub_worker.spawn.channel import Channel, close_fds
@@ -206,12 +209,12 @@ class Init:
                 os.kill(pid, signal.SIGKILL)
 
     def _answer(self, listener: int) -> None:
-        if not notify.serve(listener, self._note_denial):
+        if not notify.serve(listener, self._common.watched, self._note):
             self._poller.unregister(listener)
             self._listeners.discard(listener)
             os.close(listener)
 
-    def _note_denial(self, request: notify.Request) -> None:
+    def _note(self, request: notify.Request) -> None:
         """Tell what was tried, each thing once; a runner's own test of its denials is none."""
         runner = self._runners.get(request.caller)
         if runner is not None and runner.status is not None:
@@ -219,10 +222,21 @@ class Init:
             self._read_report(request.caller, runner, runner.status)
             if runner.status is not None:
                 return
-        denial = notify.described(request)
+        call = name_of(request.call)
+        if call not in self._common.watched:
+            self._tell_denied(*notify.described(request))
+            return
+        mine = own(self._jail, request.caller, request.thread)
+        waits = request.still_waits
+        for deed, path in paths.asked(call, request.words, request.thread, mine, waits):
+            told = sum(text.startswith("/") for _, text in self._denials)
+            if told < notify.MOST_FILES:
+                self._tell_denied(deed, path)
+
+    def _tell_denied(self, call: str, detail: str) -> None:
+        denial = (call, detail)
         if denial not in self._denials and len(self._denials) < notify.MOST_DENIALS:
             self._denials.add(denial)
-            call, detail = denial
             self._channel.send({"event": "denied", "call": call, "detail": detail})
 
     def _read_reports(self, fd: int) -> None:

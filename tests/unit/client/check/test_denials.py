@@ -8,17 +8,24 @@ from envhub_sandbox.check.denials import sorted_out
 
 
 @pytest.mark.parametrize(
-    ("denied", "network", "kernel"),
+    ("denied", "network", "files", "kernel"),
     [
-        ((), 0, 0),
-        (("setpriority", "mbind", "socket AF_NETLINK"), 0, 0),
-        (("socket AF_INET", "socket AF_INET6", "socket AF_PACKET"), 3, 0),
-        (("socket AF_UNIX", "ptrace", "mount"), 0, 3),
-        (("ptrace", "ptrace"), 0, 1),
+        ((), 0, 0, 0),
+        (("setpriority", "mbind", "socket AF_NETLINK"), 0, 0, 0),
+        (("socket AF_INET", "socket AF_INET6", "socket AF_PACKET"), 3, 0, 0),
+        (("socket AF_UNIX", "ptrace", "mount"), 0, 0, 3),
+        (("ptrace", "ptrace"), 0, 0, 1),
+        (("read /etc/shadow", "unlink /socket AF_INET", "connect /run/x"), 0, 3, 0),
     ],
-    ids=["nothing", "harmless", "network", "kernel", "once"],
+    ids=["nothing", "harmless", "network", "kernel", "once", "files"],
 )
-def test_attempts_are_sorted(denied: tuple[str, ...], network: int, kernel: int) -> None:
+def test_attempts_are_sorted(
+    denied: tuple[str, ...], network: int, files: int, kernel: int
+) -> None:
     """By what they reach for; what libraries do without is none."""
     found = sorted_out(denied)
-    assert (len(found["denied-network"]), len(found["denied-kernel"])) == (network, kernel)
+    assert {check: len(texts) for check, texts in found.items()} == {
+        "denied-network": network,
+        "denied-files": files,
+        "denied-kernel": kernel,
+    }

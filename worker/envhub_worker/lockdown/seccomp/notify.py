@@ -27,6 +27,7 @@ from envhub_worker.lockdown.seccomp.syscalls import name_of, number
 
 _RECEIVE = 0xC0502100
 _SEND = 0xC0182101
+_STILL_WAITS = 0x40082102
 _CONTINUE = 1
 
 # struct seccomp_notif: id, tid, flags, then struct seccomp_data: call, arch, address, arguments.
@@ -44,12 +45,16 @@ class Request:
         caller: Its process.
         call: The call's number.
         arguments: The first three, as the C integers that the kernel reads.
+        words: All six, as the registers are.
+        still_waits: Raises OSError where the caller has gone since.
     """
 
     thread: int
     caller: int
     call: int
     arguments: tuple[int, int, int]
+    words: tuple[int, ...] = ()
+    still_waits: Callable[[], object] = lambda: None
 
 
 @dataclass(frozen=True)
@@ -65,12 +70,19 @@ _Inside = Callable[[], Collection[int]]
 _SIGNALS = ("kill", "tkill", "tgkill")
 
 
-def serve(listener: int, denied: Callable[[Request], None]) -> bool:
+def serve(
+    listener: int,
+    permitted: Collection[str],
+    note: Callable[[Request], None],
+) -> bool:
     """Answer one request that waits at ``listener``; False when nobody is left to ask.
 
     Args:
         listener: Where calls arrive.
-        denied: Is told of what is no signal: the policy denies it, and it is only recorded.
+        permitted: Calls that the policy allows whatever their arguments, and that only ask so that
+            they are seen: the kernel goes on with them. What is neither one of these nor a signal
+            is denied.
+        note: Is told of what is no signal.
     """
     buffer = bytearray(_REQUEST.size)
     try:
@@ -80,12 +92,18 @@ def serve(listener: int, denied: Callable[[Request], None]) -> bool:
         return error.errno == errno.EINTR or _has_callers(listener)
     identity, thread, _, call, _, _, *words = _REQUEST.unpack(buffer)
     first, second, third = (_c_int(word) for word in words[:3])
-    request = Request(thread, reap.process_of(thread), call, (first, second, third))
+
+    def still_waits() -> object:
+        return fcntl.ioctl(listener, _STILL_WAITS, struct.pack("=Q", identity))
+
+    caller = reap.process_of(thread)
+    request = Request(thread, caller, call, (first, second, third), tuple(words), still_waits)
     if request.call in map(number, _SIGNALS):
         answer = decide(request, lambda: reap.descendants(os.getpid()))
     else:
-        denied(request)  # told before the caller goes on, so that nobody can look too early
-        answer = Answer(refusal(name_of(request.call)))
+        note(request)  # told before the caller goes on, so that nobody can look too early
+        name = name_of(request.call)
+        answer = _PROCEED if name in permitted else Answer(refusal(name))
     flags = _CONTINUE if answer.proceed else 0
     with contextlib.suppress(OSError):
         fcntl.ioctl(listener, _SEND, _ANSWER.pack(identity, 0, -answer.error, flags))
@@ -94,6 +112,8 @@ def serve(listener: int, denied: Callable[[Request], None]) -> bool:
 
 MOST_DENIALS = 64
 """Different ones that are told of a jail."""
+MOST_FILES = 32
+"""Of these, files: a flood of names hides no other attempt."""
 
 
 def described(request: Request) -> tuple[str, str]:

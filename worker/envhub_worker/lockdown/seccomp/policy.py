@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterable, Mapping
 
+from envhub_worker.lockdown.seccomp.paths import NAMED
 from envhub_worker.protocol.records import dataclass
 
 _ERRNO = 0x00050000
@@ -151,13 +152,22 @@ def recorded(verdicts: Mapping[str, Verdict], names: Iterable[str]) -> dict[str,
     """The same, where init answers what is denied, and so knows that it was tried.
 
     What is not there at all (ENOSYS), or only seems to work, is no attempt at anything: libraries
-    ask for it on their way to something else.
+    ask for it on their way to something else. What names files is seen on its way to the kernel.
 
     Args:
         verdicts: Of ``table``.
         names: Every call that there is.
     """
-    return {name: _asking(verdicts.get(name, EPERM)) for name in names}
+    denied = {name: _asking(verdicts.get(name, EPERM)) for name in names}
+    return denied | dict.fromkeys(watched(verdicts) & denied.keys(), ASK)
+
+
+def watched(verdicts: Mapping[str, Verdict]) -> frozenset[str]:
+    """What opens and changes files, where nothing of it is denied: init lets the kernel go on.
+
+    Not so where arguments decide: the kernel would make the call without looking at them again.
+    """
+    return frozenset(name for name in NAMED if verdicts.get(name) == ALLOW)
 
 
 def _asking(verdict: Verdict) -> Verdict:

@@ -9,7 +9,9 @@ from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.limits import rlimits
 from envhub_worker.lockdown.mechanisms import capabilities, landlock, process
 from envhub_worker.lockdown.mechanisms.landlock import DEVICE, READ, READ_DIR, WRITE, Rule
+from envhub_worker.lockdown.mechanisms.scratch import Scratch
 from envhub_worker.lockdown.seccomp import filter
+from envhub_worker.lockdown.seccomp.paths import Own
 from envhub_worker.lockdown.stages import selftest
 
 # What the C library and numerical libraries read; nothing here is about a person.
@@ -89,12 +91,23 @@ def rules(jail: JailContext, pid: int) -> list[Rule]:
     own = f"/proc/{pid}"
     own_files = [f"{own}/{name}" for name in _OWN_FILES.split()]
     readable += ["/proc", "/etc", "/dev"] if common.namespaced else [*_HOST_FILES, *own_files]
-    writable = [scratch.home, scratch.temporary, scratch.work]
-    if scratch.shared_memory is not None:
-        writable.append(scratch.shared_memory)
+    writable = _writable(scratch)
     return [
         *(Rule(path, READ) for path in readable),
         *([] if common.namespaced else [Rule(own, READ_DIR)]),
         *(Rule(path, WRITE) for path in writable),
         *(Rule(path, DEVICE) for path in common.devices),
     ]
+
+
+def _writable(scratch: Scratch) -> list[str]:
+    shared = [] if scratch.shared_memory is None else [scratch.shared_memory]
+    return [scratch.home, scratch.temporary, scratch.work, *shared]
+
+
+def own(jail: JailContext, pid: int, thread: int) -> Own:
+    """What a process may change and read, by the names that it has for it."""
+    streams = ("/dev/fd", "/dev/stdin", "/dev/stdout", "/dev/stderr")
+    itself = ("/proc/self", "/proc/thread-self", f"/proc/{pid}", f"/proc/{thread}")
+    changed = (*_writable(jail.scratch), *jail.common.devices, *streams, *itself)
+    return Own(changed=changed, read=(*jail.common.trees, jail.spec.snapshot, *changed))

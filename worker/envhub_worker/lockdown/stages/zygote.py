@@ -23,6 +23,7 @@ from envhub_worker.lockdown.mechanisms.kernel import CLONE_NEWNS, unshare
 from envhub_worker.lockdown.plan import needs_broker
 from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp.filter import compile_filter
+from envhub_worker.lockdown.seccomp.policy import table, watched
 
 
 def enter(config: ZygoteConfig) -> Common:
@@ -75,8 +76,14 @@ def enter(config: ZygoteConfig) -> Common:
         landlock_abi=abi,
         brokered=brokered,
         asks=brokered or config.record,
+        watched=_watched(config) if config.record else frozenset(),
         programs=programs,
     )
+
+
+def _watched(config: ZygoteConfig) -> frozenset[str]:
+    """The same for both filters: what measures memory makes no difference to files."""
+    return watched(table(namespaced=config.profile == "strict", network=config.network))
 
 
 def _check_gpu() -> None:

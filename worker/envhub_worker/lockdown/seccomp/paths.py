@@ -1,0 +1,171 @@
+"""Which files a call asks for, as far as its caller's memory says so a moment later.
+
+The kernel is always told to go on with such a call: whether it may is decided by it, by mounts and
+Landlock, and nothing here can make it another. What is read is a stranger's memory, which another
+thread may have changed since, so that it is evidence of an attempt and proof of nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import struct
+import sys
+from collections.abc import Callable, Collection, Sequence
+from typing import BinaryIO
+
+from envhub_worker.protocol.records import dataclass
+from envhub_worker.protocol.text import printable
+
+_LONGEST_PATH = 4096
+_PAGE = 4096
+_SHOWN = 200
+_AT_FDCWD = -100
+_AF_UNIX = 1
+_SOCKET_ADDRESS = 110
+
+_Where = tuple[tuple[int | None, int], ...]
+
+# Where the descriptor of a folder is among a call's arguments (None: there is none), and the path.
+_AT: _Where = ((0, 1),)
+_PLAIN: _Where = ((None, 0),)
+_TWO_AT: _Where = ((0, 1), (2, 3))
+_TWO: _Where = ((None, 0), (None, 1))
+_CALLS: tuple[tuple[str, _Where], ...] = (
+    ("openat openat2 mkdirat unlinkat fchmodat fchmodat2 fchownat utimensat futimesat", _AT),
+    ("open creat mkdir rmdir unlink truncate chmod chown lchown utime utimes", _PLAIN),
+    ("setxattr lsetxattr removexattr lremovexattr", _PLAIN),
+    ("renameat renameat2 linkat", _TWO_AT),
+    ("rename link", _TWO),
+    ("symlink", ((None, 1),)),
+    ("symlinkat", ((1, 2),)),
+    ("connect", ()),
+)
+#: What opens and changes files by name.
+NAMED: dict[str, _Where] = {name: where for names, where in _CALLS for name in names.split()}
+_FLAGS = {"open": 1, "openat": 2}
+_CHANGING = os.O_ACCMODE | os.O_CREAT | os.O_TRUNC
+
+_PRIVATE = re.compile(
+    r"/(home|root|Users|run/user|run/secrets|var/(run|log|mail|spool|backups)"
+    r"|etc/(shadow|gshadow|sudoers|sudoers\.d|ssh|ssl/private))(/.*)?"
+    r"|/proc/\d+(/task/\d+)?/(environ|mem|maps|smaps|auxv|io|fd|fdinfo|root|cwd)(/.*)?",
+    re.DOTALL,
+)
+"""What nobody reads by chance; libraries look for a configuration in many another place."""
+_HARMLESS = ("/var/run/nscd/socket", "/run/nscd/socket")
+"""The C library asks there who a user is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Own:
+    """What a jail's processes may do by name.
+
+    Attributes:
+        changed: Folders and files that they may change.
+        read: Those that they may read.
+    """
+
+    changed: tuple[str, ...] = ()
+    read: tuple[str, ...] = ()
+
+
+def asked(
+    call: str,
+    words: Sequence[int],
+    thread: int,
+    own: Own,
+    still_waits: Callable[[], object],
+) -> list[tuple[str, str]]:
+    """What a waiting call asks for and is not its own: what it would do, and each path, shown.
+
+    Args:
+        call: Its name, one of ``NAMED``.
+        words: Its arguments, as the registers are.
+        thread: Who calls.
+        own: What it may have.
+        still_waits: Raises OSError where the caller has gone: its number may be another's now.
+    """
+    with contextlib.suppress(OSError, ValueError, OverflowError):
+        with open(f"/proc/{thread}/mem", "rb", buffering=0) as memory:
+            still_waits()  # not before it is open: from here on it is this caller's memory
+            if call == "connect":
+                return _connected(memory, words, thread, own)
+            deed = _deed(call, memory, words)
+            paths = [_named(memory, thread, words, *where) for where in NAMED[call]]
+        return [(deed, _shown(path)) for path in paths if path and not _may(deed, path, own)]
+    return []
+
+
+def _deed(call: str, memory: BinaryIO, words: Sequence[int]) -> str:
+    if call == "openat2":
+        flags = int.from_bytes(os.pread(memory.fileno(), 8, words[2]), sys.byteorder)
+    elif call in _FLAGS:
+        flags = words[_FLAGS[call]]
+    else:
+        return "write" if call == "creat" else call
+    return "write" if flags & _CHANGING else "read"
+
+
+def _named(
+    memory: BinaryIO, thread: int, words: Sequence[int], folder: int | None, path: int
+) -> str:
+    """The path that is named; empty where it is none, or has no end."""
+    text = _text(memory, words[path])
+    if not text:
+        return ""
+    number = _AT_FDCWD if folder is None else _c_int(words[folder])
+    return _absolute(thread, "cwd" if number == _AT_FDCWD else f"fd/{number}", text)
+
+
+def _text(memory: BinaryIO, place: int) -> bytes:
+    text = b""
+    while b"\0" not in text and len(text) < _LONGEST_PATH:
+        more = os.pread(memory.fileno(), _PAGE - place % _PAGE, place)  # the next may be no page
+        if not more:
+            return b""
+        text, place = text + more, place + len(more)
+    text, end, _ = text.partition(b"\0")
+    return text if end and len(text) < _LONGEST_PATH else b""
+
+
+def _absolute(thread: int, base: str, text: bytes) -> str:
+    """From where the caller stands; a base that is no folder, as a socket, makes no path."""
+    path = os.fsdecode(text)
+    if not path.startswith("/"):
+        path = os.path.join(os.readlink(f"/proc/{thread}/{base}"), path)
+    path = os.path.normpath(path)
+    return path[path.startswith("//") :] if path.startswith("/") else ""
+
+
+def _c_int(word: int) -> int:
+    return (word & 0xFFFFFFFF) - ((word & 0x80000000) << 1)
+
+
+def _connected(
+    memory: BinaryIO, words: Sequence[int], thread: int, own: Own
+) -> list[tuple[str, str]]:
+    """The socket's file; one without a name in the file system is the jail's own network's."""
+    address = os.pread(memory.fileno(), min(words[2] & 0xFFFFFFFF, _SOCKET_ADDRESS), words[1])
+    text = address[2:].partition(b"\0")[0]
+    if address[:2] != struct.pack("=H", _AF_UNIX) or not text:
+        return []
+    path = _absolute(thread, "cwd", text)
+    known = not path or path in _HARMLESS or _is_within(path, own.changed)
+    return [] if known else [("connect", _shown(path))]
+
+
+def _may(deed: str, path: str, own: Own) -> bool:
+    if deed == "read":
+        return _is_within(path, own.read) or _PRIVATE.fullmatch(path) is None
+    return _is_within(path, own.changed)
+
+
+def _is_within(path: str, folders: Collection[str]) -> bool:
+    return any(path == one or path.startswith(f"{one}/") for one in folders)
+
+
+def _shown(path: str) -> str:
+    text = printable(path.encode(errors="backslashreplace").decode())[:_SHOWN]
+    return text.replace("\n", "\\n").replace("\t", "\\t")
