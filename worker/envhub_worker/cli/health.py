@@ -15,7 +15,7 @@ _WAIT_S = 5.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``health``."""
-    parser.add_argument("--port", type=int, default=5555)
+    parser.add_argument("--port", type=int, default=5555, help="it listens on (default: 5555)")
     parser.add_argument("--state-dir", type=Path, help="as for listen")
 
 

@@ -15,7 +15,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, default=Path(), metavar="DIR", help="where both lie (default: here)"
     )
-    parser.add_argument("--name", default="client", help="of NAME.key (secret) and NAME.pub")
+    parser.add_argument(
+        "--name", default="client", help="of NAME.key (secret) and NAME.pub (default: client)"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
