@@ -33,13 +33,14 @@ class Counters:
         requests: Requests sent.
         timeouts: Replies that were late.
         deaths: Processes that ended under a request.
+        steps: Steps that were answered.
     """
 
     def __init__(self) -> None:
         self.requests = 0
         self.timeouts = 0
         self.deaths = 0
-        self._steps = 0
+        self.steps = 0
         self._total_ns = 0
         self._latencies = array("q", bytes(8 * KEPT))
         self._connection: Connection | None = None
@@ -47,8 +48,8 @@ class Counters:
 
     def stepped(self, elapsed_ns: int) -> None:
         """A step has been answered."""
-        self._latencies[self._steps & (KEPT - 1)] = elapsed_ns
-        self._steps += 1
+        self._latencies[self.steps & (KEPT - 1)] = elapsed_ns
+        self.steps += 1
         self._total_ns += elapsed_ns
 
     def connected(self, connection: Connection | None) -> None:
@@ -73,7 +74,7 @@ class Counters:
         stale, sent, received = self._traffic()
         return {
             "requests": self.requests,
-            "steps": self._steps,
+            "steps": self.steps,
             "timeouts": self.timeouts,
             "deaths": self.deaths,
             "stale_replies": stale,
@@ -84,7 +85,7 @@ class Counters:
 
     def latencies_s(self) -> Any:
         """The last step latencies, float64 ``(at most KEPT,)``, in no order."""
-        return np.array(self._latencies[: min(self._steps, KEPT)], np.float64) / 1e9
+        return np.array(self._latencies[: min(self.steps, KEPT)], np.float64) / 1e9
 
     def _percentiles(self) -> dict[str, float]:
         kept = self.latencies_s()

@@ -18,6 +18,7 @@ from envhub_sandbox.errors import (
     WorkerError,
     WorkerTimeoutError,
 )
+from envhub_sandbox.session.attributes import Attributes
 from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.head_start import HeadStart
 from envhub_sandbox.session.lease import Lease
@@ -30,6 +31,7 @@ from envhub_sandbox.transport.deadline import Deadline, StepDeadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.replies import check, typed
+from envhub_sandbox.transport.request import Request
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Event, State
@@ -55,6 +57,7 @@ class Exchange:
 
     Attributes:
         results: Makes of replies what Gymnasium returns.
+        attributes: What need not be asked for.
     """
 
     def __init__(
@@ -69,6 +72,7 @@ class Exchange:
         recovery: Recovery,
     ) -> None:
         self.results = results
+        self.attributes = Attributes(lease, counters)
         self.lifecycle = lease.lifecycle
         self._lease = lease
         self._turns = turns
@@ -83,8 +87,15 @@ class Exchange:
 
     # --- requests ------------------------------------------------------------------------------
 
-    def submit(self, operation: str, message_for: MessageFor) -> None:
+    def submit(
+        self, operation: str, message_for: MessageFor, instead: MessageFor | None = None
+    ) -> None:
         """Send a request to every shard, opening the jail if there is none.
+
+        Args:
+            operation: What it is called.
+            message_for: Makes what is asked, as it is remembered.
+            instead: Makes what is sent in its place, if the answer is to say more.
 
         Raises:
             LocalProtocolError: It cannot be sent; nothing was.
@@ -92,26 +103,30 @@ class Exchange:
         """
         with self._turns.lock:
             try:
-                self._submit(operation, message_for)
+                self._submit(operation, message_for, instead)
             except BaseException:
                 with self._turns.take(operation):  # only now: what goes well has no need of it
                     raise
             if self.lifecycle.state is State.CLOSED:
                 self._lease.let_go()
 
-    def _submit(self, operation: str, message_for: MessageFor) -> None:
+    def _submit(self, operation: str, message_for: MessageFor, instead: MessageFor | None) -> None:
         self._make_ready(operation)
         lane = self._lane()
-        messages = [message_for(lane.number, bounds) for bounds in self.results.bounds]
         try:
-            request = lane.request(operation, messages)
+            request = self._request(lane, operation, message_for)
+            sent = request if instead is None else self._request(lane, operation, instead)
         except LocalProtocolError:
             self._refuse_whole(operation, message_for)
             raise
-        self._send(operation, lambda: lane.send(request))
+        self._send(operation, lambda: lane.send(sent))
         self._recovery.sent(request)
         self._history.requested(request)
         self._head_start.note_use()
+
+    def _request(self, lane: Lane, operation: str, message_for: MessageFor) -> Request:
+        bounds = self.results.bounds
+        return lane.request(operation, [message_for(lane.number, each) for each in bounds])
 
     def _refuse_whole(self, operation: str, message_for: MessageFor) -> None:
         """Raise what cannot be sent as it is called in the caller's arguments, not in a shard's."""

@@ -21,6 +21,7 @@ from envhub_sandbox.transport.values import pickles
 from envhub_sandbox.transport.values.described import Described
 from envhub_sandbox.transport.values.tensors import to_tensor
 from envhub_sandbox.transport.warned import Heard
+from envhub_sandbox.transport.watched import Watched
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.limits import WireLimits
@@ -68,6 +69,7 @@ class JailHandle:
             a container around it too.
         before_end: Runs before it is ended; brings what it has printed last.
         heard: What its repository has warned of.
+        watched: What its runners watch for us.
     """
 
     def __init__(
@@ -85,13 +87,14 @@ class JailHandle:
         self.report = report
         self.before_end: Callable[[], None] = _nothing
         self.heard = Heard()
+        self.watched = Watched()
         self._limits = limits
         self._asked: dict[int, int] = {}  # how many runners, by request
 
     def through(self, client: WorkerClient) -> JailHandle:
         """The same jail over another connection of ours."""
         jail = JailHandle(client, self.number, self.runners, self.report, self._limits)
-        jail.before_end, jail.heard = self.before_end, self.heard
+        jail.before_end, jail.heard, jail.watched = self.before_end, self.heard, self.watched
         return jail
 
     def start_runners(self, count: int, deadline: Deadline) -> list[int]:
@@ -114,6 +117,7 @@ class JailHandle:
 
     def replace_runners(self, dead: Sequence[int], deadline: Deadline) -> list[int]:
         """Fork a runner in the place of each that has died; returns the new numbers, in order."""
+        self.watched.forget()
         self.runners = [runner for runner in self.runners if runner not in dead]
         return self.start_runners(len(dead), deadline)
 
@@ -170,7 +174,7 @@ class JailHandle:
         return RunnersDiedError(living, deaths)
 
     def _unpack(self, frames: Sequence[Buffer]) -> m.Message:
-        own = self.heard.take(frames)
+        own = self.heard.take(self.watched.take(frames))
         return m.unpack(own, limits=self._limits, tensors=to_tensor, things=Described)[1]
 
     def exchange(

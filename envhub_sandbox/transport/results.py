@@ -109,7 +109,7 @@ class Results:
         check(reply)
         return self._info(typed(reply, m.Value).value)
 
-    def one_each(self, what: str, replies: list[m.Value]) -> tuple[Any, ...]:
+    def one_each(self, what: str, replies: Sequence[m.Value | m.Watched]) -> tuple[Any, ...]:
         """One value for each sub-environment."""
         gathered: list[Any] = []
         for reply, size in zip(replies, self._sizes, strict=True):

@@ -120,9 +120,11 @@ class Asking:
         with contextlib.suppress(RemoteEnvWarning):
             self.tell()
 
-    def submit(self, operation: str, message_for: MessageFor) -> None:
-        """Send a request to every shard."""
-        self.unwarned(self._exchange.submit, operation, message_for)
+    def submit(
+        self, operation: str, message_for: MessageFor, instead: MessageFor | None = None
+    ) -> None:
+        """Send a request to every shard; see ``Exchange.submit``."""
+        self.unwarned(self._exchange.submit, operation, message_for, instead)
 
     def collect(self, timeout_s: float | None, kind: type[m.M]) -> list[m.M]:
         """The shards' replies, each of the kind that was asked for."""

@@ -18,6 +18,7 @@ from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.session.env_session import EnvSession
+from envhub_sandbox.session.exchange import MessageFor
 from envhub_sandbox.transport.replies import typed
 from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.transport.values import generators
@@ -214,8 +215,26 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method, or read an attribute, of every sub-environment: a tuple of results."""
         self._asking.refuse_if_busy("call_async")
+        if not (args or kwargs) and self._manifest.shardable:
+            return self._read(name)
         self._send_call(name, args, kwargs)  # as reset
         return self._end_call(self._timeouts.call_s)
+
+    def _read(self, name: str) -> tuple[Any, ...]:
+        """``call`` without arguments; what is asked for after each step is watched."""
+        attributes = self._exchange.attributes
+        known = attributes.known(name)
+        if known is not None:
+            return known
+        if not attributes.wanted(name):
+            self._send_call(name, (), {})
+            return self._end_call(self._timeouts.call_s)
+        self._send_call(name, (), {}, lambda number, _: m.Watch(number, name))
+        replies = self._asking.collect(self._timeouts.call_s, m.Watched)
+        with self._exchange.handling():
+            values = self._exchange.results.one_each("call", replies)
+        attributes.learn(name, values, watched=all(reply.watched for reply in replies))
+        return values
 
     @folded
     def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
@@ -224,13 +243,19 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         self._send_call(name, args, kwargs)
         self._asking.waiting = "call"
 
-    def _send_call(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+    def _send_call(
+        self,
+        name: str,
+        args: tuple[Any, ...],
+        kwargs: dict[str, Any],
+        instead: MessageFor | None = None,
+    ) -> None:
         _check_name(name)
         if name in _NOT_CALLED and not self._manifest.sync:
             raise ValueError(
                 f"Trying to call function `{name}` with `call`, use `{name}` directly instead."
             )
-        self._asking.submit("call", lambda number, _: m.Call(number, name, args, kwargs))
+        self._asking.submit("call", lambda number, _: m.Call(number, name, args, kwargs), instead)
 
     @folded
     def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:

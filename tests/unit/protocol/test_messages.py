@@ -89,6 +89,9 @@ SAMPLES: list[m.Message] = [
     m.OutputBytes(4096, b"caf\xc3\xa9\x1b"),
     m.Raised("KeyError", "mypkg.Oops", "gone", "Traceback ...", "step"),
     m.Warned((("UserWarning", "slow"), ("mypkg.Own", "caf\u00e9"))),
+    m.Watch(1, "task"),
+    m.Watched(("reach", "lift"), True),
+    m.Changed(((1, "task"), (2, "x"))),
 ]  # fmt: skip
 BY_NAME = {type(message).__name__: message for message in SAMPLES}
 

@@ -22,6 +22,7 @@ from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.stream import Packet, pack_packet, read_packet
 from envhub_worker.runner.infos import InfoWriter, Pairs, join
 from envhub_worker.runner.sync_envs import SubEnvs
+from envhub_worker.runner.watches import Watches
 
 _RING = (1).to_bytes(8, "little")
 _MEASURE = 31
@@ -41,6 +42,7 @@ class Lane:
         raised: Makes a message of an exception.
         warned: What the repository has warned of, and no reply has taken along: while there is
             something, answers are fetched by the server, with that in front of them.
+        watches: What the client has had watched; what has changed of it goes the same way.
 
     Attributes:
         number: The environment's.
@@ -56,12 +58,15 @@ class Lane:
         pack: Callable[[m.Message, int], list[Any]],
         raised: Callable[[BaseException, str], m.Raised],
         warned: Sequence[Any] = (),
+        watches: Watches | None = None,
     ) -> None:
         self.number = attach.env
         self.unsent: list[Any] = []
         self._answer = answer
         self._raised = raised
         self._warned = warned
+        self._watches = watches or Watches()
+        self._watched, self._changed = self._watches.readings, self._watches.changed
         layout = slabs.layout_of(env.single_action_space, env.num_envs)
         observed = slabs.observation_layout(
             env.single_observation_space, attach.count, attach.slots
@@ -167,22 +172,28 @@ class Lane:
             # copied, because an environment may keep its action and the client writes the next one
             actions = self._assemble([take() for take in self._takes])
             pairs = self._pairs = self._env.run_step(actions)
-            if self._warned:
+            if (self._watched or self._warned) and self._has_more_to_say():
                 return slabs.FETCH, 0
             return self._writer.write(pairs) if pairs else (slabs.DONE, 0)
         except BaseException as error:
             frame = _raised_frame(self._raised(error, "step"))
-            if self._warned:
+            if (self._watched or self._warned) and self._has_more_to_say():
                 self.unsent = [frame]
                 return slabs.FETCH, 0
             return slabs.RAISED, self._writer.put(frame)
+
+    def _has_more_to_say(self) -> bool:
+        """After a step: whether there is something to be put in front of its answer."""
+        if self._watched:
+            self._watches.look()
+        return bool(self._warned or self._changed)
 
     def _run_message(self, length: int) -> tuple[int, int]:
         start = self._layout.message
         packet = read_packet(self._request[start : start + length])
         frames = self._answer(packet)
         data = b"".join(pack_packet(packet.request_id, frames))
-        if self._warned or len(data) > slabs.INFO_BYTES:
+        if self._warned or self._changed or len(data) > slabs.INFO_BYTES:
             self.unsent = frames
             return slabs.FETCH, 0
         self.unsent = []

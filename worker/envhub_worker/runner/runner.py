@@ -33,6 +33,7 @@ from envhub_worker.runner.lane import Lane
 from envhub_worker.runner.sync_envs import SubEnvs
 from envhub_worker.runner.tasks import ResultError, Task, tasks_of
 from envhub_worker.runner.warned import Warned
+from envhub_worker.runner.watches import Watches
 
 _ANCILLARY_BYTES = socket.CMSG_SPACE(8 * array("i").itemsize)
 _RECHECK_MS = 2
@@ -96,6 +97,7 @@ class Runner:
 
     Attributes:
         warned: What the repository has warned of.
+        watches: What the client has had watched.
     """
 
     def __init__(self, snapshot: str, entry: str, version: int = m.VERSION) -> None:
@@ -108,12 +110,13 @@ class Runner:
         self._envs: dict[int, Any] = {}
         self._stage = ""
         self.warned = Warned()
+        self.watches = Watches()
         self.lane: Lane | None = None
         self.descriptors: list[int] = []
 
     def answer(self, packet: Packet) -> list[Any]:
-        """The reply's frames, with what was warned of until then in front of them."""
-        return self.warned.in_front(self.reply(packet))
+        """The reply's frames, with what is to be said of other things in front of them."""
+        return self.watches.in_front(self.warned.in_front(self.reply(packet)))
 
     def reply(self, packet: Packet, *, by_lane: bool = False) -> list[Any]:
         """The reply's frames; whatever the repository raises becomes ``Raised``."""
@@ -137,6 +140,9 @@ class Runner:
             return m.pack(raised(error, "return", self._snapshot), request_id)
         except BaseException as error:
             return m.pack(raised(error, self._stage, self._snapshot), request_id)
+        finally:
+            if self.watches.readings:
+                self.watches.look()
 
     def load(self, request: m.Load) -> m.Message:
         """Import the repository, call ``make_env``, describe what came back."""
@@ -219,8 +225,8 @@ class Runner:
             return m.Value(False)
         reply = partial(self.reply, by_lane=True)
         fail = partial(raised, root=self._snapshot)
-        warned = self.warned.pending
-        self.lane = Lane(env, request, self.descriptors, reply, self._pack, fail, warned)
+        told = (self.warned.pending, self.watches)
+        self.lane = Lane(env, request, self.descriptors, reply, self._pack, fail, *told)
         return m.Value(True)
 
     def fetch_infos(self, request: m.FetchInfos) -> m.Message:
@@ -236,6 +242,13 @@ class Runner:
         """``VectorEnv.call``."""
         results = _caller(self._envs[request.env])(request.name, *request.args, **request.kwargs)
         return m.Value(tuple(results) if isinstance(results, list) else results)
+
+    def watch(self, request: m.Watch) -> m.Message:
+        """``VectorEnv.call`` without arguments, and from now on its answer is watched."""
+        number, name = request.env, request.name
+        called = self.call(m.Call(number, name, (), {}))
+        values = called.value if isinstance(called, m.Value) else ()
+        return m.Watched(values, self.watches.begin(number, self._envs[number], name, values))
 
     def set_attr(self, request: m.SetAttr) -> m.Message:
         """``VectorEnv.set_attr``."""
@@ -303,6 +316,7 @@ class Runner:
     def close(self, request: m.Close) -> m.Message:
         """``VectorEnv.close``."""
         env = self._envs.pop(request.env, None)
+        self.watches.forget(request.env)
         if env is not None:
             env.close()
         return m.Value(None)
@@ -341,6 +355,7 @@ _HANDLERS: dict[type[m.Message], Callable[[Runner, Any], m.Message]] = {
     m.Step: Runner.step,
     m.Revive: Runner.revive,
     m.Call: Runner.call,
+    m.Watch: Runner.watch,
     m.SetAttr: Runner.set_attr,
     m.Render: Runner.render,
     m.GetOwn: Runner.get_own,

@@ -22,7 +22,7 @@ class _Exchange:
         self.sent = 0
         self.ends_in: BaseException | None = None
 
-    def submit(self, operation: str, message_for: object) -> None:
+    def submit(self, operation: str, message_for: object, instead: object = None) -> None:
         """Sent."""
         self.heard.untold.append(("Warning", f"sent {self.sent}"))
         self.sent += 1

@@ -59,10 +59,11 @@ class _Session:
         said = {"timeouts": timeouts, "heard": Heard(), "label": "a/b", "copy": True}
         self.repository = SimpleNamespace(**said)
         self.results = SimpleNamespace(one_each=lambda what, replies: replies[0].value)
+        self.attributes = SimpleNamespace(known=lambda _: None, wanted=lambda _: False)
         self.exchange = self
         self.pending = ""
 
-    def submit(self, operation: str, message_for: object) -> None:
+    def submit(self, operation: str, message_for: object, instead: object = None) -> None:
         """Owe an answer."""
         assert not self.pending
         self.pending = operation

@@ -225,6 +225,32 @@ class Warned(Message, kind=57):
     warnings: tuple[object, ...]
 
 
+class Watch(Message, kind=60, asks="call"):
+    """As ``Call`` without arguments; from now on the runner says when that is not true any more.
+
+    Since version 12 of the protocol. Reply: ``Watched``.
+    """
+
+    env: int
+    name: str
+
+
+class Watched(Message, kind=61):
+    """What ``Call`` would have answered, and whether it stays so until a ``Changed`` says other."""
+
+    value: object
+    watched: bool
+
+
+class Changed(Message, kind=62):
+    """In front of the frames of a reply: what is another now, and watched no more. See ``changed``.
+
+    ``((env, name), ...)``.
+    """
+
+    attributes: tuple[object, ...]
+
+
 class Raised(Message, kind=49):
     """The repository's code raised. ``builtin`` is its nearest builtin ancestor."""
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
+from envhub_worker.protocol.messages.front import stands_in_front
 
 FIRST_VERSION = 10
 """Of the protocol: an older client reads no ``Warned``."""
@@ -20,9 +21,6 @@ MAX_CATEGORY = 256
 MAX_TEXT = 2048
 """Characters."""
 _MAX_BYTES = 4 * MOST_AT_ONCE * (MAX_CATEGORY + MAX_TEXT) + 1024
-_HEAD = b"\x93" + bytes([m.Warned.kind])
-"""A list of three that starts with the kind; in front of it there is the length of the document."""
-_LENGTH_BYTES = 4
 
 Told = tuple[str, str]
 """The category's name, and the text."""
@@ -35,10 +33,7 @@ def in_front(warnings: Sequence[Told], frames: Sequence[Buffer]) -> list[Buffer]
 
 def stand_in_front(frames: Sequence[Buffer]) -> bool:
     """Whether there are warnings in front of a reply."""
-    if len(frames) < 2:
-        return False
-    head = memoryview(frames[0]).cast("B")[_LENGTH_BYTES : _LENGTH_BYTES + len(_HEAD)]
-    return head == _HEAD
+    return stands_in_front(m.Warned, frames)
 
 
 def read(frame: Buffer) -> list[Told]:

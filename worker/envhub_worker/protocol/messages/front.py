@@ -1,0 +1,25 @@
+"""What a runner says in front of a reply: a message in the first frame, the reply in the others.
+
+Where there is something to say, a reply has at least two frames, and the first tells by its kind
+what it is. Where there is nothing, nothing is sent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.messages.base import Message
+
+_LENGTH_BYTES = 4
+"""The length of the document."""
+_LIST = 0x90
+"""The head of a short list of msgpack; a message is one of its kind, its id and its fields."""
+
+
+def stands_in_front(kind: type[Message], frames: Sequence[Buffer]) -> bool:
+    """Whether a message of this kind is in front of a reply. Trust: two bytes are looked at."""
+    if len(frames) < 2:
+        return False
+    head = bytes([_LIST + 2 + len(kind.FIELDS), kind.kind])
+    return memoryview(frames[0]).cast("B")[_LENGTH_BYTES : _LENGTH_BYTES + len(head)] == head
