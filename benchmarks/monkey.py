@@ -248,23 +248,34 @@ class Monkey:
 
     def _kill(self, subject: Subject) -> None:
         """One of its processes, or all."""
-        if inside.loaded(subject.env) is None:
-            return
-        pids = inside.pids(subject.env)
-        if self._rng.random() < 0.8:
+        pids = self._pids(subject)
+        if pids and self._rng.random() < 0.8:
             pids = [int(self._rng.choice(pids))]
         self._end(subject, pids)
 
     def _kill_amid(self, subject: Subject) -> None:
         """In the middle of a step; asked before it, since a reply must not be taken from it."""
-        if inside.loaded(subject.env) is None or not subject.ready:
+        pids = self._pids(subject)
+        if not pids or not subject.ready:
             return
-        pids = inside.pids(subject.env)
         self._send(subject)
         time.sleep(self._rng.random() * _AMID_S)
         self._end(subject, pids)
 
+    def _pids(self, subject: Subject) -> list[int]:
+        """None where it has no jail; or where that may have died, which it has not noticed so."""
+        if inside.loaded(subject.env) is None:
+            return []
+        try:
+            return inside.pids(subject.env)
+        except (errors.WorkerDiedError, StopIteration):
+            if not subject.doubt:
+                raise
+            return []
+
     def _end(self, subject: Subject, pids: Sequence[int]) -> None:
+        if not pids:
+            return
         self.counts["killed"] += 1
         subject.doubted()
         for pid in pids:

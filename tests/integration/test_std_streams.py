@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from tests.remote.listening import WORKER
+from tests.support.processes import eventually
 from tests.support.samples import sample
 
 _PROGRAM = """
@@ -52,3 +55,25 @@ def test_a_command_runs(streams: str) -> None:
     """Its exit code says how it went."""
     command = [sys.executable, "-I", "-m", "envhub_sandbox", "inspect", sample("counter")]
     assert without(streams, *command) == 0
+
+
+def test_a_server_has_nothing_of_its_own_there(tmp_path: Path) -> None:
+    """What a library prints into it would otherwise go into a lock, or wake its loop."""
+    state = tmp_path / "state"
+    command = [*WORKER, "listen", "--bind", "tcp://127.0.0.1:*", "--state-dir", str(state)]
+    words = ["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", *command]
+    with subprocess.Popen(words) as server:
+        try:
+            assert eventually(lambda: noted(state) or server.poll() is not None)
+            assert server.poll() is None
+            assert [os.readlink(f"/proc/{server.pid}/fd/{number}") for number in range(3)] == [
+                os.devnull
+            ] * 3
+        finally:
+            server.terminate()
+
+
+def noted(state: Path) -> bool:
+    """Whether a server says on its machine where it listens."""
+    note = state / "endpoint"
+    return note.exists() and bool(note.read_text())

@@ -37,11 +37,13 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 
+from envhub_worker import std_streams
 from envhub_worker.cli import serve
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command: see the head of this file."""
+    std_streams.replace_missing()  # before anything of ours is opened
     # jails of root are another user, who must get through to what we make; what is private says so
     os.umask(0o022)
     argv = sys.argv[1:] if argv is None else argv
