@@ -189,7 +189,8 @@ class Monkey:
     def _reset(self, subject: Subject) -> None:
         seed = int(self._rng.integers(2**31))
         got = subject.env.reset(seed=seed)
-        subject.ready = True
+        if not subject.ready:  # it may have found out by itself, and has another jail then
+            subject.ready, subject.doubt = True, 0
         self._compare(got, subject.model.reset(seed=seed))
 
     def _reset_some(self, subject: Subject) -> None:
@@ -256,7 +257,7 @@ class Monkey:
     def _kill_amid(self, subject: Subject) -> None:
         """In the middle of a step; asked before it, since a reply must not be taken from it."""
         pids = self._pids(subject)
-        if not pids or not subject.ready:
+        if not pids:
             return
         self._send(subject)
         time.sleep(self._rng.random() * _AMID_S)
@@ -264,7 +265,7 @@ class Monkey:
 
     def _pids(self, subject: Subject) -> list[int]:
         """None where it has no jail; or where that may have died, which it has not noticed so."""
-        if inside.loaded(subject.env) is None:
+        if not subject.ready or inside.loaded(subject.env) is None:
             return []
         try:
             return inside.pids(subject.env)
@@ -284,7 +285,7 @@ class Monkey:
 
     def _kill_server(self, subject: Subject) -> None:
         """Where it is this process's own: all environments that it serves die with it."""
-        if inside.loaded(subject.env) is None:
+        if not subject.ready or inside.loaded(subject.env) is None:
             return
         process = getattr(inside.server(subject.env), "process", None)
         if process is None:
@@ -292,9 +293,9 @@ class Monkey:
             return
         self.counts["servers killed"] += 1
         for one in self._subjects:
-            one.doubted()
             # one that has no jail has nothing to lose, and need not notice
-            one.doubt = one.doubt if inside.loaded(one.env) is not None else 0
+            if inside.loaded(one.env) and inside.server(one.env).process is process:
+                one.doubted()
         process.kill()
         process.wait()  # whoever asks next must not be given one that is about to end
 
