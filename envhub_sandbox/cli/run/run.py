@@ -25,8 +25,8 @@ from envhub_sandbox.cli.shared.select import select
 from envhub_sandbox.errors import EnvHubError
 
 if TYPE_CHECKING:
-    from envhub_sandbox.cli.run.episodes import EpisodeCounter, Rollout
-    from envhub_sandbox.cli.run.video import VideoWriter
+    from envhub_sandbox.rollouts.episodes import EpisodeCounter, Rollout
+    from envhub_sandbox.rollouts.video import VideoWriter
 
 
 class PolicyName(str, Enum):
@@ -173,7 +173,7 @@ class _Run:
 
     def _check_video(self) -> None:
         if self._play.video is not None:
-            from envhub_sandbox.cli.run.video import check_target
+            from envhub_sandbox.rollouts.video import check_target
 
             check_target(self._play.video)
 
@@ -197,12 +197,12 @@ class _Run:
     def _play_task(
         self, bar: Bar, suite: str, task: int | str, env: Any, video: Path | None
     ) -> TaskResult:
-        from envhub_sandbox.cli.run.episodes import autoreset_mode
+        from envhub_sandbox.rollouts.episodes import autoreset_mode
 
         if video is None:
             rollout = self._roll_out(env, bar, None)
         else:
-            from envhub_sandbox.cli.run.video import VideoWriter, fps_of
+            from envhub_sandbox.rollouts.video import VideoWriter, fps_of
 
             with VideoWriter(video, fps_of(env.metadata)) as writer:
                 rollout = self._roll_out(env, bar, writer)
@@ -216,8 +216,8 @@ class _Run:
         )
 
     def _roll_out(self, env: Any, bar: Bar, writer: VideoWriter | None) -> Rollout:
-        from envhub_sandbox.cli.run.episodes import rollout
-        from envhub_sandbox.cli.run.video import frame_of
+        from envhub_sandbox.rollouts.episodes import rollout
+        from envhub_sandbox.rollouts.video import frame_of
 
         filming = writer is not None
 

@@ -76,7 +76,7 @@ def code_for(error: BaseException) -> Exit:
         return Exit.INTERRUPTED
     if not isinstance(error, EnvHubError):
         return Exit.BUG
-    from envhub_sandbox.cli.run.video import VideoError  # numpy, which only a failure may cost
+    from envhub_sandbox.rollouts.video import VideoError  # numpy, which only a failure may cost
 
     if isinstance(error, (UsageError, VideoError)):
         return Exit.USAGE

@@ -14,7 +14,7 @@ from envhub_sandbox.dependencies.progress import shown_by
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from envhub_sandbox.cli.run.episodes import EpisodeCounter
+    from envhub_sandbox.rollouts.episodes import EpisodeCounter
 
 _EVERY_S = 0.1
 

@@ -11,7 +11,7 @@ from envhub_sandbox.cli.shared.console import safe_line
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from envhub_sandbox.cli.run.episodes import Rollout
+    from envhub_sandbox.rollouts.episodes import Rollout
 
 _SHOWN_DIGITS = 12
 _SHOWN_PACKAGES = ("gymnasium", "numpy")

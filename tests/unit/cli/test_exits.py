@@ -14,8 +14,6 @@ import pytest
 import typer
 
 from envhub_sandbox import errors
-from envhub_sandbox.cli.run.episodes import Episode, Rollout, RolloutError
-from envhub_sandbox.cli.run.video import VideoError
 from envhub_sandbox.cli.shared.console import plain, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import (
     EXIT_CODES,
@@ -27,6 +25,8 @@ from envhub_sandbox.cli.shared.exits import (
 )
 from envhub_sandbox.cli.shared.report import TaskResult, returns_of, statistics, task_document
 from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.rollouts.episodes import Episode, Rollout, RolloutError
+from envhub_sandbox.rollouts.video import VideoError
 
 CODES = {
     errors.HubReferenceError: 2,

@@ -44,7 +44,7 @@ OPTIONAL = {
     "envhub_sandbox.metrics": {"prometheus_client"},
     "envhub_worker.cli.metrics": {"prometheus_client"},
     "envhub_sandbox.transport.values.tensors": {"torch"},
-    "envhub_sandbox.cli.run.video": {"imageio_ffmpeg"},
+    "envhub_sandbox.rollouts.video": {"imageio_ffmpeg"},
     "envhub_sandbox.pytest_plugin": {"pytest"},
 }
 DESERIALISERS = {"_pickle", "copyreg", "dill", "joblib", "marshal", "pickle", "shelve"}
@@ -56,7 +56,7 @@ MAY_IMPORT = {
     "envhub_sandbox": {"api", "gym", "hub", "policy", "sandboxes", "vector"},
     "envhub_sandbox.__main__": {"cli"},
     "envhub_sandbox.cli": {
-        *("", "api", "check", "crash", "dependencies", "hub", "locks", "policy"),
+        *("", "api", "check", "crash", "dependencies", "hub", "locks", "policy", "rollouts"),
         *("sandboxes", "session", "std_streams"),
     },
     "envhub_sandbox.api": {"making", "policy", "sandboxes", "vector"},
@@ -65,8 +65,9 @@ MAY_IMPORT = {
         *("transport", "vector"),
     },
     "envhub_sandbox.check": {
-        *("api", "dependencies", "hub", "locks", "policy", "session", "vector"),
+        *("api", "dependencies", "hub", "locks", "policy", "rollouts", "session", "vector"),
     },
+    "envhub_sandbox.rollouts": set(),
     "envhub_sandbox.gym": {"api", "vector"},
     "envhub_sandbox.pytest_plugin": {"api", "hub"},
     "envhub_sandbox.integrations": {"api", "hub", "vector"},

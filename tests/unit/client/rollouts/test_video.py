@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envhub_sandbox.cli.run.video import (
+from envhub_sandbox.errors import RemoteEnvError
+from envhub_sandbox.rollouts.video import (
     MAX_SIDE,
     VideoError,
     VideoWriter,
@@ -18,7 +19,6 @@ from envhub_sandbox.cli.run.video import (
     fps_of,
     frame_of,
 )
-from envhub_sandbox.errors import RemoteEnvError
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 
