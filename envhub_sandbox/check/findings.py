@@ -7,6 +7,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
+from envhub_sandbox.check.plays import Play
 from envhub_sandbox.check.table import CHECKS, Check, Severity
 from envhub_worker.protocol.text import printable
 
@@ -57,6 +58,8 @@ class Report:
         figures: Of each task that was played: plain numbers.
         provenance: What ran, if anything did.
         left_out: How many findings are not in ``findings``.
+        asked: How it was judged, by name, in words of ours.
+        plays: What each task gave to look at.
     """
 
     reference: str
@@ -65,6 +68,8 @@ class Report:
     figures: dict[str, dict[str, float]] = field(default_factory=dict)
     provenance: dict[str, Any] | None = None
     left_out: int = 0
+    asked: dict[str, str] = field(default_factory=dict)
+    plays: dict[str, Play] = field(default_factory=dict)
     _kept: Counter[str] = field(default_factory=Counter, repr=False)
 
     def judged(self, check: str, found: Collection[str], task: str = "") -> None:

@@ -10,13 +10,16 @@ import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
 
+from envhub_sandbox import __version__
 from envhub_sandbox.api import make_env
 from envhub_sandbox.check import denials, leaks, parsing, source, traces
 from envhub_sandbox.check.findings import Report
+from envhub_sandbox.check.plays import Play, facts_of, film
 from envhub_sandbox.check.survey import survey
 from envhub_sandbox.check.table import CHECKS
 from envhub_sandbox.check.traces import Trace
@@ -42,6 +45,8 @@ from envhub_sandbox.policy import policy_from
 from envhub_sandbox.session.recipe import pinned
 from envhub_sandbox.vector.suites import EnvSuites
 
+_PICTURED = 12
+"""Tasks of which a page has pictures: a suite may have hundreds."""
 _MODES = ("NextStep", "SameStep", "Disabled")
 
 
@@ -60,6 +65,7 @@ class Asked:
         resets: In a row, four times: what they leave behind is counted. 0 asks nothing.
         tasks: Chooses ``(suite, task)`` pairs of the environments.
         tell: Is told what is done next.
+        pictures: Also gather what only a page shows: frames, and memory over time.
     """
 
     reference: str
@@ -71,6 +77,7 @@ class Asked:
         default=lambda suites: [(suite, task) for suite in suites for task in suites[suite]]
     )
     tell: Callable[[str], None] = lambda what: None
+    pictures: bool = False
 
 
 def judge(asked: Asked) -> Report:
@@ -84,8 +91,24 @@ def judge(asked: Asked) -> Report:
     where = {name: asked.arguments.get(name) for name in ("hub_cache_dir", "token", "endpoint")}
     snapshot = named(asked.reference, **where)
     report = Report(pinned(snapshot))
+    report.asked = _told(asked)
     _Judge(asked, snapshot, report).ask()
     return report
+
+
+def _told(asked: Asked) -> dict[str, str]:
+    """How it is judged, for who reads of it later: in the caller's words and ours."""
+    policy = policy_from(asked.arguments.get("policy"), asked.arguments.get("limits"))
+    limits = (f"{name} {value}" for name, value in vars(policy.limits).items() if value is not None)
+    return {
+        "judged at": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+        "by": f"envhub-sandbox {__version__}",
+        "sandbox": str(asked.arguments.get("sandbox", "process")),
+        "profile": policy.profile,
+        "network": policy.network,
+        "limits": ", ".join(limits),
+        "plays": f"{asked.steps} steps each, seed {asked.seed}, {asked.resets} resets a round",
+    }
 
 
 class _Judge:
@@ -176,6 +199,7 @@ class _Judge:
                 with self._stopping(f"{suite} / {task}"):
                     asking.ask()
                 asking.denied()
+                asking.film()
                 suites[suite][task].close()
             self._report.provenance = suites.provenance
 
@@ -221,12 +245,18 @@ class _Task:
         self._env = suites[suite][task]
         self._suite, self._task = suite, task
         self._name = f"{suite} / {task}"
+        self._play = self._report.plays[self._name] = Play(facts_of(self._env))
+        self._pictured = self._asked.pictures and len(self._report.plays) <= _PICTURED
 
     def ask(self) -> None:
         mode = getattr(self._env.metadata.get("autoreset_mode"), "value", None)
         stated = mode in _MODES
         self._say("autoreset-stated", [] if stated else ["the metadata does not say"])
-        first = traces.play(self._env, mode, seed=self._asked.seed, steps=self._asked.steps)
+        usage, seen = getattr(self._env, "jail_usage", None), {}
+        if usage is not None and self._pictured:
+            seen = {"observe": self._play.sampling(usage, self._asked.steps)}
+        first = traces.play(self._env, mode, seed=self._asked.seed, steps=self._asked.steps, **seen)
+        self._play.episodes = first.counted
         self._say("rewards", first.bad_rewards)
         if stated:
             self._say("autoreset", first.autoreset)
@@ -243,12 +273,25 @@ class _Task:
             for check, found in denials.sorted_out(denied).items():
                 self._say(check, found)
 
+    def film(self) -> None:
+        """Last of all, so that no verdict depends on whether somebody looks."""
+        if self._pictured and self._is_alive and self._env.render_mode == "rgb_array":
+            self._play.film = film(self._env, seed=self._asked.seed)
+
+    @property
+    def _is_alive(self) -> bool:
+        return not any(
+            one.task == self._name and one.id == "survives" for one in self._report.findings
+        )
+
     def _leaks(self) -> None:
         usage = getattr(self._env, "jail_usage", None)
         if usage is None or not self._asked.resets:
             return
         seen = leaks.watch(
-            lambda: self._env.reset(seed=self._asked.seed), usage, self._asked.resets
+            lambda: self._env.reset(seed=self._asked.seed),
+            self._play.counting(usage),
+            self._asked.resets,
         )
         if not seen:
             return  # a server on another host that does not count
@@ -273,6 +316,7 @@ class _Task:
             "episodes": second.episodes,
             **second.times,
         }
+        self._play.step_s = second.spent
         at = first.differs_from(second)
         self._say("seeding", [] if at is None else [_first_difference(at, "in two processes")])
         if at is None and self._env.num_envs > 1:

@@ -1,97 +1,212 @@
 """A report as one page for people: HTML that needs nothing else, and runs nothing.
 
-Its texts are partly a stranger's. All of them go through ``markup.text``.
+Its texts are partly a stranger's. All of them go through ``markup.text``. Its pictures and plots
+are made here, of numbers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from envhub_sandbox.check.findings import Finding, Report
-from envhub_sandbox.check.markup import document, table, text
+from envhub_sandbox.check.markup import data, document, facts, folded, table, text
+from envhub_sandbox.check.plays import Film, Play
+from envhub_sandbox.check.plots import bars, course, finite, histogram, milliseconds, number
 from envhub_sandbox.check.table import CHECKS
 
 _MOST_WORDS = 2_000
-_UNITS = {"_s": ("ms", 1e3, 2), "_bytes": ("MiB", 2.0**-20, 1)}
+_MOST_TASKS = 40
+"""Of which there is more than a line."""
+_MOST_PICTURES = 12 << 20
+"""Bytes of all pictures and films together."""
+_RAN = ("repository", "repo_type", "commit", "path", "protocol")
 
 
 def page(report: Report, failures: Collection[Finding]) -> str:
     """The whole page. Trust: whatever stands in a report may be a stranger's text."""
-    body = [*_head(report, failures), *_findings(report, failures), *_figures(report)]
-    body += [*_held(report), *_provenance(report.provenance or {})]
+    body = [*_head(report, failures), *_findings(report, failures), *_tasks(report)]
+    body += [*_figures(report), *_held(report), *_judged(report), *_ran(report.provenance or {})]
     return document(f"envhub check: {report.reference}", body)
 
 
 def _head(report: Report, failures: Collection[Finding]) -> Iterator[str]:
-    style, verdict = ("error", f"{len(failures)} findings fail") if failures else ("passed",) * 2
+    style, verdict = "passed", "passed"
+    if failures:
+        style, verdict = "error", f"not passed, by {_findings_of(len(failures))}"
+    yield f'<p class="dim">envhub check <span class="badge {style}">{verdict}</span></p>'
     yield f"<h1>{text(report.reference)}</h1>"
-    yield f'<p class="{style}"><strong>{verdict}</strong></p>'
     left_out = f", {report.left_out} more are left out" if report.left_out else ""
-    yield f"<p>{len(report.passed)} checks hold, {len(report.findings)} findings{left_out}.</p>"
+    findings = f"{_findings_of(len(report.findings))}{left_out}"
+    when = f" Judged at {report.asked['judged at']}." if "judged at" in report.asked else ""
+    held = f"{len(report.passed)} checks hold, {findings}."
+    yield f'<p class="dim">{text(held + when)}</p>'
+
+
+def _findings_of(count: int) -> str:
+    return f"{count} finding" if count == 1 else f"{count} findings"
 
 
 def _findings(report: Report, failures: Collection[Finding]) -> Iterator[str]:
     if not report.findings:
         return
-    yield "<h2>Findings</h2>"
-    rows = []
-    for one in report.findings:
+    yield '<h2>Findings</h2>\n<ul class="findings">'
+    for one in sorted(report.findings, key=lambda one: one not in failures):
         severity = one.check.severity.value
-        mark = f"{severity}, fails" if one in failures else severity
-        cure = f'<span class="cure">{text(one.check.cure)}</span>'
-        cells = (text(one.id), text(one.task), f"{text(one.text)}{cure}")
-        rows.append((f'<span class="{severity}">{mark}</span>', *cells))
-    yield from table(("", "check", "task", "what was seen, and what cures it"), rows)
+        mark = f"{severity}, fails it" if one in failures else severity
+        where = f' <span class="dim">{text(one.task)}</span>' if one.task else ""
+        badge = f'<span class="badge">{mark}</span>'
+        yield f'<li class="{severity}">{badge} <code>{one.id}</code>{where}'
+        yield f'<p>{text(one.text)}</p><span class="cure">{text(one.check.cure)}</span></li>'
+    yield "</ul>"
+
+
+def _tasks(report: Report) -> Iterator[str]:
+    if not report.plays:
+        return
+    yield "<h2>Tasks</h2>"
+    left = _MOST_PICTURES
+    for name, play in list(report.plays.items())[:_MOST_TASKS]:
+        yield f'<section class="sheet"><h3>{text(name)}</h3>'
+        if play.film is not None:
+            shown, left = _fitting(play.film, left)
+            yield from _pictures(shown)
+        yield from _plots(play)
+        yield from facts(play.facts.items())
+        yield "</section>"
+    if len(report.plays) > _MOST_TASKS:
+        yield f'<p class="dim">{len(report.plays) - _MOST_TASKS} more have a line below.</p>'
+
+
+def _fitting(film: Film, left: int) -> tuple[Film, int]:
+    """A film, or what of it the page can still hold; and what then is left."""
+    stills = sum(map(len, film.stills))
+    size = stills + len(film.video)
+    if size <= left:
+        return film, left - size
+    too_large = "this page would be too large with its film"
+    if stills <= left:
+        return Film(film.stills, frames=film.frames, lacks=too_large), left - stills
+    return Film(frames=film.frames, lacks=too_large), left
+
+
+def _pictures(film: Film) -> Iterator[str]:
+    yield '<div class="pictures">'
+    if film.video:
+        source = data("video/mp4", film.video)
+        yield f'<figure><video controls loop muted playsinline src="{source}"></video>'
+        yield f"<figcaption>{film.frames} frames, {number(film.fps)} a second</figcaption></figure>"
+    yield '<div class="stills">'
+    for index, still in enumerate(film.stills):
+        alt = f"rendered frame {index + 1} of {len(film.stills)}"
+        yield f'<img alt="{alt}" src="{data("image/png", still)}">'
+    yield "</div></div>"
+    if film.lacks:
+        what = "No film" if film.stills else "No picture"
+        yield f'<p class="dim">{what}: {text(film.lacks)}</p>'
+
+
+def _plots(play: Play) -> Iterator[str]:
+    returns = [episode.returns[0] for episode in play.episodes]
+    lengths = [float(episode.length) for episode in play.episodes]
+    many = len(play.episodes[0].returns) if play.episodes else 1
+    of = f"Return, component 1 of {many}" if many > 1 else "Return"
+    drawn = [
+        _plot(f"{of}, per episode", _mean(returns), bars(f"{of} of each episode", returns)),
+        _plot("Length of episodes", _mean(lengths), bars("Length of each episode", lengths)),
+        _plot("Time of a step", _median(play.step_s), histogram("Times of steps", play.step_s)),
+        _plot("Memory", "", course("Memory of its processes", play.memory, _parts(play))),
+    ]
+    if not play.episodes and play.step_s:
+        yield '<p class="dim">No episode ended while it was played: see --steps.</p>'
+    if any(drawn):
+        yield f'<div class="plots">{"".join(drawn)}</div>'
+
+
+def _plot(name: str, figure: str, svg: str) -> str:
+    if not svg:
+        return ""
+    told = f" <strong>{figure}</strong>" if figure else ""
+    return f"<figure><figcaption>{name}{told}</figcaption>{svg}</figure>"
+
+
+def _parts(play: Play) -> list[tuple[int, str]]:
+    return [(play.played, "played"), (len(play.memory) - play.played, "resets")]
+
+
+def _mean(values: Sequence[float]) -> str:
+    known = finite(values)
+    return f"mean {number(float(np.mean(known)))}" if len(known) else ""
+
+
+def _median(seconds: Sequence[float]) -> str:
+    return f"median {milliseconds(float(np.median(seconds)))}" if seconds else ""
 
 
 def _figures(report: Report) -> Iterator[str]:
     if not report.figures:
         return
     names = list(dict.fromkeys(name for row in report.figures.values() for name in row))
+    heads = (name.removesuffix("_s").removesuffix("_bytes").replace("_", " ") for name in names)
     yield "<h2>Figures</h2>"
     rows = [
         (text(task), *(_figure(name, row.get(name)) for name in names))
         for task, row in report.figures.items()
     ]
-    yield from table(("task", *(text(name) for name in names)), rows)
+    yield from table(("task", *map(text, heads)), rows)
 
 
 def _figure(name: str, value: float | None) -> str:
     if value is None:
         return ""
-    for ending, (unit, factor, digits) in _UNITS.items():
-        if name.endswith(ending):
-            return f"{value * factor:.{digits}f} {unit}"
-    return f"{value:g}"
+    if name.endswith("_bytes"):
+        return f"{value * 2.0**-20:.1f} MiB"
+    return milliseconds(value) if name.endswith("_s") else f"{value:g}"
 
 
 def _held(report: Report) -> Iterator[str]:
-    yield "<h2>Checks that hold</h2>"
     tasks: dict[str, list[str]] = {}
     for check, task in report.passed:
         tasks.setdefault(check, []).append(task)
     rows = [
-        (text(check), text(CHECKS[check].sentence), text(", ".join(filter(None, of))))
+        (f"<code>{check}</code>", text(CHECKS[check].sentence), text(", ".join(filter(None, of))))
         for check, of in tasks.items()
     ]
-    yield from table(("check", "what holds", "tasks"), rows)
+    yield "<h2>Checks that hold</h2>"
+    what = "1 check holds" if len(rows) == 1 else f"{len(rows)} checks hold"
+    yield from folded(what, table(("check", "what holds", "tasks"), rows))
 
 
-def _provenance(provenance: Mapping[str, Any]) -> Iterator[str]:
+def _judged(report: Report) -> Iterator[str]:
+    if report.asked:
+        yield "<h2>How it was judged</h2>"
+        yield from facts(report.asked.items())
+
+
+def _ran(provenance: Mapping[str, Any]) -> Iterator[str]:
     if not provenance:
         return
     yield "<h2>What ran</h2>"
-    names = ("repository", "repo_type", "commit", "path", "protocol")
-    rows = [(text(name), text(provenance.get(name))) for name in names]
-    for name in ("interpreter", "packages"):
-        told = provenance.get(name)
-        if isinstance(told, Mapping):  # Trust: the worker's own words
-            words = ", ".join(f"{key} {value}" for key, value in list(told.items())[:_MOST_WORDS])
-            rows.append((f"{name}, as it says", text(words)))
-    yield from table(("", ""), rows)
+    interpreter = _pairs(provenance.get("interpreter"))
+    told = [(f"{name}, as it says", value) for name, value in interpreter]
+    yield from facts([*((name, provenance.get(name)) for name in _RAN), *told])
     layers = [
         tuple(text(layer.get(name)) for name in ("layer", "enforced", "detail"))
         for layer in provenance.get("layers") or ()
     ]
-    yield from table(("layer", "holds", "how"), layers)
+    yield from folded(f"{len(layers)} layers confined it", table(("layer", "holds", "how"), layers))
+    for name, said in (
+        ("files", "{} files, by their hashes"),
+        ("installed", "{} packages, installed as it declares"),
+        ("packages", "{} packages that it had, as it says"),
+    ):
+        pairs = _pairs(provenance.get(name))
+        if pairs:
+            yield from folded(said.format(len(pairs)), facts(pairs[:_MOST_WORDS]))
+
+
+def _pairs(told: object) -> list[tuple[str, Any]]:
+    """Trust: the worker's own words."""
+    return list(told.items()) if isinstance(told, Mapping) else []

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from gymnasium.vector import VectorEnv
+
+from envhub_sandbox.rollouts.episodes import Episode, EpisodeCounter, RolloutError
 
 Env = VectorEnv[Any, Any, Any]
 
@@ -24,6 +26,9 @@ class Trace:
         autoreset: What the autoreset mode would not permit, the first few.
         episodes: How many ended.
         times: Seconds: of the reset and of steps, for who reads it; no check asks for them.
+        counted: The episodes that ended, to be looked at; fewer, where its rewards are such that
+            nobody can count.
+        spent: Seconds of each step.
     """
 
     steps: list[str] = field(default_factory=list)
@@ -31,6 +36,8 @@ class Trace:
     autoreset: list[str] = field(default_factory=list)
     episodes: int = 0
     times: dict[str, float] = field(default_factory=dict)
+    counted: list[Episode] = field(default_factory=list)
+    spent: list[float] = field(default_factory=list)
 
     def differs_from(self, other: Trace) -> int | None:
         """The first step that differs, 0 for the reset; None if none does."""
@@ -38,7 +45,14 @@ class Trace:
         return next((number for number, (one, two) in pairs if one != two), None)
 
 
-def play(env: Env, mode: str | None, *, seed: int, steps: int) -> Trace:
+def play(
+    env: Env,
+    mode: str | None,
+    *,
+    seed: int,
+    steps: int,
+    observe: Callable[[int], None] = lambda number: None,
+) -> Trace:
     """Reset and step with seeded random actions.
 
     Args:
@@ -46,25 +60,43 @@ def play(env: Env, mode: str | None, *, seed: int, steps: int) -> Trace:
         mode: Its autoreset mode, as its metadata says.
         seed: Of the environment and of the actions.
         steps: Vector steps.
+        observe: Is told the number of each step that was made; 0 is the reset.
     """
     trace, ended = Trace(), np.zeros(env.num_envs, np.bool_)
+    counter: EpisodeCounter | None = EpisodeCounter(env.num_envs, env.num_envs * steps, mode)
     env.action_space.seed(seed)
     began = time.perf_counter()
     first = env.reset(seed=seed)[0]
     reset_s = time.perf_counter() - began
     trace.steps.append(digest(first))
-    spent = []
+    observe(0)
     for number in range(1, steps + 1):
         if mode == "Disabled" and ended.any():
             trace.steps[-1] += digest(env.reset(options={"reset_mask": ended})[0])
         actions = env.action_space.sample()
         begun = time.perf_counter()
         result = env.step(actions)
-        spent.append(time.perf_counter() - begun)
+        trace.spent.append(time.perf_counter() - begun)
         trace.steps.append(digest(result[:4]))  # infos may hold times
         ended = _judge(trace, result, ended, mode, number)
-    trace.times = {"reset_s": reset_s, **_times(spent)}
+        counter = _count(trace, counter, result)
+        observe(number)
+    trace.times = {"reset_s": reset_s, **_times(trace.spent)}
     return trace
+
+
+def _count(
+    trace: Trace, counter: EpisodeCounter | None, result: tuple[Any, ...]
+) -> EpisodeCounter | None:
+    """The counter, or None once there was something that it cannot count."""
+    if counter is None:
+        return None
+    try:
+        counter.step(*result[1:])
+    except RolloutError:
+        return None
+    trace.counted = counter.counted
+    return counter
 
 
 def _times(spent: list[float]) -> dict[str, float]:

@@ -159,7 +159,7 @@ def check(
         least, allowed = level(fail_on), _known(allow or ())
         if settings is not None:
             _refuse_the_judged(settings, ref)
-        play = _Play(seed, steps, resets, suite, task)
+        play = _Play(seed, steps, resets, suite, task, html is not None)
         report = _judge(make, policy, play, quiet=json or github)
         failures = report.failures(least, allowed)
         _write(report, failures, junit=junit, sarif=sarif, html=html)
@@ -230,6 +230,7 @@ class _Play:
     resets: int
     suites: list[str] | None
     tasks: list[str] | None
+    pictures: bool
 
 
 def _judge(make: opt.MakeOptions, policy: Path | None, play: _Play, *, quiet: bool) -> Report:
@@ -254,6 +255,7 @@ def _judge(make: opt.MakeOptions, policy: Path | None, play: _Play, *, quiet: bo
             resets=play.resets,
             tasks=chosen,
             tell=tell,
+            pictures=play.pictures,
         )
         return judge(asked)
 

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import importlib.util
 import os
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any
 
@@ -39,7 +40,7 @@ def check_target(path: Path) -> None:
     Raises:
         VideoError: The text says what to do.
     """
-    if importlib.util.find_spec("imageio_ffmpeg") is None:
+    if not can_encode():
         raise VideoError(
             "writing a video needs imageio's ffmpeg, which is not installed here; install it with: "
             "pip install 'envhub-sandbox[video]'"
@@ -50,6 +51,28 @@ def check_target(path: Path) -> None:
         raise VideoError(f"{path}: there is no folder {path.parent}")
     if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
         raise VideoError(f"{path} cannot be written: permission denied, or it is a folder")
+
+
+def can_encode() -> bool:
+    """Whether what writes videos is installed."""
+    return importlib.util.find_spec("imageio_ffmpeg") is not None
+
+
+def encoded(frames: Sequence[Frame], fps: float) -> bytes:
+    """The bytes of an MP4 with H.264, of frames of one size as ``first_frame`` gives them.
+
+    Raises:
+        VideoError: It cannot be written.
+    """
+    with TemporaryDirectory(prefix="envhub-film-") as folder:
+        path = Path(folder) / "film.mp4"
+        with VideoWriter(path, fps) as writer:
+            for frame in frames:
+                writer.add(frame)
+        try:
+            return path.read_bytes()
+        except OSError as error:
+            raise VideoError(f"ffmpeg wrote nothing: {error.strerror}") from error
 
 
 def fps_of(metadata: Any) -> float:

@@ -65,7 +65,7 @@ MAY_IMPORT = {
         *("transport", "vector"),
     },
     "envhub_sandbox.check": {
-        *("api", "dependencies", "hub", "locks", "policy", "rollouts", "session", "vector"),
+        *("", "api", "dependencies", "hub", "locks", "policy", "rollouts", "session", "vector"),
     },
     "envhub_sandbox.rollouts": set(),
     "envhub_sandbox.gym": {"api", "vector"},
