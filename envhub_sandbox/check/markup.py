@@ -96,9 +96,9 @@ def document(title: str, body: Iterable[str]) -> str:
     )
 
 
-def text(value: object) -> str:
+def text(value: object, limit: int = _LONGEST) -> str:
     """Text, and nothing but text: in a page as in an attribute of it."""
-    return html.escape(printable(str(value), _LONGEST), quote=True)
+    return html.escape(printable(str(value), limit), quote=True)
 
 
 def data(kind: str, content: bytes) -> str:
@@ -106,11 +106,11 @@ def data(kind: str, content: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
-def facts(rows: Iterable[tuple[str, object]]) -> Iterator[str]:
-    """Names of ours, and what a stranger may have said of each."""
+def facts(rows: Iterable[tuple[object, object]], limit: int = _LONGEST) -> Iterator[str]:
+    """Names, and what is said of each; both may be a stranger's."""
     yield "<dl>"
     for name, value in rows:
-        yield f"<dt>{text(name)}</dt><dd>{text(value)}</dd>"
+        yield f"<dt>{text(name, limit)}</dt><dd>{text(value, limit)}</dd>"
     yield "</dl>"
 
 

@@ -17,7 +17,8 @@ from envhub_sandbox.check.plays import Film, Play
 from envhub_sandbox.check.plots import bars, course, finite, histogram, milliseconds, number
 from envhub_sandbox.check.table import CHECKS
 
-_MOST_WORDS = 2_000
+_MOST_PAIRS, _LONGEST_WORD = 1_000, 160
+"""Of files and of packages, each with what is said of it."""
 _MOST_TASKS = 40
 """Of which there is more than a line."""
 _MOST_PICTURES = 12 << 20
@@ -121,6 +122,8 @@ def _plots(play: Play) -> Iterator[str]:
     ]
     if not play.episodes and play.step_s:
         yield '<p class="dim">No episode ended while it was played: see --steps.</p>'
+    if play.episodes and not drawn[0]:
+        yield '<p class="dim">No return is a finite number.</p>'
     if any(drawn):
         yield f'<div class="plots">{"".join(drawn)}</div>'
 
@@ -204,7 +207,7 @@ def _ran(provenance: Mapping[str, Any]) -> Iterator[str]:
     ):
         pairs = _pairs(provenance.get(name))
         if pairs:
-            yield from folded(said.format(len(pairs)), facts(pairs[:_MOST_WORDS]))
+            yield from folded(said.format(len(pairs)), facts(pairs[:_MOST_PAIRS], _LONGEST_WORD))
 
 
 def _pairs(told: object) -> list[tuple[str, Any]]:

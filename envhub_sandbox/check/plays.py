@@ -22,7 +22,8 @@ _SIDE = 320
 _FRAMES = 75
 _SECONDS = 1.5
 _FPS = 25.0
-"""At most: so that a film of 75 frames takes three seconds."""
+_LASTS = 3.0
+"""Seconds, where there are so few frames that at their own rate a film were over at once."""
 _STILLS = 4
 _SAMPLES = 10
 """How often memory is counted in a play: a server counts only so often (``Counting``)."""
@@ -103,19 +104,24 @@ def facts_of(env: VectorEnv[Any, Any, Any]) -> dict[str, str]:
     return {name: printable(str(value), 1_000) for name, value in found.items()}
 
 
-def film(env: VectorEnv[Any, Any, Any], *, seed: int) -> Film:
+def film(env: VectorEnv[Any, Any, Any], *, seed: int, seconds: float = _SECONDS) -> Film:
     """Play again from the start, and look: bounded in frames and in time, encoded here.
 
     What fails is said in the film and is no finding: its checks have been made.
+
+    Args:
+        env: Is left open.
+        seed: Of the environment and of the actions.
+        seconds: After which no further step is made.
     """
     frames: list[Frame] = []
     lacks = ""
     try:
-        for frame in _rendered(env, seed):
+        for frame in _rendered(env, seed, monotonic() + seconds):
             frames.append(frame)
     except (EnvHubError, gym.error.Error) as error:
         lacks = printable(str(error), 300)
-    fps = min(video.fps_of(env.metadata), _FPS)
+    fps = min(video.fps_of(env.metadata), _FPS, max(len(frames) / _LASTS, 1.0))
     chosen = np.linspace(0, len(frames) - 1, min(_STILLS, len(frames))).astype(int)
     stills = tuple(png(frames[at]) for at in chosen)
     if not frames or not video.can_encode():
@@ -127,14 +133,13 @@ def film(env: VectorEnv[Any, Any, Any], *, seed: int) -> Film:
         return Film(stills, frames=len(frames), lacks=printable(str(error), 300))
 
 
-def _rendered(env: VectorEnv[Any, Any, Any], seed: int) -> Iterator[Frame]:
-    ends = monotonic() + _SECONDS
+def _rendered(env: VectorEnv[Any, Any, Any], seed: int, ends: float) -> Iterator[Frame]:
     disabled = facts_of(env)["autoreset"] == "DISABLED"
     env.action_space.seed(seed)
     env.reset(seed=seed)
     for _ in range(_FRAMES):
         yield _even(shrunk(video.frame_of(env), _SIDE))
-        if monotonic() > ends:
+        if monotonic() >= ends:
             return
         _, _, terminations, truncations, _ = env.step(env.action_space.sample())
         ended = np.logical_or(np.asarray(terminations, bool), np.asarray(truncations, bool))

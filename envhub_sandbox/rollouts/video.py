@@ -64,15 +64,15 @@ def encoded(frames: Sequence[Frame], fps: float) -> bytes:
     Raises:
         VideoError: It cannot be written.
     """
-    with TemporaryDirectory(prefix="envhub-film-") as folder:
-        path = Path(folder) / "film.mp4"
-        with VideoWriter(path, fps) as writer:
-            for frame in frames:
-                writer.add(frame)
-        try:
+    try:
+        with TemporaryDirectory(prefix="envhub-film-") as folder:
+            path = Path(folder) / "film.mp4"
+            with VideoWriter(path, fps) as writer:
+                for frame in frames:
+                    writer.add(frame)
             return path.read_bytes()
-        except OSError as error:
-            raise VideoError(f"ffmpeg wrote nothing: {error.strerror}") from error
+    except OSError as error:
+        raise VideoError(f"no video can be written: {error.strerror}") from error
 
 
 def fps_of(metadata: Any) -> float:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.judge import Asked, judge
 from envhub_sandbox.check.table import CHECKS, Severity
 from envhub_sandbox.errors import SnapshotError
+from envhub_sandbox.rollouts.pictures import png
 from tests.integration.test_cli_run import envhub
 from tests.support import checks
 from tests.support.repositories import write_repository
@@ -118,9 +120,9 @@ def repository(folder: Path, text: str = _HONEST, **files: str) -> Path:
     return write_repository(folder, text, **papers)
 
 
-def judged(folder: Path, steps: int = 25) -> Report:
+def judged(folder: Path, steps: int = 25, *, pictures: bool = False) -> Report:
     """What is found in it."""
-    asked = Asked(reference=str(folder), arguments={"n_envs": 2}, steps=steps)
+    asked = Asked(reference=str(folder), arguments={"n_envs": 2}, steps=steps, pictures=pictures)
     return judge(asked)
 
 
@@ -131,7 +133,7 @@ def test_the_page_is_the_table() -> None:
 
 def test_an_honest_repository_passes(tmp_path: Path) -> None:
     """Every check that can be made of it holds, and the figures are of what was played."""
-    report = judged(repository(tmp_path / "walk"))
+    report = judged(repository(tmp_path / "walk"), pictures=True)
     assert report.findings == []
     unasked = set(CHECKS) - {check for check, _ in report.passed}
     assert unasked == set(), "every check is made"
@@ -139,6 +141,15 @@ def test_an_honest_repository_passes(tmp_path: Path) -> None:
     assert report.figures["hub_env / 0"]["episodes"] == 4
     assert report.provenance is not None
     assert report.provenance["layers"], "it ran confined"
+    play = report.plays["hub_env / 0"]
+    assert [(one.returns, one.length) for one in play.episodes] == [((10.0,), 10)] * 4
+    assert len(play.step_s) == 25
+    assert play.played >= 9, "memory, while it was played"
+    assert len(play.memory) == play.played + 4, "and after each round of resets"
+    assert play.film is not None
+    assert play.film.stills[0] == png(np.zeros((4, 6, 3), np.uint8))
+    assert play.facts["observations"].startswith("Box(-100.0, 100.0, (2,)")
+    assert report.asked["profile"] == "strict"
 
 
 @pytest.mark.parametrize("check", _FAULTS)
@@ -220,7 +231,9 @@ def test_the_command_line_judges(tmp_path: Path) -> None:
     bad = envhub("check", folder, "--steps", "5", *files)
     assert bad.returncode == 1, bad.stderr
     assert "ZeroDivisionError" in bad.stdout
-    assert "ZeroDivisionError" in (tmp_path / "html").read_text()
+    told = (tmp_path / "html").read_text()
+    assert "ZeroDivisionError" in told
+    assert "data:image/png" in told, "what fails is shown, too"
     assert 'failures="1"' in (tmp_path / "junit").read_text()
     [result] = json.loads((tmp_path / "sarif").read_text())["runs"][0]["results"]
     assert result["ruleId"] == "runs"

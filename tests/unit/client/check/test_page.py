@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import re
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
 
 from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.check.page import page
+from envhub_sandbox.check.plays import Film, Play
+from envhub_sandbox.rollouts.episodes import Episode
+from envhub_sandbox.rollouts.pictures import png
 from envhub_worker.protocol.text import printable
 
 _HOSTILE = (
@@ -21,10 +28,14 @@ _HOSTILE = (
     "<" * 100_000,
 )
 _QUIET = "walk"
+_FRAME = np.full((4, 6, 3), 200, np.uint8)
+_DRAWN = frozenset({"svg", "rect", "line", "polyline", "polygon", "text"})
 _OURS = frozenset(
     {
         *("html", "head", "meta", "title", "style", "body", "h1", "h2", "p", "strong", "span"),
-        *("table", "tr", "th", "td"),
+        *("table", "tr", "th", "td", "div", "ul", "li", "code", "section", "h3", "dl", "dt", "dd"),
+        *("figure", "figcaption", "video", "img", "details", "summary"),
+        *("svg", "rect", "line", "polyline", "polygon", "text"),
     }
 )
 
@@ -65,8 +76,18 @@ def report(text: str) -> Report:
         "commit": text,
         "interpreter": {text: text},
         "packages": {text: [text]},
+        "installed": {text: text},
+        "files": {text: text},
         "layers": [{"layer": text, "enforced": True, "detail": text}],
     }
+    made.asked = {"sandbox": text}
+    film = Film((png(_FRAME), png(_FRAME)), b"a video", frames=2, fps=25.0, lacks=text)
+    made.plays[text] = Play({"observations": text}, memory=[1 << 20, 2 << 20], film=film)
+    made.plays[text].step_s = [0.001, 0.002]
+    made.plays[text].episodes = [
+        Episode(sub_env=0, returns=(total, 0.0), length=3, terminated=True, success=None)
+        for total in (1.0, float("inf"))
+    ]
     return made
 
 
@@ -95,12 +116,58 @@ def test_a_page_needs_and_runs_nothing() -> None:
     """No script, no link, no picture from elsewhere; and a browser is told so."""
     made = report("http://example.com/x.js")
     found = _Read(page(made, []))
-    attributes = {name for _, attrs in found.tags for name, _ in attrs}
-    assert attributes == {"lang", "charset", "http-equiv", "content", "name", "class"}
+    attributes = {name for tag, attrs in found.tags for name, _ in attrs if tag not in _DRAWN}
+    assert attributes == {
+        *("lang", "charset", "http-equiv", "content", "name", "class", "alt", "src"),
+        *("controls", "loop", "muted", "playsinline"),
+    }
+    for _, attrs in found.tags:
+        source = dict(attrs).get("src")
+        assert source is None or source.startswith(("data:image/png;base64,", "data:video/mp4;"))
     [policy] = [dict(attrs)["content"] for _, attrs in found.tags if ("http-equiv" in dict(attrs))]
     assert policy is not None
     assert policy.startswith("default-src 'none'")
     assert "script" not in policy
+    assert "unsafe" not in policy, "nor does it look as a stranger's style says"
+    [style] = re.findall("<style>(.*)</style>", page(made, []), re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
+    assert f"'sha256-{digest}'" in policy
+
+
+def test_what_was_played_can_be_seen() -> None:
+    """Pictures, a film, and a plot of each thing."""
+    found = _Read(page(report(_QUIET), []))
+    tags = [tag for tag, _ in found.tags]
+    assert (tags.count("img"), tags.count("video"), tags.count("svg")) == (2, 1, 4)
+    shown = [dict(attrs)["src"] for tag, attrs in found.tags if tag == "img"]
+    assert shown == [f"data:image/png;base64,{base64.b64encode(png(_FRAME)).decode()}"] * 2
+    words = "".join(found.words)
+    for told in ("Return, component 1 of 2, per episode", "mean 1", "Length of episodes", "Memory"):
+        assert told in words
+
+
+def test_pictures_are_no_reason_for_a_page_of_any_size() -> None:
+    """What does not fit any more is left out, and the page says so."""
+    made = report(_QUIET)
+    for number in range(30):
+        film = Film((b"s" * (1 << 20),), b"v" * (2 << 20), frames=9, fps=3.0)
+        made.plays[f"task {number}"] = Play(film=film)
+    text = page(made, [])
+    assert len(text) < 18 << 20
+    assert 2 < text.count("<video") < 6
+    assert "this page would be too large" in text
+
+
+def test_what_makes_no_film_is_told() -> None:
+    """Two kinds: pictures alone, and nothing at all."""
+    made = report(_QUIET)
+    made.plays = {
+        "one": Play(film=Film((png(_FRAME),), frames=1, lacks="pip install it")),
+        "two": Play(film=Film(lacks="render() failed")),
+    }
+    words = "".join(_Read(page(made, [])).words)
+    assert "No film: pip install it" in words
+    assert "No picture: render() failed" in words
 
 
 def test_a_page_is_bounded() -> None:
