@@ -50,8 +50,15 @@ tried in a jail that has ended since is not told.
 named, and never looked for, and one that lies in what is judged is refused.
 
 `--json` prints everything; `--junit FILE` has one test case for each check of each task, `--sarif
-FILE` is SARIF 2.1.0, `--html FILE` is one page that needs nothing else and runs no script, and
-`--github` prints annotations and appends to `$GITHUB_STEP_SUMMARY`.
+FILE` is SARIF 2.1.0, and `--github` prints annotations and appends to `$GITHUB_STEP_SUMMARY`.
+
+`--html FILE` is one page that needs nothing else and runs no script. It has the findings and, of
+each task, rendered frames, a film of some seconds (with the extra `video`), the returns and lengths
+of episodes, how long steps took, the memory of the jail, and its spaces; then how it was judged and
+what ran, file by file. Pictures, film and plots are made by the client, of numbers that it has
+checked; no bytes of a repository's stand in the page, and its texts are text there. The first
+twelve tasks are filmed, each for some two seconds, once all has been asked: whether somebody looks
+changes no verdict.
 
 | Check | Severity | What holds where it passes | What cures it |
 | --- | --- | --- | --- |

@@ -63,7 +63,12 @@ _PARTS = (
     ("Values", ("envhub_worker/protocol",), "values.md"),
     (
         "The command line",
-        ("envhub_sandbox/cli", "envhub_sandbox/check", "envhub_sandbox/crash"),
+        (
+            "envhub_sandbox/cli",
+            "envhub_sandbox/check",
+            "envhub_sandbox/crash",
+            "envhub_sandbox/rollouts",
+        ),
         "cli.md",
     ),
     ("Other libraries", ("envhub_sandbox/integrations",), "integrations.md"),
@@ -94,6 +99,7 @@ _CURE = re.compile(
 _NO_MESSAGES = {"Option", "Argument", "Typer", "add_argument", "add_parser", "Check", "Template"}
 _NO_FILES = (
     "envhub_sandbox/check/markup.py",
+    "envhub_sandbox/check/page.py",
     "envhub_sandbox/check/survey.py",
     "envhub_sandbox/cli/init/starter.py",
     "envhub_sandbox/cli/doctor/doctor.py",
