@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
@@ -71,20 +72,21 @@ def told(count: int) -> list[Callable[[], gym.Env[Any, Any]]]:
 def make(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Callable[..., Any]]:
-    """Makes it in a sandbox; what is made is closed."""
+    """Makes it in a sandbox; what is made is closed, before the server that it is on ends."""
     made: list[Any] = []
 
     def build(env_fns: Any, **kwargs: Any) -> Any:
         made.append(vector(env_fns, **{**WAYS[request.param], **kwargs}))
         return made[-1]
 
-    if request.param != "tcp":
-        yield build
-    else:
-        with listening(tmp_path_factory.mktemp("server")) as place:
-            yield partial(build, options={"sandbox": place.sandbox()})
-    for env in made:
-        env.close()
+    with ExitStack() as held:
+        options: dict[str, Any] = {}
+        if request.param == "tcp":
+            place = held.enter_context(listening(tmp_path_factory.mktemp("server")))
+            options = {"options": {"sandbox": place.sandbox()}}
+        yield partial(build, **options)
+        for env in made:
+            env.close()
 
 
 def facts(spec: Any) -> tuple[Any, ...]:
