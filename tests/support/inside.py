@@ -106,11 +106,11 @@ def repository(env: Any) -> Repository:
 def hurried(env: Any, **timeouts: float) -> Iterator[None]:
     """What is asked of it meanwhile has these ``Timeouts``; it was made, and goes on, without."""
     found, before = repository(env), repository(env).timeouts
-    env._timeouts = found.timeouts = replace(before, **timeouts)
+    env._timeouts = env._asking._timeouts = found.timeouts = replace(before, **timeouts)
     try:
         yield
     finally:
-        env._timeouts = found.timeouts = before
+        env._timeouts = env._asking._timeouts = found.timeouts = before
 
 
 def launcher(env: Any) -> Launcher:
