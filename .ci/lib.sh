@@ -36,6 +36,13 @@ with_summary() {
   } >"$CI_WORK/$name.summary"
 }
 
+# processes: for tests that start much and wait for it: half as many again as there are cores, which
+# one process each leaves idle for a third of the time. Not beyond eight, as in ./test.
+processes() {
+  local wanted=$((($(nproc) * 3 + 1) / 2))
+  echo $((wanted < 8 ? wanted : 8))
+}
+
 # A skipped test fails, but for these, each with a reason that is said here.
 permit_what_this_machine_lacks() {
   if ! ls ${PIP_FIND_LINKS:-/nowhere}/torch-*.whl >/dev/null 2>&1; then

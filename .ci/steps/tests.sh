@@ -12,4 +12,4 @@ permit_what_this_machine_lacks
 # The step "container" has those that need an engine.
 export PYTEST_ADDOPTS=--ignore=tests/containers
 export ENVHUB_TEST_RUNNER="bash $CI_AGAIN"
-with_summary tests ./test --full
+with_summary tests ./test --full -n "$(processes)"

@@ -91,11 +91,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Leave out what is not in the selection.
 
     Raises:
-        UsageError: Something in the selection names no test.
+        UsageError: Something in the selection names no test, and no folder that ``--ignore`` names.
     """
     if not is_short(config):
         return
-    idle = [start for start in SHORT if not any(one.nodeid.startswith(start) for one in items)]
+    ignored = tuple(f"{folder.rstrip('/')}/" for folder in config.option.ignore or ())
+    sought = [start for start in SHORT if not start.startswith(ignored)]
+    idle = [start for start in sought if not any(one.nodeid.startswith(start) for one in items)]
     if idle:
         raise pytest.UsageError(f"the short selection names no test by {', '.join(idle)}")
     others = [one for one in items if not one.nodeid.startswith(SHORT)]

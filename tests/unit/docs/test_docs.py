@@ -135,7 +135,7 @@ def test_ci_runs_the_commands_of_the_readme() -> None:
     assert "README.md | head -2" in (steps / "readme.sh").read_text()
     _, second, *_ = fenced(README, "sh")
     assert second.strip() == "./test"
-    full = r"^with_summary tests \./test --full$"
+    full = r'^with_summary tests \./test --full -n "\$\(processes\)"$'
     assert re.search(full, (steps / "tests.sh").read_text(), re.M)
 
 

@@ -75,6 +75,15 @@ def test_a_selection_that_names_nothing_is_an_error(folder: Path, checkout: Path
     assert "the short selection names no test by test_it.py::test_gone" in run(folder, checkout)
 
 
+def test_a_folder_that_is_ignored_is_not_missed(folder: Path, checkout: Path) -> None:
+    """The rest of the selection is run."""
+    (folder / "gone").mkdir()
+    (folder / "conftest.py").write_text(CONFTEST.format(start="gone/test_other.py::"))
+    said = run(folder, checkout, "--ignore=gone/")
+    assert "names no test" not in said
+    assert "6 deselected" in said
+
+
 @pytest.mark.parametrize("arguments", [(), ("-n", "2")])
 def test_each_reason_to_skip_is_one_line(
     folder: Path, checkout: Path, arguments: tuple[str, ...]
