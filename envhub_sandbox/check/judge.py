@@ -14,6 +14,7 @@ from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
+from gymnasium.error import CustomSpaceError
 
 from envhub_sandbox import __version__
 from envhub_sandbox.api import make_env
@@ -63,6 +64,7 @@ class Asked:
         arguments: Of ``make_env``, beyond the reference.
         seed, steps: Of each play.
         resets: In a row, four times: what they leave behind is counted. 0 asks nothing.
+        slow_step_s: What half of the steps may take.
         tasks: Chooses ``(suite, task)`` pairs of the environments.
         tell: Is told what is done next.
         pictures: Also gather what only a page shows: frames, and memory over time.
@@ -73,6 +75,7 @@ class Asked:
     seed: int = 0
     steps: int = 200
     resets: int = 8
+    slow_step_s: float = 1.0
     tasks: Callable[[EnvSuites], list[tuple[str, Any]]] = field(
         default=lambda suites: [(suite, task) for suite in suites for task in suites[suite]]
     )
@@ -222,6 +225,8 @@ class _Judge:
             yield
         except ObservationError as error:
             self._report.judged("observation-space", [str(error)], task)
+        except CustomSpaceError as error:  # of actions
+            self._report.judged("runs", [str(error)], task)
         except RemoteEnvError as error:
             self._report.judged("runs", [f"{error.type_name}: {error.message}"], task)
         except (LoadError, DependencyError, RemoteProtocolError) as error:
@@ -317,6 +322,9 @@ class _Task:
             **second.times,
         }
         self._play.step_s = second.spent
+        half, most = second.times.get("step_median_s", 0.0), self._asked.slow_step_s
+        slow = f"half of the steps take {half:.2f} s or more, where {most:g} s are set"
+        self._say("slow-steps", [slow] if half > most else [])
         at = first.differs_from(second)
         self._say("seeding", [] if at is None else [_first_difference(at, "in two processes")])
         if at is None and self._env.num_envs > 1:
@@ -346,7 +354,9 @@ class _Task:
             observation = handles[0].reset(seed=self._asked.seed)[0]
         except (AttributeError, TypeError, ValueError, NotImplementedError):
             return  # it has no sub-environments of its own that can be reset
-        if not space.contains(observation):
+        with contextlib.suppress(CustomSpaceError):  # whose code is not here to be asked
+            if space.contains(observation):
+                return
             yield f"sub-environment 0 gave {_kind(observation)}, which is not in {space}"
 
 

@@ -125,6 +125,12 @@ CHECKS: dict[str, Check] = {
             "Return such an array from render(), or declare no rgb_array.",
         ),
         Check(
+            "slow-steps",
+            _W,
+            "Half of the steps take no longer than --slow-step says: a second.",
+            "Compute less in a step, or once in reset; and never wait for a clock.",
+        ),
+        Check(
             "denied-network",
             _W,
             "It tries to reach no network that the policy denies.",

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from envhub_sandbox.check.findings import Finding, Report
 
 _OPTIONS = (
-    *("steps", "resets", "seed", "fail_on", "allow", "policy", "n_envs"),
+    *("steps", "resets", "slow_step", "seed", "fail_on", "allow", "policy", "n_envs"),
     *("timeout", "memory", "disk", "processes", "cpu_time"),
 )
 """What may stand in the caller's own file."""
@@ -55,6 +55,9 @@ def check(
             min=0, help="In a row, four times: what they leave behind is counted. 0 asks nothing."
         ),
     ] = 8,
+    slow_step: Annotated[
+        float, typer.Option(metavar="SECONDS", min=0.0, help="What half of the steps may take.")
+    ] = 1.0,
     seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="Of each play.")] = 0,
     fail_on: Annotated[
         str,
@@ -159,7 +162,7 @@ def check(
         least, allowed = level(fail_on), _known(allow or ())
         if settings is not None:
             _refuse_the_judged(settings, ref)
-        play = _Play(seed, steps, resets, suite, task, html is not None)
+        play = _Play(seed, steps, resets, slow_step, suite, task, html is not None)
         report = _judge(make, policy, play, quiet=json or github)
         failures = report.failures(least, allowed)
         _write(report, failures, junit=junit, sarif=sarif, html=html)
@@ -228,6 +231,7 @@ class _Play:
     seed: int
     steps: int
     resets: int
+    slow_step_s: float
     suites: list[str] | None
     tasks: list[str] | None
     pictures: bool
@@ -253,6 +257,7 @@ def _judge(make: opt.MakeOptions, policy: Path | None, play: _Play, *, quiet: bo
             seed=play.seed,
             steps=play.steps,
             resets=play.resets,
+            slow_step_s=play.slow_step_s,
             tasks=chosen,
             tell=tell,
             pictures=play.pictures,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,6 +58,18 @@ class Twice(gym.vector.SyncVectorEnv):
 
 def make_env(n_envs=1, use_async_envs=False):
     return Twice([Walk] * n_envs)
+"""
+_OFF_BY_ONE = """
+class Late(gym.vector.SyncVectorEnv):
+    late = None
+
+    def step(self, actions):
+        *given, terminated, truncated, infos = super().step(actions)
+        self.late, told = terminated, np.zeros_like(terminated) if self.late is None else self.late
+        return *given, told.copy(), truncated, infos
+
+def make_env(n_envs=1, use_async_envs=False):
+    return Late([Walk] * n_envs)
 """
 _STAYING = """self.count = 0
         import threading
@@ -120,9 +133,9 @@ def repository(folder: Path, text: str = _HONEST, **files: str) -> Path:
     return write_repository(folder, text, **papers)
 
 
-def judged(folder: Path, steps: int = 25, *, pictures: bool = False) -> Report:
+def judged(folder: Path, steps: int = 25, **more: Any) -> Report:
     """What is found in it."""
-    asked = Asked(reference=str(folder), arguments={"n_envs": 2}, steps=steps, pictures=pictures)
+    asked = Asked(reference=str(folder), arguments={"n_envs": 2}, steps=steps, **more)
     return judge(asked)
 
 
@@ -163,6 +176,32 @@ def test_a_fault_is_told_by_its_check_alone(check: str, tmp_path: Path) -> None:
         text = text.replace("class Walk", "gym.shared = []\n\nclass Walk", 1)
     report = judged(repository(tmp_path / "walk", text))
     assert {one.id for one in report.findings} == {check}
+
+
+def test_an_autoreset_that_comes_a_step_late_is_told(tmp_path: Path) -> None:
+    """By the check that names it, and by no other."""
+    text = _HONEST.replace("def make_env", _OFF_BY_ONE + "\ndef first_make_env")
+    report = judged(repository(tmp_path / "walk", text))
+    assert {one.id for one in report.findings} == {"autoreset"}
+
+
+def test_a_space_of_its_own_is_no_finding(tmp_path: Path) -> None:
+    """Its code is not here, and so nobody here says what is in it."""
+    space = "gym.spaces.Box(-100, 100, (2,), np.float32)"
+    own = f"gym.spaces.Dict({{'at': {space}, 'word': Words()}})"
+    words = "class Words(gym.spaces.Space):\n    shape, dtype = None, None\n\nclass Walk"
+    text = _HONEST.replace(space, own).replace("class Walk", words, 1)
+    given = "np.array([self.at, self.count], np.float32)"
+    text = text.replace(given, f"{{'at': {given}, 'word': 'left'}}")
+    assert judged(repository(tmp_path / "walk", text)).findings == []
+
+
+def test_slow_steps_are_told(tmp_path: Path) -> None:
+    """Where half of them take longer than is asked for; it is a warning."""
+    text = _HONEST.replace("self.count += 1", "self.count += 1; time.sleep(0.1)")
+    text = text.replace("import numpy as np", "import time\n\nimport numpy as np")
+    report = judged(repository(tmp_path / "walk", text), 2, resets=0, slow_step_s=0.05)
+    assert {one.id for one in report.findings} == {"slow-steps"}
 
 
 def test_what_cannot_be_installed_is_told(tmp_path: Path) -> None:

@@ -26,10 +26,11 @@ What is found in source is a hint for a person: who wants to hide a call can, an
 sandbox's. Files are parsed in a child whose time and memory
 the kernel bounds; one that ends it is not read.
 
-How long resets and steps take, and what the jail holds in the end, are figures of the report and
-no checks: they say as much of the machine. What resets leave behind is counted by the worker
-server, from outside of the jail, after each of four rounds of `--resets`; what grows from each
-round to the next is told, processes before threads before memory.
+How long resets and steps take, and what the jail holds in the end, are figures of the report, for
+they say as much of the machine; only steps that take a second are a finding (`--slow-step`). What
+resets leave behind is counted by the worker server, from outside of the jail, after each of four
+rounds of `--resets`; what grows from each round to the next is told, processes before threads
+before memory.
 
 What it tried and was denied is told by the first process of the jail, which the system call filter
 asks instead of refusing by itself (`Policy.record_denials`), with `sandbox="process"` alone. What
@@ -45,9 +46,9 @@ owners and times, which seem to change. At most 32 paths are told, and 64 attemp
 tried in a jail that has ended since is not told.
 
 `--policy FILE` is TOML with the fields of `Policy`, and a table `[limits]`. Where you judge often,
-`--settings envhub.toml` has the options `steps`, `resets`, `seed`, `fail-on`, `allow`, `policy`,
-`n-envs`, `timeout` and the limits in `[check]`; what you type counts more. The file is yours: it is
-named, and never looked for, and one that lies in what is judged is refused.
+`--settings envhub.toml` has the options `steps`, `resets`, `slow-step`, `seed`, `fail-on`, `allow`,
+`policy`, `n-envs`, `timeout` and the limits in `[check]`; what you type counts more. The file is
+yours: it is named, and never looked for, and one that lies in what is judged is refused.
 
 `--json` prints everything; `--junit FILE` has one test case for each check of each task, `--sarif
 FILE` is SARIF 2.1.0, and `--github` prints annotations and appends to `$GITHUB_STEP_SUMMARY`.
