@@ -13,12 +13,11 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from typing import Any
 
-import numpy as np
 from gymnasium.error import CustomSpaceError
 
 from envhub_sandbox import __version__
 from envhub_sandbox.api import make_env
-from envhub_sandbox.check import denials, leaks, parsing, source, traces
+from envhub_sandbox.check import denials, frames, leaks, parsing, source, traces
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.plays import Play, facts_of, film
 from envhub_sandbox.check.survey import survey
@@ -165,6 +164,12 @@ class _Judge:
             self._report.judged("imports", [])
 
     @property
+    def takes_render_mode(self) -> bool:
+        """Whether its make_env names such an argument, as far as its text says."""
+        entry = self._files.get(self._snapshot.path)
+        return entry is not None and any("render_mode" in text for text, _ in entry.entries)
+
+    @property
     def _is_here(self) -> bool:
         return bool(self._asked.arguments.get("sandbox", "process") == "process")
 
@@ -263,9 +268,10 @@ class _Task:
         first = traces.play(self._env, mode, seed=self._asked.seed, steps=self._asked.steps, **seen)
         self._play.episodes = first.counted
         self._say("rewards", first.bad_rewards)
+        self._say("infos", first.infos)
         if stated:
             self._say("autoreset", first.autoreset)
-        self._say("render", list(self._frames()))
+        self._say("render", list(self._renders()))
         self._say("observation-dtype", list(self._uncast()))
         self._compare(first, mode)
         self._leaks()
@@ -332,17 +338,18 @@ class _Task:
             here = _first_difference(spread or 0, "with one worker and with two")
             self._say("workers", [] if spread is None else [here])
 
-    def _frames(self) -> Iterator[str]:
-        if self._env.render_mode != "rgb_array":
-            return
-        frames = self._env.render()
-        if not isinstance(frames, (tuple, list)) or len(frames) != self._env.num_envs:
-            yield f"render() gave {type(frames).__name__}, not a frame for each sub-environment"
-            return
-        for index, frame in enumerate(frames):
-            if not _is_frame(frame):
-                yield f"sub-environment {index} gave {_kind(frame)}"
-                return
+    def _renders(self) -> Iterator[str]:
+        """In its own mode; in the others that it declares, where its make_env takes one."""
+        yield from frames.wrong(self._env)
+        given = self._asked.arguments.get("env_kwargs") or {}
+        for mode in frames.others(self._env) if self._judge.takes_render_mode else ():
+            asked = {**given, "render_mode": mode}
+            with self._judge.make(env_kwargs=asked, num_workers=1) as suites:
+                env = suites[self._suite][self._task]
+                env.reset(seed=self._asked.seed)
+                if env.render_mode != mode:
+                    yield f"{mode}: it is declared and asked for, and is {env.render_mode!r}"
+                yield from frames.wrong(env)
 
     def _uncast(self) -> Iterator[str]:
         """What one sub-environment gives before Gymnasium writes it into a batch."""
@@ -357,17 +364,7 @@ class _Task:
         with contextlib.suppress(CustomSpaceError):  # whose code is not here to be asked
             if space.contains(observation):
                 return
-            yield f"sub-environment 0 gave {_kind(observation)}, which is not in {space}"
-
-
-def _is_frame(frame: Any) -> bool:
-    if not isinstance(frame, np.ndarray) or frame.dtype != np.uint8:
-        return False
-    return frame.ndim == 3 and frame.shape[2] == 3 and frame.size > 0
-
-
-def _kind(value: Any) -> str:
-    return f"{getattr(value, 'dtype', type(value).__name__)} {getattr(value, 'shape', '')}".strip()
+            yield f"sub-environment 0 gave {frames.kind(observation)}, which is not in {space}"
 
 
 def _first_difference(at: int, where: str) -> str:

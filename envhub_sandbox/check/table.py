@@ -95,6 +95,12 @@ CHECKS: dict[str, Check] = {
             "Bound what the reward is computed from.",
         ),
         Check(
+            "infos",
+            _W,
+            "Infos with a mask have an entry for each sub-environment, and so has the mask.",
+            "Let Gymnasium's vector environments gather them; '_name' are booleans, one for each.",
+        ),
+        Check(
             "seeding",
             _E,
             "The same seed and the same actions give the same results in another process.",
@@ -121,8 +127,10 @@ CHECKS: dict[str, Check] = {
         Check(
             "render",
             _E,
-            "With render_mode='rgb_array' it renders frames: uint8, (height, width, 3).",
-            "Return such an array from render(), or declare no rgb_array.",
+            "It renders what its mode says: rgb_array gives frames, uint8 of (height, width, 3), "
+            "rgb_array_list lists of them, ansi texts. So it does in each of these modes that "
+            "metadata['render_modes'] declares, where make_env takes a render_mode.",
+            "Return that from render(), or declare the modes that there are.",
         ),
         Check(
             "slow-steps",

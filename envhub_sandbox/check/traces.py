@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +24,7 @@ class Trace:
         steps: A digest of the reset, and of every step.
         bad_rewards: Steps with a reward that is no finite number, the first few.
         autoreset: What the autoreset mode would not permit, the first few.
+        infos: Infos that do not say which sub-environments they are of, the first few.
         episodes: How many ended.
         times: Seconds: of the reset and of steps, for who reads it; no check asks for them.
         counted: The episodes that ended, to be looked at; fewer, where its rewards are such that
@@ -34,6 +35,7 @@ class Trace:
     steps: list[str] = field(default_factory=list)
     bad_rewards: list[str] = field(default_factory=list)
     autoreset: list[str] = field(default_factory=list)
+    infos: list[str] = field(default_factory=list)
     episodes: int = 0
     times: dict[str, float] = field(default_factory=dict)
     counted: list[Episode] = field(default_factory=list)
@@ -113,6 +115,8 @@ def _times(spent: list[float]) -> dict[str, float]:
 
 def _judge(trace: Trace, result: tuple[Any, ...], ended: Any, mode: str | None, number: int) -> Any:
     _, rewards, terminations, truncations, infos = result
+    for text in _masks(infos, len(rewards)):
+        _note(trace.infos, f"step {number}: {text}")
     done = np.logical_or(np.asarray(terminations, bool), np.asarray(truncations, bool))
     trace.episodes += int(done.sum())
     if not np.isfinite(np.asarray(rewards, np.float64)).all():
@@ -128,6 +132,20 @@ def _judge(trace: Trace, result: tuple[Any, ...], ended: Any, mode: str | None, 
     if mode == "SameStep" and done.any() and "final_obs" not in infos:
         _note(trace.autoreset, f"step {number}: an episode ended without 'final_obs' (SAME_STEP)")
     return done
+
+
+def _masks(infos: Mapping[Any, Any], count: int) -> Iterator[str]:
+    """What is wrong of infos with masks; one without is about all of them. Trust: the worker's."""
+    for name, mask in infos.items():
+        value = infos.get(name[1:]) if isinstance(name, str) and name.startswith("_") else None
+        if value is None or not isinstance(mask, np.ndarray):
+            continue
+        if mask.shape != (count,) or mask.dtype != np.bool_:
+            yield f"{name!r} is {mask.dtype} {mask.shape}, of {count} sub-environments"
+        elif isinstance(value, Mapping):
+            yield from _masks(value, count)
+        elif isinstance(value, np.ndarray) and value.shape[:1] != (count,):
+            yield f"{name[1:]!r} is {value.shape}, of {count} sub-environments"
 
 
 def _note(notes: list[str], text: str) -> None:

@@ -59,6 +59,15 @@ class Twice(gym.vector.SyncVectorEnv):
 def make_env(n_envs=1, use_async_envs=False):
     return Twice([Walk] * n_envs)
 """
+_THREE_INFOS = """
+class More(gym.vector.SyncVectorEnv):
+    def step(self, actions):
+        *given, infos = super().step(actions)
+        return *given, {**infos, "at": np.zeros(3), "_at": np.ones(3, bool)}
+
+def make_env(n_envs=1, use_async_envs=False):
+    return More([Walk] * n_envs)
+"""
 _OFF_BY_ONE = """
 class Late(gym.vector.SyncVectorEnv):
     late = None
@@ -103,6 +112,7 @@ _FAULTS = {
     "seeding": ("self.at = self.np_random.random()", "self.at = np.random.default_rng().random()"),
     "workers": ("[self.at, self.count]", "[len(gym.shared), self.count]"),
     "autoreset": ("def make_env", _TWO_RESETS + "\ndef first_make_env"),
+    "infos": ("def make_env", _THREE_INFOS + "\ndef first_make_env"),
     "rewards": ("1.0, self.count >= 10", "float('nan'), self.count >= 10"),
     "render": ("(4, 6, 3), np.uint8", "(4, 6, 3), np.float32"),
     "runs": ("self.count += 1", "raise RuntimeError('it broke')"),
@@ -121,6 +131,15 @@ _FAULTS = {
     "source-pickle": ("import numpy as np", "import numpy as np\nimport pickle"),
     "source-native": ("import numpy as np", "import numpy as np\nimport ctypes"),
 }
+_MODES = """
+    def __init__(self, render_mode):
+        self.render_mode = render_mode or "rgb_array"
+
+    def render(self):
+        given = {"ansi": ".", "rgb_array": self.frame(), "rgb_array_list": [self.frame()]}
+        return given[self.render_mode]
+
+"""
 _COUNTS = """
     def __init__(self):
         gym.shared.append(self)
@@ -183,6 +202,19 @@ def test_an_autoreset_that_comes_a_step_late_is_told(tmp_path: Path) -> None:
     text = _HONEST.replace("def make_env", _OFF_BY_ONE + "\ndef first_make_env")
     report = judged(repository(tmp_path / "walk", text))
     assert {one.id for one in report.findings} == {"autoreset"}
+
+
+def test_each_mode_that_is_declared_is_rendered(tmp_path: Path) -> None:
+    """Where make_env takes one; an honest one passes, and who returns none of it does not."""
+    text = _HONEST.replace('"rgb_array"]', '"human", "rgb_array", "ansi", "rgb_array_list"]')
+    text = text.replace("def render(", "def frame(").replace("(n_envs", "(render_mode=None, n_envs")
+    text = text.replace("    count = 0\n", "    count = 0\n" + _MODES, 1)
+    text = text.replace("[Walk] * n_envs", "[lambda: Walk(render_mode)] * n_envs")
+    assert judged(repository(tmp_path / "honest", text), 2, resets=0).findings == []
+    text = text.replace('"ansi": "."', '"ansi": None').replace("[self.frame()]", "self.frame()")
+    [ansi, rgb] = judged(repository(tmp_path / "wrong", text), 2, resets=0).findings
+    assert (ansi.id, rgb.id) == ("render", "render")
+    assert {ansi.message.split(":")[0], rgb.message.split(":")[0]} == {"ansi", "rgb_array_list"}
 
 
 def test_a_space_of_its_own_is_no_finding(tmp_path: Path) -> None:
