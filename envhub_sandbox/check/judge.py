@@ -101,7 +101,7 @@ def judge(asked: Asked) -> Report:
 def _told(asked: Asked) -> dict[str, str]:
     """How it is judged, for who reads of it later: in the caller's words and ours."""
     policy = policy_from(asked.arguments.get("policy"), asked.arguments.get("limits"))
-    limits = (f"{name} {value}" for name, value in vars(policy.limits).items() if value is not None)
+    limits = (_limit(name, value) for name, value in vars(policy.limits).items() if value)
     return {
         "judged at": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
         "by": f"envhub-sandbox {__version__}",
@@ -111,6 +111,13 @@ def _told(asked: Asked) -> dict[str, str]:
         "limits": ", ".join(limits),
         "plays": f"{asked.steps} steps each, seed {asked.seed}, {asked.resets} resets a round",
     }
+
+
+def _limit(name: str, value: int) -> str:
+    words = name.replace("_", " ")
+    if name.endswith("_bytes"):
+        return f"{words.removesuffix(' bytes')} {value / (1 << 20):g} MiB"
+    return f"{words} {value}"
 
 
 class _Judge:

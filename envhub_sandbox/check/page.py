@@ -199,15 +199,17 @@ def _ran(provenance: Mapping[str, Any]) -> Iterator[str]:
         tuple(text(layer.get(name)) for name in ("layer", "enforced", "detail"))
         for layer in provenance.get("layers") or ()
     ]
-    yield from folded(f"{len(layers)} layers confined it", table(("layer", "holds", "how"), layers))
+    yield from folded(
+        f"layers that confined it ({len(layers)})", table(("layer", "holds", "how"), layers)
+    )
     for name, said in (
-        ("files", "{} files, by their hashes"),
-        ("installed", "{} packages, installed as it declares"),
-        ("packages", "{} packages that it had, as it says"),
+        ("files", "files, by their hashes"),
+        ("installed", "packages, installed as it declares"),
+        ("packages", "packages that it had, as it says"),
     ):
         pairs = _pairs(provenance.get(name))
         if pairs:
-            yield from folded(said.format(len(pairs)), facts(pairs[:_MOST_PAIRS], _LONGEST_WORD))
+            yield from folded(f"{said} ({len(pairs)})", facts(pairs[:_MOST_PAIRS], _LONGEST_WORD))
 
 
 def _pairs(told: object) -> list[tuple[str, Any]]:
