@@ -1,14 +1,15 @@
 """The program by which ``envhub-worker listen --dependencies`` makes clients' packages.
 
-``python -I -m envhub_sandbox.dependencies.for_a_server``: stdin is one order as JSON, stdout a
-file that holds what there is to say at any time, as one object of JSON: ``told``, a line of
-progress; and at the end ``own``, ``made``, or ``error`` and ``said``. With the word ``check`` it
-only says whether it could work.
+``python -I -m envhub_sandbox.dependencies.for_a_server --server-pidfd=N``: stdin is one order as
+JSON, stdout a file that holds what there is to say at any time, as one object of JSON: ``told``, a
+line of progress; and at the end ``own``, ``made``, or ``error`` and ``said``. With the word
+``check`` it only says whether it could work.
 
 Whoever orders is a client on another host, so nothing of an order is believed: requirements are
 read as a stranger's file is. What is made lies in a folder of that client's key, uv's cache
 included, and all of it has one bound. So two processes are at it: one works, and this one measures,
-ends it, and leaves nothing of what was not finished.
+ends it, and leaves nothing of what was not finished. Each has a pidfd of the one that started it,
+and ends with it, also where that was killed: nobody would measure, and nobody waits.
 """
 
 from __future__ import annotations
@@ -18,11 +19,13 @@ import fcntl
 import json
 import os
 import resource
+import select
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +44,7 @@ _WAIT_S = 60.0
 _WHERE_CHARS = 200
 _SAID_CHARS = 3800
 _NICE = 10
+_PIDFD = "--server-pidfd="
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -50,11 +54,12 @@ def main(words: Sequence[str] | None = None) -> int:
         if "check" in words:
             uv.command()
             return 0
+        ended = _pidfd(words)
         order = json.load(sys.stdin)
         os.environ[CACHE_VARIABLE] = order["folder"]
         os.environ["UV_CACHE_DIR"] = str(_uv_cache(order))
         os.environ[bounds.BYTES_VARIABLE] = str(order["bytes"])
-        said = _made(order) if "make" in words else _watched(order)
+        said = _made(order, ended) if "make" in words else _watched(order, ended)
     except DependencyError as error:
         if "check" in words:
             sys.stderr.write(f"{error}\n")
@@ -65,6 +70,24 @@ def main(words: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _pidfd(words: Sequence[str]) -> int | None:
+    """That of the process which started this one."""
+    given = [word.partition("=")[2] for word in words if word.startswith(_PIDFD)]
+    return int(given[0]) if given else None
+
+
+def _when_it_ends(pidfd: int | None, then: Callable[[], None]) -> None:
+    """Do something as soon as a process has ended."""
+    if pidfd is None:
+        return
+
+    def wait(pidfd: int) -> None:
+        select.select([pidfd], [], [])
+        then()
+
+    threading.Thread(target=wait, args=(pidfd,), daemon=True).start()
+
+
 def _say(what: Mapping[str, Any]) -> None:
     os.ftruncate(1, 0)
     os.pwrite(1, json.dumps(what).encode(), 0)
@@ -73,7 +96,8 @@ def _say(what: Mapping[str, Any]) -> None:
 # --- who works ----------------------------------------------------------------------------------
 
 
-def _made(order: Mapping[str, Any]) -> dict[str, Any]:
+def _made(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
+    _when_it_ends(ended, lambda: os.killpg(0, signal.SIGKILL))  # the group is ours, and uv's
     os.nice(_NICE)
     _, most = resource.getrlimit(resource.RLIMIT_FSIZE)  # which a plain user cannot raise
     bound = order["bytes"] if most == resource.RLIM_INFINITY else min(order["bytes"], most)
@@ -117,9 +141,10 @@ def _needed(order: Mapping[str, Any]) -> Needs:
 # --- who watches --------------------------------------------------------------------------------
 
 
-def _watched(order: Mapping[str, Any]) -> dict[str, Any]:
+def _watched(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
     """Have it made, within bounds; empty where whoever made it has said what there is to say."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    _when_it_ends(ended, lambda: os.kill(os.getpid(), signal.SIGTERM))
     with _alone(Path(order["folder"])) as held:
         unfinished = Path(order["folder"], "unfinished")
         if unfinished.exists():
@@ -140,12 +165,17 @@ def _watched(order: Mapping[str, Any]) -> dict[str, Any]:
 
 def _worked(order: Mapping[str, Any], held: int) -> bool:
     """Whether it has come to an end that leaves nothing half-made."""
-    process = subprocess.Popen(
-        [sys.executable, "-I", "-m", "envhub_sandbox.dependencies.for_a_server", "make"],
-        stdin=subprocess.PIPE,
-        pass_fds=(held,),
-        start_new_session=True,  # uv is in it, too
-    )
+    ourselves = os.pidfd_open(os.getpid())
+    program = [sys.executable, "-I", "-m", "envhub_sandbox.dependencies.for_a_server"]
+    try:
+        process = subprocess.Popen(
+            [*program, "make", f"{_PIDFD}{ourselves}"],
+            stdin=subprocess.PIPE,
+            pass_fds=(held, ourselves),
+            start_new_session=True,  # uv is in it, too
+        )
+    finally:
+        os.close(ourselves)
     try:
         assert process.stdin is not None
         with contextlib.suppress(BrokenPipeError), process.stdin as stdin:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 
 from envhub_sandbox import make_env
@@ -111,12 +115,13 @@ def order(*requirements: str, always: bool = True) -> m.NeedPackages:
     return m.NeedPackages(tuple((one, "line 1") for one in requirements), "", "", "", always)
 
 
+SLEEPING = [sys.executable, "-I", "-c", "import time; time.sleep(600)"]
+
+
 @pytest.fixture
 def idle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Packages]:
     """A server's packages, whose program never says anything."""
-    monkeypatch.setattr(
-        server_side, "command", lambda: [sys.executable, "-I", "-c", "import time; time.sleep(600)"]
-    )
+    monkeypatch.setattr(server_side, "command", lambda: SLEEPING)
     found = Packages(tmp_path / "packages", Quotas())
     yield found
     found.close()
@@ -141,6 +146,7 @@ def test_what_nobody_asks_for_any_more_is_given_up(
     idle: Packages, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The program ends, and the next in line has its turn."""
+    monkeypatch.setattr(server_side, "MAX_AT_WORK", 1)
     clock = [1000.0]
     monkeypatch.setattr(server_side, "monotonic", lambda: clock[0])
     assert idle.need(b"a", order("first"), ()).state == "making"
@@ -157,6 +163,109 @@ def test_what_nobody_asks_for_any_more_is_given_up(
 
     idle.look(())
     assert eventually(begun)
+
+
+def test_nobody_keeps_others_waiting_who_have_room(
+    idle: Packages, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A key has one program at work, all together a few; who waits hears how many are before."""
+    monkeypatch.setattr(server_side, "MAX_AT_WORK", 2)
+    begun, command = [], server_side.command
+
+    def counted() -> list[str]:
+        begun.append(True)
+        return command()
+
+    monkeypatch.setattr(server_side, "command", counted)
+
+    def told(key: bytes, name: str) -> str:
+        reply = idle.need(key, order(name), ())
+        assert reply.state == "making"
+        return reply.told
+
+    assert (told(b"a", "first"), len(begun)) == ("at work", 1)
+    assert (told(b"a", "second"), len(begun)) == ("waiting for other packages of your key", 1)
+    assert (told(b"b", "first"), len(begun)) == ("at work", 2)
+    assert told(b"c", "first") == "waiting for others' packages: 0 before it, 2 at work"
+    assert len(begun) == 2
+
+
+def test_an_order_that_takes_too_long_is_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though somebody asks for it all the time: the operator says how long."""
+    monkeypatch.setattr(server_side, "command", lambda: SLEEPING)
+    clock = [time.monotonic()]
+    monkeypatch.setattr(server_side, "monotonic", lambda: clock[0])
+    with contextlib.closing(Packages(tmp_path / "packages", Quotas(), make_s=120)) as found:
+        for _ in range(3):
+            assert found.need(b"a", order("first"), ()).state == "making"
+            clock[0] += 55
+
+        def is_refused() -> bool:
+            try:
+                found.need(b"a", order("first"), ())
+            except RefusedError as error:
+                return error.error == "IndexUnavailableError" and "--packages-s" in str(error)
+            return False
+
+        assert eventually(is_refused)
+
+
+def silent_index() -> socket.socket:
+    """It takes connections and says nothing: whoever asks it waits."""
+    return socket.create_server(("127.0.0.1", 0), backlog=64)
+
+
+_SERVER = """
+import sys, time
+from pathlib import Path
+from envhub_worker.access.packages import Packages
+from envhub_worker.access.quotas import Quotas
+from envhub_worker.protocol import messages as m
+packages = Packages(Path(sys.argv[1]), Quotas())
+packages.need(b"a", m.NeedPackages((("wanted", "line 1"),), "", "", "", True), ())
+time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize("killed", ["the server", "who watches"])
+def test_the_program_and_its_uv_end_with_who_started_them(killed: str, tmp_path: Path) -> None:
+    """Also where that was killed: nobody would measure what they take, and nobody waits for it."""
+    with silent_index() as index:
+        url = f"http://127.0.0.1:{index.getsockname()[1]}/simple"
+        environment = {**os.environ, "UV_INDEX_URL": url, "UV_HTTP_TIMEOUT": "600"}
+        command = [sys.executable, "-c", _SERVER, str(tmp_path / "packages")]
+        with subprocess.Popen(command, env=environment) as server:
+            try:
+                found = psutil.Process(server.pid)
+                assert eventually(lambda: any("uv" in one.name() for one in below(found)))
+                [watcher] = found.children()
+                rest = below(watcher)
+                assert len(rest) >= 2  # one that works, and its uv
+                (found if killed == "the server" else watcher).kill()
+                assert eventually(lambda: not any(is_alive(one) for one in rest))
+                assert killed != "the server" or eventually(lambda: not is_alive(watcher))
+            finally:
+                for one in below(found):
+                    one.kill()
+                server.kill()
+
+
+def below(process: psutil.Process) -> list[psutil.Process]:
+    """What it has started, and what that has."""
+    try:
+        return process.children(recursive=True)
+    except psutil.NoSuchProcess:
+        return []
+
+
+def is_alive(process: psutil.Process) -> bool:
+    """Whether it is there, and not only its entry."""
+    try:
+        return process.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
 
 
 def test_a_program_that_cannot_be_started_is_not_tried_for_ever(

@@ -2,8 +2,9 @@
 
 They are made by another program, which the operator has installed beside this one: the client's
 own, with its bounds. It chooses versions, installs wheels by their hashes, runs nothing of them,
-and says what it did. One of them is at work at a time, each client key has a folder of its own, and
-whatever nobody asks for any more is given up.
+and says what it did. Each client key has a folder of its own and one of them at work at a time, all
+keys together a few; whatever nobody asks for any more is given up, and so is what takes too long:
+who fills a turn with it keeps nobody else waiting for good.
 """
 
 from __future__ import annotations
@@ -38,12 +39,15 @@ MAX_WAITING = 2
 """Orders of one key that wait or are at work."""
 MAX_IN_LINE = 64
 """Of everybody."""
+MAX_AT_WORK = 4
+"""Programs at once; of one key there is one."""
+MAKE_S = 1800.0
+"""For so long one may be at work."""
 MAX_PER_HOUR = 60
 """Of one key: each asks the index."""
 _REMEMBERED = 512
 _RESULT_BYTES = 1 << 20
 _HOUR_S = 3600.0
-_MAKE_S = 3600.0
 _FORGOTTEN_S = 60.0
 """What nobody has asked for in so long, nobody waits for."""
 _FAILED_S = 30.0
@@ -71,7 +75,7 @@ class Order:
     plain: dict[str, Any]
     owner: bytes = b""
     asked: float = field(default_factory=monotonic)
-    told: str = "waiting for others' packages"
+    told: str = "at work"
 
 
 @dataclass(frozen=True)
@@ -114,16 +118,18 @@ class Packages:
     Args:
         folder: Where they lie; None where the operator does not permit any.
         quotas: How much of them each key may have.
+        make_s: For how long an order may be at work.
     """
 
-    def __init__(self, folder: Path | None, quotas: Quotas) -> None:
+    def __init__(self, folder: Path | None, quotas: Quotas, make_s: float = MAKE_S) -> None:
         self._folder = folder
         self._quotas = quotas
+        self._make_s = make_s
         self._line: OrderedDict[Place, Order] = OrderedDict()
         self._outcomes: OrderedDict[Place, Outcome] = OrderedDict()
         self._handed: dict[Place, tuple[Runtime, float]] = {}
         self._begun: dict[str, deque[float]] = {}
-        self._work: Work | None = None
+        self._at_work: dict[str, Work] = {}  # by key
         self._news: list[News] = []
         if folder is not None:
             make_passable(folder)
@@ -161,7 +167,8 @@ class Packages:
             if place in self._outcomes:
                 return self.need(key, request, in_use, owner)
         order.asked = monotonic()
-        return m.Packages("making", "", {}, order.told)
+        told = order.told if self._is_at(place) else self._waits(place)
+        return m.Packages("making", "", {}, told)
 
     def runtime(self, key: bytes, name: str) -> Runtime:
         """What a client's packages are, and their interpreter.
@@ -179,8 +186,8 @@ class Packages:
     def look(self, in_use: Collection[str]) -> None:
         """Take what is done, give up what nobody waits for, and begin the next."""
         now = monotonic()
-        if self._work is not None:
-            self._follow(self._work, now)
+        for work in list(self._at_work.values()):
+            self._follow(work, now)
         deserted = [
             place
             for place, order in self._line.items()
@@ -188,8 +195,9 @@ class Packages:
         ]
         for place in deserted:
             del self._line[place]
-        if self._work is None and self._line:
-            self._begin(min(self._line, key=lambda place: self._last(place[0])), in_use)
+        for place in self._next():
+            if len(self._at_work) < MAX_AT_WORK and place[0] not in self._at_work:
+                self._begin(place, in_use)
 
     def news(self) -> list[News]:
         """What became of orders since this was asked last."""
@@ -197,13 +205,15 @@ class Packages:
         return told
 
     def close(self) -> None:
-        """End the program; it leaves nothing half-made, or the next one removes it."""
-        if self._work is not None:
-            self._work.process.terminate()
+        """End the programs; they leave nothing half-made, or the next ones remove it."""
+        works, self._at_work = list(self._at_work.values()), {}
+        for work in works:
+            work.process.terminate()
+        until = monotonic() + _STOP_S
+        for work in works:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._work.process.wait(_STOP_S)
-            _kill(self._work)
-            self._work = None
+                work.process.wait(max(0.0, until - monotonic()))
+            _kill(work)
 
     # --- orders --------------------------------------------------------------------------------
 
@@ -245,13 +255,25 @@ class Packages:
 
     # --- the program ---------------------------------------------------------------------------
 
+    def _next(self) -> list[Place]:
+        """Who waits, in turn: first the key for which nothing was begun for longest."""
+        waiting = [place for place in self._line if not self._is_at(place)]
+        return sorted(waiting, key=lambda place: self._last(place[0]))
+
     def _last(self, home: str) -> float:
-        """When something was begun for a key: who has waited longest for a turn is next."""
         begun = self._begun.get(home)
         return begun[-1] if begun else 0.0
 
+    def _waits(self, place: Place) -> str:
+        """What is told to one who waits. Of others it says how many there are, and no more."""
+        if place[0] in self._at_work:
+            return "waiting for other packages of your key"
+        before = self._next().index(place)
+        return f"waiting for others' packages: {before} before it, {len(self._at_work)} at work"
+
     def _is_at(self, place: Place) -> bool:
-        return self._work is not None and self._work.place == place
+        work = self._at_work.get(place[0])
+        return work is not None and work.place == place
 
     def _begin(self, place: Place, in_use: Collection[str]) -> None:
         assert self._folder is not None
@@ -269,7 +291,7 @@ class Packages:
         self._begun.setdefault(place[0], deque(maxlen=MAX_PER_HOUR)).append(now)
         try:
             make_passable(folder)
-            self._work = _started(place, order)
+            self._at_work[place[0]] = _started(place, order)
         except OSError as error:  # a full disk, no process left: whoever asked hears it, once
             text = f"the program that makes packages cannot be started: {error.strerror}"
             self._end(place, {"error": "DependencyError", "said": text}, now)
@@ -282,17 +304,21 @@ class Packages:
         said = _said(work)
         if work.process.poll() is None:
             order.told = str(said.get("told", order.told))
-            late = now - work.since > _MAKE_S
+            late = now - work.since > self._make_s
             if work.told_to_end is None and (late or now - order.asked > _FORGOTTEN_S):
                 work.process.terminate()
                 work.told_to_end = now
             elif work.told_to_end is not None and now - work.told_to_end > _STOP_S:
                 _kill(work)
             return
-        self._work = None
+        del self._at_work[work.place[0]]
         work.said.close()
         if work.told_to_end is not None:
-            said = {"error": "IndexUnavailableError", "said": "they were not made in time"}
+            text = (
+                f"they were not made in time: the server gives an order {self._make_s:.0f} s "
+                "(--packages-s)"
+            )
+            said = {"error": "IndexUnavailableError", "said": text}
         elif not said.keys() & {"own", "made", "error"}:
             code = work.process.returncode
             text = f"the program that makes packages ended with {code}; its server's log says why"
@@ -314,9 +340,18 @@ def _started(place: Place, order: Mapping[str, Any]) -> Work:
         with tempfile.TemporaryFile() as given:
             given.write(json.dumps(order).encode())
             given.seek(0)
-            process = subprocess.Popen(
-                command(), stdin=given, stdout=said, cwd="/", start_new_session=True
-            )
+            ourselves = os.pidfd_open(os.getpid())  # it ends when we do, whatever ends us
+            try:
+                process = subprocess.Popen(
+                    [*command(), f"--server-pidfd={ourselves}"],
+                    stdin=given,
+                    stdout=said,
+                    cwd="/",
+                    start_new_session=True,
+                    pass_fds=(ourselves,),
+                )
+            finally:
+                os.close(ourselves)
         undo.pop_all()  # it lasts as long as the program
     return Work(place, process, said)
 

@@ -28,7 +28,7 @@ import zmq
 from envhub_worker import __version__
 from envhub_worker.access import keys
 from envhub_worker.access.keys import AuthorizedClients, KeyPair
-from envhub_worker.access.packages import Packages, why_impossible
+from envhub_worker.access.packages import MAKE_S, Packages, why_impossible
 from envhub_worker.access.port.connection_limit import MAX_CONNECTIONS
 from envhub_worker.access.quotas import Permissions, Quotas
 from envhub_worker.access.remote_gate import RemoteGate, Rules
@@ -111,6 +111,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--dependencies",
         action="store_true",
         help="install the packages that repositories declare; needs envhub-sandbox beside this",
+    )
+    parser.add_argument(
+        "--packages-s",
+        type=_count,
+        default=int(MAKE_S),
+        metavar="SECONDS",
+        help=f"for so long an order of them may be at work (default: {MAKE_S:.0f})",
     )
     parser.add_argument(
         "--log-format",
@@ -463,7 +470,8 @@ def _gate(
         drain_s=arguments.drain_s,
         profile=identity.profile,
     )
-    packages = Packages(state / "packages" if arguments.dependencies else None, quotas)
+    folder = state / "packages" if arguments.dependencies else None
+    packages = Packages(folder, quotas, arguments.packages_s)
     return RemoteGate(rules, Uploads(state / "store", quotas), packages, log, publish)
 
 
