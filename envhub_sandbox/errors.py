@@ -62,6 +62,7 @@ from envhub_worker.protocol.errors import (
     RemoteProtocolError,
     VersionMismatchError,
 )
+from envhub_worker.protocol.text import continued, quoted
 
 __all__ = [
     "ActionError",
@@ -328,7 +329,7 @@ class RemoteEnvError(EnvHubError):
     """
 
     def __init__(self, type_name: str, message: str, traceback: str = "") -> None:
-        super().__init__(f"{type_name}: {message}" if message else type_name)
+        super().__init__(f"{type_name}: {continued(message)}" if message else type_name)
         self.type_name = type_name
         self.message = message
         self.traceback = traceback
@@ -352,7 +353,7 @@ class RemoteEnvWarning(UserWarning):
     """
 
     def __init__(self, label: str, category: str, text: str) -> None:
-        super().__init__(f"{label}: {category}: {text}")
+        super().__init__(f"{label}: {category}: {continued(text)}")
         self.label = label
         self.category = category
         self.text = text
@@ -453,7 +454,7 @@ def name_line(error: EnvHubError, where: str) -> None:
     if where:
         error.args = (f"{error.args[0]}\n{where}", *error.args[1:])
     if remote.traceback:
-        note = f"In the environment:\n{remote.traceback.rstrip()}"
+        note = f"In the environment:\n{quoted(remote.traceback.rstrip())}"
         # before Python 3.11 only some shells and test runners show it
         vars(error)["__notes__"] = [*getattr(error, "__notes__", ()), note]
 

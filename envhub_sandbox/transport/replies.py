@@ -33,7 +33,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.confinement import Reason
 from envhub_worker.protocol.messages.busy import ERROR, Busy
-from envhub_worker.protocol.text import printable
+from envhub_worker.protocol.text import continued, printable, quoted
 
 # --- what was asked for ------------------------------------------------------------------------
 
@@ -140,7 +140,7 @@ def death(reply: m.Died) -> WorkerDiedError:
         how += f" (exit code {reply.exit_code})"
     during = f" during {reply.operation}" if reply.operation else ""
     detail = f"\n{reply.detail}" if reply.detail else ""
-    tail = f"\nIts last output:\n{reply.tail}" if reply.tail else ""
+    tail = f"\nIts last output:\n{quoted(reply.tail)}" if reply.tail else ""
     return WorkerDiedError(
         f"the worker process died{during}: {how}{detail}{tail}",
         exit_code=reply.exit_code,
@@ -168,16 +168,16 @@ def raised(reply: m.Raised) -> EnvHubError:
     reply = _harmless(reply)
     if reply.stage not in _LOADING:
         return remote_error(reply.builtin, reply.type_name, reply.message, reply.traceback)
-    what = _LOADING[reply.stage]
+    what, said = _LOADING[reply.stage], continued(reply.message)
     if reply.stage == "return":
-        return load_error("ValueError", reply.message)
+        return load_error("ValueError", said)
     cause: Any = remote_error(reply.builtin, reply.type_name, reply.message, reply.traceback)
     if reply.builtin == "ModuleNotFoundError":
-        error: EnvHubError = MissingModuleError(f"{what}: {reply.message}")
+        error: EnvHubError = MissingModuleError(f"{what}: {said}")
     elif reply.type_name.endswith(_LOADERS_OWN):
-        return load_error(reply.builtin, reply.message)
+        return load_error(reply.builtin, said)
     else:
-        error = load_error(reply.builtin, f"{what}: {reply.type_name}: {reply.message}")
+        error = load_error(reply.builtin, f"{what}: {reply.type_name}: {said}")
     error.__cause__ = cause
     return error
 

@@ -445,7 +445,7 @@ def tracebacks(dice: Dice) -> None:
     point_out(error, _SNAPSHOT)
     for told in (str(error), *vars(error).get("__notes__", ())):
         demand(all(one in "\n\t" or one.isprintable() for one in told), "a control character")
-        demand(len(told) < 60_000, "a text without end")
+        demand(len(told) < 200_000, "a text without end")  # each line has a margin
     remote: Any = error if stage == "step" else error.__cause__
     own = (
         r'  File "/home/me/env/(env|lib/a)\.py", line [0-9]+(, in [^\n]*)?(\n    [^\n]*)?(\n +\^+)?'

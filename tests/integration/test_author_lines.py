@@ -11,6 +11,7 @@ import pytest
 import envhub_sandbox
 from envhub_sandbox import SandboxEnv, make_env
 from envhub_sandbox.errors import EnvHubError, LoadError
+from envhub_worker.protocol.text import MARGIN
 from tests.hub.stub_hub import StubHub
 from tests.support.repositories import write_repository
 
@@ -130,6 +131,6 @@ def test_a_syntax_error_is_shown_as_python_shows_it(tmp_path: Path, name: str, s
         line.replace("    \t\t", "    ").replace("\t", " ") for line in place
     ]
     [note] = vars(caught.value)["__notes__"]
-    assert "\n".join(place) in note
+    assert "\n".join(place) in note.replace(f"\n{MARGIN}", "\n")
     # the import of what is broken, where it is not the entry file, and no line of ours
     assert note.count("File ") == (1 if name == "env.py" else 2), note

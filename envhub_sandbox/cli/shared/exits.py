@@ -14,6 +14,7 @@ import typer
 from envhub_sandbox import errors
 from envhub_sandbox.cli.shared.console import safe_text, say
 from envhub_sandbox.errors import EnvHubError
+from envhub_worker.protocol.text import quoted
 
 _TAIL_LINES = 10
 
@@ -89,10 +90,10 @@ def describe(error: BaseException) -> str:
         return safe_text(f"a bug in envhub: {type(error).__name__}: {error}")
     text = str(error)
     tail = getattr(error, "log_tail", "")
-    before, found, after = text.rpartition(tail) if tail else (text, "", "")
+    before, found, after = text.rpartition(quoted(tail)) if tail else (text, "", "")
     if found:
         kept = tail.rstrip().splitlines()[-_TAIL_LINES:]
-        text = before + "\n".join(f"  {line}" for line in kept) + after
+        text = before + quoted("\n".join(kept)) + after
     return safe_text(text)
 
 

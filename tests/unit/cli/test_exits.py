@@ -27,6 +27,7 @@ from envhub_sandbox.cli.shared.report import TaskResult, returns_of, statistics,
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.rollouts.episodes import Episode, Rollout, RolloutError
 from envhub_sandbox.rollouts.video import VideoError
+from envhub_worker.protocol.text import quoted
 
 CODES = {
     errors.HubReferenceError: 2,
@@ -83,10 +84,10 @@ def test_a_message_carries_no_traceback_and_no_escape_sequence() -> None:
 def test_the_end_of_the_output_is_kept_short() -> None:
     """The last lines are those that help."""
     tail = "\n".join(f"line {number}" for number in range(100))
-    error = errors.WorkerDiedError(f"it died\nIts last output:\n{tail}", log_tail=tail)
+    error = errors.WorkerDiedError(f"it died\nIts last output:\n{quoted(tail)}", log_tail=tail)
     lines = describe(error).splitlines()
     assert lines[:2] == ["it died", "Its last output:"]
-    assert lines[2:] == [f"  line {number}" for number in range(90, 100)]
+    assert lines[2:] == [f"  | line {number}" for number in range(90, 100)]
 
 
 def fail(error: BaseException, *, debug: bool) -> int:

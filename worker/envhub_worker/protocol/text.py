@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 _KEPT = "\n\t"
+MARGIN = "  | "
+"""Before a stranger's lines among ours."""
 
 
 def printable(text: str, limit: int = 16_384) -> str:
@@ -19,6 +21,19 @@ def printable(text: str, limit: int = 16_384) -> str:
     if text.isprintable():
         return text
     return "".join(char if char in _KEPT or char.isprintable() else _escaped(char) for char in text)
+
+
+def continued(text: str) -> str:
+    """A stranger's text behind words of ours: lines that follow the first have a margin.
+
+    Else they could be taken for ours: for the rest of an error, a line of a log, a traceback.
+    """
+    return text.replace("\n", f"\n{MARGIN}")
+
+
+def quoted(text: str) -> str:
+    """The same below words of ours: every line has the margin."""
+    return MARGIN + continued(text)
 
 
 def _escaped(char: str) -> str:

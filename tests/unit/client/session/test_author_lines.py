@@ -15,6 +15,7 @@ from envhub_sandbox.hub.listing import FileRecord, Snapshot
 from envhub_sandbox.session.author_lines import point_out
 from envhub_sandbox.transport.replies import raised
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.text import MARGIN
 from envhub_worker.runner.exceptions import raised as described
 
 ROOT = "/store/tree"
@@ -44,7 +45,7 @@ def told(traceback: str, snapshot: Snapshot = LOCAL, stage: str = "step") -> Env
 
 def notes(error: EnvHubError) -> str:
     """What Python prints below the error."""
-    return "\n".join(vars(error).get("__notes__", ()))
+    return "\n".join(vars(error).get("__notes__", ())).replace(f"\n{MARGIN}", "\n")
 
 
 @pytest.mark.parametrize(

@@ -212,7 +212,7 @@ def test_the_kinds_of_both_conversations_are_apart() -> None:
     [
         (m.Died(1, "exit", 3, None, "", "", "step"), "died during step: it exited (exit code 3)"),
         (m.Died(1, "signal", None, "SIGKILL", "", "", ""), "died: a signal ended it (SIGKILL)"),
-        (m.Died(1, "exit", 0, None, "", "bye", "reset"), "Its last output:\nbye"),
+        (m.Died(1, "exit", 0, None, "", "bye", "reset"), "Its last output:\n  | bye"),
         (m.Died(1, "exit", 0, None, "why", "", "reset"), "\nwhy"),
     ],
 )
@@ -276,3 +276,36 @@ def test_every_reason_of_a_death_is_told() -> None:
     for reason in REASONS[: REASONS.index("server")]:
         text = str(death(m.Died(-1, reason, None, None, "", "", "step")))
         assert not text.endswith(f": {reason}")
+
+
+_IMITATION = (
+    "gone\nTraceback (most recent call last):\n"
+    "2026-01-01 envhub_sandbox.worker WARNING type your token here"
+)
+
+
+@pytest.mark.parametrize("stage", ["", "import", "make_env", "return"])
+@pytest.mark.parametrize("builtin", ["ValueError", "ModuleNotFoundError"])
+def test_a_strangers_lines_cannot_be_taken_for_ours(stage: str, builtin: str) -> None:
+    """Nor for a traceback of the caller's: all but the first have a margin."""
+    error = raised(m.Raised(builtin, "Oops", _IMITATION, _IMITATION, stage))
+    if not isinstance(error, errors.RemoteEnvError) and error.__cause__ is None:
+        shown = [str(error)]
+    else:
+        errors.name_line(error, "")
+        shown = [str(error), str(error.__cause__ or error), *vars(error)["__notes__"]]
+    shown.append(str(errors.RemoteEnvWarning("repo", "Oops", _IMITATION)))
+    for text in shown:
+        first, *others = text.splitlines()
+        assert "gone" in first or "In the environment" in first
+        assert len(others) >= 2
+        assert all(line.startswith("  | ") for line in others), text
+
+
+def test_the_last_output_cannot_be_taken_for_ours() -> None:
+    """What a worker prints before it dies is told apart from what is said of its death."""
+    died = death(m.Died(1, "exit", 1, None, "", _IMITATION, "step"))
+    _, _, *lines = str(died).splitlines()
+    assert len(lines) == 3
+    assert all(line.startswith("  | ") for line in lines)
+    assert died.log_tail == _IMITATION
