@@ -60,6 +60,7 @@ class Report:
         left_out: How many findings are not in ``findings``.
         asked: How it was judged, by name, in words of ours.
         plays: What each task gave to look at.
+        commit: Of what was judged; of a folder of this machine a hash of its content.
     """
 
     reference: str
@@ -70,6 +71,7 @@ class Report:
     left_out: int = 0
     asked: dict[str, str] = field(default_factory=dict)
     plays: dict[str, Play] = field(default_factory=dict)
+    commit: str = ""
     _kept: Counter[str] = field(default_factory=Counter, repr=False)
 
     def judged(self, check: str, found: Collection[str], task: str = "") -> None:

@@ -92,7 +92,7 @@ def judge(asked: Asked) -> Report:
     asked.tell(f"reading {asked.reference}")
     where = {name: asked.arguments.get(name) for name in ("hub_cache_dir", "token", "endpoint")}
     snapshot = named(asked.reference, **where)
-    report = Report(pinned(snapshot))
+    report = Report(pinned(snapshot), commit=snapshot.commit)
     report.asked = _told(asked)
     _Judge(asked, snapshot, report).ask()
     return report

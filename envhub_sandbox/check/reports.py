@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -26,6 +26,7 @@ def document(report: Report, failures: Sequence[Finding]) -> dict[str, Any]:
     """Everything, as plain data."""
     return {
         "reference": report.reference,
+        "commit": report.commit,
         "passed": not failures,
         "findings": [_finding(one, failures) for one in report.findings],
         "left_out": report.left_out,
@@ -48,13 +49,49 @@ def _finding(one: Finding, failures: Sequence[Finding]) -> dict[str, Any]:
     }
 
 
+def read(told: Mapping[str, Any]) -> tuple[Report, list[Finding]]:
+    """A report and what fails it, of what ``document`` has made and somebody may have changed.
+
+    Raises:
+        KeyError, TypeError, ValueError: It is no such document.
+    """
+    report = Report(_str(told["reference"]), commit=_str(told["commit"]))
+    failures = []
+    for row in told["findings"]:
+        place = (_str(row["task"] or ""), _str(row["file"] or ""), int(row["line"] or 0))
+        report.add(Finding(CHECKS[row["check"]].id, _str(row["message"]), *place))
+        failures += report.findings[-1:] if row["fails"] is True else []
+    report.passed = [(CHECKS[row["check"]].id, _str(row["task"])) for row in told["held"]]
+    report.left_out = int(told["left_out"])
+    if told["passed"] is not (not failures):
+        raise ValueError("the findings are not what the verdict says")
+    return report, failures
+
+
+def _str(value: object) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{type(value).__name__} is no text")
+    return value
+
+
 def junit(report: Report, failures: Sequence[Finding]) -> str:
     """One test case for each check of each task; what does not fail the whole is its output."""
+    return xml(suite(report, failures))
+
+
+def xml(root: ElementTree.Element) -> str:
+    """A document as text."""
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def suite(report: Report, failures: Sequence[Finding]) -> ElementTree.Element:
+    """A report as one of JUnit's suites."""
     asked = dict.fromkeys([*((one.id, one.task) for one in report.findings), *report.passed])
     failed = dict.fromkeys((one.id, one.task) for one in failures)
-    suite = ElementTree.Element(
+    made = ElementTree.Element(
         "testsuite",
-        name=_xml(report.reference),
+        name=xml_text(report.reference),
         tests=str(len(asked)),
         failures=str(len(failed)),
         errors="0",
@@ -62,20 +99,20 @@ def junit(report: Report, failures: Sequence[Finding]) -> str:
     )
     for check, task in asked:
         case = ElementTree.SubElement(
-            suite, "testcase", classname=_xml(task or "repository"), name=check
+            made, "testcase", classname=xml_text(task or "repository"), name=check
         )
         found = [one for one in report.findings if (one.id, one.task) == (check, task)]
         text = "\n".join(one.text for one in found)
         if (check, task) in failed:
-            words = _xml(CHECKS[check].sentence)
-            ElementTree.SubElement(case, "failure", message=words).text = _xml(text)
+            words = xml_text(CHECKS[check].sentence)
+            ElementTree.SubElement(case, "failure", message=words).text = xml_text(text)
         elif found:
-            ElementTree.SubElement(case, "system-out").text = _xml(text)
-    ElementTree.indent(suite)
-    return ElementTree.tostring(suite, encoding="unicode", xml_declaration=True) + "\n"
+            ElementTree.SubElement(case, "system-out").text = xml_text(text)
+    return made
 
 
-def _xml(text: str) -> str:
+def xml_text(text: str) -> str:
+    """Without what XML cannot say."""
     return _NO_XML.sub("?", text)
 
 
@@ -130,10 +167,13 @@ def workflow_commands(report: Report) -> Iterator[str]:
         place = f"file={_property(one.file)}," if one.file else ""
         place += f"line={one.line}," if one.line else ""
         title = f"envhub check: {one.id}" + (f" ({one.task})" if one.task else "")
-        yield (
-            f"::{_GITHUB[one.check.severity]} {place}title={_property(title)}::"
-            f"{_data(one.message)}%0A{_data(one.check.cure)}"
-        )
+        text = f"{one.message}\n{one.check.cure}"
+        yield workflow_command(_GITHUB[one.check.severity], title, text, place)
+
+
+def workflow_command(level: str, title: str, text: str, place: str = "") -> str:
+    """One of them; a place has its properties escaped already."""
+    return f"::{level} {place}title={_property(title)}::{_data(text)}"
 
 
 def _data(text: str) -> str:
@@ -147,17 +187,17 @@ def _property(text: str) -> str:
 def summary(report: Report, failures: Collection[Finding]) -> str:
     """A table for GitHub's step summary; a stranger's text is no markup there."""
     verdict = f"{len(failures)} findings fail" if failures else "passed"
-    lines = [f"### envhub check: {verdict}", "", _cell(report.reference), ""]
+    lines = [f"### envhub check: {verdict}", "", cell(report.reference), ""]
     if report.findings:
         lines += ["| | check | task | finding |", "| --- | --- | --- | --- |"]
     for one in report.findings:
         mark = "**fails**" if one in failures else one.check.severity.value
-        lines.append(f"| {mark} | {one.id} | {_cell(one.task)} | {_cell(one.text)} |")
+        lines.append(f"| {mark} | {one.id} | {cell(one.task)} | {cell(one.text)} |")
     return "\n".join(lines) + "\n"
 
 
-def _cell(text: str) -> str:
-    # every character that Markdown or HTML gives a meaning to, by its number
+def cell(text: str) -> str:
+    """A cell of a table in Markdown: each character that means something there by its number."""
     return re.sub(
         r"[^a-zA-Z0-9 ,;=-]", lambda found: f"&#{ord(found[0])};", text.replace("\n", " ")
     )

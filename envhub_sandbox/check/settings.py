@@ -5,6 +5,7 @@ Nothing of the repository that is judged is read here: it has no say in how it i
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -68,7 +69,7 @@ def options(path: Path, known: Collection[str]) -> dict[str, Any]:
 
 def is_judged(path: Path, reference: str) -> bool:
     """Whether a file lies in what is judged, by whatever links one gets there."""
-    judged = Path(reference.partition(":")[0]).resolve()
+    judged = Path(os.path.expanduser(reference.partition(":")[0])).resolve()
     folder = judged if judged.is_dir() else judged.parent
     return judged.exists() and path.resolve().is_relative_to(folder)
 

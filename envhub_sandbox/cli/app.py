@@ -8,7 +8,6 @@ import typer
 
 from envhub_sandbox.cli import (
     cache,
-    check,
     diff,
     gc,
     image,
@@ -18,6 +17,7 @@ from envhub_sandbox.cli import (
     replay,
     version,
 )
+from envhub_sandbox.cli.check.check import check
 from envhub_sandbox.cli.doctor.doctor import doctor
 from envhub_sandbox.cli.init.init import init
 from envhub_sandbox.cli.inspect.inspect import inspect
@@ -59,7 +59,7 @@ def envhub(
 
 app.command("run", epilog=EXIT_CODES)(run)
 app.command("inspect", epilog=EXIT_CODES)(inspect)
-app.command("check", epilog=EXIT_CODES)(check.check)
+app.command("check", epilog=EXIT_CODES)(check)
 app.command("diff", epilog=EXIT_CODES)(diff.diff)
 app.command("prefetch", epilog=EXIT_CODES)(prefetch.prefetch)
 app.command("lock", epilog=EXIT_CODES)(lock.lock)

@@ -51,7 +51,7 @@ class Candidate:
 
     def fetched(self) -> Snapshot:
         """The revision as the Hub resolves it now, downloaded unless it is in the store."""
-        slot = self._slot(self._resolved())
+        slot = self._slot(self.resolved())
         files = store.load_whole(slot)
         if files is None:
             self._bring(slot)
@@ -60,11 +60,8 @@ class Candidate:
             raise SnapshotError(f"{slot.title}: somebody removed it from the store; try again")
         return self._finished(slot, files)
 
-    def _slot(self, commit: str) -> store.Slot:
-        title = f"{'/'.join(self.repo)}@{commit} on {self.hub.public_endpoint}"
-        return store.Slot(self.folder, commit, title)
-
-    def _resolved(self) -> str:
+    def resolved(self) -> str:
+        """The commit that the revision is at the Hub now."""
         commit = self.hub.resolve(self.repo, self.ref.revision)
         if self.ref.is_pinned and commit != self.ref.revision:
             raise SnapshotIntegrityError(
@@ -72,6 +69,10 @@ class Candidate:
                 "than the pinned one. Do not trust this endpoint; use another"
             )
         return commit
+
+    def _slot(self, commit: str) -> store.Slot:
+        title = f"{'/'.join(self.repo)}@{commit} on {self.hub.public_endpoint}"
+        return store.Slot(self.folder, commit, title)
 
     def _bring(self, slot: store.Slot) -> None:
         listing = self.hub.listing(self.repo, slot.commit)

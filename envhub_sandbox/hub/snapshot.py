@@ -9,8 +9,10 @@ read-only in a store of our own. A full commit that is in the store costs no req
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from envhub_sandbox.errors import HubReferenceError, RepositoryUnavailableError, SnapshotError
 from envhub_sandbox.hub import store as store
@@ -25,13 +27,21 @@ from envhub_sandbox.hub.listing import (
     check_names,
     within_limits,
 )
-from envhub_sandbox.hub.local import content_commit, copier, hash_files, scan, split_local
+from envhub_sandbox.hub.local import (
+    LocalFile,
+    content_commit,
+    copier,
+    hash_files,
+    scan,
+    split_local,
+)
 from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef, is_local
 
 __all__ = ["FileRecord", "Snapshot", "SnapshotLimits", "fetch", "local"]
 
 _SHOWN_COMMITS = 5
 _LOCAL_COPIES_DAYS = 14.0
+T = TypeVar("T")
 
 
 def named(
@@ -46,7 +56,7 @@ def named(
     The path of a ``.py`` file that is here means that file. A reference that is also a folder here
     gets a hint.
     """
-    if is_local(reference) or (reference.endswith(".py") and os.path.isfile(reference)):
+    if is_here(reference):
         return local(reference)
     try:
         ref = HubRef.parse(reference)
@@ -56,6 +66,37 @@ def named(
             hint = f"There is such a folder here; for it, write './{reference}'."
             error.args = (f"{error}\n{hint}",)
         raise
+
+
+def is_here(reference: str) -> bool:
+    """Whether a reference names a folder or a file of this machine."""
+    return is_local(reference) or (reference.endswith(".py") and os.path.isfile(reference))
+
+
+def commit_of(
+    reference: str,
+    *,
+    hub_cache_dir: str | Path | None = None,
+    token: str | bool | None = None,
+    endpoint: str | None = None,
+) -> str:
+    """The commit that a reference means now; raises as ``named`` does.
+
+    Nothing is downloaded or copied, and a full commit costs no request. Whether it has the entry
+    file is not looked at.
+    """
+    if is_here(reference):
+        root, _ = split_local(reference, DEFAULT_PATH)
+        return content_commit(_found_here(root, DEFAULT_LIMITS)[1])
+    ref = HubRef.parse(reference)
+    if ref.is_pinned and ref.revision is not None:
+        return ref.revision
+    hub = HubClient(checked_endpoint(endpoint), checked_token(token), hub_cache_dir)
+    candidates = _candidates(ref, hub, DEFAULT_LIMITS)
+    try:
+        return _first(candidates, Candidate.resolved)
+    except HubFailure as failure:
+        raise _unavailable(candidates, [failure]) from failure.__cause__
 
 
 def fetch(
@@ -86,22 +127,24 @@ def fetch(
         HubReferenceError: The token or endpoint cannot be one.
     """
     hub = HubClient(checked_endpoint(endpoint), checked_token(token), hub_cache_dir)
-    candidates = [
-        Candidate(ref, Repository(kind, ref.repo_id), hub, limits)
-        for kind in ((ref.repo_type,) if ref.repo_type else ("model", "space"))
-    ]
+    candidates = _candidates(ref, hub, limits)
     try:
-        return _first_stored(candidates) or _first_fetched(candidates)
+        return _first_stored(candidates) or _first(candidates, Candidate.fetched)
     except HubFailure as failure:
         raise _unavailable(candidates, [failure]) from failure.__cause__
     except store.HalfDeletedError as half:
         return _fetched_again(candidates, half)
 
 
+def _candidates(ref: HubRef, hub: HubClient, limits: SnapshotLimits) -> list[Candidate]:
+    kinds = (ref.repo_type,) if ref.repo_type else ("model", "space")
+    return [Candidate(ref, Repository(kind, ref.repo_id), hub, limits) for kind in kinds]
+
+
 def _fetched_again(candidates: list[Candidate], half: store.HalfDeletedError) -> Snapshot:
     """What is left of it stays, until there is all of it."""
     try:
-        return _first_fetched(candidates)
+        return _first(candidates, Candidate.fetched)
     except HubFailure as failure:
         error, cause = _unavailable(candidates, [failure]), failure.__cause__
     except RepositoryUnavailableError as unavailable:
@@ -117,11 +160,11 @@ def _first_stored(candidates: list[Candidate]) -> Snapshot | None:
     return next((snapshot for snapshot in stored if snapshot is not None), None)
 
 
-def _first_fetched(candidates: list[Candidate]) -> Snapshot:
+def _first(candidates: list[Candidate], ask: Callable[[Candidate], T]) -> T:
     failures: list[HubFailure] = []
     for candidate in candidates:
         try:
-            return candidate.fetched()
+            return ask(candidate)
         except HubFailure as failure:
             if failure.kind not in ABSENT:
                 raise
@@ -177,12 +220,7 @@ def local(
     """
     root, path = split_local(str(folder), path)
     title = f"local folder {root}"
-    try:
-        found = within_limits(scan(root), limits, title)
-    except OSError as error:
-        raise SnapshotError(f"{title}: it cannot be read: {error}") from error
-    files = hash_files(found, title)
-    check_names(files, title)
+    found, files = _found_here(root, limits)
     if all(file.path != path for file in files):
         what, advice = missing_entry(path, files)
         raise RepositoryUnavailableError(f"{title} {what}. {advice}")
@@ -193,3 +231,16 @@ def local(
         store.remove_unused(slot.folder, days=_LOCAL_COPIES_DAYS)
     store.mark_used(slot)
     return Snapshot(str(root), "local", slot.commit, path, slot.tree, files)
+
+
+def _found_here(
+    root: Path, limits: SnapshotLimits
+) -> tuple[tuple[LocalFile, ...], tuple[FileRecord, ...]]:
+    title = f"local folder {root}"
+    try:
+        found = within_limits(scan(root), limits, title)
+    except OSError as error:
+        raise SnapshotError(f"{title}: it cannot be read: {error}") from error
+    files = hash_files(found, title)
+    check_names(files, title)
+    return found, files

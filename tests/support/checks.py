@@ -52,6 +52,7 @@ yours: it is named, and never looked for, and one that lies in what is judged is
 
 `--json` prints everything; `--junit FILE` has one test case for each check of each task, `--sarif
 FILE` is SARIF 2.1.0, and `--github` prints annotations and appends to `$GITHUB_STEP_SUMMARY`.
+`--all FILE` judges a list, every night: see [ci.md](ci.md#every-night).
 
 `--html FILE` is one page that needs nothing else and runs no script. It has the findings and, of
 each task, rendered frames, a film of some seconds (with the extra `video`), the returns and lengths

@@ -6,6 +6,9 @@ stands at a line's beginning, or is ``##[``, which is broken up.
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -53,3 +56,12 @@ def level(name: str) -> Severity:
     if name not in {one.value for one in Severity}:
         raise UsageError(f"--fail-on is {name!r}; it takes error, warning or note")
     return Severity(name)
+
+
+def annotate(commands: Iterable[str], summary: str) -> None:
+    """Print GitHub's workflow commands, and append to its step's summary."""
+    for line in commands:
+        typer.echo(line)
+    if path := os.environ.get("GITHUB_STEP_SUMMARY"):
+        with Path(path).open("a", encoding="utf-8") as file:
+            file.write(summary)

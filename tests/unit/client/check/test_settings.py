@@ -76,15 +76,22 @@ def test_a_file_that_says_nothing_is_refused(text: str, says: str, tmp_path: Pat
         options(tmp_path, text)
 
 
-def test_what_is_judged_has_no_say(tmp_path: Path) -> None:
+def test_what_is_judged_has_no_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whether a folder is judged or a file, and by whatever link one gets there."""
     judged, link = tmp_path / "judged", tmp_path / "link"
     (judged / "sub").mkdir(parents=True)
     (judged / "env.py").touch()
     link.symlink_to(judged)
+    monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "mine.toml").symlink_to(judged / "envhub.toml")
     for file in (judged / "envhub.toml", judged / "sub/envhub.toml", tmp_path / "mine.toml"):
-        for reference in (str(judged), str(link), str(judged / "env.py"), f"{link}:env.py"):
+        for reference in (
+            str(judged),
+            str(link),
+            str(judged / "env.py"),
+            f"{link}:env.py",
+            "~/link",
+        ):
             assert settings.is_judged(file, reference), (file, reference)
     assert not settings.is_judged(tmp_path / "envhub.toml", str(judged))
     assert not settings.is_judged(judged / "envhub.toml", "org/repo@0123")

@@ -14,7 +14,7 @@ from envhub_sandbox.errors import (
     SnapshotIntegrityError,
     SnapshotTooLargeError,
 )
-from envhub_sandbox.hub.snapshot import Snapshot, SnapshotLimits, local
+from envhub_sandbox.hub.snapshot import Snapshot, SnapshotLimits, commit_of, local, store
 
 
 @pytest.fixture
@@ -92,6 +92,17 @@ def test_file_in_a_sub_folder_takes_its_own_folder(folder: Path) -> None:
     """A path to a file means the folder around it, nothing further up."""
     snapshot = local(folder / "sub" / "other.py")
     assert (snapshot.path, names(snapshot)) == ("other.py", ["other.py"])
+
+
+def test_a_folders_commit_is_named_without_a_copy(folder: Path) -> None:
+    """By its content, and by whatever file of it."""
+    (folder / "new.py").write_text("new = 1")
+    named = commit_of(str(folder))
+    assert named == commit_of(f"{folder}:new.py") == commit_of(f"{folder}/new.py")
+    assert store.commits(store.local_folder()) == []
+    assert local(folder).commit == named
+    (folder / "new.py").write_text("new = 2")
+    assert commit_of(str(folder)) != named
 
 
 def test_missing_folder_says_what_to_write(folder: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import secrets
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -14,10 +13,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from envhub_sandbox.cli.check import options as of_list
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
-from envhub_sandbox.cli.shared.findings import STYLES, level
+from envhub_sandbox.cli.shared.findings import STYLES, annotate, level
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_sandbox.cli.shared.select import select
 
@@ -45,7 +45,15 @@ def _with_settings(ctx: typer.Context, path: Path | None) -> Path | None:
 
 
 def check(
-    ref: opt.Ref,
+    ctx: typer.Context,
+    ref: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="REF",
+            help="A hub reference, 'org/repo@revision:path/env.py', or a folder, './my-env'; or "
+            "none, with --all.",
+        ),
+    ] = None,
     steps: Annotated[
         int, typer.Option(min=1, help="Vector steps of each play; there are up to three.")
     ] = 200,
@@ -97,6 +105,12 @@ def check(
             rich_help_panel=_PANEL,
         ),
     ] = False,
+    listed: of_list.File = None,
+    output: of_list.Output = None,
+    jobs: of_list.Jobs = None,
+    memory_budget: of_list.MemoryBudget = None,
+    deadline: of_list.Deadline = None,
+    again: of_list.Again = False,
     suite: opt.Suite = None,
     task: opt.Task = None,
     n_envs: opt.NEnvs = 2,
@@ -132,10 +146,12 @@ def check(
     something does; others: it could not be judged.
 
     [bold]envhub check org/repo@<commit> --junit report.xml[/bold]
+
+    [bold]envhub check --all references.txt --output judged[/bold]
     """
     with _unheard(github) as heard, reported(debug=debug):
         make = opt.MakeOptions(
-            ref=ref,
+            ref=ref or "",
             n_envs=n_envs,
             use_async=use_async,
             env_kwargs=env_kwargs,
@@ -160,6 +176,33 @@ def check(
             hub_cache_dir=hub_cache_dir,
         )
         least, allowed = level(fail_on), _known(allow or ())
+        if listed is not None:
+            _refuse_beside_a_list(ref=ref, sarif=sarif, html=html)
+            from envhub_sandbox.cli.check import many
+
+            wanted = many.Wanted(
+                file=listed,
+                output=output,
+                jobs=jobs,
+                memory_budget=memory_budget,
+                deadline=deadline,
+                again=again,
+                make=make,
+                settings=settings,
+                policy=policy,
+                arguments=many.handed_on(ctx),
+                debug=debug,
+            )
+            many.show(
+                many.judge_all(wanted), json=json, junit=junit, heard=heard if github else None
+            )
+            return
+        if ref is None:
+            raise UsageError("name a repository, or a list of them: --all FILE --output DIR")
+        if output or jobs or memory_budget or deadline or again:
+            raise UsageError(
+                "--output, --jobs, --memory-budget, --deadline and --again are for --all FILE"
+            )
         if settings is not None:
             _refuse_the_judged(settings, ref)
         play = _Play(seed, steps, resets, slow_step, suite, task, html is not None)
@@ -167,8 +210,10 @@ def check(
         failures = report.failures(least, allowed)
         _write(report, failures, junit=junit, sarif=sarif, html=html)
         if github:
+            from envhub_sandbox.check import reports
+
             with heard():
-                _annotate(report, failures)
+                annotate(reports.workflow_commands(report), reports.summary(report, failures))
         if json:
             from envhub_sandbox.check.reports import document
 
@@ -203,6 +248,18 @@ def _unheard(github: bool) -> Iterator[Callable[[], AbstractContextManager[None]
             yield heard
         finally:
             typer.echo(f"\n::{token}::")
+
+
+def _refuse_beside_a_list(**options: object) -> None:
+    for name, value in options.items():
+        if value is None:
+            continue
+        if name == "ref":
+            raise UsageError(f"a list, by --all, or one repository, {value}: not both")
+        raise UsageError(
+            f"--{name} is about one repository; with --all each has its page and its JSON in "
+            "--output DIR, and --junit FILE is about all"
+        )
 
 
 def _refuse_the_judged(settings: Path, ref: str) -> None:
@@ -240,6 +297,7 @@ class _Play:
 def _judge(make: opt.MakeOptions, policy: Path | None, play: _Play, *, quiet: bool) -> Report:
     arguments = make.arguments()
     del arguments["cfg"], arguments["validate"], arguments["num_workers"]
+    arguments["prewarm"] = 0  # a jail that nobody has asked for yet would be one more at once
     from envhub_sandbox.check import settings
     from envhub_sandbox.check.judge import Asked, judge
 
@@ -282,16 +340,6 @@ def _write(
             reports.write(path, form(report, failures))
         except OSError as error:
             raise UsageError(f"the report cannot be written: {error}") from error
-
-
-def _annotate(report: Report, failures: list[Finding]) -> None:
-    from envhub_sandbox.check import reports
-
-    for line in reports.workflow_commands(report):
-        typer.echo(line)
-    if path := os.environ.get("GITHUB_STEP_SUMMARY"):
-        with Path(path).open("a", encoding="utf-8") as file:
-            file.write(reports.summary(report, failures))
 
 
 def _print(report: Report, failures: list[Finding]) -> None:

@@ -1,0 +1,111 @@
+"""The list: one reference a line, and all that is wrong with it told before anything is run."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import IO
+
+from envhub_sandbox.errors import EnvHubError, HubReferenceError
+from envhub_sandbox.hub.grammar import has_control_characters
+from envhub_sandbox.hub.local import split_local
+from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef
+from envhub_sandbox.hub.snapshot import is_here
+from envhub_worker.protocol.text import printable
+
+MOST_BYTES = 1 << 20
+MOST = 2_000
+"""References: a page of as many rows is one that people can read."""
+_LONGEST = 4_096
+_TOLD = 20
+_SLUG = 48
+
+
+@dataclass(frozen=True)
+class Listed:
+    """One reference of a list.
+
+    Attributes:
+        reference: As it is run and shown.
+        meaning: The same for every way to write it.
+        line: Where it stands.
+    """
+
+    reference: str
+    meaning: str
+    line: int
+
+    @property
+    def name(self) -> str:
+        """What its files are called: a part that people know, and a hash that no other has.
+
+        Of the reference's own characters only letters and digits are left, so that nothing in it
+        is a path, hidden, an option or markup; on disks that ignore case, too.
+        """
+        known = self.meaning.partition("@")[0]
+        if self.meaning.startswith("/"):
+            known = "/".join(Path(self.meaning.rpartition(":")[0]).parts[-2:])
+        slug = re.sub(r"[^a-z0-9]+", "-", known.lower()).strip("-")[:_SLUG].strip("-")
+        digest = hashlib.sha256(self.meaning.encode("utf-8", "surrogatepass")).hexdigest()[:16]
+        return f"{slug}-{digest}" if slug else digest
+
+
+def read(file: IO[bytes], title: str) -> list[Listed]:
+    """The references of a list. Empty lines, and those that begin with ``#``, are none.
+
+    Args:
+        file: The list, in UTF-8. A folder in it is looked for from the current one.
+        title: What it is called in errors.
+
+    Raises:
+        HubReferenceError: Something in it is no reference, no folder that is here, or stands there
+            twice; or there is too much, or nothing.
+    """
+    data = file.read(MOST_BYTES + 1)
+    if len(data) > MOST_BYTES:
+        raise HubReferenceError(f"{title} is larger than {MOST_BYTES} bytes; divide it")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        raise HubReferenceError(f"{title}:{line}: this is not UTF-8") from None
+    found: dict[str, Listed] = {}
+    wrong = list(_read_into(found, text))
+    if wrong:
+        more = [f"and {len(wrong) - _TOLD} more"] if len(wrong) > _TOLD else []
+        told = "\n".join([*(f"{title}:{line}: {what}" for line, what in wrong[:_TOLD]), *more])
+        raise HubReferenceError(f"nothing was run, for the list cannot be read:\n{told}")
+    if not found:
+        raise HubReferenceError(f"{title} has no reference in it: one a line")
+    if len(found) > MOST:
+        raise HubReferenceError(f"{title} has more than {MOST} references; divide it")
+    return list(found.values())
+
+
+def _read_into(found: dict[str, Listed], text: str) -> Iterator[tuple[int, str]]:
+    """Take every line; yield where something is wrong, and what."""
+    for number, line in enumerate(text.split("\n"), 1):
+        written = line.strip()
+        if not written or written.startswith("#"):
+            continue
+        try:
+            reference, meaning = _meaning(written)
+        except (EnvHubError, OSError, ValueError) as error:
+            yield number, printable(str(error), _LONGEST)
+            continue
+        first = found.setdefault(meaning, Listed(reference, meaning, number))
+        if first.line != number:
+            yield number, f"{reference} stands in line {first.line} already, as {first.reference}"
+
+
+def _meaning(reference: str) -> tuple[str, str]:
+    if len(reference) > _LONGEST or has_control_characters(reference):
+        raise HubReferenceError("this is no reference: too long, or with control characters")
+    if is_here(reference):
+        folder, path = split_local(reference, DEFAULT_PATH)
+        return reference, f"{folder.resolve()}:{path}"
+    ref = HubRef.parse(reference)
+    return str(ref), str(replace(ref, revision=ref.revision or "main"))

@@ -1,0 +1,264 @@
+"""What has been judged, in a folder: whatever ends a run, the next one goes on from there.
+
+A repository's report (``NAME.json``) is written last, and says which page (``NAME.html``) belongs
+to it: one that is there is whole. It counts again for the same commit, judged in the same way.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import json
+import math
+import os
+import shutil
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from envhub_sandbox.check import reports
+from envhub_sandbox.check.findings import Finding, Report
+from envhub_sandbox.check.many.lines import Listed
+from envhub_sandbox.check.parsing import content
+
+MOST_BYTES = 32 << 20
+"""Of one report, and of one page."""
+_MARK = ".envhub-check"
+_RUNNING = ".running"
+_REPORTS = "reports"
+
+
+class FolderError(Exception):
+    """Results cannot be kept there."""
+
+
+class ForeignResultError(Exception):
+    """A file is where a result would be, and is none; the text says why."""
+
+
+class Verdict(Enum):
+    """What came of a reference."""
+
+    FAILED = "failed"
+    UNJUDGED = "not judged"
+    WAITING = "waiting"
+    PASSED = "passed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """What came of one reference.
+
+    Attributes:
+        listed: The reference.
+        verdict: Ours.
+        commit: Which was judged; empty if none was.
+        found: How many findings of each severity.
+        fails: The checks that fail it.
+        seconds: What that took.
+        ended: When, as ISO 8601 has it.
+        said: Why it could not be judged. Trust: partly a stranger's text.
+    """
+
+    listed: Listed
+    verdict: Verdict = Verdict.WAITING
+    commit: str = ""
+    found: Mapping[str, int] | None = None
+    fails: tuple[str, ...] = ()
+    seconds: float = 0.0
+    ended: str = ""
+    said: str = ""
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether there is a report of it."""
+        return self.verdict in (Verdict.PASSED, Verdict.FAILED)
+
+
+class Results:
+    """A folder of results, which one run at a time has.
+
+    Args:
+        folder: It is made if it is missing.
+        settings: A digest of how is judged: results of others do not count.
+    """
+
+    def __init__(self, folder: Path, settings: str) -> None:
+        self._folder, self._settings = folder, settings
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[Path]:
+        """Hold the folder; yields a place in it for what is being judged.
+
+        Raises:
+            FolderError: It has other things in it, is another run's, or cannot be written.
+        """
+        running = self._folder / _RUNNING
+        try:
+            with self._marked():
+                (self._folder / _REPORTS).mkdir(exist_ok=True)
+                _remove(running)  # of a run that was killed
+                running.mkdir(mode=0o700)
+                try:
+                    yield running
+                finally:
+                    _remove(running)
+        except BrokenPipeError:
+            raise  # nobody reads what is printed meanwhile
+        except OSError as error:
+            raise FolderError(f"{self._folder}: results cannot be kept there: {error}") from error
+
+    @contextlib.contextmanager
+    def _marked(self) -> Iterator[None]:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        mark = self._folder / _MARK
+        if not mark.exists() and any(self._folder.iterdir()):
+            raise FolderError(
+                f"{self._folder} has other things in it, and no results: name a new folder"
+            )
+        flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+        descriptor = os.open(mark, flags, 0o666)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(descriptor)
+            raise FolderError(f"another run writes to {self._folder}; wait for its end") from None
+        try:
+            yield
+        finally:
+            os.close(descriptor)
+
+    def kept(self, listed: Listed) -> Result | None:
+        """What came of a reference when it was judged before, in this way; None if it was not.
+
+        Raises:
+            ForeignResultError: What is there is cut off, changed, or none of ours.
+        """
+        told = self._told(listed)
+        return None if told is None else told[0]
+
+    def report(self, listed: Listed) -> tuple[Report, list[Finding]] | None:
+        """The report that ``kept`` speaks of, if there is one."""
+        with contextlib.suppress(ForeignResultError):
+            if (told := self._told(listed)) is not None:
+                return told[1:]
+        return None
+
+    def _told(self, listed: Listed) -> tuple[Result, Report, list[Finding]] | None:
+        path = self._path(listed, "json")
+        if not os.path.lexists(path):
+            return None
+        data = content(path, MOST_BYTES)
+        if data is None:
+            raise ForeignResultError(f"{path} is no file of ours")
+        try:
+            told = json.loads(data)
+            how = told["judgement"]
+            if how["settings"] != self._settings:
+                return None
+            if how["reference"] != listed.meaning or how["page"] != self._digest(listed):
+                raise ValueError("not of this reference, or without its page")
+            report, failures = reports.read(told)
+            seconds, ended = _seconds(how["seconds"]), str(how["ended"])[:40]
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
+            raise ForeignResultError(f"{path} is cut off, or was changed ({error})") from error
+        result = _result(listed, report, failures, seconds=seconds, ended=ended)
+        return result, report, failures
+
+    def keep(
+        self, listed: Listed, told: Mapping[str, Any], page: Path, *, seconds: float, ended: str
+    ) -> Result:
+        """Keep a report as ``check --json`` has printed it, and take its page.
+
+        Raises:
+            ForeignResultError: It is no such report, or there is no page.
+            OSError: It cannot be written.
+        """
+        try:
+            report, failures = reports.read(told)
+        except (KeyError, TypeError, ValueError) as error:
+            raise ForeignResultError(f"this is no report: {error}") from error
+        data = content(page, MOST_BYTES)
+        if data is None:
+            raise ForeignResultError("there is no page")
+        write(self._path(listed, "html"), data)
+        how = {
+            "settings": self._settings,
+            "reference": listed.meaning,
+            "page": hashlib.sha256(data).hexdigest(),
+            "seconds": round(seconds, 3),
+            "ended": ended,
+        }
+        text = json.dumps({**told, "judgement": how}, indent=2, allow_nan=False)
+        write(self._path(listed, "json"), text.encode())
+        return _result(listed, report, failures, seconds=seconds, ended=ended)
+
+    def forget(self, listed: Listed) -> None:
+        """Let it be judged again."""
+        self._path(listed, "json").unlink(missing_ok=True)
+
+    def write(self, name: str, text: str) -> None:
+        """Write a file about all of them."""
+        write(self._folder / name, text.encode("utf-8", "backslashreplace"))
+
+    def _digest(self, listed: Listed) -> str | None:
+        data = content(self._path(listed, "html"), MOST_BYTES)
+        return None if data is None else hashlib.sha256(data).hexdigest()
+
+    def _path(self, listed: Listed, kind: str) -> Path:
+        return self._folder / link(listed, kind)
+
+
+def link(listed: Listed, kind: str) -> str:
+    """Where a reference's ``html`` or ``json`` lies in the folder."""
+    return f"{_REPORTS}/{listed.name}.{kind}"
+
+
+def write(path: Path, data: bytes) -> None:
+    """Write a file; whoever reads it meanwhile, or after the power failed, reads the old one.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    part = path.with_name(f".{path.name}.part")
+    part.unlink(missing_ok=True)
+    fd = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+    try:
+        with open(fd, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(fd)
+        os.replace(part, path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def _result(
+    listed: Listed, report: Report, failures: list[Finding], *, seconds: float, ended: str
+) -> Result:
+    return Result(
+        listed=listed,
+        verdict=Verdict.FAILED if failures else Verdict.PASSED,
+        commit=report.commit,
+        found=Counter(one.check.severity.value for one in report.findings),
+        fails=tuple(dict.fromkeys(one.id for one in failures)),
+        seconds=seconds,
+        ended=ended,
+    )
+
+
+def _seconds(value: object) -> float:
+    seconds = float(value)  # type: ignore[arg-type]
+    if not math.isfinite(seconds):
+        raise ValueError("that is no time")
+    return seconds
+
+
+def _remove(folder: Path) -> None:
+    if folder.exists():
+        shutil.rmtree(folder)

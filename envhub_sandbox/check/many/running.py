@@ -1,0 +1,169 @@
+"""Judgements side by side, each a process of its own: what ends one ends no other.
+
+One thread starts them, looks what has become of them, and ends them: so that there is one place
+that an interrupt can come to, and whatever it interrupts, none is left.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Generator, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Generic, TypeVar
+
+from envhub_worker.protocol.text import printable
+
+_TICK_S = 0.1
+_MOST_BYTES = 32 << 20
+"""Of what one prints: a document, or what it complains of."""
+_TAIL_BYTES = 4_096
+_KILLED_S = 20.0
+"""For the kernel to end one, where that is not in a disk's hands."""
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ended(Generic[T]):
+    """What has become of a process.
+
+    Attributes:
+        order: What it was started for.
+        folder: Its own, with what it has written. It is there until the next is asked for.
+        code: Its exit code, negative for a signal; None where we have ended it.
+        seconds: How long it ran.
+        out: What it has printed.
+        said: The end of what it has complained of, or why we have ended it. Trust: partly a
+            stranger's text; it is printable.
+    """
+
+    order: T
+    folder: Path
+    code: int | None
+    seconds: float
+    out: bytes
+    said: str
+
+
+class _Running(Generic[T]):
+    def __init__(
+        self, order: T, folder: Path, command: list[str], variables: Mapping[str, str]
+    ) -> None:
+        self.order, self._folder = order, folder
+        self._begun = time.monotonic()
+        folder.mkdir(mode=0o700)
+        with self._file("out").open("xb") as out, self._file("err").open("xb") as err:
+            self.process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=err,
+                env={**os.environ, **variables},
+                start_new_session=True,  # Ctrl-C is for us, who then end it
+            )
+
+    def ended(self, most_s: float, patience_s: float) -> Ended[T] | None:
+        """What has become of it, if it has ended; one that takes or says too much is ended."""
+        code = self.process.poll()
+        why = "" if code is not None else self._too_much(most_s)
+        if code is None and not why:
+            return None
+        if why:
+            end([self], patience_s)
+        return Ended(
+            order=self.order,
+            folder=self._folder,
+            code=code,
+            seconds=time.monotonic() - self._begun,
+            out=b"" if why else self._read("out", _MOST_BYTES),
+            said=why or self._complaint(code),
+        )
+
+    def _too_much(self, most_s: float) -> str:
+        if time.monotonic() - self._begun > most_s:
+            return f"there was no verdict within {most_s:g} s (--deadline)"
+        if any(self._file(name).stat().st_size > _MOST_BYTES for name in ("out", "err")):
+            return f"it printed more than {_MOST_BYTES} bytes"
+        return ""
+
+    def _complaint(self, code: int | None) -> str:
+        end = f"a signal ended it: {-code}. " if code is not None and code < 0 else ""
+        text = self._read("err", _TAIL_BYTES).decode("utf-8", "replace")
+        return printable(end + text.strip())
+
+    def _read(self, name: str, last: int) -> bytes:
+        with self._file(name).open("rb") as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - last))
+            return file.read(last)
+
+    def _file(self, name: str) -> Path:
+        return self._folder / name
+
+
+def judgements(
+    orders: Iterable[T],
+    command: Callable[[T, Path], list[str]],
+    *,
+    folder: Path,
+    jobs: int,
+    most_s: float,
+    variables: Mapping[str, str],
+    patience_s: float = 20.0,
+) -> Generator[Ended[T], None, None]:
+    """Run a command for each order, and tell in the order in which they end.
+
+    Whoever stops asking, or is interrupted, must close the iterator: then all are ended.
+
+    Args:
+        orders: What is asked for the next as soon as there is room for it.
+        command: What is run for an order, with a folder of its own.
+        folder: Where these folders are made.
+        jobs: How many run at once.
+        most_s: How long one may take.
+        variables: Of the environment, beyond ours.
+        patience_s: For one that is told to end: its jails have to go.
+    """
+    waiting = enumerate(orders)
+    running: list[_Running[T]] = []
+    more = True
+    try:
+        while more or running:
+            while more and len(running) < jobs:
+                number, order = next(waiting, (-1, None))
+                more = order is not None
+                if order is not None:
+                    place = folder / str(number)
+                    running.append(_Running(order, place, command(order, place), variables))
+            time.sleep(_TICK_S)
+            for job in tuple(running):
+                what = job.ended(most_s, patience_s)
+                if what is not None:
+                    running.remove(job)
+                    yield what
+                    shutil.rmtree(what.folder, ignore_errors=True)
+    finally:
+        end(running, patience_s)
+
+
+def end(running: Iterable[_Running[T]], patience_s: float) -> None:
+    """End processes, and what they have started; whoever is impatient may interrupt again."""
+    left = [one.process for one in running]
+    until = time.monotonic() + patience_s
+    try:
+        for process in left:
+            process.terminate()
+        while time.monotonic() < until and any(process.poll() is None for process in left):
+            time.sleep(_TICK_S / 4)
+    finally:
+        for process in left:
+            if process.poll() is None:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+        for process in left:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(_KILLED_S)

@@ -1,0 +1,1 @@
+"""``envhub check``: one repository, or a list of them."""

@@ -1,0 +1,60 @@
+"""Options of ``envhub check`` that are about a list."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+_PANEL = "A list"
+
+File = Annotated[
+    str | None,
+    typer.Option(
+        "--all",
+        metavar="FILE",
+        help="Judge each reference of a list, one a line; '-' is stdin.",
+        rich_help_panel=_PANEL,
+    ),
+]
+Output = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR",
+        help="With --all: where the reports and their index go. A run goes on from what is there.",
+        rich_help_panel=_PANEL,
+    ),
+]
+Jobs = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        help="With --all: judgements at once; by default one for every two cores.",
+        rich_help_panel=_PANEL,
+    ),
+]
+MemoryBudget = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SIZE",
+        help="With --all: what the limits of all jails at once may add up to; by default the "
+        "memory that is free.",
+        rich_help_panel=_PANEL,
+    ),
+]
+Deadline = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SECONDS",
+        min=1,
+        help="With --all: how long one judgement may take as a whole; an hour by default.",
+        rich_help_panel=_PANEL,
+    ),
+]
+Again = Annotated[
+    bool,
+    typer.Option(
+        "--again", help="With --all: judge all of them, as if nothing was.", rich_help_panel=_PANEL
+    ),
+]

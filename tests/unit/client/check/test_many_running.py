@@ -1,0 +1,114 @@
+"""Processes side by side: never more than there may be, and what ends one ends no other."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+
+from envhub_sandbox.check.many.running import Ended, judgements
+from tests.support.processes import eventually
+
+_PROGRAMS = {
+    "well": "print('a document')",
+    "crash": "import os, sys; print('partly', file=sys.stderr, flush=True); os.abort()",
+    "fail": "import sys; sys.exit('\\x1b[2Jit is wrong')",
+    "hang": "import time; time.sleep(3600)",
+    "flood": "import sys\nwhile True: sys.stdout.write('x' * 1_000_000)",
+    "stubborn": (
+        "import os, signal, time\n"
+        "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+        "open('ready', 'w').close() if os.fork() else None\n"
+        "time.sleep(3600)"
+    ),
+}
+
+
+def command(order: str, place: Path) -> list[str]:
+    """What is run for an order, in its folder."""
+    return [
+        sys.executable,
+        "-I",
+        "-c",
+        f"import os; os.chdir({str(place)!r})\n{_PROGRAMS[order]}",
+    ]
+
+
+def run(folder: Path, *orders: str, jobs: int = 2, most_s: float = 300.0) -> dict[str, Ended[str]]:
+    """What becomes of orders."""
+    found = judgements(
+        orders, command, folder=folder, jobs=jobs, most_s=most_s, variables={"ENVHUB_X": "1"}
+    )
+    with contextlib.closing(found):
+        return {one.order: one for one in found}
+
+
+def test_what_ends_one_ends_no_other(tmp_path: Path) -> None:
+    """Each is told with its code, and the end of what it complained of."""
+    found = run(tmp_path, "crash", "well", "fail")
+    assert (found["well"].code, found["well"].out) == (0, b"a document\n")
+    assert found["crash"].code == -6
+    assert found["crash"].said == "a signal ended it: 6. partly"
+    assert (found["fail"].code, found["fail"].said) == (1, "\\x1b[2Jit is wrong")
+    assert list(tmp_path.iterdir()) == [], "their folders are gone"
+
+
+@pytest.mark.parametrize(("order", "says"), [("hang", "--deadline"), ("flood", "printed more")])
+def test_one_that_takes_or_says_too_much_is_ended(order: str, says: str, tmp_path: Path) -> None:
+    """And the next is run."""
+    most_s = 0.5 if order == "hang" else 300.0
+    found = run(tmp_path, order, jobs=1, most_s=most_s)
+    assert (found[order].code, says in found[order].said) == (None, True), found
+    assert found[order].out == b""
+    assert run(tmp_path, "well")["well"].code == 0
+
+
+@pytest.mark.parametrize("jobs", [1, 2, 3])
+def test_there_are_never_more_than_there_may_be(jobs: int, tmp_path: Path) -> None:
+    """And as many, while there are orders."""
+    begun, ended, most = 0, 0, []
+
+    def counted(order: int, place: Path) -> list[str]:
+        nonlocal begun
+        begun += 1
+        most.append(begun - ended)
+        return command("well", place)
+
+    found = judgements(range(7), counted, folder=tmp_path, jobs=jobs, most_s=300, variables={})
+    for one in found:
+        assert one.code == 0
+        ended += 1
+    assert (begun, ended, max(most)) == (7, 7, jobs)
+
+
+def test_whoever_stops_leaves_none(tmp_path: Path) -> None:
+    """Nor what they have started, however stubborn it is."""
+    found = judgements(
+        ["well", "stubborn", "hang"],
+        command,
+        folder=tmp_path,
+        jobs=3,
+        most_s=300.0,
+        variables={},
+        patience_s=1.0,
+    )
+    assert next(found).order == "well"
+    assert eventually(lambda: (tmp_path / "1" / "ready").exists())
+    below = [
+        one
+        for one in psutil.Process().children(recursive=True)
+        if str(tmp_path) in " ".join(one.cmdline())
+    ]
+    assert len(below) == 3, "the control: two of ours, and one of theirs"
+    found.close()
+    assert eventually(lambda: not any(map(runs, below)))
+
+
+def runs(process: psutil.Process) -> bool:
+    """Whether it has not ended."""
+    with contextlib.suppress(psutil.NoSuchProcess):
+        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+    return False
