@@ -58,8 +58,8 @@ def recording(env: object) -> Recording | None:
 @contextmanager
 def standing_in() -> Iterator[None]:
     """While it lasts, the two classes record instead of building."""
-    for cls, lazy in _LAZY.items():
-        cls.__init__ = _recorder(cls, lazy)
+    for cls, recorder in _RECORDERS.items():
+        cls.__init__ = recorder
     try:
         yield
     finally:
@@ -159,3 +159,5 @@ def _close(self: Any, **kwargs: Any) -> None:
 _CLASSES: tuple[Any, ...] = (SyncVectorEnv, AsyncVectorEnv)
 _LAZY: dict[Any, type] = {cls: _lazy_class(cls) for cls in _CLASSES}
 _REAL_INIT: dict[Any, Callable[..., None]] = {cls: cls.__init__ for cls in _LAZY}
+# here, where a zygote makes them once: what a signature is takes its time
+_RECORDERS = {cls: _recorder(cls, lazy) for cls, lazy in _LAZY.items()}
