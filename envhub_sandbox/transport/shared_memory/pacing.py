@@ -10,6 +10,8 @@ from envhub_sandbox.transport.shared_memory.sharding import ASK_NS, Cost, Pace, 
 
 _PACE_STEPS = 256
 """Steps after which what shards cost one another is worth remembering."""
+_LEAST_SHARE = 0.25
+"""How much a step counts at least where a life was shorter."""
 _SAMPLES = 64
 
 
@@ -38,10 +40,12 @@ class Pacing:
 
         An evaluation plays each task of a suite for a few steps. After so few, what a wake-up costs
         is not told from one or two of them, but how long a step is can be: the shard that was
-        disturbed least says so.
+        disturbed least says so. It counts as shorter than it was: so short a life does not make up
+        for the start of a process more, and one step may have been disturbed in every shard.
         """
         if self._samples and shards[0].sequence >= _PACE_STEPS:
             asleep, awake = self._sizes[self._awake :], self._sizes[: self._awake]
             return pace_of(self._samples, max(asleep), max(awake))
         each = [shard.busy_ns / size for shard, size in zip(shards, self._sizes, strict=True)]
-        return Pace(Cost(ASK_NS, min(each)), None) if all(each) else None
+        share = min(1.0, max(_LEAST_SHARE, shards[0].sequence / _PACE_STEPS))
+        return Pace(Cost(ASK_NS, share * min(each)), None) if all(each) else None

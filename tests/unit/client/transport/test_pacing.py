@@ -22,11 +22,26 @@ def shards(sequence: int, *busy_ns: int) -> list[Any]:
     return [Shard(busy, sequence) for busy in busy_ns]
 
 
-def test_a_short_life_tells_how_long_a_step_is() -> None:
-    """Of sixty steps one was measured, in each shard; what was disturbed is longer."""
+def told(pacing: Pacing, *measured: int) -> float:
+    """How long a step is, where nothing is told of wake-ups."""
+    pace = pacing.pace(shards(*measured))
+    assert pace is not None
+    assert pace == Pace(Cost(ASK_NS, pace.awake.step_ns), None)
+    return pace.awake.step_ns
+
+
+def test_a_life_without_samples_tells_how_long_a_step_is() -> None:
+    """One was measured, in each shard; what was disturbed is longer."""
     pacing = Pacing([2, 2], awake=1)
-    assert pacing.pace(shards(61, 14_000, 90_000)) == Pace(Cost(ASK_NS, 7_000), None)
-    assert Pacing([4], awake=1).pace(shards(61, 28_000)) == Pace(Cost(ASK_NS, 7_000), None)
+    assert told(pacing, 256, 14_000, 90_000) == told(pacing, 5_000, 90_000, 14_000) == 7_000
+    assert told(Pacing([4], awake=1), 256, 28_000) == 7_000
+
+
+def test_in_a_short_life_steps_count_as_shorter() -> None:
+    """It does not make up for the start of a process more; but a long step stays a long one."""
+    pacing = Pacing([4], awake=1)
+    assert told(pacing, 128, 28_000) == 3_500
+    assert told(pacing, 61, 28_000) == told(pacing, 33, 28_000) == 1_750
 
 
 def test_a_life_without_a_measured_step_tells_nothing() -> None:
