@@ -310,8 +310,10 @@ class Exchange:
         except RunnersDiedError:
             raise
         except EnvHubError as error:
+            self._lease.forget_watched()
             self._failed(error, deadline)
         except BaseException as error:  # Ctrl-C, or whatever else a signal handler raises or does
+            self._lease.forget_watched()
             self._interrupted(error)
             raise
         lifecycle.request = None

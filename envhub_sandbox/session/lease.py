@@ -111,6 +111,12 @@ class Lease:
         if self.loaded is not None:
             self.loaded.jail.output(operation, deadline)
 
+    def forget_watched(self) -> None:
+        """A reply is lost that may have said what has changed, of others in the jail, too."""
+        loaded = self.loaded  # another thread may give it back
+        if loaded is not None:
+            loaded.jail.watched.forget()
+
     # --- moving in -----------------------------------------------------------------------------
 
     def acquire(self, deadline: StartupDeadline) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import random
 from pathlib import Path
 from typing import Any
@@ -11,17 +12,22 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import WorkerDiedError
+from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
 from tests.support.compare import assert_same
+from tests.support.processes import eventually
 
 ENVS = 3
 REPOSITORY = '''
 import os
+import signal
 import threading
 import time
 
 import gymnasium as gym
 import numpy as np
+
+
+ALL = []
 
 
 class Told(gym.Env):
@@ -35,6 +41,7 @@ class Told(gym.Env):
         self.task = "reach"
         self.steps = self.episodes = self.asked = 0
         self.ready = self.mortal = False
+        ALL.append(self)
 
     def reset(self, *, seed=None, options=None):
         self.episodes += 1
@@ -67,10 +74,30 @@ class Told(gym.Env):
 
         threading.Thread(target=later).start()
 
+    def listen(self):
+        signal.signal(signal.SIGALRM, lambda *_: self.get_ready())
+
+    def rename_all(self):
+        time.sleep(0.3)
+        for one in ALL:
+            one.task = "another"
+
+
+class Live(gym.vector.SyncVectorEnv):
+    """Is built by itself, so that all tasks share a process."""
+
+    def step(self, actions):
+        return super().step(actions)
+
 
 def make_env(n_envs=1, use_async_envs=False):
     return gym.vector.SyncVectorEnv([Told] * n_envs)
 '''
+SUITE = REPOSITORY.replace(
+    "    return gym.vector.SyncVectorEnv([Told] * n_envs)\n",
+    "    kinds = (gym.vector.SyncVectorEnv, gym.vector.SyncVectorEnv, Live)\n"
+    "    return {'suite': {task: kind([Told] * n_envs) for task, kind in enumerate(kinds)}}\n",
+)
 READ = ("task", "kind", "steps", "episodes", "count", "asked", "absent")
 WAYS = [
     {"lane": "auto", "num_workers": 1},
@@ -154,6 +181,49 @@ def test_who_waits_for_a_change_sees_it(folder: Path) -> None:
         env.call("get_ready")
         while not all(env.get_attr("ready")):
             pass
+
+
+def test_who_waits_for_a_signal_is_not_watched(folder: Path) -> None:
+    """It may come between two requests, from a timer or a child."""
+    with make_env(folder, ENVS, num_workers=1) as suites:
+        env = suites.env
+        env.reset()
+        for listens in (False, True):
+            if listens:
+                env.call("listen")
+            for _ in range(3):
+                env.step(np.zeros(ENVS, np.int64))
+                env.get_attr("kind")
+            before = env.stats()["requests"]
+            for _ in range(10):
+                env.step(np.zeros(ENVS, np.int64))
+                assert env.get_attr("kind") == ("reacher",) * ENVS
+            assert env.stats()["requests"] - before == (20 if listens else 10)
+
+
+@pytest.mark.parametrize("way", ["late", "closed"])
+def test_a_reply_that_is_lost_says_nothing(tmp_path: Path, way: str) -> None:
+    """It would have said that an environment of the same process has changed another's."""
+    (tmp_path / "env.py").write_text(SUITE)
+    with make_env(tmp_path, ENVS) as suites:
+        env, other = suites["suite"][0], suites["suite"][1]
+        for one in (env, other):
+            one.reset()
+        for _ in range(3):
+            env.step(np.zeros(ENVS, np.int64))
+            assert env.get_attr("task") == ("reach",) * ENVS
+        other.call_async("rename_all")
+        if way == "closed":
+            other.close()
+        else:
+            with contextlib.suppress(WorkerTimeoutError):  # or it came already, and was read
+                other.call_wait(timeout=0)
+
+        def is_told() -> bool:
+            env.step(np.zeros(ENVS, np.int64))
+            return bool(env.get_attr("task") == ("another",) * ENVS)
+
+        assert eventually(is_told)
 
 
 @pytest.mark.parametrize("way", WAYS, ids=str)

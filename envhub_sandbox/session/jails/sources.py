@@ -100,6 +100,7 @@ class SharedJail:
     def give_back(self, loaded: LoadedJail, *, wait: bool = True) -> None:
         """Drop a connection; with the last one the jail ends."""
         self.launcher.disconnect(loaded)
+        loaded.jail.watched.forget()  # a reply may be lost that says what the others would be told
         with self._lock:
             self._users -= 1
             if self._users == 0:

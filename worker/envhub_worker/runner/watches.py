@@ -4,12 +4,14 @@ An evaluation asks for its task's description after every step, which costs as m
 what is read again and again is looked at here after each request, and the client is told when it
 is something else. Only what can be looked at without any code of the repository's running in
 between, and by nobody being noticed, is watched: plain attributes with plain values, in a process
-with one thread. Followed: ``gymnasium.Wrapper.get_wrapper_attr``.
+with one thread that no signal runs anything in. Followed: ``gymnasium.Wrapper.get_wrapper_attr``.
 """
 
 from __future__ import annotations
 
+import _signal  # type: ignore[import-not-found]
 import _thread
+import signal
 from collections.abc import Callable
 from typing import Any
 
@@ -26,9 +28,16 @@ _SEARCHES: frozenset[Any] = frozenset(
 """Gymnasium's own."""
 
 
+_SIGNALS = tuple(
+    signal.Signals[f"SIG{name}"].value
+    for name in ("HUP", "USR1", "USR2", "ALRM", "TERM", "CHLD", "URG", "VTALRM", "PROF", "IO")
+)
+"""What timers, children and others interrupt a process with that waits for its next request."""
+
+
 def is_alone() -> bool:
-    """Whether this process has no other threads of Python's."""
-    return not _thread._count()
+    """Whether this process has no other threads of Python's, and handlers of no signals."""
+    return not (_thread._count() or any(map(callable, map(_signal.getsignal, _SIGNALS))))
 
 
 _Reading = tuple[Callable[[str], Any], Any]
