@@ -214,7 +214,9 @@ def test_an_order_that_takes_too_long_is_ended(
 
 def silent_index() -> socket.socket:
     """It takes connections and says nothing: whoever asks it waits."""
-    return socket.create_server(("127.0.0.1", 0), backlog=64)
+    index = socket.create_server(("127.0.0.1", 0), backlog=64)
+    index.settimeout(90)
+    return index
 
 
 _SERVER = """
@@ -232,14 +234,15 @@ time.sleep(600)
 @pytest.mark.parametrize("killed", ["the server", "who watches"])
 def test_the_program_and_its_uv_end_with_who_started_them(killed: str, tmp_path: Path) -> None:
     """Also where that was killed: nobody would measure what they take, and nobody waits for it."""
-    with silent_index() as index:
+    with contextlib.ExitStack() as stack:
+        index = stack.enter_context(silent_index())
         url = f"http://127.0.0.1:{index.getsockname()[1]}/simple"
         environment = {**os.environ, "UV_INDEX_URL": url, "UV_HTTP_TIMEOUT": "600"}
         command = [sys.executable, "-c", _SERVER, str(tmp_path / "packages")]
         with subprocess.Popen(command, env=environment) as server:
             try:
                 found = psutil.Process(server.pid)
-                assert eventually(lambda: any("uv" in one.name() for one in below(found)))
+                stack.callback(index.accept()[0].close)  # from here on uv waits for an answer
                 [watcher] = found.children()
                 rest = below(watcher)
                 assert len(rest) >= 2  # one that works, and its uv
