@@ -34,6 +34,9 @@ POLICY = (
     "style-src 'self' 'unsafe-inline'; form-action 'none'\">"
 )
 _LINK = re.compile(r"\]\((?!https?:|mailto:|#)([^)\s#]+)")
+_EXAMPLE = re.compile(r"^\[(examples/[\w/]+\.py)\]\([^)]*\)$", re.M)
+_ROW = re.compile(r"^\|.*\|$", re.M)
+_CODE = re.compile(r"(?<!\\)`[^`]+`")
 _DIAGRAM = re.compile(r'<pre class="mermaid">.*?</pre>', re.S)
 _CDN = re.compile(rb'"https://[^"]*/mermaid[^"]*"')
 
@@ -49,7 +52,10 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Lead each link to where its target is on the site."""
+    """Lead each link to where its target is on the site; show an example that stands by itself."""
+    markdown = _EXAMPLE.sub(_shown, markdown)
+    # a bar in code in a table: forges want it escaped, and MkDocs shows the escape
+    markdown = _ROW.sub(lambda row: _CODE.sub(_with_bars, row[0]), markdown)
     place = page.file.src_uri
     sources = {there: here for here, there in PLACES.items()}
     folder = os.path.dirname(sources.get(place, f"docs/{place}"))
@@ -60,6 +66,14 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
         return f"]({os.path.relpath(there, os.path.dirname(place) or '.')}"
 
     return _LINK.sub(led, markdown)
+
+
+def _with_bars(code: re.Match[str]) -> str:
+    return code[0].replace("\\|", "|")
+
+
+def _shown(found: re.Match[str]) -> str:
+    return f"`{found[1]}`:\n\n```python\n{(ROOT / found[1]).read_text()}```"
 
 
 def on_post_page(output: str, page: Any, config: Any) -> str:

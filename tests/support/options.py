@@ -60,7 +60,7 @@ def _part(name: str, what: str | None, rows: list[Row]) -> Iterator[str]:
     if rows:
         yield "| option | default | what it is |\n|---|---|---|"
         yield from (
-            f"| {_code(name)} | {default} | {_cell(text)} |" for name, default, text in rows
+            f"| {_written(name)} | {default} | {_cell(text)} |" for name, default, text in rows
         )
         yield ""
 
@@ -123,6 +123,13 @@ class _Told:
         if default is not None:
             text = text.replace(default[0], "")
         self.rows.append((written, _cell(default[1]) if default else "", text))
+
+
+def _written(option: str) -> str:
+    """The names in one piece, and each value in one, so that a narrow column can have them."""
+    names, _, value = option.rpartition(" ")
+    parts = [_code(names), " \\| ".join(_code(one) for one in value.split("|"))]
+    return " ".join(parts) if names and value[0] != "-" else _code(option)
 
 
 def _code(text: str) -> str:

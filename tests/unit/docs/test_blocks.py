@@ -1,0 +1,161 @@
+"""Every block of code in the documents is executed, or held against what it talks about."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import importlib.util
+import inspect
+import re
+import shlex
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+import envhub_sandbox
+from envhub_sandbox.cli.app import app
+from tests.support import blocks, options
+from tests.support.blocks import BOUND, CHECKOUT, DRAWN, HELD, PARSED, RUN, SHOWN, Block
+
+# Programs of others, whose options are theirs; and what begins a line that is no command.
+_OTHERS = {"docker", "pip", "lerobot-eval", "lerobot-train", "lerobot-eval-sandboxed", "ruff"}
+_RUN_BY = {
+    "README.md": "tests/unit/docs/test_docs.py",
+    "docs/integrations.md": "tests/unit/docs/test_docs.py",
+    "docs/authors.md": "tests/integration/test_documents.py",
+    "docs/observing.md": "tests/integration/test_documents.py",
+    "docs/quickstart.md": "tests/integration/test_documents.py",
+}
+
+
+def named(block: Block) -> str:
+    """A block in a test's name."""
+    return f"{block.document}: {block.text.strip().splitlines()[0][:40]}"
+
+
+def test_every_block_has_a_way_and_every_way_a_block() -> None:
+    """None is skipped in silence, and nothing is said of blocks that there are not."""
+    there = Counter(block.way for block in blocks.blocks())
+    assert set(there) == {RUN, HELD, BOUND, PARSED, SHOWN, DRAWN}
+    assert set(blocks.TABLE) <= {(block.document, block.language) for block in blocks.blocks()}
+
+
+def test_what_is_not_executed_has_its_reason_and_what_is_its_test() -> None:
+    """Every block of Python is one or the other."""
+    assert {block.document for block in blocks.tested(BOUND)} == set(blocks.REASONS)
+    assert {block.document for block in blocks.tested(RUN)} <= set(_RUN_BY)
+    for document in {block.document for block in blocks.tested(RUN)}:
+        assert f'"{document}"' in (CHECKOUT / _RUN_BY[document]).read_text()
+
+
+def test_no_code_is_merely_indented() -> None:
+    """It would be no block to those who look for blocks."""
+    for document in blocks.DOCUMENTS:
+        text = re.sub(r"^```.*?^```$", "", (CHECKOUT / document).read_text(), flags=re.M | re.S)
+        assert re.findall(r"^[^\s*-].*\n\n {4}\S.*$", text, re.M) == [], document
+
+
+def commands(text: str) -> Iterator[list[str]]:
+    """The words of each command, without comments, variables and folders of programs."""
+    text = re.sub(r"<[^>\n]*>", "X", text.replace("\\\n", " "))
+    for line in text.splitlines():
+        for command in line.split("&&"):
+            words = shlex.split(command, comments=True)
+            if words:
+                yield [words[0].removeprefix(".venv/bin/"), *words[1:]]
+
+
+@pytest.mark.parametrize("block", blocks.tested(HELD), ids=named)
+def test_commands_are_ones_that_there_are(block: Block) -> None:
+    """Their programs, subcommands and options."""
+    for words in commands(block.text):
+        held(words)
+
+
+@pytest.mark.parametrize("block", blocks.tested(SHOWN), ids=named)
+def test_commands_that_are_shown_with_their_output_are_too(block: Block) -> None:
+    """What stands behind a prompt."""
+    for line in re.findall(r"^\$ (.*)$", block.text, re.M):
+        for words in commands(line):
+            held(words)
+
+
+def held(words: list[str]) -> None:
+    """One command is one that there is, or this fails."""
+    program, *rest = words
+    if program == "envhub":
+        done = CliRunner().invoke(app, [*(word for word in rest if word != "..."), "--help"])
+        assert done.exit_code == 0, (words, done.output)
+    elif program == "envhub-worker":
+        known = re.split(r"^## ", options.document(), flags=re.M)
+        [part] = [one for one in known if one.startswith(f"`envhub-worker {rest[0]}`")]
+        assert {word for word in rest if word.startswith("--")} <= set(
+            re.findall(r"--[\w-]+", part)
+        )
+    elif program in ("python", "python3") and rest[0] == "-m":
+        assert importlib.util.find_spec(rest[1]) is not None, words
+    elif program == "pytest":
+        ours = (CHECKOUT / "tests" / "support" / "selection.py").read_text()
+        plugin = inspect.getsource(importlib.import_module("envhub_sandbox.pytest_plugin"))
+        long = [word for word in rest if word.startswith("--")]
+        assert all(f'"{word}"' in ours + plugin for word in long), words
+    elif program == "bash":
+        assert (CHECKOUT / rest[0]).is_file(), words
+        assert all((CHECKOUT / ".ci" / "steps" / f"{step}.sh").is_file() for step in rest[1:])
+    else:
+        assert program in _OTHERS or (CHECKOUT / program).is_file(), words
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        "envhub rnu X",
+        "envhub run X --episode-count 3",
+        "envhub-worker listen --key-file X",
+        "python -m tests.nothing_of_that_name",
+        "bash .ci/run everything",
+        "frobnicate",
+    ],
+)
+def test_a_command_that_is_not_there_is_found(wrong: str) -> None:
+    """So the tests above can fail."""
+    with pytest.raises(AssertionError):
+        held(shlex.split(wrong))
+
+
+@pytest.mark.parametrize("block", blocks.tested(BOUND), ids=named)
+def test_calls_that_cannot_be_made_here_have_arguments_that_there_are(block: Block) -> None:
+    """Each call of something of ours binds to its signature."""
+    calls = [node for node in ast.walk(ast.parse(block.text)) if isinstance(node, ast.Call)]
+    ours = [call for call in calls if isinstance(call.func, ast.Name)]
+    assert ours
+    for call in ours:
+        name = call.func.id  # type: ignore[attr-defined]
+        function: Any = getattr(envhub_sandbox, name, envhub_sandbox.make_env)
+        # LeRobot's install takes the options of make_env, and cannot be imported without LeRobot
+        given = ["org/repo"] if name == "install" else call.args
+        inspect.signature(function).bind(*given, **{str(one.arg): one for one in call.keywords})
+
+
+def test_what_ci_takes_has_inputs_and_hooks_that_there_are(checkout: Any) -> None:
+    """The two blocks of docs/ci.md."""
+    workflow, hooks = (yaml.safe_load(block.text) for block in blocks.tested(PARSED))
+    step = workflow["jobs"]["check"]["steps"][1]
+    action = yaml.safe_load((checkout / "action.yml").read_text())
+    assert set(step["with"]) <= set(action["inputs"])
+    there = yaml.safe_load((checkout / ".pre-commit-hooks.yaml").read_text())
+    assert {one["id"] for one in hooks["repos"][0]["hooks"]} <= {one["id"] for one in there}
+
+
+def test_examples_that_pages_show_are_executed(checkout: Any) -> None:
+    """A link to one that stands by itself is the example on the site; RLlib's alone is not run."""
+    page = (checkout / "docs" / "integrations.md").read_text()
+    shown = re.findall(r"^\[examples/([\w/]+\.py)\]\(\.\./examples/\1\)$", page, re.M)
+    executed = (checkout / "tests" / "integration" / "test_dropin_examples.py").read_text()
+    assert len(shown) == 4
+    assert [name for name in shown if f'"{name}"' not in executed] == ["with_rllib.py"]
+    assert "is in no\ntest" in page
