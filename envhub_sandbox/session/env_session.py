@@ -35,6 +35,8 @@ from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 
 _DENIAL = re.compile(r"[a-z0-9_]{1,40}( [A-Z0-9_]{1,40}| /.{0,400})?")
+_MOST = 1 << 63
+"""Of anything that there may be: a server on another host may send larger numbers."""
 _GRACE_S = 2.0
 """How long ``reset`` waits for a late reply before it gives the jail up and starts another."""
 
@@ -98,9 +100,9 @@ class EnvSession:
     def usage(self) -> dict[str, int]:
         """What its jail holds, as its server counts it; empty where nobody says."""
         told = self.lease.status()
-        named = ("processes", "threads", "memory_bytes")
-        found = {name: told[name] for name in named if type(told.get(name)) is int}
-        return found if len(found) == len(named) else {}
+        found = {name: told.get(name) for name in ("processes", "threads", "memory_bytes")}
+        counts = {name: one for name, one in found.items() if type(one) is int and 0 <= one < _MOST}
+        return counts if len(counts) == len(found) else {}
 
     def denials(self) -> tuple[str, ...] | None:
         """What its jail was denied, as its server says; None where nobody records it."""

@@ -93,6 +93,21 @@ def test_a_path_starts_where_its_caller_stands(tmp_path: Path) -> None:
     assert ask("unlinkat", _HERE, b"x") == [("unlinkat", f"{os.getcwd()}/x")]
 
 
+def test_a_path_goes_through_the_entries_of_processes(tmp_path: Path) -> None:
+    """What is reached by way of one's own entry is where it is, and no entry."""
+    folder = os.open(tmp_path, os.O_RDONLY)
+    try:
+        for own in ("self", "thread-self", f"self/task/{os.getpid()}", str(os.getpid())):
+            assert ask("unlink", f"/proc/{own}/root/srv/x".encode()) == [("unlink", "/srv/x")]
+        assert ask("unlink", b"/proc/self/cwd/x") == [("unlink", f"{os.getcwd()}/x")]
+        assert ask("unlink", b"/proc/self/fd/%d/x" % folder) == [("unlink", f"{tmp_path}/x")]
+        through = b"/proc/self/root" * 3 + b"/srv/x"
+        assert ask("unlink", through) == [("unlink", "/srv/x")]
+        assert len(ask("unlink", b"/proc/self/root" * 50 + b"/sandbox/work/x")) == 1
+    finally:
+        os.close(folder)
+
+
 def test_a_path_may_end_where_memory_does() -> None:
     """It is read to the end of its page, and the next is looked at only where it goes on."""
     pages = mmap.mmap(-1, 2 * mmap.PAGESIZE)

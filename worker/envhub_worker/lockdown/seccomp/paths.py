@@ -54,6 +54,11 @@ _PRIVATE = re.compile(
     re.DOTALL,
 )
 """What nobody reads by chance; libraries look for a configuration in many another place."""
+_DOORS = re.compile(
+    r"/proc/(?:self|thread-self|\d+)(?:/task/\d+)?/(root|cwd|fd/\d+)(/.+)", re.DOTALL
+)
+"""Below a process's own entries one is somewhere else."""
+_MOST_DOORS = 8
 _HARMLESS = ("/var/run/nscd/socket", "/run/nscd/socket")
 """The C library asks there who a user is."""
 
@@ -135,8 +140,15 @@ def _absolute(thread: int, base: str, text: bytes) -> str:
     path = os.fsdecode(text)
     if not path.startswith("/"):
         path = os.path.join(os.readlink(f"/proc/{thread}/{base}"), path)
-    path = os.path.normpath(path)
-    return path[path.startswith("//") :] if path.startswith("/") else ""
+    for _ in range(_MOST_DOORS):
+        path = os.path.normpath(path)
+        path = path[path.startswith("//") :]
+        door = _DOORS.fullmatch(path)
+        if door is None:
+            return path if path.startswith("/") else ""
+        leads = "" if door[1] == "root" else os.readlink(f"/proc/{thread}/{door[1]}")
+        path = leads + door[2]
+    return f"/...{path}"  # wherever that is: nobody's own
 
 
 def _c_int(word: int) -> int:
