@@ -237,7 +237,9 @@ def test_the_program_and_its_uv_end_with_who_started_them(killed: str, tmp_path:
     with contextlib.ExitStack() as stack:
         index = stack.enter_context(silent_index())
         url = f"http://127.0.0.1:{index.getsockname()[1]}/simple"
-        environment = {**os.environ, "UV_INDEX_URL": url, "UV_HTTP_TIMEOUT": "600"}
+        # what else chooses an index, as other tests' variables do, is not to be asked first
+        kept = {k: v for k, v in os.environ.items() if not k.startswith(("UV_", "PIP_"))}
+        environment = {**kept, "UV_DEFAULT_INDEX": url, "UV_HTTP_TIMEOUT": "600"}
         command = [sys.executable, "-c", _SERVER, str(tmp_path / "packages")]
         with subprocess.Popen(command, env=environment) as server:
             try:
