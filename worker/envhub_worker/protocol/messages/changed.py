@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
-from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
-from envhub_worker.protocol.messages.front import stands_in_front
+from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.messages.front import stands_in_front, things_said
 
 MOST = 16
 """Attributes that one runner watches."""
@@ -42,13 +42,8 @@ def read(frame: Buffer) -> list[Attribute]:
     Raises:
         RemoteProtocolError: They are too many, too long, or something else.
     """
-    size = memoryview(frame).nbytes
-    if size > _MAX_BYTES:
-        raise MessageTooLargeError(f"{size} bytes of changes are over the limit of {_MAX_BYTES}.")
-    message = m.unpack([frame])[1]
-    if not isinstance(message, m.Changed) or len(message.attributes) > MOST:
-        raise RemoteProtocolError("the worker tells of changes in another way than was agreed on")
-    return [_checked(one) for one in message.attributes]
+    said = things_said(m.Changed, frame, most=MOST, max_bytes=_MAX_BYTES)
+    return [_checked(one) for one in said]
 
 
 def _checked(one: object) -> Attribute:

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
-from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
-from envhub_worker.protocol.messages.front import stands_in_front
+from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.messages.front import stands_in_front, things_said
 
 FIRST_VERSION = 10
 """Of the protocol: an older client reads no ``Warned``."""
@@ -42,13 +42,8 @@ def read(frame: Buffer) -> list[Told]:
     Raises:
         RemoteProtocolError: They are too many, too long, or something else.
     """
-    size = memoryview(frame).nbytes
-    if size > _MAX_BYTES:
-        raise MessageTooLargeError(f"{size} bytes of warnings are over the limit of {_MAX_BYTES}.")
-    message = m.unpack([frame])[1]
-    if not isinstance(message, m.Warned) or len(message.warnings) > MOST_AT_ONCE:
-        raise RemoteProtocolError("the worker warns in another way than was agreed on")
-    return [_checked(one) for one in message.warnings]
+    said = things_said(m.Warned, frame, most=MOST_AT_ONCE, max_bytes=_MAX_BYTES)
+    return [_checked(one) for one in said]
 
 
 def _checked(one: object) -> Told:
