@@ -146,7 +146,7 @@ class EnvSession:
         try:
             if lane is None or request is None:
                 raise WorkerError("an earlier attempt gave the jail up, or nobody knows how far")
-            lane.jail.watched.forget()  # of an answer that was interrupted, nobody knows what
+            self.lease.forget_watched()  # also where nobody waited yet when it was interrupted
             lane.catch_up(Deadline(_GRACE_S))
         except RunnersDiedError:
             pass  # the reset that follows meets them

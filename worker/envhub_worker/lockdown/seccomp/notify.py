@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from envhub_worker.lockdown.mechanisms import reap
 from envhub_worker.lockdown.mechanisms.kernel import syscall
 from envhub_worker.lockdown.seccomp.policy import refusal
-from envhub_worker.lockdown.seccomp.syscalls import name_of, number
+from envhub_worker.lockdown.seccomp.syscalls import c_int, name_of, number
 
 _RECEIVE = 0xC0502100
 _SEND = 0xC0182101
@@ -91,7 +91,7 @@ def serve(
         # Something took the caller out of its call; others may still come.
         return error.errno == errno.EINTR or _has_callers(listener)
     identity, thread, _, call, _, _, *words = _REQUEST.unpack(buffer)
-    first, second, third = (_c_int(word) for word in words[:3])
+    first, second, third = (c_int(word) for word in words[:3])
 
     def still_waits() -> object:
         return fcntl.ioctl(listener, _STILL_WAITS, struct.pack("=Q", identity))
@@ -132,11 +132,6 @@ def _has_callers(listener: int) -> bool:
     poller = select.poll()
     poller.register(listener, select.POLLIN)
     return not any(events & select.POLLHUP for _, events in poller.poll(0))
-
-
-def _c_int(word: int) -> int:
-    low = word & 0xFFFFFFFF
-    return low - (1 << 32) if low >> 31 else low
 
 
 def decide(request: Request, inside: _Inside) -> Answer:

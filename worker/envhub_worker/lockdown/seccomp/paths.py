@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable, Collection, Sequence
 from typing import BinaryIO
 
+from envhub_worker.lockdown.seccomp.syscalls import c_int
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.text import printable
 
@@ -120,7 +121,7 @@ def _named(
     text = _text(memory, words[path])
     if not text:
         return ""
-    number = _AT_FDCWD if folder is None else _c_int(words[folder])
+    number = _AT_FDCWD if folder is None else c_int(words[folder])
     return _absolute(thread, "cwd" if number == _AT_FDCWD else f"fd/{number}", text)
 
 
@@ -149,10 +150,6 @@ def _absolute(thread: int, base: str, text: bytes) -> str:
         leads = "" if door[1] == "root" else os.readlink(f"/proc/{thread}/{door[1]}")
         path = leads + door[2]
     return f"/...{path}"  # wherever that is: nobody's own
-
-
-def _c_int(word: int) -> int:
-    return (word & 0xFFFFFFFF) - ((word & 0x80000000) << 1)
 
 
 def _connected(

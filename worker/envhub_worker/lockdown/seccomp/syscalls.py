@@ -1,4 +1,4 @@
-"""Names and numbers of system calls on x86-64 and aarch64, to Linux 6.17."""
+"""Names and numbers of system calls on x86-64 and aarch64, to Linux 6.17; their arguments."""
 
 from __future__ import annotations
 
@@ -115,3 +115,8 @@ def name_of(call: int) -> str:
     """The name of a call of this machine by its number."""
     numbers = NUMBERS[os.uname().machine]
     return next((name for name, one in numbers.items() if one == call), f"call {call}")
+
+
+def c_int(word: int) -> int:
+    """An argument as the kernel reads an ``int``: the lower half of its register, with a sign."""
+    return (word & 0xFFFFFFFF) - ((word & 0x80000000) << 1)
