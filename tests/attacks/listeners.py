@@ -8,8 +8,9 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Protocol
 
+from tests.attacks.harness import Run, token
 from tests.support.processes import eventually
 
 _POLL_S = 0.05
@@ -37,10 +38,6 @@ class Listener:
         """Whether ``text`` has come, waiting generously if it is expected to."""
         deadline = 10.0 if wait else _GRACE_S
         return eventually(lambda: text.encode() in self._data, deadline)
-
-    def forget(self) -> None:
-        """Drop what has come."""
-        self._data = b""
 
     def _receive(self) -> None:
         with selectors.DefaultSelector() as selector:
@@ -86,3 +83,25 @@ def listening(
         yield listener
     finally:
         listener.close()
+
+
+class Attacks(Protocol):
+    """Where a payload is run as a control and inside."""
+
+    def attack(self, title: str, payload: str, succeeded: Any, /, **arguments: Any) -> None:
+        """Fail unless it succeeds as a control only."""
+
+
+def sends(place: Attacks, title: str, payload: str, listener: Listener, **arguments: Any) -> None:
+    """Attack with a message that ``listener`` must hear in the control, and never from inside.
+
+    Each half has a message of its own: what the control sends a second time may still be on its
+    way when the inside begins.
+    """
+    control, inside = token(), token()
+
+    def heard(run: Run) -> bool:
+        return listener.heard(inside if run.inside else control, wait=not run.inside)
+
+    halves = {"message": control, "inside": {"message": inside}}
+    place.attack(title, payload, heard, **halves, **arguments)

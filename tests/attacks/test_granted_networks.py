@@ -40,10 +40,9 @@ def sends(
     arena: Arena, env: Any, title: str, payload: str, listener: Listener, **arguments: Any
 ) -> None:
     """What the control tells ``listener`` does not come from a jail that is open already."""
-    message = token()
-    with control_run(payload, {"message": message, **arguments}) as control:
-        assert listener.heard(message, wait=True), control.text
-    listener.forget()
+    before, message = token(), token()
+    with control_run(payload, {"message": before, **arguments}) as control:
+        assert listener.heard(before, wait=True), control.text
     run = run_in(env, payload, message=message, **arguments)
     arena.judge(title, "succeeds", listener.heard(message, wait=False), run.text)
 

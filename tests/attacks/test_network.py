@@ -10,23 +10,13 @@ import psutil
 import pytest
 
 from tests.attacks.harness import USER, Arena, Run, token
-from tests.attacks.listeners import Listener, listening
+from tests.attacks.listeners import listening, sends
 
 FAMILY = "Network"
 
 _NETLINK_USERSOCK = 2
 _TCP_FASTOPEN = (socket.IPPROTO_TCP, 23, 16)
 _ETHERTYPE = 0x88B5
-
-
-def sends(arena: Arena, title: str, payload: str, listener: Listener, **arguments: object) -> None:
-    """Attack with a message that ``listener`` must hear in the control, and never from inside."""
-    message = token()
-
-    def heard(run: Run) -> bool:
-        return listener.heard(message, wait=not run.inside)
-
-    arena.attack(title, payload, heard, before=listener.forget, message=message, **arguments)
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])

@@ -191,21 +191,16 @@ class Raid:
 
     def sockets(self) -> None:
         """A socket beside those of its server, the modes of which permit everybody to connect."""
-        path, message = Path(self._other.server, "canary"), token()
+        path = Path(self._other.server, "canary")
+        messages = {True: token(), False: token()}
         with listening(socket.AF_UNIX, socket.SOCK_STREAM, str(path)) as listener:
             path.chmod(0o777)
 
             def heard(run: Run) -> bool:
-                said = listener.heard(message, wait=not run.inside)
-                listener.forget()
-                return said
+                return listener.heard(messages[run.inside], wait=not run.inside)
 
-            self.attack(
-                "socket of the server",
-                "unix_stream",
-                heard,
-                {"path": str(path), "message": message},
-            )
+            at = [{"path": str(path), "message": messages[inside]} for inside in (False, True)]
+            self.attack("socket of the server", "unix_stream", heard, *at)
 
 
 def open_to_all(folder: Path, *others: str) -> None:

@@ -18,8 +18,8 @@ from envhub_sandbox import make_env
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
-from tests.attacks.harness import HOSTILE, Run, token
-from tests.attacks.listeners import Listener, listening
+from tests.attacks.harness import HOSTILE, token
+from tests.attacks.listeners import listening, sends
 from tests.attacks.test_bombs import of_processes, tasks
 from tests.attacks.victim import victim
 from tests.containers.kit import Walls, container_of, pids_in
@@ -39,16 +39,6 @@ def an_address_of_this_machine() -> str:
         if one.family == socket.AF_INET and name != "lo"
     ]
     return found[0] if found else pytest.skip("this machine has no network but its loopback")
-
-
-def sends(walls: Walls, title: str, payload: str, listener: Listener, **arguments: object) -> None:
-    """Attack with a message that the listener must hear in the control, and never from inside."""
-    message = token()
-
-    def heard(run: Run) -> bool:
-        return listener.heard(message, wait=not run.inside)
-
-    walls.attack(title, payload, heard, before=listener.forget, message=message, **arguments)
 
 
 @pytest.mark.parametrize(
