@@ -7,8 +7,9 @@ export ENVHUB_CI=1 ENVHUB_TEST_DIR=$CI_WORK/tests
 # the profiles without a private root need; root's pyenv lies below /root, closed to others.
 PYTHON=$(find_python 3.11 || command -v python3)
 [ "$(id -u)" != 0 ] || [ ! -x /usr/bin/python3 ] || PYTHON=/usr/bin/python3
-export PYTHON
+export PYTHON PATH=$PATH:$CI_WORK/unpacked/usr/bin  # a Prometheus, where the step "system" got one
 permit_what_this_machine_lacks
+command -v prometheus >/dev/null || export ENVHUB_CI_WITHOUT_PROMETHEUS=1
 # The step "container" has those that need an engine.
 export PYTEST_ADDOPTS=--ignore=tests/containers
 export ENVHUB_TEST_RUNNER="bash $CI_AGAIN"

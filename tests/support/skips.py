@@ -13,6 +13,7 @@ import pytest
 _PERMITTED = {
     "needs torch": "ENVHUB_CI_WITHOUT_TORCH",
     "may not make control groups": "ENVHUB_CI_WITHOUT_CGROUPS",
+    "there is no prometheus": "ENVHUB_CI_WITHOUT_PROMETHEUS",
 }
 _NOT_INSTALLED = re.compile(r"could not import '([\w.]+)'")
 
