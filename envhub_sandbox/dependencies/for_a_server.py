@@ -19,16 +19,15 @@ import fcntl
 import json
 import os
 import resource
-import select
 import signal
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from envhub_sandbox import parent
 from envhub_sandbox.dependencies import bounds, environments, host, interpreters, uv
 from envhub_sandbox.dependencies.choice import DATE, Choice
 from envhub_sandbox.dependencies.declared import Declared, one
@@ -41,6 +40,7 @@ BLOCK_BYTES = 4096
 """What the smallest file is charged: it takes disk, too."""
 _LOOK_S = 0.5
 _WAIT_S = 60.0
+_CLEANING_S = 2 * _WAIT_S
 _WHERE_CHARS = 200
 _SAID_CHARS = 3800
 _NICE = 10
@@ -76,18 +76,6 @@ def _pidfd(words: Sequence[str]) -> int | None:
     return int(given[0]) if given else None
 
 
-def _when_it_ends(pidfd: int | None, then: Callable[[], None]) -> None:
-    """Do something as soon as a process has ended."""
-    if pidfd is None:
-        return
-
-    def wait(pidfd: int) -> None:
-        select.select([pidfd], [], [])
-        then()
-
-    threading.Thread(target=wait, args=(pidfd,), daemon=True).start()
-
-
 def _say(what: Mapping[str, Any]) -> None:
     os.ftruncate(1, 0)
     os.pwrite(1, json.dumps(what).encode(), 0)
@@ -97,7 +85,8 @@ def _say(what: Mapping[str, Any]) -> None:
 
 
 def _made(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
-    _when_it_ends(ended, lambda: os.killpg(0, signal.SIGKILL))  # the group is ours, and uv's
+    if ended is not None:
+        parent.end_with(ended, 0.0)  # uv is in our group, too
     os.nice(_NICE)
     _, most = resource.getrlimit(resource.RLIMIT_FSIZE)  # which a plain user cannot raise
     bound = order["bytes"] if most == resource.RLIM_INFINITY else min(order["bytes"], most)
@@ -144,7 +133,8 @@ def _needed(order: Mapping[str, Any]) -> Needs:
 def _watched(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
     """Have it made, within bounds; empty where whoever made it has said what there is to say."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    _when_it_ends(ended, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    if ended is not None:
+        parent.end_with(ended, _CLEANING_S)
     with _alone(Path(order["folder"])) as held:
         unfinished = Path(order["folder"], "unfinished")
         if unfinished.exists():
@@ -165,17 +155,14 @@ def _watched(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
 
 def _worked(order: Mapping[str, Any], held: int) -> bool:
     """Whether it has come to an end that leaves nothing half-made."""
-    ourselves = os.pidfd_open(os.getpid())
     program = [sys.executable, "-I", "-m", "envhub_sandbox.dependencies.for_a_server"]
-    try:
+    with parent.pidfd() as ourselves:
         process = subprocess.Popen(
             [*program, "make", f"{_PIDFD}{ourselves}"],
             stdin=subprocess.PIPE,
             pass_fds=(held, ourselves),
             start_new_session=True,  # uv is in it, too
         )
-    finally:
-        os.close(ourselves)
     try:
         assert process.stdin is not None
         with contextlib.suppress(BrokenPipeError), process.stdin as stdin:

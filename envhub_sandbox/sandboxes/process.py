@@ -18,6 +18,7 @@ from functools import partial
 from pathlib import Path
 
 import envhub_worker.protocol
+from envhub_sandbox import parent
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.log import WORKER
 from envhub_sandbox.sandboxes import runtime_folder
@@ -124,28 +125,23 @@ def _start(store: Path, runtime: Runtime) -> ProcessServer:
 def _execute(
     folder: Path, store: Path, runtime: Runtime, endpoint: str, ready: int
 ) -> subprocess.Popen[bytes]:
-    ourselves = os.pidfd_open(os.getpid())
     arguments = [
         *(sys.executable, "-I", str(BOOTSTRAP), "worker", "serve"),
         *("--endpoint", endpoint, "--runtime-dir", str(folder)),
         *("--readable-root", str(store)),
-        *("--ready-fd", str(ready), "--client-pidfd", str(ourselves)),
         *("--ahead", "--python", runtime.python, "--packages", runtime.packages),
     ]
-    try:
-        with (folder / "server.log").open("wb") as log:
-            return subprocess.Popen(
-                arguments,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                cwd="/",
-                env=_environment(),
-                pass_fds=(ready, ourselves),
-                start_new_session=True,  # Ctrl-C is for the client, which then closes us
-            )
-    finally:
-        os.close(ourselves)
+    with (folder / "server.log").open("wb") as log, parent.pidfd() as ourselves:
+        return subprocess.Popen(
+            [*arguments, "--ready-fd", str(ready), "--client-pidfd", str(ourselves)],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            cwd="/",
+            env=_environment(),
+            pass_fds=(ready, ourselves),
+            start_new_session=True,  # Ctrl-C is for the client, which then closes us
+        )
 
 
 def _environment() -> dict[str, str]:

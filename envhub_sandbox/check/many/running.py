@@ -15,17 +15,22 @@ import time
 from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
+from envhub_sandbox import parent
+from envhub_sandbox.errors import WorkerStartupError
 from envhub_worker.protocol.text import printable
 
 _TICK_S = 0.1
 _MOST_BYTES = 32 << 20
 """Of what one prints: a document, or what it complains of."""
 _TAIL_BYTES = 4_096
+PATIENCE_S = 20.0
+"""For one that is told to end: its jails have to go."""
 _KILLED_S = 20.0
 """For the kernel to end one, where that is not in a disk's hands."""
 T = TypeVar("T")
+Command = Callable[[T, Path, int], list[str]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,33 +57,70 @@ class Ended(Generic[T]):
 
 class _Running(Generic[T]):
     def __init__(
-        self, order: T, folder: Path, command: list[str], variables: Mapping[str, str]
+        self, order: T, folder: Path, command: Command[T], variables: Mapping[str, str]
     ) -> None:
         self.order, self._folder = order, folder
         self._begun = time.monotonic()
         folder.mkdir(mode=0o700)
-        with self._file("out").open("xb") as out, self._file("err").open("xb") as err:
-            self.process = subprocess.Popen(
-                command,
+        with (
+            self._file("out").open("xb") as out,
+            self._file("err").open("xb") as err,
+            parent.pidfd() as ourselves,
+        ):
+            self._process = _started(
+                command(order, folder, ourselves),
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=err,
                 env={**os.environ, **variables},
+                pass_fds=(ourselves,),
                 start_new_session=True,  # Ctrl-C is for us, who then end it
             )
 
+    @property
+    def has_ended(self) -> bool:
+        """Asked so that its number stays its own until its group is killed."""
+        if self._process.returncode is not None:
+            return True
+        try:
+            how = os.WEXITED | os.WNOHANG | os.WNOWAIT
+            return os.waitid(os.P_PID, self._process.pid, how) is not None
+        except ChildProcessError:  # whoever started us has SIGCHLD ignored: nobody waits for it
+            return True
+
+    def terminate(self) -> None:
+        """Tell it to end."""
+        self._signal(os.kill, signal.SIGTERM)
+
+    def kill(self) -> None:
+        """End it by force, and what it has left in its group, also where it has ended itself."""
+        self._signal(os.killpg, signal.SIGKILL)
+
+    def _signal(self, send: Callable[[int, int], None], number: signal.Signals) -> None:
+        if self._process.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                send(self._process.pid, number)
+
+    def reap(self) -> int | None:
+        """Its exit code; None where the kernel cannot end it."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_KILLED_S)
+        return self._process.returncode
+
     def ended(self, most_s: float, patience_s: float) -> Ended[T] | None:
         """What has become of it, if it has ended; one that takes or says too much is ended."""
-        code = self.process.poll()
-        why = "" if code is not None else self._too_much(most_s)
-        if code is None and not why:
-            return None
-        if why:
+        why = ""
+        if not self.has_ended:
+            why = self._too_much(most_s)
+            if not why:
+                return None
             end([self], patience_s)
+        self.kill()
+        code = self.reap()
         return Ended(
             order=self.order,
             folder=self._folder,
-            code=code,
+            code=None if why else code,
             seconds=time.monotonic() - self._begun,
             out=b"" if why else self._read("out", _MOST_BYTES),
             said=why or self._complaint(code),
@@ -105,15 +147,25 @@ class _Running(Generic[T]):
         return self._folder / name
 
 
+def _started(command: list[str], **how: Any) -> subprocess.Popen[bytes]:
+    try:
+        return subprocess.Popen(command, **how)
+    except OSError as error:
+        raise WorkerStartupError(
+            f"no judgement can be started: {error.strerror}. What has been judged is kept; let "
+            "fewer run at once, by --jobs"
+        ) from error
+
+
 def judgements(
     orders: Iterable[T],
-    command: Callable[[T, Path], list[str]],
+    command: Command[T],
     *,
     folder: Path,
     jobs: int,
     most_s: float,
     variables: Mapping[str, str],
-    patience_s: float = 20.0,
+    patience_s: float = PATIENCE_S,
 ) -> Generator[Ended[T], None, None]:
     """Run a command for each order, and tell in the order in which they end.
 
@@ -121,12 +173,13 @@ def judgements(
 
     Args:
         orders: What is asked for the next as soon as there is room for it.
-        command: What is run for an order, with a folder of its own.
+        command: What is run for an order, with a folder of its own, and a pidfd of ours that it
+            has to end with.
         folder: Where these folders are made.
         jobs: How many run at once.
         most_s: How long one may take.
         variables: Of the environment, beyond ours.
-        patience_s: For one that is told to end: its jails have to go.
+        patience_s: For one that is told to end.
     """
     waiting = enumerate(orders)
     running: list[_Running[T]] = []
@@ -137,8 +190,7 @@ def judgements(
                 number, order = next(waiting, (-1, None))
                 more = order is not None
                 if order is not None:
-                    place = folder / str(number)
-                    running.append(_Running(order, place, command(order, place), variables))
+                    running.append(_Running(order, folder / str(number), command, variables))
             time.sleep(_TICK_S)
             for job in tuple(running):
                 what = job.ended(most_s, patience_s)
@@ -152,18 +204,15 @@ def judgements(
 
 def end(running: Iterable[_Running[T]], patience_s: float) -> None:
     """End processes, and what they have started; whoever is impatient may interrupt again."""
-    left = [one.process for one in running]
+    left = list(running)
     until = time.monotonic() + patience_s
     try:
-        for process in left:
-            process.terminate()
-        while time.monotonic() < until and any(process.poll() is None for process in left):
+        for one in left:
+            one.terminate()
+        while time.monotonic() < until and not all(one.has_ended for one in left):
             time.sleep(_TICK_S / 4)
     finally:
-        for process in left:
-            if process.poll() is None:
-                with contextlib.suppress(ProcessLookupError):
-                    os.killpg(process.pid, signal.SIGKILL)
-        for process in left:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(_KILLED_S)
+        for one in left:
+            one.kill()
+        for one in left:
+            one.reap()

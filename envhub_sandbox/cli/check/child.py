@@ -1,25 +1,20 @@
 """``envhub check REF`` as one of a list: it ends when the process that started it does.
 
-``python -I -m envhub_sandbox.cli.check.child PID check ...``: no Ctrl-C of a terminal reaches it,
-and whoever kills its parent by force leaves nobody who would end it.
+``python -I -m envhub_sandbox.cli.check.child PIDFD check ...``: no Ctrl-C of a terminal reaches it,
+and whoever kills its parent by force leaves nobody else who would end it.
 """
 
 from __future__ import annotations
 
-import ctypes
-import os
-import signal
 import sys
 
-_PR_SET_PDEATHSIG = 1
+from envhub_sandbox import parent
+from envhub_sandbox.check.many.running import PATIENCE_S
 
 
 def main() -> None:
     """Run the command line; never returns."""
-    parent = int(sys.argv.pop(1))
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGTERM), 0, 0, 0)
-    if os.getppid() != parent:
-        sys.exit(143)  # it has ended already
+    parent.end_with(int(sys.argv.pop(1)), PATIENCE_S)
     from envhub_sandbox.cli import main as command_line
 
     command_line()

@@ -127,7 +127,7 @@ def _judge_in(running: Path, judged: Judged, wanted: Wanted, jobs: int, policy: 
     judged.write()
     ended = judgements(
         _waiting(judged, wanted.make),
-        lambda one, place: _command(wanted, one, place, policy),
+        lambda one, place, ourselves: _command(wanted, one, place, ourselves, policy),
         folder=running,
         jobs=jobs,
         most_s=wanted.deadline or _HOUR_S,
@@ -359,8 +359,10 @@ def _means(listed: Listed, make: opt.MakeOptions) -> str:
         return "nobody knows"  # whoever judges it says why
 
 
-def _command(wanted: Wanted, listed: Listed, place: Path, policy: Path) -> list[str]:
-    command = [sys.executable, "-I", "-m", "envhub_sandbox.cli.check.child", str(os.getpid())]
+def _command(
+    wanted: Wanted, listed: Listed, place: Path, ourselves: int, policy: Path
+) -> list[str]:
+    command = [sys.executable, "-I", "-m", "envhub_sandbox.cli.check.child", str(ourselves)]
     command += ["check", "--json", f"--html={place / 'page.html'}", *wanted.arguments]
     command += [] if wanted.policy is None else [f"--policy={policy}"]
     command += ["--debug"] if wanted.debug else []

@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from envhub_sandbox import parent
 from envhub_sandbox.dependencies.choice import Choice
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.hub.snapshot import Snapshot
@@ -320,8 +321,7 @@ def _user() -> tuple[int, int]:
 def _execute(
     engine: Engine, wanted: Container, folder: Path, ready: int
 ) -> subprocess.Popen[bytes]:
-    ourselves = os.pidfd_open(os.getpid())
-    try:
+    with parent.pidfd() as ourselves:
         return subprocess.Popen(
             [
                 *(sys.executable, "-I", "-S", str(_MONITOR), str(ourselves), str(ready)),
@@ -336,8 +336,6 @@ def _execute(
             pass_fds=(ready, ourselves),
             start_new_session=True,  # Ctrl-C is for the client, which then ends the container
         )
-    finally:
-        os.close(ourselves)
 
 
 def _answer(ready: int, process: subprocess.Popen[bytes]) -> bytes:

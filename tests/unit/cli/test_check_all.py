@@ -27,7 +27,7 @@ def started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, 
 
     def judgements(orders, command, *, folder, jobs, **_):  # type: ignore[no-untyped-def]
         for number, order in enumerate(orders):
-            found.append((jobs, command(order, folder / str(number))))
+            found.append((jobs, command(order, folder / str(number), 7)))
             yield Ended(
                 order=order, folder=folder, code=3, seconds=1.0, out=b"", said="Error: not there"
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import psutil
 import pytest
 
 from envhub_sandbox.check.many.running import Ended, judgements
+from envhub_sandbox.errors import WorkerStartupError
 from tests.support.processes import eventually
 
 _PROGRAMS = {
@@ -18,6 +20,12 @@ _PROGRAMS = {
     "fail": "import sys; sys.exit('\\x1b[2Jit is wrong')",
     "hang": "import time; time.sleep(3600)",
     "flood": "import sys\nwhile True: sys.stdout.write('x' * 1_000_000)",
+    "leave": (
+        "import os, time\n"
+        "if os.fork() == 0: time.sleep(3600)\n"
+        "open('../left', 'w').write(str(os.getpid()))\n"
+        "os.abort()"
+    ),
     "stubborn": (
         "import os, signal, time\n"
         "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
@@ -27,7 +35,7 @@ _PROGRAMS = {
 }
 
 
-def command(order: str, place: Path) -> list[str]:
+def command(order: str, place: Path, _: int = -1) -> list[str]:
     """What is run for an order, in its folder."""
     return [
         sys.executable,
@@ -71,7 +79,7 @@ def test_there_are_never_more_than_there_may_be(jobs: int, tmp_path: Path) -> No
     """And as many, while there are orders."""
     begun, ended, most = 0, 0, []
 
-    def counted(order: int, place: Path) -> list[str]:
+    def counted(order: int, place: Path, _: int) -> list[str]:
         nonlocal begun
         begun += 1
         most.append(begun - ended)
@@ -82,6 +90,34 @@ def test_there_are_never_more_than_there_may_be(jobs: int, tmp_path: Path) -> No
         assert one.code == 0
         ended += 1
     assert (begun, ended, max(most)) == (7, 7, jobs)
+
+
+def test_one_that_crashes_leaves_none(tmp_path: Path) -> None:
+    """What it had started is in its group."""
+    assert run(tmp_path, "leave")["leave"].code == -6
+    group = int((tmp_path / "left").read_text())
+    assert eventually(lambda: not any(of_group(one, group) for one in psutil.process_iter()))
+
+
+def of_group(process: psutil.Process, group: int) -> bool:
+    """Whether it is one of a group, and has not ended."""
+    with contextlib.suppress(ProcessLookupError):
+        return os.getpgid(process.pid) == group and runs(process)
+    return False
+
+
+def test_what_cannot_be_started_is_told(tmp_path: Path) -> None:
+    """In words of its own: the folder of results is not at fault."""
+    found = judgements(
+        ["x"],
+        lambda *_: [str(tmp_path / "nothing")],
+        folder=tmp_path,
+        jobs=1,
+        most_s=1.0,
+        variables={},
+    )
+    with pytest.raises(WorkerStartupError, match="no judgement can be started: No such file"):
+        next(found)
 
 
 def test_whoever_stops_leaves_none(tmp_path: Path) -> None:

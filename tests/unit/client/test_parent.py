@@ -1,0 +1,106 @@
+"""A process that ends with the one that started it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.support.processes import eventually
+
+_PARENT = """
+import fcntl, resource, subprocess, sys, threading, time
+from envhub_sandbox import parent
+
+def start():
+    with parent.pidfd() as ourselves:
+        number = ourselves
+        if sys.argv[1] == "high":  # beyond what select() can wait for
+            _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+            resource.setrlimit(resource.RLIMIT_NOFILE, (min(most, 2048), most))
+            number = fcntl.fcntl(ourselves, fcntl.F_DUPFD, 1500)
+        command = [sys.executable, "-I", "-c", sys.argv[2], str(number), sys.argv[1]]
+        subprocess.Popen(command, pass_fds=(number,), start_new_session=True)
+
+thread = threading.Thread(target=start)  # which is no reason to end
+thread.start()
+thread.join()
+time.sleep(3600)
+"""
+_CHILD = """
+import os, signal, subprocess, sys, time
+from envhub_sandbox import parent
+
+def end(*_):
+    open("ended", "x").close()
+    os._exit(7)
+
+how = sys.argv[2]
+signal.signal(signal.SIGTERM, signal.SIG_IGN if how == "stubborn" else end)
+below = subprocess.Popen([sys.executable, "-I", "-c", "import time; time.sleep(3600)"])
+if how != "nobody":
+    patience = {"at once": 0.0, "stubborn": 0.1}.get(how, 600.0)
+    parent.end_with(int(sys.argv[1]), patience)
+print(os.getpid(), below.pid, flush=True)
+time.sleep(3600)
+"""
+
+
+@contextlib.contextmanager
+def family(how: str, folder: Path) -> Iterator[tuple[subprocess.Popen[str], list[psutil.Process]]]:
+    """A parent, and who was started by it and below that."""
+    command = [sys.executable, "-I", "-c", _PARENT, how, _CHILD]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=folder) as parent:
+        assert parent.stdout is not None
+        below = [psutil.Process(int(word)) for word in parent.stdout.readline().split()]
+        try:
+            assert len(below) == 2
+            yield parent, below
+        finally:
+            for one in (parent, *below):
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    one.kill()
+
+
+def runs(process: psutil.Process) -> bool:
+    """Whether it has not ended."""
+    with contextlib.suppress(psutil.NoSuchProcess):
+        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+    return False
+
+
+@pytest.mark.parametrize("how", ["soon", "high", "at once", "stubborn"])
+def test_it_ends_when_its_parent_is_killed(how: str, tmp_path: Path) -> None:
+    """Not when the thread ends that started it; as SIGTERM says if it may, by force if it must."""
+    with family(how, tmp_path) as (parent, (child, below)):
+        assert runs(child)
+        parent.kill()
+        assert eventually(lambda: not runs(child), 120)
+        cleaned = how in ("soon", "high")
+        assert (tmp_path / "ended").exists() is cleaned
+        if not cleaned:
+            assert eventually(lambda: not runs(below), 120), "it is in the group"
+
+
+def test_without_it_it_would_stay(tmp_path: Path) -> None:
+    """The control: another's end is told to nobody."""
+    with family("nobody", tmp_path) as (parent, (child, _)):
+        parent.send_signal(signal.SIGKILL)
+        parent.wait()
+        assert runs(child)
+        assert not (tmp_path / "ended").exists()
+
+
+def test_who_is_started_by_another_thread_meanwhile_does_not_inherit_it() -> None:
+    """It is for one alone."""
+    from envhub_sandbox import parent
+
+    with parent.pidfd() as ourselves:
+        assert not os.get_inheritable(ourselves)
