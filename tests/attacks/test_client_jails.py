@@ -14,7 +14,6 @@ from typing import Any
 
 import cloudpickle
 import numpy as np
-import psutil
 import pytest
 
 from envhub_sandbox import make_env
@@ -29,6 +28,7 @@ from envhub_worker.protocol.codec.codec import Buffer
 from tests.attacks.harness import TIMEOUTS, Arena
 from tests.attacks.lying_server import step_done
 from tests.attacks.test_client_lies import Canary, peak_growth
+from tests.support.processes import most_grown, resident
 from tests.support.repositories import write_repository
 from tests.support.wire import message
 
@@ -107,12 +107,12 @@ def lies_to(arena: Arena, folder: str, **timeouts: float) -> tuple[Exception, in
     options["timeouts"] = {**TIMEOUTS, **timeouts}
     with make_env(folder, n_envs=2, **options) as suites:
         suites.env.reset()
-        servers = [process.pid for process in psutil.Process().children()]
-        before = [psutil.Process(pid).memory_info().rss for pid in servers]
+        before = resident()
+        del before[os.getpid()]
         with pytest.raises(EnvHubError) as caught:
             suites.env.step([0, 0])
-        after = [psutil.Process(pid).memory_info().rss for pid in servers]
-    return caught.value, max(late - early for late, early in zip(after, before, strict=True))
+        grown = most_grown(before)
+    return caught.value, grown
 
 
 @pytest.fixture

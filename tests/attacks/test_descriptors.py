@@ -33,7 +33,7 @@ from tests.attacks.harness import (
     start_control,
     token,
 )
-from tests.support.processes import eventually
+from tests.support.processes import eventually, most_grown, resident
 from tests.support.repositories import write_repository
 
 FAMILY = "Open files"
@@ -140,13 +140,12 @@ def test_descriptors_cannot_be_pushed_into_the_server(arena: Arena, home: Path) 
 
 
 def open_files(pid: int) -> list[str]:
-    """What a process has open."""
+    """What a process has open; nothing, if it has ended."""
     links = []
-    for fd in os.listdir(f"/proc/{pid}/fd"):
-        try:
-            links.append(os.readlink(f"/proc/{pid}/fd/{fd}"))
-        except OSError:
-            continue
+    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+        for fd in os.listdir(f"/proc/{pid}/fd"):
+            with contextlib.suppress(OSError):
+                links.append(os.readlink(f"/proc/{pid}/fd/{fd}"))
     return links
 
 
@@ -205,11 +204,23 @@ def sharers(runner: int, fd: int, kind: str) -> set[str]:
             USER != "root" and process.pid not in {os.getpid(), *servers()}
         ):
             continue
-        for theirs in descriptors(process.pid):
-            with contextlib.suppress(FileNotFoundError):  # closed meanwhile
-                if open_file(process.pid, theirs) == kind and same(runner, fd, process.pid, theirs):
-                    found.add(names.get(process.pid, "zygote"))
+        if any(shares(runner, fd, kind, process.pid, theirs) for theirs in held_by(process.pid)):
+            found.add(names.get(process.pid, "zygote"))
     return found
+
+
+def held_by(pid: int) -> list[int]:
+    """What a process has open; nothing, if it has ended, as a server does that has lingered."""
+    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+        return descriptors(pid)
+    return []
+
+
+def shares(runner: int, fd: int, kind: str, pid: int, theirs: int) -> bool:
+    """Whether another process has the same; not if it has closed it meanwhile."""
+    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+        return open_file(pid, theirs) == kind and same(runner, fd, pid, theirs)
+    return False
 
 
 @pytest.mark.parametrize(
@@ -252,14 +263,13 @@ def test_noise_on_the_stream_ends_only_its_jail(arena: Arena, noise: bytes) -> N
         other.reset()
         with arena.environment() as env:
             env.reset()
-            before = [psutil.Process(pid).memory_info().rss for pid in servers()]
+            before = resident()
             run = Run(new_alias(), True)
             with pytest.raises(EnvHubError) as caught:
                 make_noise(env, noise, run)
-            after = [psutil.Process(pid).memory_info().rss for pid in servers()]
+            grown = most_grown(before)
             assert eventually(lambda: not run.pids()), "the noisy jail lives on"
         other.step([0])
-    grown = max(late - early for late, early in zip(after, before, strict=True))
     text = str(caught.value)
     through = grown > 64 << 20 or "rules" not in text
     arena.judge("write noise to the stream", "succeeds", through, f"{text} (grew {grown})")

@@ -41,6 +41,24 @@ def halted(pids: Iterable[int]) -> Iterator[None]:
                 os.kill(pid, signal.SIGCONT)
 
 
+def resident() -> dict[int, int]:
+    """Bytes of memory of this process and of each of its children, by pid."""
+    found = {}
+    for process in (psutil.Process(), *psutil.Process().children()):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            found[process.pid] = int(process.memory_info().rss)
+    return found
+
+
+def most_grown(before: dict[int, int]) -> int:
+    """By how many bytes the one of these has grown that has grown most.
+
+    Who has ended since does not count: a server of earlier tests may linger, and its time come.
+    """
+    now = resident()
+    return max(now[pid] - bytes_ for pid, bytes_ in before.items() if pid in now)
+
+
 def is_stopped(pid: int) -> bool:
     """Whether a process has been stopped by a signal."""
     return bool(psutil.Process(pid).status() == psutil.STATUS_STOPPED)
