@@ -48,11 +48,11 @@ def sends(
 
 
 @contextlib.contextmanager
-def with_loopback(arena: Arena) -> Iterator[tuple[Any, int]]:
+def with_loopback(arena: Arena, port: int = 0) -> Iterator[tuple[Any, int]]:
     """A jail whose own loopback device works, and the port on which it listens there."""
     with arena.environment({"network": "loopback"}) as env:
         message = token()
-        run = run_in(env, "listen", port=0, message=message)
+        run = run_in(env, "listen", port=port, message=message)
         assert message in run_in(env, "listen", port=None, message="").text, run.text
         yield env, int(run.value)
 
@@ -87,15 +87,18 @@ def arguments_for(listener: Listener, family: int, name: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize("arena", profiles("strict"), indirect=True)
 def test_its_own_loopback_is_not_another_jails(arena: Arena) -> None:
-    """Two jails listen on one port, and so does the host: each hears only itself."""
+    """A jail listens on a port, and so does the host: each hears only itself.
+
+    The host is the first: which of its ports are free, no jail knows.
+    """
     title, message = 'with network="loopback": TCP to another jail', token()
     with (
-        with_loopback(arena) as (other, port),
+        listening(**_TCP, address=("127.0.0.1", 0)) as outside,
+        with_loopback(arena, outside.port) as (other, port),
         with_loopback(arena) as (env, _),
-        listening(**_TCP, address=("127.0.0.1", port)) as outside,
     ):
-        with control_run("tcp", {"host": "127.0.0.1", "port": port, "message": message}):
-            assert outside.heard(message, wait=True)
+        with control_run("tcp", {"host": "127.0.0.1", "port": port, "message": message}) as control:
+            assert outside.heard(message, wait=True), control.text
         run = run_in(env, "tcp", host="127.0.0.1", port=port, message=message)
         heard = run_in(other, "listen", port=None, message="")
         assert not heard.error
@@ -113,9 +116,11 @@ def test_nothing_is_served_from_its_own_loopback(arena: Arena) -> None:
 
     with control_run("listen", {"port": 0, "message": token()}) as control:
         assert reached(control.value), control.text
-    with with_loopback(arena) as (_, port):
-        title = 'with network="loopback": serve on a port of the host'
-        arena.judge(title, "succeeds", reached(port), "nobody listens there")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))  # and so nobody else on the host comes to listen there
+        with with_loopback(arena, taken.getsockname()[1]) as (_, port):
+            title = 'with network="loopback": serve on a port of the host'
+            arena.judge(title, "succeeds", reached(port), "nobody listens there")
 
 
 def test_the_hosts_network_is_no_more_than_tcp_and_udp(arena: Arena, home: Path) -> None:
