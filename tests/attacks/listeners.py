@@ -15,6 +15,7 @@ from tests.support.processes import eventually
 
 _POLL_S = 0.05
 _GRACE_S = 0.3
+_PATIENCE_S = 60.0
 
 
 class Listener:
@@ -36,8 +37,7 @@ class Listener:
 
     def heard(self, text: str, *, wait: bool) -> bool:
         """Whether ``text`` has come, waiting generously if it is expected to."""
-        deadline = 10.0 if wait else _GRACE_S
-        return eventually(lambda: text.encode() in self._data, deadline)
+        return eventually(lambda: text.encode() in self._data, _PATIENCE_S if wait else _GRACE_S)
 
     def _receive(self) -> None:
         with selectors.DefaultSelector() as selector:

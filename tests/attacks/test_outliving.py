@@ -54,7 +54,8 @@ def test_nothing_outlives_the_environment(
     with control_run(payload, arguments):
         assert eventually(lambda: bool(pids_named(alias)))
     try:
-        assert lives(alias), f"the control of {title} ended with its parent"
+        # one that keeps forking may be missed by many looks in a row, on a machine that is slow
+        assert lives(alias, 60.0), f"the control of {title} ended with its parent"
     finally:
         kill_group(alias)
     # another name: what the control left behind would be blamed on the jail
@@ -72,19 +73,24 @@ def test_nothing_outlives_the_environment(
     arena.judge(f"outlive the environment: {title}", "succeeds", left, run.text)
 
 
-def lives(alias: str) -> bool:
+def lives(alias: str, patience_s: float = 1.0) -> bool:
     """Whether there is such a process; one that keeps forking is missed by a single look."""
-    return eventually(lambda: bool(pids_named(alias)), 1.0)
+    return eventually(lambda: bool(pids_named(alias)), patience_s)
 
 
 def kill_group(alias: str) -> None:
     """End a session that a payload has opened, all of it at once."""
-    for pid in pids_named(alias):
-        with contextlib.suppress(ProcessLookupError):
-            group = os.getpgid(pid)
-            assert group != os.getpgid(0)
-            os.killpg(group, signal.SIGKILL)
-    assert eventually(lambda: not pids_named(alias))
+
+    def gone() -> bool:
+        found = pids_named(alias)
+        for pid in found:  # again and again: one that keeps forking is another one by now
+            with contextlib.suppress(ProcessLookupError):
+                group = os.getpgid(pid)
+                assert group != os.getpgid(0)
+                os.killpg(group, signal.SIGKILL)
+        return not found
+
+    assert eventually(gone)
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGABRT])

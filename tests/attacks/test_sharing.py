@@ -74,9 +74,11 @@ def opened_again_and_again(path: Path) -> Iterator[None]:
 
     thread = threading.Thread(target=work)
     thread.start()
-    yield
-    done.set()
-    thread.join()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
 
 
 @pytest.mark.parametrize("way", ["inotify", "F_NOTIFY"])
