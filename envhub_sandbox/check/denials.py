@@ -10,7 +10,8 @@ from collections.abc import Iterable
 
 _NETWORK = "socket AF_"
 _LOCAL = frozenset({"socket AF_UNIX", "socketpair AF_UNIX"})
-_DEEDS = {"connect": "connect to"}
+_DEEDS = {"connect": "connect to", "sendto": "send to"}
+_OTHER = " OTHER_PROCESS"
 _HARMLESS = frozenset(
     {
         *("mbind", "set_mempolicy", "set_mempolicy_home_node", "migrate_pages", "move_pages"),
@@ -37,5 +38,7 @@ def _finding(one: str) -> tuple[str, str]:
     deed, _, path = one.partition(" ")
     if path.startswith("/"):
         return "denied-files", f"asked to {_DEEDS.get(deed, deed)} {path}, which is not its own"
+    if one.endswith(_OTHER):
+        return "denied-kernel", f"tried {deed} of a process that is not its own"
     is_network = one.startswith(_NETWORK) and one not in _LOCAL
     return "denied-network" if is_network else "denied-kernel", f"tried {one}, and was refused"

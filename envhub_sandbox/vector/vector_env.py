@@ -357,9 +357,10 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     def jail_denials(self) -> tuple[str, ...] | None:
         """Which system calls its jail has tried and was denied: ``("ptrace", "socket AF_INET")``.
 
-        And which files it has asked for that are not its own: ``"write /home/me/.profile"``. By the
-        word of its first process, which answers or sees them, and not by the repository's. None
-        unless it runs under a policy with ``record_denials``.
+        And which files it has asked for that are not its own: ``"write /home/me/.profile"``, and
+        what it has tried with processes that are not: ``"kill OTHER_PROCESS"``. By the word of its
+        first process, which answers or sees them, and not by the repository's. None unless it runs
+        under a policy with ``record_denials``.
         """
         return self._session.denials()
 

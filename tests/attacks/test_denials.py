@@ -88,6 +88,87 @@ def test_a_recorded_jail_is_refused_the_same(tmp_path: Path) -> None:
     assert attempts(told) == ["mount", "ptrace", "socket AF_INET", "unshare"]
 
 
+_PROCESSES = """
+import os, signal
+import gymnasium as gym
+import numpy as np
+
+def answer(act, *arguments):
+    try:
+        act(*arguments)
+    except OSError as error:
+        return error.errno
+    return 0
+
+class Processes(gym.Env):
+    observation_space = gym.spaces.Box(0, 200, (4,), np.int64)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(4, np.int64), {}
+
+    def own(self):
+        child = os.fork()
+        if child == 0:
+            signal.pause()
+            os._exit(0)
+        os.close(os.pidfd_open(child))
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        os.sched_setscheduler(child, os.SCHED_OTHER, os.sched_param(0))
+        os.kill(os.getpid(), signal.SIGURG)
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        return [answer(os.kill, child, signal.SIGTERM), answer(os.kill, os.getppid(), 0)]
+
+    def others(self, number):
+        idle = os.SCHED_IDLE, os.sched_param(0)
+        return [
+            answer(os.kill, os.getppid(), signal.SIGURG),
+            answer(os.kill, number, signal.SIGURG),
+            answer(os.sched_setscheduler, os.getppid(), *idle),
+            answer(os.setpriority, os.PRIO_PROCESS, os.getppid(), 5),
+            answer(open, f"/proc/{number}/cmdline"),
+        ]
+
+    def step(self, action):
+        return np.zeros(4, np.int64), 0.0, False, False, {}
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([Processes] * n_envs)
+"""
+_NOBODY = 1 << 30
+
+
+@pytest.mark.parametrize("profile", profiles("strict", "no-userns"))
+def test_who_names_a_process_that_is_not_its_own_is_told(home: Path, profile: str) -> None:
+    """And is answered as ever; of its own ones, and of one that has ended, nothing is told.
+
+    The controls are the jail that records nothing, and what the repository does with its own.
+    """
+    folder = write_repository(home / "processes", _PROCESSES)
+    answers, told = {}, {}
+    for recorded in (False, True):
+        policy = {"profile": profile, "record_denials": recorded}
+        with make_env(str(folder), policy=policy) as suites:
+            env = suites.env
+            env.reset(seed=0)
+            own = env.call("own")
+            told[recorded] = env.jail_denials()
+            answers[recorded] = own, env.call("others", _NOBODY)
+            after = env.jail_denials()
+    assert answers[True] == answers[False]
+    assert told[False] is None
+    assert attempts(told[True] or ()) == []
+    assert after is not None
+    assert attempts(after) == [
+        "kill OTHER_PROCESS",
+        f"read /proc/{_NOBODY}/cmdline",
+        "sched_setscheduler OTHER_PROCESS",
+        "setpriority OTHER_PROCESS",
+    ]
+
+
 _FILES = """
 import ctypes, os, threading
 import gymnasium as gym

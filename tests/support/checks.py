@@ -34,16 +34,18 @@ before memory.
 
 What it tried and was denied is told by the first process of the jail, which the system call filter
 asks instead of refusing by itself (`Policy.record_denials`), with `sandbox="process"` alone. What
-allocators and the C library try on their way is left out.
+allocators and the C library try on their way is left out. Of signals, priorities and the like it is
+told when they name a process that is not the jail's own: one that lives outside of it, or a number
+that nobody has had yet; what nobody has any more may have been a child, and is left out.
 
 Of files that process sees each opening and change by name, and lets the kernel decide: what is
 told is that a path was asked for that is not the jail's own, read from the memory of who asks, and
-no more is known. Told is all that would change something, connecting to a socket's file, and
-reading homes, secrets of the system and other processes (libraries look for configurations in many
-another place). Not seen are: who only looks whether a file is there; what a link of its own leads
-to; what is changed by an open descriptor; datagrams to a socket's file; under `no-userns` modes,
-owners and times, which seem to change. At most 32 paths are told, and 64 attempts in all. What was
-tried in a jail that has ended since is not told.
+no more is known. Told is all that would change something, connecting or sending to a socket's file,
+and reading homes, secrets of the system and other processes (libraries look for configurations in
+many another place). Not seen are: who only looks whether a file is there; what a link of its own
+leads to; what is changed by an open descriptor; a datagram that `sendmsg` sends to a socket's file;
+under `no-userns` modes, owners and times, which seem to change. At most 32 paths are told, and 64
+attempts in all. What was tried in a jail that has ended since is not told.
 
 `--policy FILE` is TOML with the fields of `Policy`, and a table `[limits]`. Where you judge often,
 `--settings envhub.toml` has the options `steps`, `resets`, `slow-step`, `seed`, `fail-on`, `allow`,

@@ -31,7 +31,6 @@ _WORD = {"message": "x"}
 _NAMED = {"alias": "judged"}
 _PORT = {"host": "127.0.0.1", "port": 9, **_WORD}
 _LOG = {"path": "/dev/log", **_WORD}
-_NOT_THERE = "its pid namespace has no such process"
 _LIBRARIES = "libraries try it too, on their way"
 _OWN = "it harms nobody but itself"
 
@@ -66,13 +65,13 @@ ATTACKS = {
     "change_times": Attack(_FILES, "utimensat /home/other/file", _OUTSIDE),
     "chroot": Attack(_KERNEL, "tried chroot", _NAMED),
     "clone_with_namespace": Attack(_KERNEL, "tried clone", {**_NAMED, "way": "clone"}),
-    "command_lines_of_others": Attack("source-outside", "", _CLIENT, unseen=_NOT_THERE),
+    "command_lines_of_others": Attack(_FILES, "read /proc/", _CLIENT),
     "create_file": Attack(_FILES, "write /home/other/file", {**_OUTSIDE, **_TEXT}),
     "daemon": Attack("leaks-processes", "processes after each", _NAMED, stage="reset"),
     "delete_file": Attack(_FILES, "unlink /home/other/file", _OUTSIDE),
     "dns": Attack(_NETWORK, "tried socket AF_INET", _PORT),
     "docker_api": Attack(_FILES, "connect to /var/run/docker", {"path": "/var/run/docker.sock"}),
-    "enter_namespaces": Attack("source-outside", "", {**_NAMED, **_CLIENT}, unseen=_NOT_THERE),
+    "enter_namespaces": Attack(_KERNEL, "tried pidfd_open of", {**_NAMED, **_CLIENT}),
     "environment": Attack("source-outside", "", unseen="it may read its own, which we make"),
     "environment_of_others": Attack(_FILES, "read /proc/1/environ", _CLIENT),
     "fill_disk": Attack("", "", {"folders": [], "size": 1 << 30}, {"disk_bytes": 64 * _MIB}, _OWN),
@@ -84,7 +83,7 @@ ATTACKS = {
     "grandchildren": Attack("source-process", "", {**_NAMED, "seconds": 1}, unseen=_OWN),
     "hold_file": Attack(_KERNEL, "tried fcntl", {"path": "/etc/passwd", "way": "lease"}),
     "inherited_descriptors": Attack(unseen="there are none but its own"),
-    "ioprio_set": Attack("runs", "ioprio_set", {**_CLIENT, "priority": 0}, unseen=_LIBRARIES),
+    "ioprio_set": Attack(_KERNEL, "tried ioprio_set of", {**_CLIENT, "priority": 0}),
     "kernel_log_device": Attack(_KERNEL, "tried mknodat"),
     "kernel_object": Attack(_KERNEL, "tried bpf", {"kind": "bpf"}),
     "keyring": Attack(_KERNEL, "tried keyctl", {"name": "x"}),
@@ -94,15 +93,13 @@ ATTACKS = {
     "memory_bomb": Attack("survives", "out of memory", {"kind": "heap", "size": 1 << 31}),
     "mount_tmpfs": Attack(_KERNEL, "tried mount", {**_NAMED, "source": "none"}),
     "mptcp": Attack(_NETWORK, "tried socket AF_INET", _PORT),
-    "netlink_message": Attack(
-        "source-network", "", {"port": os.getpid(), **_WORD}, unseen=_LIBRARIES
-    ),
+    "netlink_message": Attack(_NETWORK, "tried socket AF_NETLINK", {"port": os.getpid(), **_WORD}),
     "netlink_routes": Attack("source-network", "", unseen=_LIBRARIES),
     "network_table": Attack("source-outside", "", {"name": "tcp"}, unseen="it sees its own"),
     "oom_score": Attack(_FILES, "oom_score_adj", {**_CLIENT, "score": 900}),
     "own_memory": Attack("source-outside", "", {"prefix": "x"}, unseen="it may read its own"),
     "packet": Attack(_NETWORK, "tried socket AF_PACKET", {"device": "lo", **_WORD}),
-    "pidfd_getfd": Attack("runs", "No such process", {**_CLIENT, "fd": 0}, unseen=_NOT_THERE),
+    "pidfd_getfd": Attack(_KERNEL, "tried pidfd_open of", {**_CLIENT, "fd": 0}),
     "pivot_root": Attack(_KERNEL, "tried unshare", _NAMED),
     "prlimit": Attack(_KERNEL, "tried prlimit64", {**_CLIENT, "files": 1}),
     "proc_fd": Attack(_FILES, "read /proc/", {**_CLIENT, "fd": 0}),
@@ -115,10 +112,7 @@ ATTACKS = {
     "raid": Attack(_FILES, "write /home/other/file", {"paths": ["/home/other/file"], **_TEXT}),
     "raw_icmp": Attack(_NETWORK, "tried socket AF_INET", {"host": "127.0.0.1", **_WORD}),
     "read_by_handle": Attack(
-        "source-native",
-        "",
-        {"handle": "00" * 8, "kind": 1, "mounts": []},
-        unseen="without a folder to start from it asks nothing",
+        _KERNEL, "tried open_by_handle_at", {"handle": "00" * 8, "kind": 1, "mounts": ["."]}
     ),
     "read_file": Attack(_FILES, "read /home/other/.ssh/id_rsa", _KEY),
     "read_through_hard_link": Attack(_FILES, "link /home/other", {**_KEY, "folders": ["/tmp"]}),
@@ -126,33 +120,31 @@ ATTACKS = {
     "read_through_symlink": Attack("runs", "No such file", _KEY, unseen="the link is its own"),
     "remount_root": Attack(_KERNEL, "tried unshare", _NAMED),
     "rename_file": Attack(_FILES, "rename /home/other/file", _OUTSIDE),
-    "sched_setaffinity": Attack(
-        "runs", "No such process", {**_CLIENT, "cpus": [0]}, unseen=_NOT_THERE
-    ),
-    "sched_setscheduler": Attack("", "", _CLIENT, unseen="it seems to work, and does nothing"),
+    "sched_setaffinity": Attack(_KERNEL, "sched_setaffinity of", {**_CLIENT, "cpus": [0]}),
+    "sched_setscheduler": Attack(_KERNEL, "tried sched_setscheduler of", _CLIENT),
     "send_descriptor": Attack(_FILES, "connect to", {"name": "x", "path": "/etc/passwd"}),
-    "setpriority": Attack("runs", "not permitted", {**_CLIENT, "nice": 5}, unseen=_LIBRARIES),
+    "setpriority": Attack(_KERNEL, "tried setpriority of", {**_CLIENT, "nice": 5}),
     "setuid_program": Attack(
         "source-process",
         "",
         {"command": ["/bin/true"], "uid": None},
         unseen="programs may be run, and gain nothing",
     ),
-    "signal_all": Attack("runs", "No such process", unseen=_NOT_THERE),
-    "signal_one": Attack("runs", "No such process", {**_CLIENT, "way": "kill"}, unseen=_NOT_THERE),
+    "signal_all": Attack(_KERNEL, "tried kill of"),
+    "signal_one": Attack(_KERNEL, "tried kill of", {**_CLIENT, "way": "kill"}),
     "socket_of_family": Attack(
         _NETWORK, "tried socket AF_ALG", {"family": 38, "kind": 5, "protocol": 0}
     ),
     "spin": Attack("survives", "step", {"seconds": 60}),
     "stat_file": Attack("runs", "No such file", _OUTSIDE, unseen="who only looks is not seen"),
-    "stop_processes": Attack("", "", {"pids": [os.getpid()], "own": False}, unseen=_NOT_THERE),
+    "stop_processes": Attack(_KERNEL, "tried kill of", {"pids": [os.getpid()], "own": False}),
     "tcp": Attack(_NETWORK, "tried socket AF_INET", _PORT),
     "tcp_fast_open": Attack(_NETWORK, "tried socket AF_INET", _PORT),
     "thread_bomb": Attack("runs", "new thread", {"count": 500}, {"processes": 64}, _OWN),
     "type_into_terminal": Attack(_KERNEL, "tried ioctl", _TEXT),
     "udp": Attack(_NETWORK, "tried socket AF_INET", _PORT),
-    "unix_datagram": Attack("source-network", "", _LOG, unseen="datagrams are not seen"),
-    "unix_datagram_of_a_pair": Attack("source-network", "", _LOG, unseen="datagrams are not seen"),
+    "unix_datagram": Attack(_FILES, "send to /dev/log", _LOG),
+    "unix_datagram_of_a_pair": Attack(_FILES, "send to /dev/log", _LOG),
     "unix_stream": Attack(_FILES, "connect to /var/run/x", {"path": "/var/run/x", **_WORD}),
     "use_up": Attack("source-network", "", {"kind": "pipes", "name": "x"}, unseen=_OWN),
     "user_namespace": Attack(_KERNEL, "tried unshare", _NAMED),

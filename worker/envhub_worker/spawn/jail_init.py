@@ -223,8 +223,10 @@ class Init:
             if runner.status is not None:
                 return
         call = name_of(request.call)
-        if call not in self._common.watched:
-            self._tell_denied(*notify.described(request))
+        if call not in paths.NAMED or call not in self._common.watched:
+            detail = notify.detail(request)
+            if detail or not notify.is_own_affair(call, self._common.watched):
+                self._tell_denied(call, detail)
             return
         mine = own(self._jail, request.caller, request.thread)
         waits = request.still_waits

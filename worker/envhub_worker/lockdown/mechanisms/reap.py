@@ -90,6 +90,16 @@ def process_of(thread: int) -> int:
     return 0
 
 
+def is_below(pid: int, root: int) -> bool:
+    """Whether ``root`` is above ``pid``; so it is of one that goes meanwhile."""
+    try:
+        while pid > 1 and pid != root:
+            pid = _parent(pid)
+    except OSError:
+        return True
+    return pid == root
+
+
 def _parent(pid: int) -> int:
     with open(f"/proc/{pid}/stat", "rb") as stat:
         # The command may hold anything, parentheses and blanks included.

@@ -24,6 +24,7 @@ from envhub_worker.lockdown.mechanisms import reap
 from envhub_worker.lockdown.mechanisms.kernel import syscall
 from envhub_worker.lockdown.seccomp.policy import refusal
 from envhub_worker.lockdown.seccomp.syscalls import c_int, name_of, number
+from envhub_worker.lockdown.seccomp.targets import NAMING, OTHER, PRETENDED, is_another
 
 _RECEIVE = 0xC0502100
 _SEND = 0xC0182101
@@ -68,6 +69,8 @@ class Answer:
 _PROCEED = Answer(proceed=True)
 _Inside = Callable[[], Collection[int]]
 _SIGNALS = ("kill", "tkill", "tgkill")
+_NETLINKS = (0, 15)
+"""Of addresses and of devices: what the C library and what looks for devices asks."""
 
 
 def serve(
@@ -82,7 +85,7 @@ def serve(
         permitted: Calls that the policy allows whatever their arguments, and that only ask so that
             they are seen: the kernel goes on with them. What is neither one of these nor a signal
             is denied.
-        note: Is told of what is no signal.
+        note: Is told of each.
     """
     buffer = bytearray(_REQUEST.size)
     try:
@@ -98,12 +101,14 @@ def serve(
 
     caller = reap.process_of(thread)
     request = Request(thread, caller, call, (first, second, third), tuple(words), still_waits)
-    if request.call in map(number, _SIGNALS):
+    note(request)  # told before the caller goes on, so that nobody can look too early
+    name = name_of(request.call)
+    if name in permitted:
+        answer = _PROCEED
+    elif name in _SIGNALS:
         answer = decide(request, lambda: reap.descendants(os.getpid()))
     else:
-        note(request)  # told before the caller goes on, so that nobody can look too early
-        name = name_of(request.call)
-        answer = _PROCEED if name in permitted else Answer(refusal(name))
+        answer = Answer(refusal(name))
     flags = _CONTINUE if answer.proceed else 0
     with contextlib.suppress(OSError):
         fcntl.ioctl(listener, _SEND, _ANSWER.pack(identity, 0, -answer.error, flags))
@@ -116,16 +121,25 @@ MOST_FILES = 32
 """Of these, files: a flood of names hides no other attempt."""
 
 
-def described(request: Request) -> tuple[str, str]:
-    """A call that is denied, and of its arguments what the kernel itself reads in a register."""
+def detail(request: Request) -> str:
+    """Of the arguments of a call what the kernel itself reads in a register."""
     call = name_of(request.call)
+    if call in NAMING and is_another(call, request.arguments, request.caller, os.getpid()):
+        return OTHER
     if call not in ("socket", "socketpair"):
-        return call, ""
-    family = request.arguments[0]
+        return ""
+    family, _, protocol = request.arguments
     try:
-        return call, socket.AddressFamily(family).name
+        name = socket.AddressFamily(family).name
     except ValueError:
-        return call, "AF_UNKNOWN"
+        return "AF_UNKNOWN"
+    is_known = family != socket.AF_NETLINK or protocol in _NETLINKS
+    return name if is_known else f"{name}_OTHER"
+
+
+def is_own_affair(call: str, permitted: Collection[str]) -> bool:
+    """Whether a call is no attempt at anything, where it is about the jail's own processes."""
+    return call in permitted or call in PRETENDED or call in _SIGNALS
 
 
 def _has_callers(listener: int) -> bool:

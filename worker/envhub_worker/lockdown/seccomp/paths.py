@@ -16,6 +16,7 @@ from collections.abc import Callable, Collection, Sequence
 from typing import BinaryIO
 
 from envhub_worker.lockdown.seccomp.syscalls import c_int
+from envhub_worker.lockdown.seccomp.targets import never_was
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.text import printable
 
@@ -41,17 +42,18 @@ _CALLS: tuple[tuple[str, _Where], ...] = (
     ("rename link", _TWO),
     ("symlink", ((None, 1),)),
     ("symlinkat", ((1, 2),)),
-    ("connect", ()),
+    ("connect sendto", ()),
 )
 #: What opens and changes files by name.
 NAMED: dict[str, _Where] = {name: where for names, where in _CALLS for name in names.split()}
 _FLAGS = {"open": 1, "openat": 2}
+_ADDRESS = {"connect": (1, 2), "sendto": (4, 5)}
 _CHANGING = os.O_ACCMODE | os.O_CREAT | os.O_TRUNC
 
 _PRIVATE = re.compile(
     r"/(home|root|Users|run/user|run/secrets|var/(run|log|mail|spool|backups)"
     r"|etc/(shadow|gshadow|sudoers|sudoers\.d|ssh|ssl/private))(/.*)?"
-    r"|/proc/\d+(/task/\d+)?/(environ|mem|maps|smaps|auxv|io|fd|fdinfo|root|cwd)(/.*)?",
+    r"|/proc/\d+(/task/\d+)?/(environ|mem|maps|smaps|auxv|io|fd|fdinfo|root|cwd|ns)(/.*)?",
     re.DOTALL,
 )
 """What nobody reads by chance; libraries look for a configuration in many another place."""
@@ -96,8 +98,11 @@ def asked(
     with contextlib.suppress(OSError, ValueError, OverflowError):
         with open(f"/proc/{thread}/mem", "rb", buffering=0) as memory:
             still_waits()  # not before it is open: from here on it is this caller's memory
-            if call == "connect":
-                return _connected(memory, words, thread, own)
+            if call in _ADDRESS:
+                place, size = (words[one] for one in _ADDRESS[call])
+                path = _addressed(memory, place, size, thread)
+                known = not path or path in _HARMLESS or _is_within(path, own.changed)
+                return [] if known else [(call, _shown(path))]
             deed = _deed(call, memory, words)
             paths = [_named(memory, thread, words, *where) for where in NAMED[call]]
         return [(deed, _shown(path)) for path in paths if path and not _may(deed, path, own)]
@@ -152,22 +157,19 @@ def _absolute(thread: int, base: str, text: bytes) -> str:
     return f"/...{path}"  # wherever that is: nobody's own
 
 
-def _connected(
-    memory: BinaryIO, words: Sequence[int], thread: int, own: Own
-) -> list[tuple[str, str]]:
+def _addressed(memory: BinaryIO, place: int, size: int, thread: int) -> str:
     """The socket's file; one without a name in the file system is the jail's own network's."""
-    address = os.pread(memory.fileno(), min(words[2] & 0xFFFFFFFF, _SOCKET_ADDRESS), words[1])
+    address = os.pread(memory.fileno(), min(size & 0xFFFFFFFF, _SOCKET_ADDRESS), place)
     text = address[2:].partition(b"\0")[0]
     if address[:2] != struct.pack("=H", _AF_UNIX) or not text:
-        return []
-    path = _absolute(thread, "cwd", text)
-    known = not path or path in _HARMLESS or _is_within(path, own.changed)
-    return [] if known else [("connect", _shown(path))]
+        return ""
+    return _absolute(thread, "cwd", text)
 
 
 def _may(deed: str, path: str, own: Own) -> bool:
     if deed == "read":
-        return _is_within(path, own.read) or _PRIVATE.fullmatch(path) is None
+        is_private = _PRIVATE.fullmatch(path) is not None or never_was(path)
+        return not is_private or _is_within(path, own.read)
     return _is_within(path, own.changed)
 
 

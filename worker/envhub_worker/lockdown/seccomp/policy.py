@@ -10,6 +10,7 @@ import errno
 from collections.abc import Iterable, Mapping
 
 from envhub_worker.lockdown.seccomp.paths import NAMED
+from envhub_worker.lockdown.seccomp.targets import NAMING, PRETENDED
 from envhub_worker.protocol.records import dataclass
 
 _ERRNO = 0x00050000
@@ -152,37 +153,40 @@ def recorded(verdicts: Mapping[str, Verdict], names: Iterable[str]) -> dict[str,
     """The same, where init answers what is denied, and so knows that it was tried.
 
     What is not there at all (ENOSYS), or only seems to work, is no attempt at anything: libraries
-    ask for it on their way to something else. What names files is seen on its way to the kernel.
+    ask for it on their way to something else. What names files is seen on its way to the kernel,
+    and so is what names a process, which may be another's.
 
     Args:
         verdicts: Of ``table``.
         names: Every call that there is.
     """
-    denied = {name: _asking(verdicts.get(name, EPERM)) for name in names}
-    return denied | dict.fromkeys(watched(verdicts) & denied.keys(), ASK)
+    denied = {name: _asking(name, verdicts.get(name, EPERM)) for name in names}
+    seen: dict[str, Verdict] = dict.fromkeys(watched(verdicts), ASK)
+    if "sendto" in seen:  # what is connected names nobody
+        seen["sendto"] = ByArguments((((Check(4, 0, wide=True),), ALLOW),), ASK)
+    return denied | {name: verdict for name, verdict in seen.items() if name in denied}
 
 
 def watched(verdicts: Mapping[str, Verdict]) -> frozenset[str]:
-    """What opens and changes files, where nothing of it is denied: init lets the kernel go on.
+    """What names files and processes, where nothing of it is denied: init lets the kernel go on.
 
     Not so where arguments decide: the kernel would make the call without looking at them again.
     """
-    return frozenset(name for name in NAMED if verdicts.get(name) == ALLOW)
+    return frozenset(name for name in (*NAMED, *NAMING) if verdicts.get(name) == ALLOW)
 
 
-def _asking(verdict: Verdict) -> Verdict:
-    if isinstance(verdict, ByArguments):
-        rules = tuple((checks, _asked(action)) for checks, action in verdict.rules)
-        return ByArguments(rules, _asked(verdict.otherwise))
-    return _asked(verdict)
-
-
-def _asked(verdict: int) -> int:
-    return ASK if verdict in (EPERM, _EAFNOSUPPORT) else verdict
+def _asking(name: str, verdict: Verdict) -> Verdict:
+    asked = {EPERM, _EAFNOSUPPORT} | ({PRETEND} if name in PRETENDED else set())
+    if not isinstance(verdict, ByArguments):
+        return ASK if verdict in asked else verdict
+    rules = ((checks, ASK if one in asked else one) for checks, one in verdict.rules)
+    return ByArguments(tuple(rules), ASK if verdict.otherwise in asked else verdict.otherwise)
 
 
 def refusal(call: str) -> int:
-    """The errno with which a call that is denied answers, whoever gives it."""
+    """The errno with which a call that is denied answers, whoever gives it; 0: it seems to work."""
+    if call in PRETENDED:
+        return 0
     return errno.EAFNOSUPPORT if call in ("socket", "socketpair") else errno.EPERM
 
 

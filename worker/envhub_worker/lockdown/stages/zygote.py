@@ -76,14 +76,15 @@ def enter(config: ZygoteConfig) -> Common:
         landlock_abi=abi,
         brokered=brokered,
         asks=brokered or config.record,
-        watched=_watched(config) if config.record else frozenset(),
+        watched=_watched(config, brokered=brokered) if config.record else frozenset(),
         programs=programs,
     )
 
 
-def _watched(config: ZygoteConfig) -> frozenset[str]:
-    """The same for both filters: what measures memory makes no difference to files."""
-    return watched(table(namespaced=config.profile == "strict", network=config.network))
+def _watched(config: ZygoteConfig, *, brokered: bool) -> frozenset[str]:
+    """The same for both filters: what measures memory makes no difference to files and signals."""
+    namespaced = config.profile == "strict"
+    return watched(table(namespaced=namespaced, network=config.network, brokered=brokered))
 
 
 def _check_gpu() -> None:

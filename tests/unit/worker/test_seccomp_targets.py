@@ -1,0 +1,85 @@
+"""Whether a call is about a process of the jail's own: here, this process's children."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+from collections.abc import Iterator
+
+import pytest
+
+from envhub_worker.lockdown.seccomp.targets import is_another, never_was
+
+_NOBODY = 1 << 30
+"""Numbers end long before."""
+
+
+@pytest.fixture(scope="module")
+def children() -> Iterator[tuple[int, int]]:
+    """Two processes, of which neither is below the other."""
+    both = [subprocess.Popen(["sleep", "600"]) for _ in range(2)]
+    yield both[0].pid, both[1].pid
+    for one in both:
+        one.kill()
+        one.wait()
+
+
+@pytest.mark.parametrize(
+    ("call", "place"),
+    [
+        ("kill", 0),
+        ("tkill", 0),
+        ("tgkill", 0),
+        ("rt_sigqueueinfo", 0),
+        ("pidfd_open", 0),
+        ("sched_setscheduler", 0),
+        ("sched_setaffinity", 0),
+        ("setpriority", 1),
+        ("ioprio_set", 1),
+    ],
+)
+def test_what_is_not_below_init_is_another(
+    call: str, place: int, children: tuple[int, int]
+) -> None:
+    """Also what cannot have been there; not so the caller, nor what lives with it."""
+    first, second = children
+
+    def about(number: int, *, init: int) -> bool:
+        before = (1,) if call == "ioprio_set" else (0,) * place
+        words = (*before, number, signal.SIGTERM, signal.SIGTERM)
+        return is_another(call, words[:3], first, init)
+
+    assert not about(first, init=os.getpid())
+    assert not about(second, init=os.getpid())
+    assert not about(0, init=os.getpid())
+    assert about(second, init=first)
+    assert about(_NOBODY, init=os.getpid())
+    assert about(os.getpid(), init=os.getpid()) == (call != "pidfd_open")
+
+
+def test_who_only_looks_signals_nobody(children: tuple[int, int]) -> None:
+    """Groups and everybody are named by numbers below zero; a group of one's own may have ended."""
+    first, second = children
+    assert not is_another("kill", (second, 0, 0), first, first)
+    assert is_another("kill", (-1, 15, 0), first, os.getpid())
+    assert is_another("kill", (-_NOBODY, 15, 0), first, os.getpid())
+    assert not is_another("kill", (-second, 15, 0), first, os.getpid())
+    assert not is_another("setpriority", (1, _NOBODY, 0), first, os.getpid())
+
+
+def test_who_has_ended_may_have_been_its_own() -> None:
+    """Nothing is said of a number that is nobody's any more."""
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    assert not is_another("kill", (ended.pid, 15, 0), os.getpid(), os.getpid())
+    assert not never_was(f"/proc/{ended.pid}/stat")
+
+
+def test_a_path_names_a_process_that_nobody_can_have_met() -> None:
+    """What a list of processes shows, or a child's number is, was there."""
+    assert never_was(f"/proc/{_NOBODY}/cmdline")
+    assert never_was(f"/proc/{_NOBODY}")
+    for path in (f"/proc/{os.getpid()}/cmdline", "/proc/self/cmdline", f"/home/{_NOBODY}"):
+        assert not never_was(path)
+    assert not never_was(f"/proc/{'9' * 5000}/cmdline")

@@ -1,0 +1,68 @@
+"""Which processes a waiting call is about, where it names one by its number.
+
+The number stands in a register, so that it is what the kernel will read. What is seen decides
+nothing: whether the call may reach that process is decided by the kernel, or by ``notify``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from envhub_worker.lockdown.mechanisms import reap
+
+_PRETENDED = "sched_setscheduler sched_setparam sched_setattr sched_setaffinity"
+_WHICH = {"setpriority": 0, "ioprio_set": 1}  # and what says there that a process is meant
+_SIGNUM = {"kill": 1, "tkill": 1, "tgkill": 2, "rt_sigqueueinfo": 1, "rt_tgsigqueueinfo": 2}
+#: What does nothing and says that it worked, where it is not permitted.
+PRETENDED = frozenset(_PRETENDED.split())
+#: Calls that name a process, and which of their arguments does.
+NAMING = dict.fromkeys((*_SIGNUM, "pidfd_open", *PRETENDED), 0) | dict.fromkeys(_WHICH, 1)
+#: What is told of a call that names another.
+OTHER = "OTHER_PROCESS"
+
+_ENTRY = re.compile(r"/proc/(\d{1,18})(/.*)?", re.DOTALL)
+
+
+def is_another(call: str, arguments: Sequence[int], caller: int, init: int) -> bool:
+    """Whether a call is about a process outside of its jail, init among these.
+
+    Args:
+        call: Its name, one of ``NAMING``.
+        arguments: Its first three, as C integers.
+        caller: The process that calls.
+        init: The first process of the jail.
+    """
+    if call in _WHICH and arguments[0] != _WHICH[call]:
+        return False
+    if call in _SIGNUM and arguments[_SIGNUM[call]] == 0:
+        return False  # it only looks whether somebody is there
+    number = arguments[NAMING[call]]
+    if call == "kill" and number < 0:
+        return number == -1 or _never_was(-number)
+    if number <= 0 or (call == "pidfd_open" and number == init):
+        return False
+    return _is_outside(number, caller, init)
+
+
+def never_was(path: str) -> bool:
+    """Whether a path is below the entry of a process that nobody in the jail can have met."""
+    entry = _ENTRY.fullmatch(path)
+    return entry is not None and _never_was(int(entry[1]))
+
+
+def _is_outside(number: int, caller: int, init: int) -> bool:
+    """A number that is nobody's now may have been a child's: then nothing is said of it."""
+    process = reap.process_of(number)
+    if process == 0:
+        return _never_was(number)
+    return process == init or (process != caller and not reap.is_below(process, init))
+
+
+def _never_was(number: int) -> bool:
+    """Whether this pid namespace has not yet come to that number."""
+    try:
+        with open("/proc/loadavg", encoding="ascii") as file:
+            return number > int(file.read().split()[-1])
+    except (OSError, ValueError):
+        return False
