@@ -32,6 +32,7 @@ from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say, size_of
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_sandbox.cli.shared.findings import annotate
+from envhub_sandbox.cli.shared.memory import free_bytes
 from envhub_sandbox.cli.version import versions
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import commit_of
@@ -310,7 +311,7 @@ def _jobs(wanted: Wanted) -> int:
     each, budget = _JAILS * one, opt.read_size("--memory-budget", wanted.memory_budget)
     needs = f"a judgement may take {size_of(each)}: {_JAILS} jails of {size_of(one)}"
     if budget is None:
-        budget = max(each, free_bytes())
+        budget = max(each, free_bytes() or 0)
     elif budget < each:
         raise UsageError(
             f"--memory-budget {wanted.memory_budget} is too little: {needs}. "
@@ -321,13 +322,6 @@ def _jobs(wanted: Wanted) -> int:
     if wanted.jobs is not None and jobs < wanted.jobs:
         say(f"{jobs} at once: {needs}, of {size_of(budget)}; see --memory and --memory-budget.")
     return jobs
-
-
-def free_bytes() -> int:
-    """Memory that nobody uses, or that the kernel would give back."""
-    from envhub_sandbox.cli.doctor.doctor import resources
-
-    return int(resources()["free_memory_bytes"] or 0)
 
 
 def _digest(arguments: Sequence[str], policy: bytes) -> str:

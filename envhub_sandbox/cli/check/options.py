@@ -39,7 +39,7 @@ MemoryBudget = Annotated[
     typer.Option(
         metavar="SIZE",
         help="With --all: what the limits of all jails at once may add up to; by default the "
-        "memory that is free.",
+        "memory that is free, here and in the control groups around.",
         rich_help_panel=_PANEL,
     ),
 ]

@@ -7,7 +7,6 @@ missing, so the layers are also tried one by one, to name all of them at once.
 
 from __future__ import annotations
 
-import contextlib
 import json as json_format
 import os
 import platform
@@ -24,6 +23,7 @@ import typer
 
 from envhub_sandbox.cli.shared.console import console, print_json, safe_line, safe_text
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, describe, reported
+from envhub_sandbox.cli.shared.memory import free_bytes
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_sandbox.cli.version import versions
 from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError
@@ -178,15 +178,7 @@ def resources() -> dict[str, Any]:
 
     folder = next(one for one in (cache_root(), *cache_root().parents) if one.is_dir())
     disk = {"folder": str(folder), "free_bytes": shutil.disk_usage(folder).free}
-    return {"free_memory_bytes": _available(Path("/proc/meminfo")), "disk": disk}
-
-
-def _available(meminfo: Path) -> int | None:
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        for line in meminfo.read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) * 1024
-    return None
+    return {"free_memory_bytes": free_bytes(), "disk": disk}
 
 
 def probe() -> dict[str, Any]:

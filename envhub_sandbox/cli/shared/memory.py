@@ -1,0 +1,95 @@
+"""Memory that may still be taken here: of the machine, and of the control groups that we are in."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+_V1, _V2 = "memory", ""
+_FILES = (
+    ("memory.max", "memory.current", "inactive_file"),
+    ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+)
+"""Of each version: the limit, what is used, and what of this the kernel would give back."""
+_UNLIMITED = 1 << 60
+"""The first version writes no limit as the largest number of pages."""
+
+
+def free_bytes(proc: Path = Path("/proc")) -> int | None:
+    """What nobody uses, or the kernel would give back; None where it does not tell.
+
+    A control group that we are in, or one around it, may have less left than the machine: that of
+    a container, or of a service.
+    """
+    found = [_of_machine(proc / "meminfo"), *map(_of_group, _groups(proc / "self"))]
+    return min((one for one in found if one is not None), default=None)
+
+
+def _of_machine(meminfo: Path) -> int | None:
+    kilobytes = _fields(meminfo).get("MemAvailable:")
+    return None if kilobytes is None else kilobytes * 1024
+
+
+def _of_group(folder: Path) -> int | None:
+    for limit, used, idle in _FILES:
+        most = _number(folder / limit)
+        if most is not None and most < _UNLIMITED:
+            held = (_number(folder / used) or 0) - _fields(folder / "memory.stat").get(idle, 0)
+            return max(0, most - max(0, held))
+    return None
+
+
+def _groups(process: Path) -> Iterator[Path]:
+    """The folders of the groups that count our memory, from our own to the top of what we see."""
+    lines = [line.split(":", 2) for line in _text(process / "cgroup").splitlines()]
+    own = {name: line[2] for line in lines if len(line) == 3 for name in line[1].split(",")}
+    for kind, root, top in _mounts(process / "mountinfo"):
+        folder = top / _below(own.get(kind, "/"), root)
+        yield folder
+        while folder != top:
+            folder = folder.parent
+            yield folder
+
+
+def _below(path: str, root: str) -> PurePosixPath:
+    """Where a group is in a mount of one around it: in a container it may be out of sight."""
+    with contextlib.suppress(ValueError):
+        below = PurePosixPath(path).relative_to(root)
+        if ".." not in below.parts:
+            return below
+    return PurePosixPath()
+
+
+def _mounts(mountinfo: Path) -> Iterator[tuple[str, str, Path]]:
+    """The version, the group and the folder of each mount of groups that may count memory."""
+    for line in _text(mountinfo).splitlines():
+        left, _, right = line.partition(" - ")
+        place, what = left.split(" "), right.split(" ")
+        if len(place) < 5 or len(what) < 3:
+            continue
+        kind = {"cgroup2": _V2, "cgroup": _V1}.get(what[0])
+        if kind == _V2 or (kind == _V1 and _V1 in what[2].split(",")):
+            yield kind, _unescaped(place[3]), Path(_unescaped(place[4]))
+
+
+def _unescaped(word: str) -> str:
+    return re.sub(r"\\([0-7]{3})", lambda found: chr(int(found[1], 8)), word)
+
+
+def _fields(path: Path) -> dict[str, int]:
+    lines = [line.split() for line in _text(path).splitlines()]
+    return {line[0]: int(line[1]) for line in lines if len(line) > 1 and line[1].isdigit()}
+
+
+def _number(path: Path) -> int | None:
+    text = _text(path).strip()
+    return int(text) if text.isdigit() else None
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(errors="replace")
+    except OSError:
+        return ""
