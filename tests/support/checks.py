@@ -36,7 +36,7 @@ What it tried and was denied is told by the first process of the jail, which the
 asks instead of refusing by itself (`Policy.record_denials`), with `sandbox="process"` alone. What
 allocators and the C library try on their way is left out. Of signals, priorities and the like it is
 told when they name a process that is not the jail's own: one that lives outside of it, or a number
-that nobody has had yet; what nobody has any more may have been a child, and is left out.
+that nobody in it can have had; what nobody has any more may have been a child, and is left out.
 
 Of files that process sees each opening and change by name, and lets the kernel decide: what is
 told is that a path was asked for that is not the jail's own, read from the memory of who asks, and

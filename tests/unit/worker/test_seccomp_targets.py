@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -83,3 +84,12 @@ def test_a_path_names_a_process_that_nobody_can_have_met() -> None:
     for path in (f"/proc/{os.getpid()}/cmdline", "/proc/self/cmdline", f"/home/{_NOBODY}"):
         assert not never_was(path)
     assert not never_was(f"/proc/{'9' * 5000}/cmdline")
+
+
+def test_a_namespace_of_ones_own_has_come_to_fewer_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its first process knows the last one; elsewhere they may have begun again since."""
+    most = int(Path("/proc/sys/kernel/pid_max").read_text())
+    assert not never_was(f"/proc/{most - 1}/cmdline")
+    monkeypatch.setattr(os, "getpid", lambda: 1)
+    assert never_was(f"/proc/{most}/cmdline")
+    assert not never_was("/proc/1/cmdline")

@@ -6,6 +6,7 @@ nothing: whether the call may reach that process is decided by the kernel, or by
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 
@@ -21,6 +22,7 @@ NAMING = dict.fromkeys((*_SIGNUM, "pidfd_open", *PRETENDED), 0) | dict.fromkeys(
 #: What is told of a call that names another.
 OTHER = "OTHER_PROCESS"
 
+_FIRST = 1
 _ENTRY = re.compile(r"/proc/(\d{1,18})(/.*)?", re.DOTALL)
 
 
@@ -60,9 +62,13 @@ def _is_outside(number: int, caller: int, init: int) -> bool:
 
 
 def _never_was(number: int) -> bool:
-    """Whether this pid namespace has not yet come to that number."""
+    """Whether a jail's own namespace has not yet come to that number, or no other can.
+
+    A host begins again at low numbers, and a jail hardly ever lives that long.
+    """
+    is_ours = os.getpid() == _FIRST
     try:
-        with open("/proc/loadavg", encoding="ascii") as file:
+        with open("/proc/loadavg" if is_ours else "/proc/sys/kernel/pid_max") as file:
             return number > int(file.read().split()[-1])
     except (OSError, ValueError):
         return False
