@@ -7,7 +7,7 @@ our own comparison found nothing, never because the repository says so.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
@@ -28,6 +28,7 @@ from envhub_sandbox.dependencies.declared import declared
 from envhub_sandbox.dependencies.prepare import provided
 from envhub_sandbox.errors import (
     DependencyError,
+    EnvHubError,
     LoadError,
     ObservationError,
     PackageIntegrityError,
@@ -48,6 +49,8 @@ from envhub_sandbox.vector.suites import EnvSuites
 _PICTURED = 12
 """Tasks of which a page has pictures: a suite may have hundreds."""
 _MODES = ("NextStep", "SameStep", "Disabled")
+_ITS_FAULT = (LoadError, DependencyError, RemoteProtocolError, WorkerDiedError, WorkerTimeoutError)
+"""Where it does not load: what the repository is to blame for."""
 
 
 class _StoppedError(Exception):
@@ -183,6 +186,9 @@ class _Judge:
     def make(self, **changes: Any) -> EnvSuites:
         """Its environments; of the very files that were read, or it cannot be judged."""
         given = {**self._asked.arguments, "cfg": self._report.reference, **changes}
+        policy = policy_from(given.get("policy"), given.get("limits"))
+        # no death is to be survived that nobody is told of
+        given |= {"policy": replace(policy, restart="never"), "limits": None}
         suites = make_env(**given)
         if suites.provenance["commit"] != self._snapshot.commit:  # a folder of this machine
             suites.close()
@@ -193,30 +199,35 @@ class _Judge:
         self._asked.tell("loading it")
         try:
             suites = self._made_to_record()
-        except LoadError as error:
-            self._report.judged("loads", [str(error)])
-            raise _StoppedError from error
-        except DependencyError as error:
-            if not self._found("imports"):  # where it stands has been said already
-                self._report.judged("imports", [str(error)])
-            raise _StoppedError from error
-        except RemoteProtocolError as error:  # such as a suite's name that a terminal would obey
-            self._report.judged("loads", [str(error)])
-            raise _StoppedError from error
-        except (WorkerDiedError, WorkerTimeoutError) as error:
-            self._report.judged("survives", [f"while it loaded: {error}"])
+        except _ITS_FAULT as error:
+            self._unloaded(error)
+            self.denied(error.denied)
             raise _StoppedError from error
         with suites:
             self._report.judged("loads", [])
             for suite, task in self._asked.tasks(suites):
                 self._asked.tell(f"{suite} / {task}")
                 asking = _Task(self, suites, suite, task)
-                with self._stopping(f"{suite} / {task}"):
+                with self._stopping(f"{suite} / {task}", asking):
                     asking.ask()
                 asking.denied()
                 asking.film()
                 suites[suite][task].close()
             self._report.provenance = suites.provenance
+
+    def _unloaded(self, error: EnvHubError) -> None:
+        if isinstance(error, (WorkerDiedError, WorkerTimeoutError)):
+            self._report.judged("survives", [f"while it loaded: {error}"])
+        elif not isinstance(error, DependencyError):  # also a name that a terminal would obey
+            self._report.judged("loads", [str(error)])
+        elif not self._found("imports"):  # where it stands has been said already
+            self._report.judged("imports", [str(error)])
+
+    def denied(self, denied: Iterable[str] | None, task: str = "") -> None:
+        """What a jail was refused, where that was recorded."""
+        if denied is not None:
+            for check, found in denials.sorted_out(denied).items():
+                self._report.judged(check, found, task)
 
     def _made_to_record(self) -> EnvSuites:
         """Of which what they are denied is recorded, where a kernel and its containers let it be.
@@ -232,9 +243,10 @@ class _Judge:
         return self.make(num_workers=1, validate=True)
 
     @contextmanager
-    def _stopping(self, task: str) -> Iterator[None]:
+    def _stopping(self, task: str, asking: _Task) -> Iterator[None]:
         try:
-            yield
+            with asking.ending():
+                yield
         except ObservationError as error:
             self._report.judged("observation-space", [str(error)], task)
         except CustomSpaceError as error:  # of actions
@@ -263,6 +275,7 @@ class _Task:
         self._suite, self._task = suite, task
         self._name = f"{suite} / {task}"
         self._play = self._report.plays[self._name] = Play(facts_of(self._env))
+        self._denied: tuple[str, ...] | None = None
         self._pictured = self._asked.pictures and len(self._report.plays) <= _PICTURED
 
     def ask(self) -> None:
@@ -283,13 +296,20 @@ class _Task:
         self._compare(first, mode)
         self._leaks()
 
+    @contextmanager
+    def ending(self) -> Iterator[None]:
+        """Keep what its jail was refused, where that ends: nobody knows it afterwards."""
+        try:
+            yield
+        except EnvHubError as error:
+            self._denied = error.denied
+            raise
+
     def denied(self) -> None:
         """What was refused so far: also where it ended in an error."""
         told = getattr(self._env, "jail_denials", None)
         denied = None if told is None else told()
-        if denied is not None:
-            for check, found in denials.sorted_out(denied).items():
-                self._say(check, found)
+        self._judge.denied(self._denied if denied is None else denied, self._name)
 
     def film(self) -> None:
         """Last of all, so that no verdict depends on whether somebody looks."""

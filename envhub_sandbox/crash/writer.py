@@ -124,6 +124,7 @@ def _write(folder: Path, crash: Crash) -> None:
         "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "label": crash.label,
         "death": {name: _concealed(text, crash) for name, text in death_of(crash.error).items()},
+        "denied": None if crash.error.denied is None else _denied(crash),
         "provenance": crash.provenance,
         "make_env": _arguments(crash),
         "task": crash.task,
@@ -148,6 +149,11 @@ def _write(folder: Path, crash: Crash) -> None:
     }
     for name, data in content.items():
         folders.write_private(folder / name, data)
+
+
+def _denied(crash: Crash) -> list[str]:
+    """What was tried before; a path may hold anything."""
+    return [str(_concealed(one, crash)) for one in crash.error.denied or ()]
 
 
 def _concealed(value: Any, crash: Crash) -> Any:
@@ -266,6 +272,9 @@ def _in_words(crash: Crash) -> str:
     lines += [f"Seeded: {'yes' if recording.seeded else 'no, so chance may decide otherwise'}."]
     if recording.dropped:
         lines.append(f"{recording.dropped} requests were forgotten: a replay cannot be exact.")
+    if crash.error.denied:
+        lines += ["", "What it had tried and was denied:"]
+        lines += [f"  {printable(one)}" for one in crash.error.denied]
     lines += ["", "The last requests, the last one unanswered:", *_last_requests(recording), ""]
     return "\n".join(lines)
 

@@ -9,7 +9,6 @@ brought back before a reset, closed, and abandoned in a fork.
 from __future__ import annotations
 
 import os
-import re
 import weakref
 from collections.abc import Sequence
 from typing import Any
@@ -34,7 +33,6 @@ from envhub_sandbox.transport.shared_memory.sharding import PaceBook
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 
-_DENIAL = re.compile(r"[a-z0-9_]{1,40}( [A-Z0-9_]{1,40}| /.{0,400})?")
 _MOST = 1 << 63
 """Of anything that there may be: a server on another host may send larger numbers."""
 _GRACE_S = 2.0
@@ -106,11 +104,7 @@ class EnvSession:
 
     def denials(self) -> tuple[str, ...] | None:
         """What its jail was denied, as its server says; None where nobody records it."""
-        told = self.lease.status().get("denied")
-        if not isinstance(told, tuple):
-            return None
-        texts = (one for one in told[:64] if isinstance(one, str) and one.isprintable())
-        return tuple(one for one in texts if _DENIAL.fullmatch(one))
+        return self.lease.denials()
 
     def stats(self) -> dict[str, Any]:
         """Counters, and where it is in its life."""

@@ -102,6 +102,19 @@ class Lease:
         """What its server says of its jail. Trust: a server on another host may say anything."""
         return {} if self.loaded is None else self._launcher.status(self.loaded)
 
+    def denials(self) -> tuple[str, ...] | None:
+        """What its jail was denied, also where that is dead; None where nobody records it."""
+        loaded = self.loaded  # another thread may give it back
+        if loaded is None:
+            return None
+        return self._launcher.denials(loaded.server, loaded.jail.number)
+
+    def note_denied(self, error: EnvHubError) -> None:
+        """Put that into the error that the jail ends with, before it is given back."""
+        loaded = self.loaded  # another thread may give it back
+        if loaded is not None:
+            self._launcher.note_denied(error, loaded.server, loaded.jail.number)
+
     def look(self, operation: str, deadline: Deadline) -> None:
         """Ask the server whether the jail lives.
 
@@ -193,8 +206,11 @@ class Lease:
         try:
             lane = self._builder.build(loaded, deadline)
             self.loaded, self.lane = loaded, lane
-        except BaseException:
-            self._jails.give_back(loaded)
+        except BaseException as error:
+            try:
+                self._launcher.note_denied(error, loaded.server, loaded.jail.number)
+            finally:
+                self._jails.give_back(loaded)
             raise
         self._was_loaded = True
         self._counters.connected(lane)

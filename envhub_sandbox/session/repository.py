@@ -148,6 +148,7 @@ class Repository:
                 request="make_env",
                 timeout_s=startup_s,
             )
+            late.denied = error.denied
             self.keep_crash(late)
             raise late from error
 

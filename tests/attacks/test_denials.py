@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox import make_env
+from envhub_sandbox.errors import LoadError, MissingModuleError, WorkerDiedError
 from tests.support import inside
 from tests.support.interpreter import profiles
 from tests.support.repositories import write_repository
@@ -75,13 +77,13 @@ def test_a_recorded_jail_is_refused_the_same(tmp_path: Path) -> None:
     for recorded in (False, True):
         with make_env(str(folder), policy={"record_denials": recorded}) as suites:
             env = suites.env
-            assert env.jail_denials() is None, "it does not run"
             env.reset(seed=0)
             denied = env.jail_denials()
             assert (attempts(denied) if recorded else denied) == ([] if recorded else None)
             answers[recorded] = env.step([1])[0].tolist()
             env.step([0])
             told = env.jail_denials()
+        assert env.jail_denials() is None, "it does not run any more"
     assert 0 not in answers[True][0]
     assert answers[True] == answers[False]
     assert told is not None
@@ -266,6 +268,98 @@ def test_files_that_are_asked_for_are_told(tmp_path: Path) -> None:
     assert after is not None
     assert "unshare" in after
     assert len([one for one in after if "/" in one]) == 32
+
+
+_ENDINGS = {
+    "raises": ("raise RuntimeError('it failed')", LoadError, ""),
+    "wants more": ("import nothing_of_this_name", MissingModuleError, ""),
+    "is killed": ("os.kill(os.getpid(), 9)", WorkerDiedError, "signal"),
+    "crashes": ("ctypes.string_at(0)", WorkerDiedError, "signal"),
+    "breaks the rules": (
+        """
+for fd in range(3, 256):
+    try:
+        os.write(fd, b"\\xff" * 64 if stat.S_ISSOCK(os.fstat(fd).st_mode) else b"")
+    except OSError:
+        continue
+signal.pause()
+""",
+        WorkerDiedError,
+        "protocol",
+    ),
+}
+_ENDED = """
+import ctypes, os, signal, socket, stat
+
+for attempt in (lambda: socket.socket(socket.AF_INET), lambda: open("/home/other/file", "a")):
+    try:
+        attempt()
+    except OSError:
+        pass
+"""
+
+
+@pytest.mark.parametrize("ending", _ENDINGS)
+def test_what_ends_a_jail_tells_what_it_was_denied(ending: str, tmp_path: Path) -> None:
+    """In the error that it ends with, and in the bundle, however it ends while it loads.
+
+    The control is the same where nothing is recorded.
+    """
+    text, kind, reason = _ENDINGS[ending]
+    folder = write_repository(tmp_path / "ended", f"{_ENDED}\n{text}\n")
+    for recorded in (True, False):
+        policy = {"record_denials": recorded, "crash_folder": str(tmp_path / f"crashes-{recorded}")}
+        with pytest.raises(kind) as raised:
+            make_env(str(folder), policy=policy)
+        error = raised.value
+        expected = ("socket AF_INET", "write /home/other/file") if recorded else None
+        assert error.denied == expected
+        assert getattr(error, "reason", "") == reason
+        if isinstance(error, WorkerDiedError):
+            assert error.bundle is not None
+            written = json.loads((Path(error.bundle) / "bundle.json").read_text())["denied"]
+            assert written == (list(expected) if expected else None)
+
+
+_SECOND = """
+import os
+import gymnasium as gym
+
+made = []
+
+class First(gym.Env):
+    observation_space = action_space = gym.spaces.Discrete(2)
+
+    def __init__(self):
+        made.append(self)
+
+class Second(First):
+    def __init__(self):
+        if not made:  # nor is it described
+            try:
+                open("/home/other/file", "a")
+            except OSError:
+                os.abort()
+
+def make_env(n_envs=1, use_async_envs=False):
+    return {
+        "suite": {
+            task: gym.vector.AsyncVectorEnv([kind] * n_envs)
+            for task, kind in (("first", First), ("second", Second))
+        }
+    }
+"""
+
+
+def test_what_is_denied_while_a_known_environment_is_built_is_told(tmp_path: Path) -> None:
+    """In a jail of its own, of which nobody but its server knows once it has died."""
+    folder = write_repository(tmp_path / "second", _SECOND)
+    with make_env(str(folder), prewarm=0, policy={"record_denials": True}) as suites:
+        env = suites["suite"]["second"]
+        with pytest.raises(WorkerDiedError) as raised:
+            env.reset()
+        assert raised.value.denied == ("write /home/other/file",)
+        assert env.jail_denials() is None
 
 
 @pytest.mark.parametrize("profile", profiles("no-userns"))

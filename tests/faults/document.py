@@ -25,7 +25,8 @@ In every cell:
 
 - The error's text names the repository, commit and entry file. `WorkerDiedError` carries the exit
   code or signal, the reason, the request and the last lines of output; `WorkerTimeoutError` the
-  request and the timeout. Both have them as attributes. A death leaves a
+  request and the timeout. Both have them as attributes; and, like `LoadError`, `denied`: what was
+  tried in the jail that it ended, where the policy has `record_denials`. A death leaves a
   [crash bundle](crashes.md), with which `envhub replay` does the same again.
 - Another environment of the same client, and the other tasks of a suite, go on undisturbed.
 - After `close()` no process, zombie, descriptor, mapped slab, socket, file, mount or control group

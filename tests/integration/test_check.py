@@ -236,6 +236,42 @@ def test_slow_steps_are_told(tmp_path: Path) -> None:
     assert {one.id for one in report.findings} == {"slow-steps"}
 
 
+_TRYING = """
+os = gym.vector.async_vector_env.sys.modules["os"]
+libc = gym.vector.async_vector_env.sys.modules["ctypes"].CDLL(None)
+libc.socket(2, 1, 0)
+if not os.access(os.path.join(os.sep, "srv", "walk"), 0):
+    libc.unlink(os.path.join(os.sep, "srv", "walk").encode())
+"""
+_ENDS = {
+    "loads": "raise RuntimeError('it failed')",
+    "imports": "import nothing_of_this_name",
+    "survives": "os.kill(os.getpid(), 9)",
+}
+
+
+@pytest.mark.parametrize("check", _ENDS)
+def test_what_was_tried_is_told_of_what_does_not_load(check: str, tmp_path: Path) -> None:
+    """The control is a policy that permits the one, and a file of its own for the other."""
+    text = _HONEST.replace("class Walk", f"{_TRYING}\n{_ENDS[check]}\n\nclass Walk", 1)
+    report = judged(repository(tmp_path / "walk", text))
+    assert {one.id for one in report.findings} == {check, "denied-network", "denied-files"}
+    own = text.replace('os.sep, "srv"', '"."')
+    policy = {"policy": {"network": "loopback"}}
+    asked = Asked(reference=str(repository(tmp_path / "own", own)), arguments=policy)
+    assert {one.id for one in judge(asked).findings} == {check}
+
+
+def test_what_was_tried_is_told_of_what_dies(tmp_path: Path) -> None:
+    """Whatever the policy says of restarts: no death is hidden from who judges."""
+    text = _HONEST.replace("self.count += 1", "libc.socket(2, 1, 0); os.kill(os.getpid(), 9)")
+    text = text.replace("class Walk", f"{_TRYING.partition('libc.socket')[0]}\nclass Walk", 1)
+    folder = repository(tmp_path / "walk", text)
+    policy = {"policy": {"restart": "transparent"}}
+    report = judge(Asked(reference=str(folder), arguments=policy, steps=5, resets=0))
+    assert {one.id for one in report.findings} == {"survives", "denied-network"}
+
+
 def test_what_cannot_be_installed_is_told(tmp_path: Path) -> None:
     """Nothing is run of it, nor fetched: a link is no requirement."""
     folder = repository(tmp_path / "walk", requirements__txt="x @ https://example.com/x.whl")

@@ -13,6 +13,7 @@ from envhub_sandbox.sandboxes import runtime_folder
 from tests.faults.traces import temporary_root
 from tests.remote.listening import Listening, listening
 from tests.support.processes import eventually
+from tests.support.repositories import write_repository
 from tests.support.samples import sample
 
 LIVE, EXIT = 0, 1
@@ -38,6 +39,17 @@ def test_what_dies_over_there_comes_back(server: Listening) -> None:
         env.step([LIVE, LIVE])
         assert env.step([LIVE, LIVE])[0][:, 1].tolist() == [3, 1]
     assert eventually(lambda: server.jails() == 0)
+
+
+def test_what_a_jail_was_denied_over_there_is_told(server: Listening, tmp_path: Path) -> None:
+    """Where it is dead, too; the control is the same where nothing is recorded."""
+    text = "import ctypes, os\nctypes.CDLL(None).socket(2, 1, 0)\nos.kill(os.getpid(), 9)\n"
+    folder = write_repository(tmp_path / "walk", text)
+    for recorded, denied in ((True, ("socket AF_INET",)), (False, None)):
+        policy = {"record_denials": recorded, "crash_history": 0}
+        with pytest.raises(WorkerDiedError, match="SIGKILL") as raised:
+            make_env(str(folder), policy=policy, sandbox=server.sandbox())
+        assert raised.value.denied == denied
 
 
 def test_idle_jails_end_over_there(server: Listening) -> None:

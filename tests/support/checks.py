@@ -45,7 +45,9 @@ and reading homes, secrets of the system and other processes (libraries look for
 many another place). Not seen are: who only looks whether a file is there; what a link of its own
 leads to; what is changed by an open descriptor; a datagram that `sendmsg` sends to a socket's file;
 under `no-userns` modes, owners and times, which seem to change. At most 32 paths are told, and 64
-attempts in all. What was tried in a jail that has ended since is not told.
+attempts in all. It is told of a repository that does not load, too, and of one whose process dies:
+the worker server, which hears of each attempt before who makes it goes on, remembers them until the
+jail is closed. Recorded is the first play of each task alone.
 
 `--policy FILE` is TOML with the fields of `Policy`, and a table `[limits]`. Where you judge often,
 `--settings envhub.toml` has the options `steps`, `resets`, `slow-step`, `seed`, `fail-on`, `allow`,

@@ -24,6 +24,7 @@ from envhub_sandbox.sandboxes.base import (
     Sandbox,
     WorkerServer,
 )
+from envhub_sandbox.session.jails import denied
 from envhub_sandbox.session.jails.loaded import Known, LoadedJail
 from envhub_sandbox.session.jails.server_hold import ServerHold
 from envhub_sandbox.session.repository import Repository
@@ -40,6 +41,10 @@ from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _CLOSE_S = 5.0
 _STATUS_S = 1.0
+_DENIED_S = 10.0
+"""Who records wants to know it, also of a host that is busy."""
+_UNKNOWN = ("server", "connection", "gone")
+"""How a jail died of which its server can say nothing."""
 _FIRST_WITH_LOAD_TASK = 3
 """The version of the protocol."""
 _FIRST_WITH_PACKAGES = 5
@@ -140,8 +145,11 @@ class Launcher:
             loaded = LoadedJail(jail, known.manifest, {}, set(), server)
             self.load(loaded, jail.runners, deadline, known.task)
             return loaded
-        except BaseException:
-            jail.close(Deadline(_CLOSE_S))
+        except BaseException as error:
+            try:
+                self.note_denied(error, server, jail.number)
+            finally:
+                jail.close(Deadline(_CLOSE_S))
             raise
 
     def _client(self, server: WorkerServer) -> WorkerClient:
@@ -279,8 +287,23 @@ class Launcher:
 
         The late reply may come at any moment on the jail's own connection, and would be dropped.
         """
-        client = self._client(loaded.server)
-        deadline = Deadline(_STATUS_S)
+        return self._status(loaded.server, loaded.jail.number, Deadline(_STATUS_S))
+
+    def denials(self, server: WorkerServer, jail: int) -> tuple[str, ...] | None:
+        """What a jail was denied; None where nobody records it, or nobody knows it any more."""
+        if not self.repository.policy.record_denials:
+            return None
+        return denied.read(self._status(server, jail, Deadline(_DENIED_S)).get("denied"))
+
+    def note_denied(self, error: BaseException, server: WorkerServer, jail: int) -> None:
+        """Put what a jail was denied into the error that it ends with, before it is closed."""
+        if not isinstance(error, EnvHubError) or error.denied is not None:
+            return
+        if getattr(error, "reason", "") not in _UNKNOWN:
+            error.denied = self.denials(server, jail)
+
+    def _status(self, server: WorkerServer, jail: int, deadline: Deadline) -> dict[str, Any]:
+        client = self._client(server)
         try:
             client.hello(deadline)
             status, _ = client.request(m.GetStatus(), deadline=deadline)
@@ -291,7 +314,7 @@ class Launcher:
         try:
             with UNTRUSTED:
                 jails = [one for one in expect(status, m.Status).jails if isinstance(one, dict)]
-                return next((one for one in jails if one.get("jail") == loaded.jail.number), {})
+                return next((one for one in jails if one.get("jail") == jail), {})
         except EnvHubError:  # it is for a text, or a figure that may be missing
             return {}
 

@@ -67,8 +67,11 @@ class Failures:
         lifecycle.moved(Event.DEATH)
         WORKER.info("%s: %s", self._label, str(error).partition("\n")[0])
         died = isinstance(error, WorkerDiedError)
-        if lease.loaded is not None and (lease.loaded.jail.kept or not died):
-            lease.end()
+        try:
+            lease.note_denied(error)
+        finally:
+            if lease.loaded is not None and (lease.loaded.jail.kept or not died):
+                lease.end()
         if isinstance(error, WorkerDiedError):
             self.keep_crash(error)
         return error
@@ -76,6 +79,7 @@ class Failures:
     def keep_crash(self, error: WorkerDiedError | WorkerTimeoutError) -> None:
         """Write a crash bundle, and name it in the error."""
         lease, manifest = self._lease, self._manifest
+        lease.note_denied(error)
         task = {
             "suite": manifest.suite,
             "task": manifest.task,

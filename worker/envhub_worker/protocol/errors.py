@@ -4,7 +4,14 @@ from __future__ import annotations
 
 
 class EnvHubError(Exception):
-    """Base of every error of this project."""
+    """Base of every error of this project.
+
+    Attributes:
+        denied: What the jail was denied that it ends, in the words of ``env.jail_denials()``; None
+            where nobody has recorded it, or no jail has ended.
+    """
+
+    denied: tuple[str, ...] | None = None
 
 
 class ProtocolError(EnvHubError):

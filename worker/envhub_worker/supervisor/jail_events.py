@@ -150,7 +150,7 @@ class JailEvents:
             elif isinstance(event, RunnerExited):
                 self._runner_exited(entry, event)
             elif isinstance(event, Denied):
-                entry.denied.append(f"{event.call} {event.detail}".strip())
+                self._denied(entry, event)
 
     def _runner_started(self, entry: JailEntry, event: RunnerStarted) -> None:
         entry.pids[event.runner_id] = event.pid
@@ -236,6 +236,7 @@ class JailEvents:
         if entry.death is not None:
             return
         self.deaths[death.reason] += 1
+        self._hear_last(entry)
         entry.output.read()
         entry.death = death = m.replace(death, tail=entry.output.text())
         for pending in waiting(entry):
@@ -245,6 +246,15 @@ class JailEvents:
         entry.opening.clear()
         self._witness.died(entry)
         self.kill(entry)
+
+    def _hear_last(self, entry: JailEntry) -> None:
+        """What it was denied has been told before whatever ends it, on another descriptor."""
+        for event in entry.jail.poll():
+            if isinstance(event, Denied):
+                self._denied(entry, event)
+
+    def _denied(self, entry: JailEntry, event: Denied) -> None:
+        entry.denied.append(f"{event.call} {event.detail}".strip())
 
     def kill(self, entry: JailEntry) -> None:
         """End its processes; ``jail_gone`` is when they are gone."""
