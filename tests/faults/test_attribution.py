@@ -160,19 +160,26 @@ class Attribution(RuleBasedStateMachine):
     @rule(moment=st.sampled_from([_SOON_S]))
     def interrupt(self, moment: float) -> None:
         """Ctrl-C while a step is sent or waited for, or while the worker starts."""
-        token = float(next(_tokens))
-        nothing_owed = self.state in (State.IDLE, State.READY)
+        token, before, came = float(next(_tokens)), self.state, list[bool]()
 
         def ask() -> Any:
-            signal.setitimer(signal.ITIMER_REAL, moment)
             try:
-                return self.env.step([[token, _SLOW_S]] * 2)
-            finally:
-                signal.setitimer(signal.ITIMER_REAL, 0)
+                signal.setitimer(signal.ITIMER_REAL, moment)
+                try:
+                    return self.env.step([[token, _SLOW_S]] * 2)
+                finally:
+                    signal.setitimer(signal.ITIMER_REAL, 0)
+            except KeyboardInterrupt:
+                came.append(True)
+                raise
 
         self.after(ask, lambda got: self.is_step(got, token))
-        if nothing_owed and self.state in (State.IDLE, State.READY):
-            self.expected = self.state  # it came before anything was sent
+        if came and before is State.DEAD:
+            self.expected = before  # it was refused, and we were held up on the way back
+        if before in (State.IDLE, State.READY) and self.state in (State.IDLE, State.READY):
+            self.expected = self.state  # it came before anything was sent, or after the answer
+            if came and self.state is State.READY:  # whether it was done, nobody can say
+                self.reset(0.0, _AGES_S)
 
     @precondition(lambda self: self.expected is not State.CLOSED)
     @rule(running=st.booleans())
