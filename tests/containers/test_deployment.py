@@ -6,7 +6,6 @@ import os
 import re
 import secrets
 import shutil
-import socket
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,19 +18,13 @@ from envhub_sandbox import RemoteSandbox, make_env
 from envhub_sandbox.errors import WorkerDiedError
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from tests.containers.kit import IMAGE
+from tests.remote.listening import lasting_port
 from tests.support.processes import eventually
 from tests.support.samples import sample
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 DEPLOYMENT = CHECKOUT / "examples" / "deployment"
 _STATE = "/var/lib/envhub-worker"
-
-
-def free_port() -> int:
-    """One that nobody has at present; the same for both starts."""
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        return int(taken.getsockname()[1])
 
 
 def wait_until_it_serves(engine: Engine, container: str) -> None:
@@ -98,7 +91,7 @@ def volume(engine: Engine) -> Iterator[str]:
 
 def test_the_documented_line_keeps_its_clients(engine: Engine) -> None:
     """Run twice, with an end between: the same keys, and a client that goes on."""
-    port = free_port()
+    port = lasting_port()
     with volume(engine) as name:
         line = documented()
         for what, instead in (
@@ -145,7 +138,7 @@ def test_the_compose_file_keeps_its_clients(engine: Engine, tmp_path: Path) -> N
     compose = [engine.command, "compose"]
     if subprocess.run([*compose, "version"], capture_output=True).returncode != 0:
         pytest.skip("needs docker compose")
-    port, project = free_port(), f"envhub-test-{secrets.token_hex(6)}"
+    port, project = lasting_port(), f"envhub-test-{secrets.token_hex(6)}"
     settings = {"ENVHUB_IMAGE": IMAGE, "ENVHUB_PUBLISH": f"127.0.0.1:{port}"}
     command = [*compose, "--project-name", project, "--file", str(DEPLOYMENT / "compose.yaml")]
 

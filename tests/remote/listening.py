@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import random
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -106,6 +109,19 @@ class Listening:
     def jails(self) -> int:
         """How many are open, of whomever."""
         return sum(len(one["jails"]) for one in self.sessions())
+
+    def open_jails(self) -> set[tuple[str, int]]:
+        """Which ones: the name of a session, and a number."""
+        return {(one["session"], jail["jail"]) for one in self.sessions() for jail in one["jails"]}
+
+
+def lasting_port() -> int:
+    """A port below those that the kernel gives to anybody: it is still free between two servers."""
+    while True:
+        number = random.randrange(20_000, 32_000)
+        with contextlib.suppress(OSError), socket.socket() as sock:
+            sock.bind(("127.0.0.1", number))
+            return number
 
 
 @contextmanager

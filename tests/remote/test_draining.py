@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import random
 import signal
-import socket
 import subprocess
 import threading
 from collections.abc import Callable
@@ -22,7 +20,7 @@ from envhub_worker.access.drain import Drain
 from envhub_worker.access.quotas import BusyError
 from envhub_worker.access.telling.rate_limited_log import Log
 from envhub_worker.protocol import messages as m
-from tests.remote.listening import WORKER, Listening, listening
+from tests.remote.listening import WORKER, Listening, lasting_port, listening
 from tests.remote.test_clients import peer
 from tests.support.processes import eventually
 
@@ -32,6 +30,11 @@ _LONG = ("--drain-s", "600")
 def ends(server: Listening) -> bool:
     """Whether it comes to its end by itself."""
     return eventually(lambda: server.process.poll() is not None)
+
+
+def operations(server: Listening) -> set[str]:
+    """What is being done in its jails."""
+    return {jail["operation"] for one in server.sessions() for jail in one["jails"]}
 
 
 def draining(server: Listening) -> bool:
@@ -64,9 +67,12 @@ def test_whose_time_is_up_is_told_why(tmp_path: Path, repository: Path) -> None:
     with listening(tmp_path / "server", "--drain-s", "1") as server:
         with make_env(repository, sandbox=server.sandbox()) as suites:
             suites.env.reset(seed=1)
+            suites.env.step_async(np.array([6000]))
+            # else a machine that stands still meanwhile has nobody left who could be told
+            assert eventually(lambda: "step" in operations(server))
             server.process.terminate()
             with pytest.raises(WorkerDiedError, match="the server ends") as caught:
-                suites.env.step(np.array([6000]))
+                suites.env.step_wait()
             assert caught.value.reason == "idle"
         assert ends(server)
 
@@ -103,7 +109,7 @@ def test_drain_is_told_to_the_server_of_the_state_folder(tmp_path: Path) -> None
         command = [*WORKER, "drain", "--state-dir", str(server.state)]
         done = subprocess.run(command, capture_output=True, timeout=120)
         assert done.returncode == 0, done.stderr
-        assert server.process.wait(10) == 0
+        assert server.process.wait(60) == 0
         assert "info draining " in server.said()
         done = subprocess.run(command, capture_output=True, timeout=120, text=True)
         assert done.returncode == 1
@@ -154,15 +160,6 @@ def test_the_time_of_a_drain() -> None:
 # --- two servers, restarted one after the other -----------------------------------------------
 
 
-def port() -> int:
-    """A port below those that the kernel gives to anybody: it is still free between two servers."""
-    while True:
-        number = random.randrange(20_000, 32_000)
-        with contextlib.suppress(OSError), socket.socket() as sock:
-            sock.bind(("127.0.0.1", number))
-            return number
-
-
 class Player(threading.Thread):
     """A client that plays episodes until it is told to stop; what ends it is kept."""
 
@@ -206,7 +203,7 @@ def test_a_rolling_restart_loses_nobody(tmp_path: Path, repository: Path) -> Non
     """Each server drains and another takes its port and its keys; ``on_reset`` does the rest."""
     with contextlib.ExitStack() as stack:
         options = ("--drain-s", "1")
-        places = [(tmp_path / name, f"tcp://127.0.0.1:{port()}") for name in ("one", "two")]
+        places = [(tmp_path / name, f"tcp://127.0.0.1:{lasting_port()}") for name in ("one", "two")]
         running = [stack.enter_context(ending(*place, options)) for place in places]
         servers = [server for server, _ in running]
         with _client(repository, servers[0]):

@@ -10,6 +10,7 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import WorkerDiedError
 from envhub_sandbox.sandboxes import runtime_folder
+from tests.faults.test_idle import comes_off
 from tests.faults.traces import temporary_root
 from tests.remote.listening import Listening, listening
 from tests.support.processes import eventually
@@ -60,8 +61,13 @@ def test_idle_jails_end_over_there(server: Listening) -> None:
         assert eventually(lambda: server.jails() == 0)
         with pytest.raises(WorkerDiedError, match="idle"):
             env.step([LIVE])
-        env.reset(seed=1)
-        assert env.step([LIVE])[0][:, 1].tolist() == [1]
+
+        def play() -> None:
+            env.reset(seed=1)
+            assert env.step([LIVE])[0][:, 1].tolist() == [1]
+
+        # who is held up for longer than that between the two is idle again
+        assert eventually(lambda: comes_off(play))
 
 
 def test_a_killed_server_leaves_nothing_that_nobody_finds(
