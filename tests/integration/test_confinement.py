@@ -240,7 +240,7 @@ LISTENERS = {
     "tcp": ("AF_INET", "SOCK_STREAM", ("127.0.0.1", 0)),
     "udp": ("AF_INET", "SOCK_DGRAM", ("127.0.0.1", 0)),
     "tcp6": ("AF_INET6", "SOCK_STREAM", ("::1", 0)),
-    "abstract": ("AF_UNIX", "SOCK_STREAM", "\0confinement-test"),
+    "abstract": ("AF_UNIX", "SOCK_STREAM", f"\0confinement-{os.getpid()}"),
     "file": ("AF_UNIX", "SOCK_STREAM", None),
     "file-datagram": ("AF_UNIX", "SOCK_DGRAM", None),
 }
