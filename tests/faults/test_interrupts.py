@@ -15,7 +15,7 @@ from envhub_sandbox import errors, make_env
 from envhub_sandbox.session.survival import restart_policy
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from tests.support import inside
-from tests.support.processes import descendants
+from tests.support.processes import descendants, eventually
 from tests.support.samples import sample
 
 pytestmark = pytest.mark.usefixtures("neighbour")
@@ -260,7 +260,7 @@ def test_close_waits_no_longer_than_it_may(
             patch.setattr(*inside.turn_lock(suites.env), held)
             suites.env.close()
         assert sum(held.waited) == longest
-        assert descendants() < before
+        assert eventually(lambda: descendants() < before)
         inside.clean_up(suites.env)
 
 

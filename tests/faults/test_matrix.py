@@ -122,10 +122,12 @@ def _provoke(row: Row, suites: Any) -> tuple[Exception | None, float]:
     for other in others:
         other.reset()
         other.step([0, 0])
+    if row.moment == "render":
+        env.set_attr("armed", True)
     triggers: dict[str, Callable[[], Any]] = {
         "reset": lambda: env.reset(options={"now": True}),
         "step": lambda: env.step([0, 1]),
-        "render": lambda: (env.set_attr("armed", True), env.render()),
+        "render": env.render,
         "call": lambda: env.call("trip"),
         "close": env.close,
     }

@@ -282,7 +282,7 @@ def test_many_clients_at_once_do_not_meet(folder: Path) -> None:
         env={**os.environ, "TMPDIR": str(folder)},
         cwd=folder,
     )
-    out, _ = client.communicate(timeout=120)
+    out, _ = client.communicate(timeout=240)
     assert "4 passed" in out, out
     for path in [*folder.rglob("__pycache__"), test]:
         shutil.rmtree(path) if path.is_dir() else path.unlink()

@@ -32,14 +32,15 @@ def followers() -> list[threading.Thread]:
 
 def test_the_last_words_are_in_the_file(tmp_path: Path) -> None:
     """Those of a death too, and those of a jail that was ended because it did not answer."""
-    for fault, error in (("exit", errors.WorkerDiedError), ("hang", errors.WorkerTimeoutError)):
+    died, late = errors.WorkerDiedError, errors.WorkerTimeoutError
+    for fault, error, timeout_s in (("exit", died, 60.0), ("hang", late, 1.0)):
         path = tmp_path / f"{fault}.log"
         with made(path, fault) as suites:
             suites.env.reset()
             suites.env.step_async([0, 1])
             assert eventually(lambda: "about to" in path.read_text())  # noqa: B023
             with pytest.raises(error):
-                suites.env.step_wait(timeout=1)
+                suites.env.step_wait(timeout=timeout_s)
         assert path.read_text() == f"about to {fault}\n"
     assert followers() == []
 

@@ -139,8 +139,8 @@ def test_stale_branch_is_never_returned(
     stub_hub: StubHub, get: Fetch, monkeypatch: pytest.MonkeyPatch, status: int, stall: bool
 ) -> None:
     """huggingface_hub returns the cached commit of a branch when it cannot ask: we refuse."""
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_ETAG_TIMEOUT", 0.5)
     commit = get().commit
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_ETAG_TIMEOUT", 0.5)
     stub_hub.fail("/api/", status, stall=stall)
     message = str(failure(get))
     assert f"'models/org/repo@{commit}' (main, " in message

@@ -29,7 +29,7 @@ def test_the_first_reset_finds_what_was_started() -> None:
         started = descendants()
         env.prewarm()
         env.reset(seed=0)
-        assert descendants() == started
+        assert descendants() <= started  # what others left to linger may end meanwhile
         assert env.stats()["requests"] == 1
 
 

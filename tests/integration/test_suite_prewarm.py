@@ -119,7 +119,7 @@ def test_the_next_task_is_up_and_built_before_anybody_asks(tasks: Callable[..., 
     started, asked = descendants(), time.monotonic()
     _, infos = second.reset()
     assert infos["made"][0] < asked
-    assert descendants() == started
+    assert descendants() <= started
 
 
 def test_without_it_nothing_is_started_ahead(tasks: Callable[..., Tasks]) -> None:
