@@ -19,7 +19,7 @@ from pathlib import Path
 from time import perf_counter_ns
 from typing import Any
 
-from envhub_sandbox.transport.shared_memory.doorbell import HostBell, OwnBell, Watch
+from envhub_sandbox.transport.shared_memory.doorbell import OwnBell, RunnerBell, Watch
 
 _RING = (1).to_bytes(8, "little")
 _FLAGS = socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL
@@ -65,11 +65,12 @@ def _sockets(kind: int) -> tuple[End, End]:
 
 def ours() -> tuple[End, End]:
     """What the fast lane uses: a socket there, an eventfd that is only watched back."""
-    there, back, watch = HostBell(), OwnBell(), Watch()
+    there, back, watch = RunnerBell(), OwnBell(), Watch()
     watch.bell(back)
-    fd, heard = back.fileno(), there.theirs
+    heard = there.theirs
     client = there.ring, lambda: watch.wait(None)
-    runner = (lambda: os.write(fd, _RING)), _poll(heard, lambda: os.read(heard, 8))
+    # by the bell itself, which closes with its last owner
+    runner = (lambda: os.write(back.fileno(), _RING)), _poll(heard, lambda: os.read(heard, 8))
     return client, runner
 
 

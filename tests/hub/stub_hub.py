@@ -13,7 +13,7 @@ import json
 import re
 import threading
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import PurePosixPath
 from typing import Any
@@ -27,11 +27,12 @@ def git_blob_id(content: bytes) -> str:
 
 @dataclass
 class StubRepository:
-    """A repository with one commit.
+    """A repository with one commit, and what it was before.
 
     Attributes:
         files: The true content by path.
         commit: The full commit that every ref names.
+        earlier: The content at earlier commits, which no ref names.
         refs: The revisions that exist besides the commit.
         served: Lies: other bytes for a path than the listing says.
         listed: Lies: fields of the listing's entry of a path (``{"size": 3}``).
@@ -41,11 +42,18 @@ class StubRepository:
 
     files: dict[str, bytes]
     commit: str = "c0ffee" + "0" * 34
+    earlier: dict[str, dict[str, bytes]] = field(default_factory=dict)
     refs: set[str] = field(default_factory=lambda: {"main"})
     served: dict[str, bytes] = field(default_factory=dict)
     listed: dict[str, dict[str, Any]] = field(default_factory=dict)
     truncated: set[str] = field(default_factory=set)
     head_headers: dict[str, str] = field(default_factory=dict)
+
+    def at(self, revision: str) -> StubRepository:
+        """As it was at a commit."""
+        if revision not in self.earlier:
+            return self
+        return replace(self, commit=revision, files=self.earlier[revision])
 
     def tree(self) -> list[dict[str, Any]]:
         """The listing, lies included."""
@@ -236,9 +244,9 @@ class _Handler(BaseHTTPRequestHandler):
         elif len(rest) > 1 and not self._known(repository, rest[1]):
             self._absent("RevisionNotFound")
         elif rest and rest[0] == "tree":
-            self._answer_tree(repository, query)
+            self._answer_tree(repository.at(rest[1]), query)
         else:
-            self._answer_info(repository, repo_id)
+            self._answer_info(repository.at(rest[-1]) if rest else repository, repo_id)
 
     def _answer_post(self, steps: list[str]) -> None:
         repository = self.stub.repositories.get((steps[0].removesuffix("s"), "/".join(steps[1:3])))
@@ -280,7 +288,8 @@ class _Handler(BaseHTTPRequestHandler):
         self._send_json({"success": True, "commitOid": repository.commit, "commitUrl": url})
 
     def _known(self, repository: StubRepository, revision: str) -> bool:
-        return revision in repository.refs or repository.commit.startswith(revision)
+        known = revision in repository.refs or revision in repository.earlier
+        return known or repository.commit.startswith(revision)
 
     def _answer_info(self, repository: StubRepository, repo_id: str) -> None:
         siblings = [{"rfilename": path} for path in repository.files]
@@ -302,7 +311,8 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer_file(self, steps: list[str]) -> None:
         repo_type = steps[0].removesuffix("s") if steps[0] in ("spaces", "datasets") else "model"
         steps = steps if repo_type == "model" else steps[1:]
-        repository = self.stub.repositories.get((repo_type, "/".join(steps[:2])))
+        named = self.stub.repositories.get((repo_type, "/".join(steps[:2])))
+        repository = named and named.at("".join(steps[3:4]))
         path = "/".join(steps[4:])
         if repository is None:
             self._absent("RepoNotFound", 401)

@@ -51,7 +51,8 @@ def run(arguments: list[str], folder: Path) -> None:
 
 def python_of(document: str) -> list[str]:
     """Its blocks that are executed, without those that are tests for pytest."""
-    texts = [block.text for block in blocks.tested(blocks.RUN) if block.document == document]
+    there = [one for one in blocks.tested(blocks.RUN) if one.document == document]
+    texts = [one.text for one in there if one.language == "python"]
     return [text for text in texts if "import pytest" not in text]
 
 

@@ -1,13 +1,14 @@
-"""The blocks of code in the documents, and what tests them: none is left out by itself.
+"""The blocks of code in the documents, and what executes them: none is left out by itself.
 
-Those of a language are tested in one way, but Python and others as ``TABLE`` says of the document.
-Whoever adds a block of these to a document that has none adds it there.
+Shell and Python are executed, but for what ``APART`` and ``NOT_EXECUTED`` name by its beginning;
+other languages as ``TABLE`` says of the document. Whoever adds a block that cannot be executed says
+here why, or what executes it.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,30 +19,49 @@ DOCUMENTS = tuple(
     for path in sorted(CHECKOUT.glob(pattern))
 )
 
-RUN = "executed"
-HELD = "each command, option and script in it is one that there is"
-BOUND = "not executed: it parses, and its arguments are those of what it calls"
+RUN = "executed with the others of its document"
+OWN = "executed by a test of its own"
+HELD = "not executed: each command, option and script in it is one that there is"
 PARSED = "parsed, and held against what it is about"
 SHOWN = "what is printed, or a drawing: its commands are ones that there are"
 DRAWN = "the site's build takes it, and the browser draws it"
 
-# Why a block of Python is not executed by tests of these documents.
-REASONS = {
-    "docs/deployment.md": "needs a container engine and a server: tests/containers, tests/remote",
-    "docs/lerobot.md": "needs LeRobot, a GPU and a repository of the Hub: tests/lerobot",
+# What executes blocks of shell and Python that tests/integration/test_hub_blocks.py and its like
+# do not: by document and beginning.
+APART = {
+    ("README.md", "python3 -m venv .venv"): ".ci/steps/readme.sh",
+    ("README.md", "./test"): ".ci/steps/readme.sh",
+    ("docs/deployment.md", "docker run"): "tests/containers/test_deployment.py",
 }
-# The first two of the README are run by .ci/steps/readme.sh as they stand there, authors.md's by
-# tests/integration/test_cli_init.py and test_cli_push.py, those of docker by tests/containers.
-_EVERYWHERE = {"sh": HELD, "": SHOWN, "text": SHOWN, "mermaid": DRAWN}
+# Why others are not executed as they stand there.
+_INSTALLS = "installs gigabytes, or into the reader's own interpreter"
+_LONG = "is for minutes to hours; its arguments are taken by its own parser"
+_ENGINE = "needs a container engine: tests/containers"
+_LEROBOT = "needs LeRobot, and for training gigabytes of it: tests/lerobot"
+NOT_EXECUTED = {
+    ("CONTRIBUTING.md", "python3 -m venv .venv"): _INSTALLS,
+    ("CONTRIBUTING.md", ".venv/bin/ruff"): "is what CI does: .ci/steps/lint.sh, .ci/steps/tests.sh",
+    ("CONTRIBUTING.md", ".venv/bin/python -m"): _LONG,
+    ("benchmarks/README.md", "python -m"): _LONG,
+    ("docs/deployment.md", "docker build"): _ENGINE,
+    ("docs/deployment.md", "envhub image build"): _ENGINE,
+    ("docs/deployment.md", "from envhub_sandbox import DockerSandbox"): _ENGINE,
+    ("docs/lerobot.md", "lerobot-"): _LEROBOT,
+    ("docs/lerobot.md", "from lerobot"): _LEROBOT,
+    ("docs/lerobot.md", "pip install"): _INSTALLS,
+    ("docs/lerobot.md", "python -m tests.lerobot"): _LONG,
+    ("plugins/lerobot_env_envhub_sandbox/README.md", "lerobot-"): _LEROBOT,
+}
+_EVERYWHERE = {"sh": RUN, "": SHOWN, "text": SHOWN, "mermaid": DRAWN}
 TABLE = {
-    ("README.md", "python"): RUN,
-    ("docs/authors.md", "python"): RUN,
     ("docs/ci.md", "yaml"): PARSED,
-    ("docs/deployment.md", "python"): BOUND,
-    ("docs/integrations.md", "python"): RUN,
-    ("docs/lerobot.md", "python"): BOUND,
-    ("docs/observing.md", "python"): RUN,
-    ("docs/quickstart.md", "python"): RUN,
+    **{
+        (document, "python"): RUN
+        for document in (
+            *("README.md", "docs/authors.md", "docs/deployment.md", "docs/integrations.md"),
+            *("docs/observing.md", "docs/quickstart.md"),
+        )
+    },
 }
 
 
@@ -56,7 +76,18 @@ class Block:
     @property
     def way(self) -> str | None:
         """How it is tested."""
+        if self.listed(APART):
+            return OWN
+        if self.listed(NOT_EXECUTED):
+            return HELD
         return _EVERYWHERE.get(self.language) or TABLE.get((self.document, self.language))
+
+    def listed(self, table: Mapping[tuple[str, str], str]) -> str | None:
+        """What a table says of it."""
+        for (document, beginning), said in table.items():
+            if document == self.document and self.text.startswith(beginning):
+                return said
+        return None
 
 
 def blocks() -> Iterator[Block]:

@@ -8,7 +8,6 @@ import importlib.util
 import inspect
 import re
 import shlex
-from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
@@ -18,15 +17,17 @@ from typer.testing import CliRunner
 
 import envhub_sandbox
 from envhub_sandbox.cli.app import app
-from tests.support import blocks, options
-from tests.support.blocks import BOUND, CHECKOUT, DRAWN, HELD, PARSED, RUN, SHOWN, Block
+from tests.support import blocks, options, shell
+from tests.support.blocks import CHECKOUT, DRAWN, HELD, OWN, PARSED, RUN, SHOWN, Block
 
 # Programs of others, whose options are theirs; and what begins a line that is no command.
 _OTHERS = {"docker", "pip", "lerobot-eval", "lerobot-train", "lerobot-eval-sandboxed", "ruff"}
+_SHELL = "tests/support/shell.py"
 _RUN_BY = {
     "README.md": "tests/unit/docs/test_docs.py",
     "docs/integrations.md": "tests/unit/docs/test_docs.py",
     "docs/authors.md": "tests/integration/test_documents.py",
+    "docs/deployment.md": _SHELL,
     "docs/observing.md": "tests/integration/test_documents.py",
     "docs/quickstart.md": "tests/integration/test_documents.py",
 }
@@ -39,17 +40,24 @@ def named(block: Block) -> str:
 
 def test_every_block_has_a_way_and_every_way_a_block() -> None:
     """None is skipped in silence, and nothing is said of blocks that there are not."""
-    there = Counter(block.way for block in blocks.blocks())
-    assert set(there) == {RUN, HELD, BOUND, PARSED, SHOWN, DRAWN}
-    assert set(blocks.TABLE) <= {(block.document, block.language) for block in blocks.blocks()}
+    there = list(blocks.blocks())
+    assert {block.way for block in there} == {RUN, OWN, HELD, PARSED, SHOWN, DRAWN}
+    assert set(blocks.TABLE) <= {(block.document, block.language) for block in there}
+    for table in (blocks.APART, blocks.NOT_EXECUTED):
+        for document, beginning in table:
+            begun = [one for one in there if one.text.startswith(beginning)]
+            assert any(one.document == document for one in begun), (document, beginning)
 
 
-def test_what_is_not_executed_has_its_reason_and_what_is_its_test() -> None:
-    """Every block of Python is one or the other."""
-    assert {block.document for block in blocks.tested(BOUND)} == set(blocks.REASONS)
-    assert {block.document for block in blocks.tested(RUN)} <= set(_RUN_BY)
-    for document in {block.document for block in blocks.tested(RUN)}:
+def test_what_is_executed_has_its_test() -> None:
+    """Python by the test that names its document, shell by that of all, the rest by its own."""
+    python = {block.document for block in blocks.tested(RUN) if block.language == "python"}
+    assert python <= set(_RUN_BY)
+    for document in python:
         assert f'"{document}"' in (CHECKOUT / _RUN_BY[document]).read_text()
+    assert all((CHECKOUT / path).is_file() for path in blocks.APART.values())
+    with_shell = {block.document for block in blocks.tested(RUN) if block.language == "sh"}
+    assert with_shell <= {one for one in blocks.DOCUMENTS if shell.executed(one)}
 
 
 def test_no_code_is_merely_indented() -> None:
@@ -65,11 +73,13 @@ def commands(text: str) -> Iterator[list[str]]:
     for line in text.splitlines():
         for command in line.split("&&"):
             words = shlex.split(command, comments=True)
-            if words:
+            if words and words[0] != "cd":
                 yield [words[0].removeprefix(".venv/bin/"), *words[1:]]
 
 
-@pytest.mark.parametrize("block", blocks.tested(HELD), ids=named)
+@pytest.mark.parametrize(
+    "block", [one for one in blocks.blocks() if one.language == "sh"], ids=named
+)
 def test_commands_are_ones_that_there_are(block: Block) -> None:
     """Their programs, subcommands and options."""
     for words in commands(block.text):
@@ -127,7 +137,9 @@ def test_a_command_that_is_not_there_is_found(wrong: str) -> None:
         held(shlex.split(wrong))
 
 
-@pytest.mark.parametrize("block", blocks.tested(BOUND), ids=named)
+@pytest.mark.parametrize(
+    "block", [one for one in blocks.tested(HELD) if one.language == "python"], ids=named
+)
 def test_calls_that_cannot_be_made_here_have_arguments_that_there_are(block: Block) -> None:
     """Each call of something of ours binds to its signature."""
     calls = [node for node in ast.walk(ast.parse(block.text)) if isinstance(node, ast.Call)]
