@@ -4,6 +4,18 @@ heading() {
   printf '\n======== %s ========\n' "$*"
 }
 
+# patiently COMMAND...: once more, and a last time, if it fails: apt gives up where a mirror answers 503
+# once, and so does what calls it. pip and uv ask again by themselves.
+patiently() {
+  local pause
+  for pause in 5 30; do
+    "$@" && return
+    echo "failed, and is tried again in $pause s: $*" >&2
+    sleep "$pause"
+  done
+  "$@"
+}
+
 # The files that git knows, as they are in the working tree.
 copy_checkout() {
   mkdir -p "$1"

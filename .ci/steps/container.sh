@@ -18,8 +18,8 @@ if [ ${#missing[@]} -gt 0 ]; then
   printf '#!/bin/sh\nexit 101\n' >"$CI_WORK/policy" && chmod 755 "$CI_WORK/policy"
   [ -e /usr/sbin/policy-rc.d ] || { cp "$CI_WORK/policy" /usr/sbin/policy-rc.d; policy=ours; }
   export DEBIAN_FRONTEND=noninteractive
-  apt-get update -qq
-  apt-get install -y -qq --no-install-recommends "${missing[@]}" >/dev/null
+  patiently apt-get update -qq
+  patiently apt-get install -y -qq --no-install-recommends "${missing[@]}" >/dev/null
   [ "${policy:-}" != ours ] || rm /usr/sbin/policy-rc.d
 fi
 
@@ -50,9 +50,12 @@ docker version --format 'docker {{.Server.Version}}'
 # No registry needs to be reachable: the base image is a plain Debian of this machine's mirror, and
 # trusts whom this machine trusts.
 authorities=/etc/ssl/certs/ca-certificates.crt
-mmdebstrap --quiet --variant=minbase --include=python3,python3-venv,ca-certificates \
-  --customize-hook="copy-in $authorities $(dirname $authorities)" bookworm - |
-  docker import --change "ENV PIP_CERT=$authorities SSL_CERT_FILE=$authorities" - "$base" >/dev/null
+base_image() {
+  mmdebstrap --quiet --variant=minbase --include=python3,python3-venv,ca-certificates \
+    --customize-hook="copy-in $authorities $(dirname $authorities)" bookworm - |
+    docker import --change "ENV PIP_CERT=$authorities SSL_CERT_FILE=$authorities" - "$base" >/dev/null
+}
+patiently base_image
 docker build --quiet --network host --build-arg "BASE_IMAGE=$base" --tag "$image" . >/dev/null
 docker image inspect --format 'the image has {{.Size}} bytes' "$image"
 
