@@ -11,7 +11,10 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.errors import PolicyError
+from envhub_sandbox.errors import EnvHubError, PolicyError
+from envhub_sandbox.hub.local import split_local
+from envhub_sandbox.hub.reference import DEFAULT_PATH
+from envhub_sandbox.hub.snapshot import is_here
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -69,9 +72,13 @@ def options(path: Path, known: Collection[str]) -> dict[str, Any]:
 
 def is_judged(path: Path, reference: str) -> bool:
     """Whether a file lies in what is judged, by whatever links one gets there."""
-    judged = Path(os.path.expanduser(reference.partition(":")[0])).resolve()
-    folder = judged if judged.is_dir() else judged.parent
-    return judged.exists() and path.resolve().is_relative_to(folder)
+    if not is_here(reference):
+        return False
+    try:
+        folder, _ = split_local(reference, DEFAULT_PATH)
+    except EnvHubError:
+        return False  # nothing is judged: whoever reads it says why
+    return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -1,13 +1,15 @@
-"""``docs/checks.md``, written from the table of checks.
+"""``docs/checks.md``, written from the table of checks, and that of settings.
 
 Write it again with ``python -m tests.support.checks``.
 """
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 
 from envhub_sandbox.check.table import CHECKS
+from envhub_sandbox.cli.check.options import SETTINGS
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "checks.md"
 _HEAD = """# Checks
@@ -50,9 +52,13 @@ the worker server, which hears of each attempt before who makes it goes on, reme
 jail is closed. Recorded is the first play of each task alone.
 
 `--policy FILE` is TOML with the fields of `Policy`, and a table `[limits]`. Where you judge often,
-`--settings envhub.toml` has the options `steps`, `resets`, `slow-step`, `seed`, `fail-on`, `allow`,
-`policy`, `n-envs`, `timeout` and the limits in `[check]`; what you type counts more. The file is
-yours: it is named, and never looked for, and one that lies in what is judged is refused.
+`--settings envhub.toml` has options in `[check]`:
+
+SETTINGS
+
+What you type counts more, and what is about a list (`--all`) means nothing for one repository.
+Both files are yours: they are named, and never looked for, and one that lies in what is judged is
+refused.
 
 `--json` prints everything; `--junit FILE` has one test case for each check of each task, `--sarif
 FILE` is SARIF 2.1.0, and `--github` prints annotations and appends to `$GITHUB_STEP_SUMMARY`.
@@ -77,7 +83,9 @@ def document() -> str:
         f"| `{check.id}` | {check.severity.value} | {check.sentence} | {check.cure} |"
         for check in CHECKS.values()
     ]
-    return _HEAD + "\n".join(rows) + "\n"
+    options = ", ".join(f"`{name.replace('_', '-')}`" for name in SETTINGS)
+    head = _HEAD.replace("SETTINGS", textwrap.fill(f"{options}.", 100, break_on_hyphens=False))
+    return head + "\n".join(rows) + "\n"
 
 
 if __name__ == "__main__":

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli.check import options as of_list
+from envhub_sandbox.cli.check import options as own
+from envhub_sandbox.cli.check import outside
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
@@ -24,11 +25,6 @@ from envhub_sandbox.cli.shared.select import select
 if TYPE_CHECKING:
     from envhub_sandbox.check.findings import Finding, Report
 
-_OPTIONS = (
-    *("steps", "resets", "slow_step", "seed", "fail_on", "allow", "policy", "n_envs"),
-    *("timeout", "memory", "disk", "processes", "cpu_time"),
-)
-"""What may stand in the caller's own file."""
 _PANEL = "What it says"
 _FILE = "FILE"
 _MAY = "What it may do"
@@ -40,7 +36,7 @@ def _with_settings(ctx: typer.Context, path: Path | None) -> Path | None:
         from envhub_sandbox.check import settings
 
         with reported(debug=False):
-            ctx.default_map = settings.options(path, _OPTIONS)
+            ctx.default_map = settings.options(path, own.SETTINGS)
     return path
 
 
@@ -77,7 +73,7 @@ def check(
             metavar=_FILE,
             callback=_with_settings,
             is_eager=True,
-            help="Your own TOML with these options in [check]; what you type counts more.",
+            help="Your own TOML, with options in [check]; what you type counts more.",
         ),
     ] = None,
     allow: Annotated[
@@ -105,12 +101,12 @@ def check(
             rich_help_panel=_PANEL,
         ),
     ] = False,
-    listed: of_list.File = None,
-    output: of_list.Output = None,
-    jobs: of_list.Jobs = None,
-    memory_budget: of_list.MemoryBudget = None,
-    deadline: of_list.Deadline = None,
-    again: of_list.Again = False,
+    listed: own.File = None,
+    output: own.Output = None,
+    jobs: own.Jobs = None,
+    memory_budget: own.MemoryBudget = None,
+    deadline: own.Deadline = None,
+    again: own.Again = False,
     suite: opt.Suite = None,
     task: opt.Task = None,
     n_envs: opt.NEnvs = 2,
@@ -150,31 +146,7 @@ def check(
     [bold]envhub check --all references.txt --output judged[/bold]
     """
     with _unheard(github) as heard, reported(debug=debug):
-        make = opt.MakeOptions(
-            ref=ref or "",
-            n_envs=n_envs,
-            use_async=use_async,
-            env_kwargs=env_kwargs,
-            python=python,
-            dependencies=dependencies,
-            num_workers=None,
-            sandbox=sandbox,
-            server_key=server_key,
-            trust=False,
-            profile=profile,
-            network=None,
-            gpu=False,
-            readable=None,
-            variables=None,
-            memory=memory,
-            disk=disk,
-            processes=processes,
-            cpu_time=cpu_time,
-            timeout=timeout,
-            token=token,
-            endpoint=endpoint,
-            hub_cache_dir=hub_cache_dir,
-        )
+        make = opt.MakeOptions.of(ctx, ref=ref or "")
         least, allowed = level(fail_on), _known(allow or ())
         if listed is not None:
             _refuse_beside_a_list(ref=ref, sarif=sarif, html=html)
@@ -199,12 +171,11 @@ def check(
             return
         if ref is None:
             raise UsageError("name a repository, or a list of them: --all FILE --output DIR")
-        if output or jobs or memory_budget or deadline or again:
+        if any(opt.is_typed(ctx, name) for name in own.OF_A_LIST):
             raise UsageError(
                 "--output, --jobs, --memory-budget, --deadline and --again are for --all FILE"
             )
-        if settings is not None:
-            _refuse_the_judged(settings, ref)
+        outside.refuse_the_judged({"--settings": settings, "--policy": policy}, ref)
         play = _Play(seed, steps, resets, slow_step, suite, task, html is not None)
         report = _judge(make, policy, play, quiet=json or github)
         failures = report.failures(least, allowed)
@@ -259,16 +230,6 @@ def _refuse_beside_a_list(**options: object) -> None:
         raise UsageError(
             f"--{name} is about one repository; with --all each has its page and its JSON in "
             "--output DIR, and --junit FILE is about all"
-        )
-
-
-def _refuse_the_judged(settings: Path, ref: str) -> None:
-    from envhub_sandbox.check.settings import is_judged
-
-    if is_judged(settings, ref):
-        raise UsageError(
-            f"--settings {settings} lies in what is judged, and no repository says how it is "
-            "judged: copy it elsewhere"
         )
 
 

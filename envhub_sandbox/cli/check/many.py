@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
@@ -26,8 +27,9 @@ from envhub_sandbox.check.many.results import (
 )
 from envhub_sandbox.check.many.running import Ended, judgements
 from envhub_sandbox.check.reports import write
-from envhub_sandbox.check.settings import is_judged, merged, policy
+from envhub_sandbox.check.settings import merged, policy
 from envhub_sandbox.check.table import CHECKS
+from envhub_sandbox.cli.check.outside import refuse_the_judged
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say, size_of
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
@@ -107,8 +109,12 @@ def judge_all(wanted: Wanted) -> Judged:
     """
     if wanted.output is None:
         raise UsageError("--all needs --output DIR, where reports and their index go")
+    if wanted.deadline is not None and not math.isfinite(wanted.deadline):
+        raise UsageError(f"--deadline is {wanted.deadline}; it takes seconds, such as 3600")
     listed = _listed(wanted.file)
-    _refuse_the_judged(wanted, listed)
+    places = {"--settings": wanted.settings, "--policy": wanted.policy, "--output": wanted.output}
+    for one in listed:
+        refuse_the_judged(places, one.reference, f" (line {one.line} of {wanted.file})")
     jobs, text = _jobs(wanted), _policy(wanted)
     results = Results(wanted.output, _digest(wanted.arguments, text))
     judged = Judged(results, {one: Result(listed=one) for one in listed})
@@ -131,7 +137,7 @@ def _judge_in(running: Path, judged: Judged, wanted: Wanted, jobs: int, policy: 
         lambda one, place, ourselves: _command(wanted, one, place, ourselves, policy),
         folder=running,
         jobs=jobs,
-        most_s=wanted.deadline or _HOUR_S,
+        most_s=_HOUR_S if wanted.deadline is None else wanted.deadline,
         variables=_variables(wanted.make.token),
     )
     try:
@@ -281,21 +287,6 @@ def _listed(file: str) -> list[Listed]:
         raise UsageError(f"--all {file} cannot be read: {error.strerror}") from error
 
 
-def _refuse_the_judged(wanted: Wanted, listed: Iterable[Listed]) -> None:
-    """No repository says how it is judged, and none holds what is found in it."""
-    for option, path in (
-        ("--settings", wanted.settings),
-        ("--policy", wanted.policy),
-        ("--output", wanted.output),
-    ):
-        for one in listed if path is not None else ():
-            if path is not None and is_judged(path, one.reference):
-                raise UsageError(
-                    f"{option} {path} lies in what is judged, {one.reference} (line {one.line} "
-                    f"of {wanted.file}): take a place outside"
-                )
-
-
 def _policy(wanted: Wanted) -> bytes:
     try:
         return b"" if wanted.policy is None else wanted.policy.read_bytes()
@@ -328,7 +319,7 @@ def _digest(arguments: Sequence[str], policy: bytes) -> str:
     """A digest of all that a verdict depends on beside the repository; of no secret."""
     stands_on = {name: text for name, text in versions().items() if name != "platform"}
     checks = [(one.id, one.severity.value) for one in CHECKS.values()]
-    said = [sorted(arguments), policy.decode("utf-8", "replace"), stands_on, checks]
+    said = [*arguments, policy.decode("utf-8", "replace"), stands_on, checks]
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 

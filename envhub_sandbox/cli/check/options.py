@@ -1,4 +1,4 @@
-"""Options of ``envhub check`` that are about a list."""
+"""Options of ``envhub check`` that are about a list, and which may stand in the caller's file."""
 
 from __future__ import annotations
 
@@ -7,6 +7,14 @@ from typing import Annotated
 
 import typer
 
+SETTINGS = (
+    *("steps", "resets", "slow_step", "seed", "fail_on", "allow", "policy", "n_envs"),
+    *("timeout", "memory", "disk", "processes", "cpu_time"),
+    *("jobs", "memory_budget", "deadline"),
+)
+"""What may stand in ``[check]`` of ``--settings FILE``, by the names in Python."""
+OF_A_LIST = ("output", "jobs", "memory_budget", "deadline", "again")
+"""What means nothing for one repository; it may stand in a file that is for both."""
 _PANEL = "A list"
 
 File = Annotated[

@@ -76,32 +76,7 @@ def inspect(
                 hub_cache_dir=hub_cache_dir,
             )
             return
-        make = opt.MakeOptions(
-            ref=ref,
-            n_envs=n_envs,
-            use_async=use_async,
-            env_kwargs=env_kwargs,
-            python=python,
-            dependencies=dependencies,
-            lock=lock,
-            num_workers=None,
-            sandbox=sandbox,
-            server_key=server_key,
-            trust=trust,
-            profile=profile,
-            network=network,
-            gpu=gpu,
-            readable=readable,
-            variables=variables,
-            memory=memory,
-            disk=disk,
-            processes=processes,
-            cpu_time=cpu_time,
-            timeout=timeout,
-            token=token,
-            endpoint=endpoint,
-            hub_cache_dir=hub_cache_dir,
-        )
+        make = opt.MakeOptions.of(context)
         _inspect(make, suite, task, as_json=json)
 
 

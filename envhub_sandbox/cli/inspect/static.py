@@ -12,6 +12,7 @@ import typer
 from envhub_sandbox.cli.shared.console import print_json, size_of
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_sandbox.cli.shared.findings import level, show, show_finding
+from envhub_sandbox.cli.shared.options import is_typed
 from envhub_sandbox.cli.shared.progress import Bar
 
 if TYPE_CHECKING:
@@ -31,18 +32,13 @@ def check_options(context: typer.Context, *, static: bool) -> None:
     Raises:
         UsageError: There is one.
     """
-    given = [name for name in context.params if _is_given(context, name)]
+    given = [name for name in context.params if is_typed(context, name)]
     means = _OF_BOTH | _OF_STATIC if static else set(context.params) - _OF_STATIC
     wrong = [name for name in given if name not in means]
     if wrong:
         shown = "--" + wrong[0].replace("_", "-")
         why = "with --static nothing runs" if static else "it needs --static"
         raise UsageError(f"{shown} means nothing here: {why}")
-
-
-def _is_given(context: typer.Context, name: str) -> bool:
-    source = context.get_parameter_source(name)
-    return source is not None and source.name == "COMMANDLINE"
 
 
 def inspect_static(

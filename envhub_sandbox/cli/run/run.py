@@ -37,6 +37,7 @@ class PolicyName(str, Enum):
 
 
 def run(
+    context: typer.Context,
     ref: opt.Ref,
     episodes: Annotated[
         int, typer.Option("--episodes", "-e", min=1, help="Episodes of each task, exactly.")
@@ -97,34 +98,7 @@ def run(
     [bold]envhub run ./examples/cartpole --episodes 20 --n-envs 4 --video cartpole.mp4[/bold]
     """
     with reported(debug=debug), logs.logged(verbose=verbose, worker_output=worker_output):
-        make = opt.MakeOptions(
-            ref=ref,
-            n_envs=n_envs,
-            use_async=use_async,
-            env_kwargs=env_kwargs,
-            python=python,
-            dependencies=dependencies,
-            lock=lock,
-            num_workers=num_workers,
-            sandbox=sandbox,
-            server_key=server_key,
-            trust=trust,
-            profile=profile,
-            network=network,
-            gpu=gpu,
-            readable=readable,
-            variables=variables,
-            memory=memory,
-            disk=disk,
-            processes=processes,
-            cpu_time=cpu_time,
-            timeout=timeout,
-            token=token,
-            endpoint=endpoint,
-            hub_cache_dir=hub_cache_dir,
-            output=logs.output_policy(worker_output),
-            validate=validate,
-        )
+        make = opt.MakeOptions.of(context)
         play = Play(episodes=episodes, policy=policy.value, seed=seed, steps=steps, video=video)
         _Run(make, play, suite, task, as_json=json).execute()
 

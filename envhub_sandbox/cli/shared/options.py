@@ -8,12 +8,13 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Annotated, Any
 
 import typer
 
 from envhub_sandbox.cli.shared.exits import ForeignError, UsageError
+from envhub_sandbox.cli.shared.logs import output_policy
 from envhub_sandbox.errors import EnvHubError
 from envhub_worker.protocol.limits import MAX_NUM_ENVS
 
@@ -209,7 +210,10 @@ Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks.")]
 
 @dataclass(frozen=True, kw_only=True)
 class MakeOptions:
-    """What the command line says about ``make_env``; field by field as its options."""
+    """What the command line says about ``make_env``; field by field as its options.
+
+    Those with a default are not options of every command.
+    """
 
     ref: str
     n_envs: int
@@ -217,14 +221,9 @@ class MakeOptions:
     env_kwargs: Sequence[str] | None
     python: str | None
     dependencies: str
-    num_workers: int | None
     sandbox: str
-    trust: bool
+    server_key: str | None
     profile: str | None
-    network: str | None
-    gpu: bool
-    readable: Sequence[str] | None
-    variables: Sequence[str] | None
     memory: str | None
     disk: str | None
     processes: int | None
@@ -233,10 +232,27 @@ class MakeOptions:
     token: str | None
     endpoint: str | None
     hub_cache_dir: str | None
-    server_key: str | None = None
     lock: str | None = None
-    output: str | None = None
+    num_workers: int | None = None
     validate: bool = False
+    trust: bool = False
+    network: str | None = None
+    gpu: bool = False
+    readable: Sequence[str] | None = None
+    variables: Sequence[str] | None = None
+    worker_output: str | None = None
+
+    @classmethod
+    def of(cls, context: typer.Context, **others: Any) -> MakeOptions:
+        """What a command was given: a parameter's field has its name.
+
+        Args:
+            context: The command's.
+            **others: Fields that it says in another way.
+        """
+        names = {one.name for one in fields(cls)}
+        given = {name: value for name, value in context.params.items() if name in names}
+        return cls(**{**given, **others})
 
     @property
     def in_process(self) -> bool:
@@ -300,7 +316,7 @@ class MakeOptions:
             "gpu": self.gpu or None,
             "readable": tuple(self.readable or ()) or None,
             "environment": tuple(self.variables or ()) or None,
-            "output": self.output,
+            "output": output_policy(self.worker_output),
             "limits": _given(limits) or None,
         }
         return _given(policy)
@@ -308,6 +324,12 @@ class MakeOptions:
     def _timeouts(self) -> dict[str, Any]:
         names = ("startup_s", "reset_s", "step_s", "call_s")
         return {} if self.timeout is None else dict.fromkeys(names, self.timeout)
+
+
+def is_typed(context: typer.Context, name: str) -> bool:
+    """Whether a parameter stands on the command line, and not in a file or nowhere."""
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
 
 
 def _given(options: dict[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from envhub_sandbox.check.many.running import Ended
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.check import many
 from envhub_sandbox.cli.check.check import check
+from envhub_sandbox.cli.check.options import OF_A_LIST, SETTINGS
 from envhub_sandbox.cli.shared.exits import Exit
 
 _RUNNER = CliRunner()
@@ -37,6 +38,7 @@ def started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, 
     monkeypatch.chdir(tmp_path)
     (tmp_path / "list").write_text("org/repo\n./env\n")
     (tmp_path / "env").mkdir()
+    (tmp_path / "env" / "envhub.toml").touch()
     return found
 
 
@@ -65,12 +67,39 @@ def test_each_is_told_what_holds_here(started: list[tuple[int, list[str]]]) -> N
         assert policy.endswith(".running/policy.toml")
 
 
+def test_a_file_says_what_one_may_type_about_a_list(
+    started: list[tuple[int, list[str]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And what is typed counts more. For one repository the same file is no mistake."""
+    seconds: list[float] = []
+    faked = many.judgements
+
+    def judgements(orders, command, *, most_s, **more):  # type: ignore[no-untyped-def]
+        seconds.append(most_s)
+        yield from faked(orders, command, **more)
+
+    monkeypatch.setattr(many, "judgements", judgements)
+    says = "[check]\njobs = 5\nmemory-budget = '6G'\ndeadline = 9\nmemory = '1G'\n"
+    Path("settings.toml").write_text(says)
+    arguments = ("--all", "list", "--output", "out", "--settings", "settings.toml")
+    for typed in ((), ("--jobs", "2"), ("--memory-budget", "2G"), ("--deadline", "8")):
+        done = called(*arguments, *typed)
+        assert done.exit_code == Exit.UNJUDGED, done.output
+    assert ([jobs for jobs, _ in started[::2]], seconds) == ([3, 2, 1, 3], [9, 9, 9, 8])
+    assert all("--memory=1G" in words for _, words in started)
+    assert not any(word.startswith(("--jobs", "--dead")) for _, words in started for word in words)
+    alone = called("./nothing", "--settings", "settings.toml")
+    assert "there is no such folder" in alone.output
+
+
 def test_every_option_is_handed_on_or_about_the_list() -> None:
     """A new one is handed on by itself."""
     command = typer.main.get_command(app)
     [found] = [one for name, one in command.commands.items() if name == "check"]  # type: ignore[attr-defined]
     names = {one.name for one in found.params}
     assert names > many.OF_THE_LIST
+    assert names > set(SETTINGS)
+    assert set(OF_A_LIST) < many.OF_THE_LIST
     assert names - many.OF_THE_LIST > {"steps", "fail_on", "allow", "timeout", "memory", "profile"}
     assert check.__doc__ is not None
 
@@ -91,6 +120,13 @@ def test_every_option_is_handed_on_or_about_the_list() -> None:
         ("--all nowhere --output out", "cannot be read"),
         ("--all list --output .", "has other things in it"),
         ("--all list --output env/out", "lies in what is judged, ./env (line 2"),
+        (
+            "--all list --output out --policy env/x",
+            "--policy env/x lies in what is judged",
+        ),
+        ("./env --policy env/x", "--policy env/x lies in what is judged, ./env, and no"),
+        ("./env --settings env/envhub.toml", "lies in what is judged, ./env, and no"),
+        ("--all list --output out --deadline inf", "--deadline is inf"),
         ("--all list --output out --settings env/x.toml", "cannot be read"),
         ("--all wrong --output out", "wrong:2: "),
         ("", "name a repository, or a list"),

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import typer
 
+from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.shared.exits import ForeignError, UsageError
 from envhub_sandbox.cli.shared.options import MakeOptions, read_env_kwargs, read_size
 from envhub_sandbox.cli.shared.select import select
@@ -15,7 +19,7 @@ NOTHING: dict[str, Any] = dict.fromkeys(
     (
         *("env_kwargs", "python", "num_workers", "profile", "network", "readable", "variables"),
         *("memory", "disk", "processes", "cpu_time", "timeout", "token", "endpoint"),
-        "hub_cache_dir",
+        *("hub_cache_dir", "server_key"),
     )
 )
 
@@ -25,6 +29,23 @@ def options(**given: Any) -> MakeOptions:
     defaults = {"ref": "org/repo", "n_envs": 1, "use_async": False, "gpu": False}
     defaults["dependencies"] = "auto"
     return MakeOptions(**{**NOTHING, **defaults, "sandbox": "process", "trust": False, **given})
+
+
+@pytest.mark.parametrize("name", ["run", "inspect", "check"])
+def test_every_option_about_make_env_reaches_it(name: str) -> None:
+    """By its name: a field without a default is an option of every command, and none is lost."""
+    command = typer.main.get_command(app).commands[name]  # type: ignore[attr-defined]
+    panels = ("How it is built", "What it may do", "Where it comes from")
+    about = {
+        one.name for one in command.params if getattr(one, "rich_help_panel", None) in panels
+    } - {"suite", "task", "policy"}  # which make_env is not told, or not in this way
+    names = {one.name for one in fields(MakeOptions)}
+    assert len(about) > 15
+    assert about <= names
+    params = {one.name: f"<{one.name}>" for one in command.params}
+    made = MakeOptions.of(SimpleNamespace(params=params), timeout=7.0)  # type: ignore[arg-type]
+    assert all(getattr(made, one) == f"<{one}>" for one in about - {"timeout"})
+    assert (made.ref, made.timeout) == ("<ref>", 7.0)
 
 
 @pytest.mark.parametrize(

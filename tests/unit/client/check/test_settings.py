@@ -93,5 +93,11 @@ def test_what_is_judged_has_no_say(tmp_path: Path, monkeypatch: pytest.MonkeyPat
             "~/link",
         ):
             assert settings.is_judged(file, reference), (file, reference)
+    (tmp_path / "with:colon").mkdir()
+    for reference in (str(tmp_path / "with:colon"), f"{tmp_path / 'with:colon'}:env.py"):
+        assert settings.is_judged(tmp_path / "with:colon" / "envhub.toml", reference)
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    assert not settings.is_judged(tmp_path / "loop", str(judged))
+    assert not settings.is_judged(judged / "envhub.toml", str(tmp_path / "nowhere"))
     assert not settings.is_judged(tmp_path / "envhub.toml", str(judged))
     assert not settings.is_judged(judged / "envhub.toml", "org/repo@0123")
