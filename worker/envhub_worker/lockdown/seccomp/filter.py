@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import os
 from collections.abc import Mapping
 
@@ -31,6 +32,8 @@ _PR_SET_SECCOMP = 22
 _MODE_FILTER = 2
 _SET_MODE_FILTER = 1
 _NEW_LISTENER = 1 << 3
+#: Who has been heard is interrupted by nothing that does not end it (Linux 5.19).
+WAIT_KILLABLE = 1 << 5
 
 _NUMBER, _ARCHITECTURE, _ARGUMENTS = 0, 4, 16
 
@@ -188,8 +191,7 @@ def install(compiled: bytes, *, brokered: bool = False) -> int:
     header = _Program(len(compiled) // 8, ctypes.addressof(code))
     try:
         if brokered:
-            place = ctypes.addressof(header)
-            return syscall(number("seccomp"), _SET_MODE_FILTER, _NEW_LISTENER, place)
+            return _listener(ctypes.addressof(header))
         prctl(_PR_SET_SECCOMP, _MODE_FILTER, ctypes.addressof(header))
     except OSError as error:
         raise LayerUnavailableError(
@@ -199,6 +201,20 @@ def install(compiled: bytes, *, brokered: bool = False) -> int:
             f"{', and Linux 5.5' if brokered else ''}.",
         ) from error
     return -1
+
+
+def _listener(place: int) -> int:
+    """Install the program there. A call that asks is no slow call, which signals interrupt.
+
+    An older kernel knows no such flag: there a signal takes its caller out of it, with EINTR, or
+    to ask anew where its handler has calls restarted.
+    """
+    try:
+        return syscall(number("seccomp"), _SET_MODE_FILTER, _NEW_LISTENER | WAIT_KILLABLE, place)
+    except OSError as error:
+        if error.errno != errno.EINVAL:
+            raise
+    return syscall(number("seccomp"), _SET_MODE_FILTER, _NEW_LISTENER, place)
 
 
 def installed() -> bool:
