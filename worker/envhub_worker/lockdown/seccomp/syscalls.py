@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 
 # In the order of their numbers, from 0; "-" is a number that the architecture does not use.
@@ -111,6 +112,7 @@ def number(name: str) -> int:
     return NUMBERS[os.uname().machine][name]
 
 
+@functools.cache
 def name_of(call: int) -> str:
     """The name of a call of this machine by its number."""
     numbers = NUMBERS[os.uname().machine]
