@@ -27,6 +27,7 @@ def sorted_out(denied: Iterable[str]) -> dict[str, list[str]]:
         "denied-network": [],
         "denied-files": [],
         "denied-kernel": [],
+        "limits-reached": [],
     }
     for one in sorted(set(denied) - _HARMLESS):
         check, text = _finding(one)
@@ -38,6 +39,8 @@ def _finding(one: str) -> tuple[str, str]:
     deed, _, path = one.partition(" ")
     if path.startswith("/"):
         return "denied-files", f"asked to {_DEEDS.get(deed, deed)} {path}, which is not its own"
+    if deed == "limit":
+        return "limits-reached", f"used up what limits permit of {path.lower()}"
     if one.endswith(_OTHER):
         return "denied-kernel", f"tried {deed} of a process that is not its own"
     is_network = one.startswith(_NETWORK) and one not in _LOCAL

@@ -157,6 +157,12 @@ CHECKS: dict[str, Check] = {
             "Do without: no tracing, mounting or namespaces is needed to compute a step.",
         ),
         Check(
+            "limits-reached",
+            _W,
+            "It uses up no limit: of processes and threads, open files, scratch, files in it.",
+            "Use less, or say in the card what it needs, so that its user raises that limit.",
+        ),
+        Check(
             "leaks-processes",
             _W,
             "Resets leave no processes behind.",

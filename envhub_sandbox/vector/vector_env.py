@@ -359,8 +359,9 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
         And which files it has asked for that are not its own: ``"write /home/me/.profile"``, and
         what it has tried with processes that are not: ``"kill OTHER_PROCESS"``. By the word of its
-        first process, which answers or sees them, and not by the repository's. None unless it runs
-        under a policy with ``record_denials``.
+        first process, which answers or sees them, and not by the repository's. Also which limits it
+        has used up when the server looks: ``"limit PROCESSES"``, ``OPEN_FILES``, ``DISK_BYTES`` or
+        ``DISK_FILES``. None unless it runs under a policy with ``record_denials``.
         """
         return self._session.denials()
 

@@ -171,6 +171,74 @@ def test_who_names_a_process_that_is_not_its_own_is_told(home: Path, profile: st
     ]
 
 
+_GREEDY = """
+import os, threading
+import gymnasium as gym
+
+kept = []
+
+def until_refused(take):
+    try:
+        while True:
+            kept.append(take())
+    except (OSError, RuntimeError):
+        return len(kept)
+
+class Greedy(gym.Env):
+    observation_space = action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {}
+
+    def step(self, action):
+        return 0, 0.0, False, False, {}
+
+    def threads(self):
+        def take():
+            threading.Thread(target=threading.Event().wait, daemon=True).start()
+        return until_refused(take)
+
+    def bytes(self):
+        file = os.open("large", os.O_WRONLY | os.O_CREAT)
+        return until_refused(lambda: os.write(file, bytes(1 << 20)))
+
+    def files(self):
+        def take():
+            os.close(os.open(f"file-{len(kept)}", os.O_WRONLY | os.O_CREAT))
+        os.unlink("large")
+        return until_refused(take)
+
+    def descriptors(self):
+        return until_refused(lambda: os.open("env.py", os.O_RDONLY))
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([Greedy] * n_envs)
+"""
+_FEW = {"processes": 64, "disk_bytes": 64 << 20, "disk_files": 2000, "open_files": 256}
+
+
+@pytest.mark.parametrize("profile", profiles("strict"))
+def test_limits_that_are_used_up_are_told(home: Path, profile: str) -> None:
+    """By what the kernel and the file system say; the control is the same jail before each."""
+    folder = write_repository(home / "greedy", _GREEDY)
+    expected: set[str] = set()
+    policy = {"profile": profile, "record_denials": True}
+    with make_env(str(folder), policy=policy, limits=_FEW) as suites:
+        env = suites.env
+        env.reset(seed=0)
+        for deed, limit in (
+            ("threads", "PROCESSES"),
+            ("bytes", "DISK_BYTES"),
+            ("files", "DISK_FILES"),
+            ("descriptors", "OPEN_FILES"),
+        ):
+            assert set(attempts(env.jail_denials() or ())) == expected
+            env.call(deed)
+            expected.add(f"limit {limit}")
+        assert set(attempts(env.jail_denials() or ())) == expected
+
+
 _FILES = """
 import ctypes, os, threading
 import gymnasium as gym

@@ -16,7 +16,8 @@ def test_every_payload_and_every_sample_has_its_judgement() -> None:
     assert {*judged.HONEST, *judged.FAILING} == samples | {"sub_folder"}
     assert len(judged.HONEST) >= 20
     for attack in judged.ATTACKS.values():
-        assert attack.check.startswith(("denied-", "survives", "leaks-")) or attack.unseen
+        by_layers = ("denied-", "limits-", "survives", "leaks-")
+        assert attack.check.startswith(by_layers) or attack.unseen
 
 
 @pytest.mark.parametrize("payload", ["foreign_abi", "read_file", "unix_stream", "write_file"])

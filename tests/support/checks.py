@@ -40,6 +40,10 @@ allocators and the C library try on their way is left out. Of signals, prioritie
 told when they name a process that is not the jail's own: one that lives outside of it, or a number
 that nobody in it can have had; what nobody has any more may have been a child, and is left out.
 
+Limits that are used up are told where they are so when the worker server looks, from outside: after
+the plays of a task. Processes that were refused are also counted by the jail's control group, where
+the server may make one. What was filled and emptied again is not seen, nor what stays below.
+
 Of files that process sees each opening and change by name, and lets the kernel decide: what is
 told is that a path was asked for that is not the jail's own, read from the memory of who asks, and
 no more is known. Told is all that would change something, connecting or sending to a socket's file,

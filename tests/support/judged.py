@@ -57,6 +57,7 @@ class Attack:
 
 
 _FILES, _KERNEL, _NETWORK = "denied-files", "denied-kernel", "denied-network"
+_LIMITS = "limits-reached"
 ATTACKS = {
     "answers": Attack(_KERNEL, "tried kcmp", {"calls": {"bpf": [0, 0, 0], "kcmp": [0, 0, 0]}}),
     "change_attribute": Attack(_FILES, "setxattr /home/other/file", _OUTSIDE),
@@ -74,11 +75,15 @@ ATTACKS = {
     "enter_namespaces": Attack(_KERNEL, "tried pidfd_open of", {**_NAMED, **_CLIENT}),
     "environment": Attack("source-outside", "", unseen="it may read its own, which we make"),
     "environment_of_others": Attack(_FILES, "read /proc/1/environ", _CLIENT),
-    "fill_disk": Attack("", "", {"folders": [], "size": 1 << 30}, {"disk_bytes": 64 * _MIB}, _OWN),
-    "fill_inodes": Attack("", "", {"folders": [], "count": 9999}, {"disk_files": 2000}, _OWN),
+    "fill_disk": Attack(
+        _LIMITS, "disk_bytes", {"folders": [], "size": 1 << 30}, {"disk_bytes": 64 * _MIB}
+    ),
+    "fill_inodes": Attack(
+        _LIMITS, "disk_files", {"folders": [], "count": 9999}, {"disk_files": 2000}
+    ),
     "flood": Attack("", "", {"size": 4 * _MIB}, unseen=_OWN),
     "foreign_abi": Attack("survives", "SIGSYS", {**_NAMED, "abi": "i386"}),
-    "fork_bomb": Attack("source-process", "", {"count": 200}, {"processes": 64}, _OWN),
+    "fork_bomb": Attack(_LIMITS, "processes", {"count": 200}, {"processes": 64}),
     "garbage_on_streams": Attack("survives", "", {"data": "ff"}),
     "grandchildren": Attack("source-process", "", {**_NAMED, "seconds": 1}, unseen=_OWN),
     "hold_file": Attack(_KERNEL, "tried fcntl", {"path": "/etc/passwd", "way": "lease"}),
@@ -140,13 +145,13 @@ ATTACKS = {
     "stop_processes": Attack(_KERNEL, "tried kill of", {"pids": [os.getpid()], "own": False}),
     "tcp": Attack(_NETWORK, "tried socket AF_INET", _PORT),
     "tcp_fast_open": Attack(_NETWORK, "tried socket AF_INET", _PORT),
-    "thread_bomb": Attack("runs", "new thread", {"count": 500}, {"processes": 64}, _OWN),
+    "thread_bomb": Attack(_LIMITS, "processes", {"count": 500}, {"processes": 64}),
     "type_into_terminal": Attack(_KERNEL, "tried ioctl", _TEXT),
     "udp": Attack(_NETWORK, "tried socket AF_INET", _PORT),
     "unix_datagram": Attack(_FILES, "send to /dev/log", _LOG),
     "unix_datagram_of_a_pair": Attack(_FILES, "send to /dev/log", _LOG),
     "unix_stream": Attack(_FILES, "connect to /var/run/x", {"path": "/var/run/x", **_WORD}),
-    "use_up": Attack("source-network", "", {"kind": "pipes", "name": "x"}, unseen=_OWN),
+    "use_up": Attack(_LIMITS, "open_files", {"kind": "pages of pipes", "name": "x"}),
     "user_namespace": Attack(_KERNEL, "tried unshare", _NAMED),
     "vsock": Attack(_NETWORK, "tried socket AF_VSOCK", {"cid": 2, "port": 9, **_WORD}),
     "watch_folder": Attack(
@@ -177,7 +182,7 @@ def told_of(payload: str, attack: Attack) -> list[Finding]:
 def is_told(found: list[Finding], attack: Attack) -> bool:
     """Whether the check names it, or nothing of the layers does where nothing can."""
     if not attack.check:
-        return not any(one.id.startswith("denied-") for one in found)
+        return not any(one.id.startswith(("denied-", "limits-")) for one in found)
     return any(one.id == attack.check and attack.words in one.message for one in found)
 
 

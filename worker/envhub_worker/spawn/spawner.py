@@ -324,6 +324,15 @@ class Jail:
         except OSError:
             return -1
 
+    def runner_pids(self) -> list[int]:
+        """The numbers of its runners that live, as seen from here."""
+        pids = map(process.pid_of, self._runner_pidfds.values())
+        return [pid for pid in pids if pid > 0]
+
+    def refused_processes(self) -> bool:
+        """Whether its control group, if it has one, has refused it any."""
+        return self._group is not None and self._group.refused()
+
     def runner_pidfd(self, runner_id: int) -> int:
         """A pidfd of a runner, or -1 before it has started and after it has gone."""
         return self._runner_pidfds.get(runner_id, -1)

@@ -22,6 +22,7 @@ from envhub_worker.supervisor.fd_store import Deposits
 from envhub_worker.supervisor.idle_timer import Idleness
 from envhub_worker.supervisor.jail_events import JailEvents
 from envhub_worker.supervisor.output_tail import OutputTail
+from envhub_worker.supervisor.reached import reached
 from envhub_worker.supervisor.records import (
     Answers,
     Asker,
@@ -292,12 +293,26 @@ class Jails:
 
 
 def _held(entry: JailEntry, children: Children | None) -> dict[str, object]:
-    held: dict[str, object] = {}
+    usage: dict[str, int] = {}
     if entry.death is None and children is not None:
-        held |= usage_of(entry.jail.pid, entry.pids.values(), children)
-    if entry.jail.spec.confinement.record_denials:
-        held["denied"] = tuple(entry.denied)
-    return held
+        usage = usage_of(entry.jail.pid, entry.pids.values(), children)
+    if not entry.jail.spec.confinement.record_denials:
+        return {**usage}
+    if entry.death is None:
+        _note_limits(entry, usage)
+    return {**usage, "denied": tuple(entry.denied)}
+
+
+def _note_limits(entry: JailEntry, usage: dict[str, int]) -> None:
+    """What a jail has used up it is denied; in front, where no flood of attempts hides it."""
+    wanted = entry.jail.spec.confinement
+    runners, own_root = entry.jail.runner_pids(), wanted.profile == "strict"
+    found = set(reached(wanted.limits, usage, runners, own_root=own_root))
+    if entry.jail.refused_processes():
+        found.add("PROCESSES")
+    for name in sorted(found):
+        if f"limit {name}" not in entry.denied:
+            entry.denied.insert(0, f"limit {name}")
 
 
 def _targets(

@@ -180,6 +180,12 @@ class Group:
         ]
         return [events, *joins]
 
+    def refused(self) -> bool:
+        """Whether the kernel has refused it a process, or a thread, beyond its number."""
+        with contextlib.suppress(OSError), open(f"{self._folders[-1]}/pids.events") as file:
+            return any(line.startswith("max ") and line.split()[1] != "0" for line in file)
+        return False
+
     def remove(self) -> None:
         """Remove the group; its processes must have ended."""
         _remove(self._folders)
