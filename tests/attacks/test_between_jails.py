@@ -129,7 +129,7 @@ def test_signals_do_not_reach_another_jail(arena: Arena, way: str) -> None:
         arena.attack(
             f"signal another jail: {way}",
             "signal_one",
-            lambda run: came(other, 0.5) if run.inside else came(target, 10.0),
+            lambda run: came(other, 0.5) if run.inside else came(target, 60.0),
             inside={"pid": other.pid},
             pid=target.pid,
             way=way,
@@ -145,7 +145,7 @@ def test_everybody_is_not_another_jail(arena: Arena) -> None:
         def came(run: Run) -> bool:
             of = other if run.inside else target
             return eventually(
-                lambda: of.state()["broadcasts"] > seen[0], 0.5 if run.inside else 10.0
+                lambda: of.state()["broadcasts"] > seen[0], 0.5 if run.inside else 60.0
             )
 
         def begin() -> None:  # the control is the caller's own, and reaches all that is theirs

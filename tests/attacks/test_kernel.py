@@ -25,7 +25,7 @@ def child_differs(arena: Arena, title: str, payload: str, look: Look, **argument
 
     def got(run: Run) -> bool:
         # a child that was forked by hand takes its name a moment later
-        eventually(lambda: bool(pids_named(child)), 0.5 if run.inside else 10.0)
+        eventually(lambda: bool(pids_named(child)), 0.5 if run.inside else 60.0)
         return any(look(pid, parent) for pid in pids_named(child) for parent in run.pids())
 
     arena.attack(title, payload, got, before=lambda: end(child), alias=child, **arguments)

@@ -33,7 +33,7 @@ SOMEBODY = 61999
 _OTHERS = ["another user"] if os.geteuid() == 0 and can_run("no-userns") else []
 WHOSE = ["same user", *_OTHERS]
 _GRACE_S = 0.3
-_HEARD_S = 10.0
+_HEARD_S = 60.0
 
 
 @dataclass(frozen=True)

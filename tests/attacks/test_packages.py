@@ -131,7 +131,7 @@ def test_a_jail_of_another_environment_is_out_of_reach(arena: Arena, place: Path
                 "signal_one",
                 lambda run: eventually(
                     lambda: (other if run.inside else target).state()["signals"] > 0,
-                    0.5 if run.inside else 10.0,
+                    0.5 if run.inside else 60.0,
                 ),
                 inside={"pid": other.pid},
                 pid=target.pid,

@@ -121,7 +121,7 @@ def signalled(target: Victim, kind: str = "signals") -> Callable[[Run], bool]:
 
     def more(run: Run) -> bool:
         nonlocal seen
-        deadline = 0.3 if run.inside else 10.0
+        deadline = 0.3 if run.inside else 60.0
         came = eventually(lambda: target.state()[kind] > seen, deadline)
         seen = target.state()[kind]
         return came
