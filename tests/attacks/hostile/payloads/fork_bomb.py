@@ -13,7 +13,7 @@ def attack(count):
             return [forked, str(error)]
         if pid == 0:
             try:
-                time.sleep(60)
+                time.sleep(300)
             finally:
                 os._exit(0)
         forked += 1

@@ -224,7 +224,7 @@ def _in_child(take):
         try:
             kept.append(take())
             os.write(told, b"x")
-            time.sleep(60)
+            time.sleep(300)
         finally:
             os._exit(0)
     os.close(told)

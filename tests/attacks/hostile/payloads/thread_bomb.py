@@ -7,7 +7,7 @@ kept = []
 
 def attack(count):
     for _ in range(count):
-        thread = threading.Thread(target=threading.Event().wait, args=(60,), daemon=True)
+        thread = threading.Thread(target=threading.Event().wait, args=(300,), daemon=True)
         thread.start()
         kept.append(thread)
     return len(kept)
