@@ -170,8 +170,11 @@ def decide(request: Request, inside: _Inside) -> Answer:
 
 
 def _kill(caller: int, target: int, signum: int, inside: _Inside) -> Answer:
+    group = _group_of(caller)
+    if group < 0:
+        return Answer(errno.ESRCH)  # it has gone since, and nobody waits for the answer
     # A process is alone with the jail in its own group: the host has a session of its own.
-    if target in (caller, 0, -os.getpgid(caller)):
+    if target in (caller, 0, -group):
         return _PROCEED
     if target == -1:
         return Answer(errno.EPERM)
