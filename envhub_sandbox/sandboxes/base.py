@@ -34,30 +34,43 @@ class WorkerServer(Protocol):
     def process_fd(self) -> int: ...  # noqa: D102
 
 
+class ServerUse(Protocol):
+    """One use of a server, which is given back, or ends when nobody has it any more.
+
+    Attributes:
+        shared: The server.
+        live: Whether it has not been given back.
+    """
+
+    @property
+    def shared(self) -> WorkerServer: ...  # noqa: D102
+    @property
+    def live(self) -> bool: ...  # noqa: D102
+
+    def release(self) -> None:
+        """Give it back; the last one who does gives the server up. Idempotent.
+
+        What a Ctrl-C interrupts is to be called again.
+        """
+
+
 class Sandbox(Protocol):
-    """A place for workers. Servers are shared: every ``acquire`` has its ``release``."""
+    """A place for workers. Servers are shared: each ``acquire`` is a use of one."""
 
     name: str
 
-    def acquire(self, store: Path, runtime: Runtime = OWN) -> WorkerServer:
-        """A server that may show snapshots below ``store`` to jails.
+    def acquire(self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0) -> ServerUse:
+        """Use a server that may show snapshots below ``store`` to jails.
 
         Args:
             store: The folder.
             runtime: What its first jail runs on. A hint: others may run on something else.
+            idle_s: For how long it may be kept for whoever asks next, where this use is its last;
+                0 ends it at once, None keeps it for as long as this process lives.
 
         Raises:
             SandboxUnavailableError: There is no such place here.
             WorkerStartupError: The server did not come up.
-        """
-
-    def release(self, server: WorkerServer, idle_s: float | None = 0.0) -> None:
-        """Give a server back; the last one who does gives it up.
-
-        Args:
-            server: What ``acquire`` gave.
-            idle_s: For how long it may be kept for whoever asks next; 0 ends it at once, None
-                keeps it for as long as this process lives.
         """
 
 

@@ -29,7 +29,7 @@ class Idle(Protocol):
     def runs(self) -> bool: ...  # noqa: D102
 
     def stop(self) -> None:
-        """End it, in bounded time. A fork of its owner does nothing."""
+        """End it, in bounded time, and once. A fork of its owner does nothing."""
 
 
 S = TypeVar("S", bound=Idle)
@@ -70,9 +70,16 @@ class Lingering(Generic[S]):
         with self._changed:
             if self._refuses:
                 return False
+            here = None
             for entry in self._mine():
-                entry.until = 0.0
-            self._entries.append(_Entry(key, shared, until, os.getpid()))
+                if entry.shared is shared:  # whoever gave it up was interrupted, and does so again
+                    here = entry
+                else:
+                    entry.until = 0.0
+            if here is None:
+                self._entries.append(_Entry(key, shared, until, os.getpid()))
+            else:
+                here.until = until
             self._watch()
         return True
 

@@ -7,7 +7,6 @@ whatever ended it: it holds a pidfd of us.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import select
 import shutil
@@ -22,9 +21,8 @@ from envhub_sandbox import parent
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.log import WORKER
 from envhub_sandbox.sandboxes import runtime_folder
-from envhub_sandbox.sandboxes.base import WorkerServer
 from envhub_sandbox.sandboxes.lingering import Lingering
-from envhub_sandbox.sandboxes.refcount import Sharing
+from envhub_sandbox.sandboxes.refcount import Sharing, Use, Uses
 from envhub_sandbox.transport.forks import Owner
 from envhub_worker.protocol.runtime import OWN, Runtime
 
@@ -43,7 +41,8 @@ class ProcessServer:
     process: subprocess.Popen[bytes]
     folder: Path
     owner: Owner = field(default_factory=Owner)
-    users: int = 0
+    uses: Uses = field(default_factory=Uses)
+    stopped: bool = False
 
     @property
     def fd_path(self) -> str:
@@ -60,8 +59,11 @@ class ProcessServer:
         return self.process.poll() is None and not _is_zombie(self.process.pid)
 
     def stop(self) -> None:
-        """End it and everything below it, in bounded time. A fork of its owner does nothing."""
-        if not self.owner.is_here:
+        """End it and everything below it, in bounded time. A fork of its owner does nothing.
+
+        Idempotent; what interrupts it, it goes on after.
+        """
+        if self.stopped or not self.owner.is_here:
             return
         self.process.terminate()
         try:
@@ -69,9 +71,15 @@ class ProcessServer:
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
-        with contextlib.suppress(OSError):
-            os.close(self.process_fd)
         shutil.rmtree(self.folder, ignore_errors=True)
+        try:
+            self.stopped = True  # once: the number may be somebody else's a moment later
+            os.close(self.process_fd)
+        except OSError:
+            return
+
+    def __del__(self) -> None:
+        self.stop()  # a start that was interrupted before anybody noted it
 
 
 class ProcessSandbox:
@@ -82,34 +90,35 @@ class ProcessSandbox:
     def __init__(self) -> None:
         self._servers: Sharing[ProcessServer] = Sharing(Lingering())
 
-    def acquire(self, store: Path, runtime: Runtime = OWN) -> ProcessServer:
+    def acquire(
+        self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
+    ) -> Use[ProcessServer]:
         """The server for this process, started if there is none."""
         if not sys.platform.startswith("linux"):
             raise SandboxUnavailableError(
                 f"sandbox='process' needs Linux, and this is {sys.platform}: nothing here can "
                 "confine a process. Run the worker in a container or on a Linux host."
             )
-        return self._servers.acquire(store, partial(_start, store, runtime))
-
-    def release(self, server: WorkerServer, idle_s: float | None = 0.0) -> None:
-        """Give a server back; the last one who does gives it up."""
-        assert isinstance(server, ProcessServer)
-        self._servers.release(server, idle_s)
+        return self._servers.acquire(store, partial(_start, store, runtime), idle_s)
 
 
 def _start(store: Path, runtime: Runtime) -> ProcessServer:
     folder = runtime_folder.make(runtime_folder.SERVER)  # of mode 0700: the endpoint is ours alone
     endpoint = f"ipc://{folder}/server"
     ready, ready_end = os.pipe()
+    process = None
     try:
         process = _execute(folder, store, runtime, endpoint, ready_end)
+        server = ProcessServer(endpoint, os.pidfd_open(process.pid), process, folder)
     except BaseException:
+        if process is not None:
+            process.kill()
+            process.wait()
         os.close(ready)
         shutil.rmtree(folder, ignore_errors=True)
         raise
     finally:
         os.close(ready_end)
-    server = ProcessServer(endpoint, os.pidfd_open(process.pid), process, folder)
     try:
         for path in runtime_folder.remove_stale():  # while it starts, this costs nothing
             WORKER.info("removed %s, which a client that was killed had left", path)

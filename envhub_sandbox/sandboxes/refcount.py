@@ -20,24 +20,81 @@ class Shared(Protocol):
     """A worker server, or what stands for one that is elsewhere.
 
     Attributes:
-        users: How many use it; counted here, and 0 at first.
+        uses: Who uses it; noted here, and nobody at first.
         runs: Whether it is still there.
     """
 
-    users: int
+    uses: Uses
 
     @property
     def runs(self) -> bool: ...  # noqa: D102
 
     def stop(self) -> None:
-        """End it, in bounded time. A fork of its owner does nothing."""
+        """End it, in bounded time. A fork of its owner does nothing.
+
+        Idempotent, and to be called again where it was interrupted.
+        """
 
 
 S = TypeVar("S", bound=Shared)
 
 
+class Use(Generic[S]):
+    """One use of what is shared, which ends once: given back, or when nobody has it any more.
+
+    A Ctrl-C may come between any two calls, also of those that give something back. So it can be
+    given back again and again, until that was done; and what was taken, and noted by nobody, is
+    given back by its own end.
+
+    Attributes:
+        shared: What is used.
+        live: Whether it has not been given back.
+        done: Whether nothing is left to do after that.
+    """
+
+    done = True  # until there is something
+
+    def __init__(
+        self, sharing: Sharing[S], key: tuple[int, Hashable], shared: S, idle_s: float | None
+    ) -> None:
+        self._sharing = sharing
+        self.key = key
+        self.shared = shared
+        self.idle_s = idle_s
+        self.live = True
+        self.done = False
+        shared.uses.add(self)  # from here on nobody may end it
+
+    def release(self) -> None:
+        """Give it back; the last one who does gives up what is shared, unless it has been ended."""
+        if not self.done:
+            self._sharing.release(self)
+
+    def __del__(self) -> None:
+        self.release()
+
+
+class Uses:
+    """Who uses something. The truth is who lives, and no count that an interrupt could falsify."""
+
+    def __init__(self) -> None:
+        self._refs: list[weakref.ref[Use[Any]]] = []
+
+    def __len__(self) -> int:
+        return len(self.living())
+
+    def add(self, use: Use[Any]) -> None:
+        """There is one more; those that have ended are forgotten."""
+        self._refs = [*map(weakref.ref, self.living()), weakref.ref(use)]
+
+    def living(self) -> list[Use[Any]]:
+        """Those that have not been given back."""
+        found = (ref() for ref in self._refs)
+        return [use for use in found if use is not None and use.live]
+
+
 class Sharing(Generic[S]):
-    """Counts who uses what. Thread-safe; a fork starts its own.
+    """Knows who uses what. Thread-safe; a fork starts its own.
 
     Args:
         lingering: Where what nobody uses is kept, if its last user asks for it.
@@ -50,46 +107,46 @@ class Sharing(Generic[S]):
         self._shared: dict[tuple[int, Hashable], S] = {}
         _all.add(self)
 
-    def acquire(self, key: Hashable, start: Callable[[], S]) -> S:
-        """The one with this key, in use or lingering; started if there is none that runs."""
+    def acquire(self, key: Hashable, start: Callable[[], S], idle_s: float | None = 0.0) -> Use[S]:
+        """A use of the one with this key, be it in use or lingering; started if none runs.
+
+        Args:
+            key: Which.
+            start: Starts it.
+            idle_s: For how long it is kept for the next, if this use is the last; 0 ends it, None
+                keeps it until the end of this process.
+        """
         mine = os.getpid(), key
         with self._lock:
             shared = self._shared.get(mine)
             if shared is not None:
-                shared.users += 1  # at once: nobody may end it from here on
-                try:
-                    runs = shared.runs
-                except BaseException:  # Ctrl-C, while it is looked at
-                    self.release(shared)
-                    raise
-                if runs:
-                    return shared
-                self.release(shared)
+                use = Use(self, mine, shared, idle_s)
+                # the garbage collector may just have closed the one environment that used it
+                if self._shared.get(mine) is shared and shared.runs:
+                    return use
+                use.release()
             lingering = None if self._lingering is None else self._lingering.take(mine)
-            shared = self._shared[mine] = lingering or start()
-            shared.users += 1
-            return shared
+            shared = lingering or start()
+            use = Use(self, mine, shared, idle_s)
+            self._shared[mine] = shared
+            return use
 
-    def release(self, shared: S, idle_s: float | None = 0.0) -> None:
-        """Give it back; the last one who does gives it up, unless it has been ended.
-
-        Args:
-            shared: What ``acquire`` gave.
-            idle_s: For how long it is kept for the next; 0 ends it, None keeps it until the end
-                of this process.
-        """
+    def release(self, use: Use[S]) -> None:
+        """Give it back, or go on with that where it was interrupted."""
+        shared = use.shared
         with self._lock:
-            if not shared.users:
+            use.live = False
+            if use.done or shared.uses.living():
+                use.done = True  # whoever is left sees to it
                 return
-            shared.users -= 1
-            if shared.users > 0:
+            if self._shared.get(use.key) is shared:
+                del self._shared[use.key]
+            # what was done is done again without harm: it lingers once, and is ended once
+            if self._kept(use.key, shared, use.idle_s):
+                use.done = True
                 return
-            for key, known in list(self._shared.items()):
-                if known is shared:
-                    del self._shared[key]
-                    if self._kept(key, shared, idle_s):
-                        return
         shared.stop()
+        use.done = True
 
     def _kept(self, key: tuple[int, Hashable], shared: S, idle_s: float | None) -> bool:
         """Whether it lingers from here on; what is a parent's cannot."""
@@ -103,7 +160,8 @@ class Sharing(Generic[S]):
             mine = [key for key in self._shared if key[0] == os.getpid()]
             ended = [self._shared.pop(key) for key in mine]
             for shared in ended:
-                shared.users = 0
+                for use in shared.uses.living():
+                    use.live, use.done = False, True
         for shared in ended:
             shared.stop()
 

@@ -30,9 +30,9 @@ from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes import upload
-from envhub_sandbox.sandboxes.base import WorkerServer
+from envhub_sandbox.sandboxes.base import ServerUse
 from envhub_sandbox.sandboxes.far_packages import FarEnvironment, Order, order_of
-from envhub_sandbox.sandboxes.refcount import Sharing
+from envhub_sandbox.sandboxes.refcount import Sharing, Use, Uses
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.forks import Owner
@@ -126,14 +126,15 @@ class RemoteSandbox:
         if order is None:
             return None
         where = (self.endpoint, self.far())
-        host = HOSTS.acquire(where, partial(Host, *where))
+        use = HOSTS.acquire(where, partial(Host, *where))
+        host = use.shared
         try:
             client = WorkerClient(self.endpoint, host.stopped, far=host.far)
             with contextlib.closing(client), progress.shown("packages") as tell:
                 client.hello(Deadline(_HELLO_S))
                 made = order.bring(client, Deadline(_MAKE_S), tell)
         finally:
-            HOSTS.release(host)
+            use.release()
         if made is not None:
             self._orders[made.packages] = order
         return made
@@ -149,12 +150,9 @@ class RemoteSandbox:
         server_key = _server_key(self.endpoint, self.server_key)
         return Far(server_key, _client_key(self.client_key), self.heartbeat_s)
 
-    def acquire(self, store: Path, runtime: Runtime = OWN) -> WorkerServer:
+    def acquire(self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0) -> ServerUse:
         """Not without a repository: its files have to be brought there."""
         raise SandboxUnavailableError("a remote server is asked for a repository, not for a store")
-
-    def release(self, server: WorkerServer, idle_s: float | None = 0.0) -> None:
-        """Nothing was acquired here."""
 
 
 def check_policy(policy: Policy, runtime: Runtime) -> None:
@@ -333,17 +331,14 @@ class RemoteRepository:
         self._snapshot, self._policy = snapshot, policy
         self._files: tuple[upload.Sent, ...] = ()
 
-    def acquire(self, store: Path, runtime: Runtime = OWN) -> RemoteServer:
-        """The server; nothing is sent before a jail is opened."""
+    def acquire(
+        self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
+    ) -> RemoteServer:
+        """The server, which stays for however long; nothing is sent before a jail is opened."""
         where = (self._endpoint, self._far)
-        host = HOSTS.acquire(where, partial(Host, *where))
+        use = HOSTS.acquire(where, partial(Host, *where))
         packages = "" if self._needed is None else self._needed.name
-        return RemoteServer(host, self, self._policy.profile, packages)
-
-    def release(self, server: WorkerServer, idle_s: float | None = 0.0) -> None:
-        """Give it back; after the last one who does, nobody tells it that we live. It stays."""
-        assert isinstance(server, RemoteServer)
-        HOSTS.release(server.host)
+        return RemoteServer(use, self, self._policy.profile, packages)
 
     def bring(self, client: WorkerClient, deadline: Deadline) -> str:
         """Bring the files there; returns the server's name for them."""
@@ -354,20 +349,35 @@ class RemoteRepository:
 
 
 class RemoteServer:
-    """One use of a server on another host."""
+    """One use of a server on another host, and the server as that use sees it."""
 
     fd_path = None
     layers: Sequence[Mapping[str, Any]] = ()
     python = ""
 
     def __init__(
-        self, host: Host, repository: RemoteRepository, profile: str, packages: str
+        self, use: Use[Host], repository: RemoteRepository, profile: str, packages: str
     ) -> None:
-        self.host = host
+        self._use = use
+        self.host = use.shared
         self.profile = profile
         self.packages = packages
         self.snapshot = ""
         self._repository = repository
+
+    @property
+    def shared(self) -> RemoteServer:
+        """The server is itself."""
+        return self
+
+    @property
+    def live(self) -> bool:
+        """Whether it has not been given back."""
+        return self._use.live
+
+    def release(self) -> None:
+        """Give it back; after the last one who does, nobody tells it that we live. Idempotent."""
+        self._use.release()
 
     @property
     def endpoint(self) -> str:
@@ -396,10 +406,12 @@ class Host:
     def __init__(self, endpoint: str, far: Far) -> None:
         self.endpoint = endpoint
         self.far = far
-        self.users = 0
+        self.uses = Uses()
         self.owner = Owner()
         self.uploading = threading.Lock()
-        self.stopped, self._stops = os.pipe()
+        self._ended = False
+        self._wakes: int | None
+        self.stopped, self._wakes = os.pipe()
         self._stop = threading.Event()
         self._thread = threading.Thread(
             target=self._keep_alive, name=f"envhub keep-alive {endpoint}", daemon=True
@@ -443,14 +455,21 @@ class Host:
         return True
 
     def stop(self) -> None:
-        """No longer tell it. A fork of its owner does nothing."""
-        if self.owner.is_here:
-            self._close_jails()
-            self._stop.set()
-            os.close(self._stops)  # wakes the thread, should it wait for an answer
-            self._thread.join(_STOP_S)
-            if not self._thread.is_alive():
-                os.close(self.stopped)
+        """No longer tell it. A fork of its owner does nothing.
+
+        Idempotent; what interrupts it, it goes on after.
+        """
+        if self._ended or not self.owner.is_here:
+            return
+        self._close_jails()
+        self._stop.set()
+        wakes, self._wakes = self._wakes, None
+        if wakes is not None:
+            os.close(wakes)  # wakes the thread, should it wait for an answer
+        self._thread.join(_STOP_S)
+        if not self._thread.is_alive():
+            self._ended = True  # once: the number may be somebody else's a moment later
+            os.close(self.stopped)
 
 
 HOSTS: Sharing[Host] = Sharing()

@@ -173,8 +173,12 @@ class EnvSession:
     # --- the end -------------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Close the environment and end its processes, in bounded time, from any thread."""
+        """Close the environment and end its processes, in bounded time, from any thread.
+
+        Idempotent; where a Ctrl-C came into it, the next one goes on with what is left.
+        """
         if self.closed:
+            self._finish()
             return
         if self.lifecycle.state is State.FOREIGN:
             self.lifecycle.on(Event.CLOSE)
@@ -191,6 +195,13 @@ class EnvSession:
         finally:
             try:
                 self.lease.let_go(wait=False)
+            finally:
+                self.turns.lock.release()
+
+    def _finish(self) -> None:
+        if self.turns.lock.acquire(blocking=False):  # else somebody is still at it
+            try:
+                self.lease.let_go()
             finally:
                 self.turns.lock.release()
 

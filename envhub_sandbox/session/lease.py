@@ -79,8 +79,8 @@ class Lease:
         self._was_loaded = False
         self._startup: StartupDeadline | None = None
         self._release_server: Callable[[], None] = _nothing
-        self._departs = weakref.finalize(self, jails.launcher.stay())
-        self._departs.atexit = False
+        self._departs = jails.launcher.stay()
+        weakref.finalize(self, self._departs).atexit = False
 
     @property
     def shared(self) -> bool:
@@ -200,7 +200,8 @@ class Lease:
         """Build the environment in a jail; a Ctrl-C leaves none behind.
 
         Python looks for signals where something is called. So nothing is, neither between the
-        taking and the ``try``, nor between the building and the noting.
+        taking and the ``try``, nor between the building and the noting. Python 3.10 looks anywhere:
+        there a jail that nobody has noted is given back by its own end.
         """
         loaded = take()
         try:
@@ -236,10 +237,14 @@ class Lease:
     def give_back(self, *, wait: bool = True) -> None:
         """Give the jail back, if there is one; see ``Launcher.close``."""
         with self._ending:
-            loaded, self.loaded = self.loaded, None
+            loaded = self.loaded
             try:
                 if loaded is not None:
                     self._jails.give_back(loaded, wait=wait)
+                self.loaded = None  # only now: whoever interrupts this can have it done again
+            except Exception:
+                self.loaded = None
+                raise
             finally:
                 self._close_lane()
 
@@ -292,14 +297,15 @@ class Lease:
         self._close_lane()
 
     def _close_lane(self) -> None:
-        lane, self.lane = self.lane, None
+        lane = self.lane
         if lane is not None:
             self._counters.connected(None)
             lane.close()
+            self.lane = None  # only now, as above
 
     def _let_server_go(self) -> None:
-        release, self._release_server = self._release_server, _nothing
-        release()
+        self._release_server()
+        self._release_server = _nothing
 
 
 def _nothing() -> None:

@@ -67,6 +67,7 @@ class WorkerClient:
     Attributes:
         version: The protocol's version that was agreed on; 0 before ``hello``.
         patience_s: How long the server keeps the jails of a client that says nothing; 0: for ever.
+        torn: Whether an interrupt may have left half a message, which the next would be taken into.
     """
 
     def __init__(
@@ -93,6 +94,8 @@ class WorkerClient:
         if self._link is not None:
             self._poller.register(self._link.monitor, zmq.POLLIN)
         self._sent: dict[int, tuple[int, list[Buffer]]] = {}
+        self._latest: Buffer = b""
+        self.torn = False
         self._compression = ""
         self.version = 0
         self.patience_s = 0
@@ -171,6 +174,7 @@ class WorkerClient:
         while True:
             self._wait(request_id, deadline)
             frames = self._take()
+            self._latest = frames[0]
             self.received_bytes += sum(map(len, frames))
             if self._link is not None:
                 with UNTRUSTED:
@@ -189,14 +193,27 @@ class WorkerClient:
                 self.hello(deadline)
                 self._send(request_id, unanswered)
 
+    def reply_again(self, request_id: int, deadline: Deadline) -> m.Message:
+        """The reply to a request, whose wait was interrupted before or after it came.
+
+        Without its payload; raises as ``receive`` does.
+        """
+        if self._latest:
+            reply_id, reply, _ = m.unpack_header(self._latest, limits=self._limits)
+            if reply_id == request_id:
+                return reply
+        return self.receive(request_id, deadline)[0]
+
     def _put(self, frames: Sequence[Buffer], *, copy: bool) -> None:
         deadline: Deadline | None = None
         while True:
             try:
                 # one by one: pyzmq's own loop costs more than the calls in it
+                self.torn = True
                 for frame in frames[:-1]:
                     self._socket.send(frame, _MORE_NOW, copy)
                 self._socket.send(frames[-1], _NOW, copy)
+                self.torn = False
             except zmq.Again:  # nothing of the message is left in the socket
                 deadline = deadline or Deadline(_ROOM_S)
                 self._wait_for_room(deadline)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -29,6 +30,8 @@ from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _CAUSE_S = 10.0
 _CAUSE_POLL_S = 0.01
+_UNSEEN_S = 5.0
+"""For how long a Ctrl-C waits for the jail that it came before."""
 _FIRST_WITH_FRAMED_PICKLES = 6
 """The version of the protocol."""
 
@@ -240,8 +243,12 @@ class JailHandle:
         except WorkerError:
             pass
         finally:
-            self.client.let_go(self.number)
-            self.client.close()
+            self.drop()
+
+    def drop(self) -> None:
+        """Close the connection; the jail has ended, or is about to. Idempotent."""
+        self.client.let_go(self.number)
+        self.client.close()
 
 
 def _cut(payload: list[Buffer], counts: Sequence[int]) -> list[list[Buffer]]:
@@ -277,12 +284,28 @@ def open_jail(
         SandboxUnavailableError: A layer of the confinement is missing.
         WorkerDiedError: It did not come up.
     """
-    reply, _ = client.request(request, deadline=deadline)
-    opened = expect(reply, m.JailOpened)
-    runners = _runners(opened, request.runners)
-    report = [dict(layer) for layer in opened.report if isinstance(layer, dict)]
-    client.hold(opened.jail)
-    return JailHandle(client, opened.jail, runners, report, limits)
+    sent = client.send(request)
+    try:
+        reply, _ = client.receive(sent, deadline)
+        opened = expect(reply, m.JailOpened)
+        runners = _runners(opened, request.runners)
+        report = [dict(layer) for layer in opened.report if isinstance(layer, dict)]
+        client.hold(opened.jail)
+        return JailHandle(client, opened.jail, runners, report, limits)
+    except EnvHubError:
+        raise
+    except BaseException:  # Ctrl-C: it is open, or will be, and nobody else knows its number
+        _end_unseen(client, sent)
+        raise
+
+
+def _end_unseen(client: WorkerClient, sent: int) -> None:
+    """End the jail that a request opens, whether or not the reply has been read."""
+    deadline = Deadline(_UNSEEN_S)
+    with contextlib.suppress(EnvHubError):
+        opened = expect(client.reply_again(sent, deadline), m.JailOpened)
+        client.request(m.CloseJail(opened.jail), deadline=deadline)
+        client.let_go(opened.jail)
 
 
 def _runners(opened: m.JailOpened, count: int) -> list[int]:

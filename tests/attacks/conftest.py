@@ -37,9 +37,9 @@ def _warm_server(_own_cache: None, _open_ground: Path) -> Iterator[None]:
     """One worker server for all tests in a row: its zygotes stay warm between them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ENVHUB_CACHE", str(_open_ground / "cache"))
-        server = PROCESS.acquire(store.cache_root() / "snapshots")
+        use = PROCESS.acquire(store.cache_root() / "snapshots")
         yield
-        PROCESS.release(server)
+        use.release()
 
 
 @pytest.fixture

@@ -131,12 +131,21 @@ class LyingSandbox:
     def __init__(self, server: LyingServer) -> None:
         self._server = server
 
-    def acquire(self, store: Path, runtime: Runtime = OWN) -> LyingServer:
+    def acquire(self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0) -> LyingUse:
         """The liar."""
-        return self._server
+        return LyingUse(self._server)
 
-    def release(self, server: object, idle_s: float | None = 0.0) -> None:
-        """The test ends it."""
+
+@dataclass
+class LyingUse:
+    """One use of the liar, which the test ends."""
+
+    shared: LyingServer
+    live: bool = True
+
+    def release(self) -> None:
+        """Note it."""
+        self.live = False
 
 
 @contextmanager

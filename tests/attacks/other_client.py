@@ -27,7 +27,8 @@ def become(user: int) -> None:
 def main(profile: str, secret: str) -> int:
     """Hold a jail open until there is nothing more to read."""
     cache = store.cache_root()
-    server = PROCESS.acquire(cache / "snapshots")
+    use = PROCESS.acquire(cache / "snapshots")
+    server = use.shared
     with Arena(profile, "").environment() as env:
         run = Run(new_alias(), True)
         call(env, run, "create_file", {"path": f"/dev/shm/envhub-{os.getpid()}", "text": secret})
@@ -38,7 +39,7 @@ def main(profile: str, secret: str) -> int:
         for _ in sys.stdin:
             call(env, run, "be_victim", {"secret": None})
             print(json.dumps(run.value), flush=True)
-    PROCESS.release(server)
+    use.release()
     return 0
 
 

@@ -97,9 +97,9 @@ def inherited(home: Path, other_cache: Path) -> Iterator[str]:
     (home / "private").write_text(secret)
     fd = os.open(home / "private", os.O_RDONLY)
     os.set_inheritable(fd, True)
-    server = PROCESS.acquire(other_cache / "snapshots")
+    use = PROCESS.acquire(other_cache / "snapshots")
     yield secret
-    PROCESS.release(server)
+    use.release()
     os.close(fd)
 
 

@@ -170,7 +170,8 @@ def granted(env: Any, payload: str, options: dict[str, Any]) -> None:
 
 def test_servers_sockets_are_not_part_of_the_hosts_network(arena: Arena) -> None:
     """The folder with a server's socket and the one that takes descriptors is out of reach."""
-    server = PROCESS.acquire(store.cache_root() / "snapshots")
+    use = PROCESS.acquire(store.cache_root() / "snapshots")
+    server = use.shared
     place = server.folder / f"{token()[:8]}.sock"
     server.folder.chmod(0o711)  # file modes shall not be what stops it
     try:
@@ -183,7 +184,7 @@ def test_servers_sockets_are_not_part_of_the_hosts_network(arena: Arena) -> None
             sends(arena, env, title, "unix_stream", listener, path=str(place))
     finally:
         server.folder.chmod(0o700)
-        PROCESS.release(server)
+        use.release()
 
 
 def test_addresses_are_not_listed_over_netlink_with_the_hosts_network(arena: Arena) -> None:

@@ -31,9 +31,9 @@ def hub_token(monkeypatch: pytest.MonkeyPatch) -> str:
 @pytest.fixture
 def fresh_server(hub_token: str, home: Path, other_cache: Path) -> Iterator[None]:
     """A worker server that is started while the token is in the client's environment."""
-    server = PROCESS.acquire(other_cache / "snapshots")
+    use = PROCESS.acquire(other_cache / "snapshots")
     yield
-    PROCESS.release(server)
+    use.release()
 
 
 @pytest.mark.usefixtures("fresh_server")

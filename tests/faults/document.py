@@ -119,6 +119,8 @@ stay. The folder says whose it was: the next server that this user starts remove
 
 - **Ctrl-C in a step** comes at once. The reply is then late: the next step (a notebook's next cell)
   says what was interrupted, `reset()` recovers.
+- **Ctrl-C in a close** may leave something to do. The next `close()` goes on with it, or the end
+  of the object: no process, no descriptor and no use of the server remains.
 - **A fork of the client** refuses its parent's environments with a `WorkerError` and may make its
   own. Whatever it does, the parent's go on; its end ends nothing of theirs.
 - **`close()` from another thread, or from a signal handler**, ends a running step or a start with

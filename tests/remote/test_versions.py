@@ -39,7 +39,8 @@ def test_the_pinned_bytes_are_those_of_version_1() -> None:
 
 def test_a_client_of_version_1_is_welcome(tmp_path: Path) -> None:
     """The worker of today answers it in its own version."""
-    server = PROCESS.acquire(tmp_path)
+    use = PROCESS.acquire(tmp_path)
+    server = use.shared
     try:
         with zmq.Context() as context, context.socket(zmq.DEALER) as old:
             old.setsockopt(zmq.LINGER, 0)
@@ -48,7 +49,7 @@ def test_a_client_of_version_1_is_welcome(tmp_path: Path) -> None:
             assert old.poll(30_000)
             request_id, welcome = m.unpack(old.recv_multipart())
     finally:
-        PROCESS.release(server)
+        use.release()
     assert request_id == 7
     assert isinstance(welcome, m.Welcome)
     assert welcome.version == 1
@@ -62,13 +63,14 @@ def test_a_client_that_shares_no_version_hears_whom_to_upgrade(
     tmp_path: Path, oldest: int, newest: int, upgrade: str
 ) -> None:
     """Too new, or too old."""
-    server = PROCESS.acquire(tmp_path)
+    use = PROCESS.acquire(tmp_path)
+    server = use.shared
     client = WorkerClient(server.endpoint, server.process_fd)
     try:
         reply, _ = client.request(m.Hello(oldest, newest, b"x"), deadline=Deadline(30))
     finally:
         client.close()
-        PROCESS.release(server)
+        use.release()
     assert isinstance(reply, m.Refused)
     assert reply.error == "VersionMismatchError"
     assert upgrade in reply.message

@@ -155,6 +155,13 @@ def pids(env: Any) -> list[int]:
     return next(list(one["pids"]) for one in jails if one["jail"] == jail(env).number)
 
 
+def jails(env: Any) -> int:
+    """How many jails there are in its server, of whomever."""
+    status, _ = client(env).request(m.GetStatus(), deadline=Deadline(60))
+    assert isinstance(status, m.Status)
+    return len(status.jails)
+
+
 def request_words(lane: LaneShard) -> Any:
     """What a shard's runner reads before it does anything."""
     return lane._asks

@@ -9,7 +9,6 @@ down as it does on a host. What holds is read from inside before anything runs; 
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import secrets
@@ -28,7 +27,7 @@ from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerSt
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes import runtime_folder
-from envhub_sandbox.sandboxes.base import WorkerServer
+from envhub_sandbox.sandboxes.base import ServerUse
 from envhub_sandbox.sandboxes.docker import attestation, packages, run_arguments, seccomp_profile
 from envhub_sandbox.sandboxes.docker.engines import (
     Engine,
@@ -41,7 +40,7 @@ from envhub_sandbox.sandboxes.docker.engines import (
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.lingering import Lingering
 from envhub_sandbox.sandboxes.owner import identity_of
-from envhub_sandbox.sandboxes.refcount import Sharing
+from envhub_sandbox.sandboxes.refcount import Sharing, Use, Uses
 from envhub_sandbox.transport.forks import Owner
 from envhub_worker.protocol.runtime import OWN, Runtime
 
@@ -128,12 +127,9 @@ class DockerSandbox:
         engine = find_engine(self.engine)
         return packages.provided(snapshot, choice, engine, find_image(engine, self.image))
 
-    def acquire(self, store: Path, runtime: Runtime = OWN) -> WorkerServer:
+    def acquire(self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0) -> ServerUse:
         """Not without a repository: a container sees the files of one only."""
         raise SandboxUnavailableError("a container is started for a repository, not for a store")
-
-    def release(self, server: WorkerServer, idle_s: float | None = 0.0) -> None:
-        """Nothing was acquired here."""
 
 
 def _check_users(engine: Engine) -> None:
@@ -163,7 +159,8 @@ class ContainerServer:
     profile: str
     python: str
     owner: Owner = field(default_factory=Owner)
-    users: int = 0
+    uses: Uses = field(default_factory=Uses)
+    stopped: bool = False
     snapshot: str = run_arguments.SNAPSHOT
     packages: str = ""
 
@@ -183,13 +180,22 @@ class ContainerServer:
         return self.process.poll() is None
 
     def stop(self) -> None:
-        """End the container, in bounded time. A fork of its owner does nothing."""
-        if not self.owner.is_here:
+        """End the container, in bounded time. A fork of its owner does nothing.
+
+        Idempotent; what interrupts it, it goes on after.
+        """
+        if self.stopped or not self.owner.is_here:
             return
         _end(self.process)
-        with contextlib.suppress(OSError):
-            os.close(self.process_fd)
         shutil.rmtree(self.folder, ignore_errors=True)  # where the monitor was killed itself
+        try:
+            self.stopped = True  # once: the number may be somebody else's a moment later
+            os.close(self.process_fd)
+        except OSError:
+            return
+
+    def __del__(self) -> None:
+        self.stop()  # a start that was interrupted before anybody noted it
 
 
 _IDLE: Lingering[ContainerServer] = Lingering()
@@ -217,14 +223,11 @@ class RepositoryContainer:
         self._servers: Sharing[ContainerServer] = Sharing(_IDLE)
         self._key = repr((options, engine, image, str(snapshot), policy, packages))
 
-    def acquire(self, store: Path, runtime: Runtime = OWN) -> ContainerServer:
+    def acquire(
+        self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
+    ) -> Use[ContainerServer]:
         """The repository's container, started if there is none."""
-        return self._servers.acquire(self._key, self._start)
-
-    def release(self, server: WorkerServer, idle_s: float | None = 0.0) -> None:
-        """Give it back; the last one who does gives the container up."""
-        assert isinstance(server, ContainerServer)
-        self._servers.release(server, idle_s)
+        return self._servers.acquire(self._key, self._start, idle_s)
 
     def _start(self) -> ContainerServer:
         folder = runtime_folder.make(runtime_folder.CONTAINER)

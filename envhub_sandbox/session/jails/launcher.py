@@ -22,6 +22,7 @@ from envhub_sandbox.sandboxes.base import (
     FarServer,
     PerRepository,
     Sandbox,
+    ServerUse,
     WorkerServer,
 )
 from envhub_sandbox.session.jails import denied
@@ -73,22 +74,20 @@ class Launcher:
             self._sandbox, self.runs_on = own, Runtime(own.interpreter)
         self.retry_s = self._sandbox.retry_s if isinstance(self._sandbox, Crowded) else 0.0
         self._store = store
-        self._hold = ServerHold(self._acquire, self._release)
+        self._hold = ServerHold(self._acquire)
         self._jail_numbers = count(1)
 
     def hold(self) -> Callable[[], None]:
         """Keep the server between two jails; returns what gives it back."""
-        return partial(self._release, self._acquire())
+        return self._acquire().release
 
     def stay(self) -> Callable[[], None]:
         """An environment may need the server again; returns what says that it is closed."""
         return self._hold.enter()
 
-    def _acquire(self) -> WorkerServer:
-        return self._sandbox.acquire(self._store, self.repository.runtime)
-
-    def _release(self, server: WorkerServer) -> None:
-        self._sandbox.release(server, self.repository.timeouts.server_idle_s)
+    def _acquire(self) -> ServerUse:
+        idle_s = self.repository.timeouts.server_idle_s
+        return self._sandbox.acquire(self._store, self.repository.runtime, idle_s)
 
     def open(self, deadline: Deadline, known: Known | None = None) -> LoadedJail:
         """Fork a jail and have its first runner call ``make_env``.
@@ -102,17 +101,19 @@ class Launcher:
             LoadError: The repository failed to load, or returned something unusable.
             WorkerError: The jail did not come up, died, or took too long.
         """
-        server = self._acquire()
+        use = self._acquire()
         try:
+            server = use.shared
             if self.repository.timeouts.server_idle_s != 0 and not isinstance(server, FarServer):
                 self._hold.keep(server)
             with self.repository.starting(deadline):
-                return self._open(server, deadline, known)
+                return self._open(use, deadline, known)
         except BaseException:
-            self._release(server)
+            use.release()
             raise
 
-    def _open(self, server: WorkerServer, deadline: Deadline, known: Known | None) -> LoadedJail:
+    def _open(self, use: ServerUse, deadline: Deadline, known: Known | None) -> LoadedJail:
+        server = use.shared
         wanted = self._wanted_output()
         client = self._client(server)
         try:
@@ -141,8 +142,8 @@ class Launcher:
             around = server.layers if isinstance(server, EnclosedServer) else ()
             jail.report = self.repository.latest_report = [*map(dict, around), *jail.report]
             if known is None:
-                return self._load(jail, server, deadline)
-            loaded = LoadedJail(jail, known.manifest, {}, set(), server)
+                return self._load(jail, use, deadline)
+            loaded = LoadedJail(jail, known.manifest, {}, set(), use, self.close)
             self.load(loaded, jail.runners, deadline, known.task)
             return loaded
         except BaseException as error:
@@ -170,7 +171,7 @@ class Launcher:
             return m.OpenJail(*order)
         return m.OpenJailWith(*order, runtime.packages)
 
-    def _load(self, jail: JailHandle, server: WorkerServer, deadline: Deadline) -> LoadedJail:
+    def _load(self, jail: JailHandle, use: ServerUse, deadline: Deadline) -> LoadedJail:
         runner = jail.runners[0]
         [reply] = jail.exchange(
             "make_env", [(runner, self.repository.arguments.message())], deadline
@@ -182,7 +183,7 @@ class Launcher:
         manifest = decode_manifest(
             reply.manifest, max_elements=elements, check=in_time, generator=generator
         )
-        return LoadedJail(jail, manifest, reply.manifest, {runner}, server)
+        return LoadedJail(jail, manifest, reply.manifest, {runner}, use, self.close)
 
     def _wanted_output(self) -> Wanted:
         """Where the next jail's output goes: each has a file of its own."""
@@ -234,42 +235,59 @@ class Launcher:
 
     def connect(self, loaded: LoadedJail, deadline: Deadline) -> LoadedJail:
         """A further connection to an open jail; environments that share one wait apart."""
-        server = self._acquire()
-        client = self._client(server)
+        use = self._acquire()
+        client = self._client(use.shared)
         try:
             client.hello(deadline)
         except BaseException:
             client.close()
-            self._release(server)
+            use.release()
             raise
         jail = loaded.jail.through(client)
-        return LoadedJail(jail, loaded.manifest, loaded.value, loaded.loaded, server)
+        shown = loaded.manifest, loaded.value, loaded.loaded
+        return LoadedJail(jail, *shown, use, self.disconnect)
 
     def disconnect(self, loaded: LoadedJail) -> None:
-        """Drop a further connection."""
+        """Drop a further connection. Idempotent."""
         loaded.jail.client.close()
-        self._release(loaded.server)
+        loaded.use.release()
+        loaded.closed = True
 
     def close(self, loaded: LoadedJail, *, wait: bool = True) -> None:
-        """End a jail and give its server back. Idempotent.
+        """End a jail and give its server back. Idempotent; what interrupts it, it goes on after.
 
         Args:
             loaded: The jail.
             wait: Until nothing of it is left; else whoever closes another environment of the
                 repository does, if there is one: no later than the last.
         """
-        if loaded.closed:
+        if loaded.closed or loaded.parting:  # a signal handler may come into it, or a thread
             return
-        loaded.closed = True
-        WORKER.debug("%s: jail %x closes", self.repository.label, loaded.jail.number)
         try:
+            loaded.parting = True
+            if not loaded.ended:
+                self._end(loaded, wait=wait)
+            loaded.use.release()
+            loaded.closed = True
+        except Exception:
+            loaded.use.release()
+            raise
+        finally:
+            loaded.parting = False
+
+    def _end(self, loaded: LoadedJail, *, wait: bool) -> None:
+        if not loaded.ending and not loaded.jail.client.torn:
+            loaded.ending = True
+            WORKER.debug("%s: jail %x closes", self.repository.label, loaded.jail.number)
             parting = loaded.jail.ask_to_close()
             if wait or not self._hold.goes_on(loaded.server):
                 parting(Deadline(_CLOSE_S))
             else:
                 self._hold.partings.add(lambda: parting(Deadline(_CLOSE_S)))
-        finally:
-            self._release(loaded.server)
+        else:  # nobody knows what was said before an interrupt: it is said over another connection
+            self.interrupt(loaded)
+            loaded.jail.drop()
+        loaded.ended = True
 
     def settle(self) -> bool:
         """Wait for the jails that are on their way out; whether there was one."""

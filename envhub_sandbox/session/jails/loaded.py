@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
-from envhub_sandbox.sandboxes.base import WorkerServer
+from envhub_sandbox.sandboxes.base import ServerUse, WorkerServer
+from envhub_sandbox.transport.forks import Owner
 from envhub_sandbox.transport.jail import JailHandle
 from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest
 
@@ -24,14 +26,23 @@ class Known:
     shards: int = 1
 
 
-@dataclass
+@dataclass(eq=False)
 class LoadedJail:
     """An open jail whose first runner has called ``make_env``.
+
+    It has to be given back. Where a Ctrl-C comes between its taking and its noting, so that nobody
+    has it who could, its own end does.
 
     Attributes:
         jail: The jail.
         manifest: What ``make_env`` returned, checked.
         loaded: Runners that have called it.
+        use: That of the server that it is in.
+        give_back: Gives it back: see ``Launcher.close`` and ``disconnect``.
+        ending: Whether its end was begun.
+        parting: Whether somebody is at it.
+        ended: Whether it was asked for, so that only the server's use is left.
+        closed: Whether all was given back.
         changed: Whether it returned something else in one of them than the manifest says.
     """
 
@@ -39,6 +50,22 @@ class LoadedJail:
     manifest: Manifest
     value: dict[str, object]
     loaded: set[int]
-    server: WorkerServer
+    use: ServerUse
+    give_back: Callable[[LoadedJail], None]
+    ending: bool = False
+    parting: bool = False
+    ended: bool = False
     closed: bool = False
     changed: bool = False
+    owner: Owner = field(default_factory=Owner)
+
+    @property
+    def server(self) -> WorkerServer:
+        """Where it is."""
+        return self.use.shared
+
+    def __del__(self) -> None:
+        # at the end of the process, which closes nothing one by one, no server is in use any more
+        if not self.closed and self.use.live and self.owner.is_here:
+            self.ending = True  # its connection may have gone before it
+            self.give_back(self)

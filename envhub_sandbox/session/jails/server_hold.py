@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from envhub_sandbox.sandboxes.base import WorkerServer
+from envhub_sandbox.sandboxes.base import ServerUse, WorkerServer
 from envhub_sandbox.session.jails.partings import Partings
 from envhub_sandbox.transport.forks import Owner
 
@@ -17,23 +17,21 @@ class ServerHold:
     than a server lingers.
 
     Args:
-        acquire: Asks for the server.
-        release: Gives it back.
+        acquire: Asks for a use of the server.
 
     Attributes:
         partings: The ends of jails in it that have not been waited for.
     """
 
-    def __init__(
-        self, acquire: Callable[[], WorkerServer], release: Callable[[WorkerServer], None]
-    ) -> None:
-        self._acquire, self._release = acquire, release
+    def __init__(self, acquire: Callable[[], ServerUse]) -> None:
+        self._acquire = acquire
         self.partings = Partings()
         # reentrant: the garbage collector may close an environment in the midst of this
         self._lock = threading.RLock()
         self._owner = Owner()
         self._open: set[object] = set()
-        self._server: WorkerServer | None = None
+        self._use: ServerUse | None = None
+        self._left: list[ServerUse] = []
 
     def enter(self) -> Callable[[], None]:
         """There is one environment more; returns what says that it is closed. Idempotent."""
@@ -44,29 +42,42 @@ class ServerHold:
 
     def keep(self, used: WorkerServer) -> None:
         """A jail is opened in a server: keep that, if there are environments to come."""
-        before = None
         with self._lock:
-            if not self._open or self._server is used:
+            if not self._open or self._is_kept(used):
                 return
-            server = self._acquire()
-            before, self._server = self._server, server
-        if before is not None:
-            self._release(before)  # it has died
+            use = self._acquire()
+            if self._use is not None:  # it has died
+                self._left.append(self._use)
+            self._use = use
+        self._let_go()
 
     def goes_on(self, server: WorkerServer) -> bool:
         """Whether this one is kept for more than the one who asks."""
         with self._lock:
-            return self._server is server and len(self._open) > 1
+            return self._is_kept(server) and len(self._open) > 1
+
+    def _is_kept(self, server: WorkerServer) -> bool:
+        use = self._use
+        return use is not None and use.live and use.shared is server
 
     def _leave(self, ticket: object) -> None:
+        """What interrupts it, whoever leaves next goes on after, and may be the same."""
         if not self._owner.is_here:
             return  # a fork: the server is the parent's, and somebody may have held the lock
         with self._lock:
             self._open.discard(ticket)
-            if self._open or self._server is None:
-                return
-            server, self._server = self._server, None
+            if not self._open and self._use is not None:
+                self._left.append(self._use)
+                self._use = None
         try:
-            self.partings.settle()
+            if self._left:
+                self.partings.settle()
         finally:
-            self._release(server)
+            self._let_go()
+
+    def _let_go(self) -> None:
+        for use in list(self._left):
+            use.release()
+            with self._lock:
+                if use in self._left:
+                    self._left.remove(use)

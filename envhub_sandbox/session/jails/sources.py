@@ -73,7 +73,7 @@ class SharedJail:
         self._lock = threading.RLock()  # the garbage collector may close one of them meanwhile
         self._owner = Owner()
         self._first: LoadedJail | None = None
-        self._users = 0
+        self._users: weakref.WeakSet[LoadedJail] = weakref.WeakSet()
 
     def provide(self, loaded: LoadedJail) -> None:
         """Start with a jail that is loaded already."""
@@ -87,7 +87,7 @@ class SharedJail:
             if self._first is None:
                 self._first = self.launcher.open(deadline)
             connected = self.launcher.connect(self._first, deadline)
-            self._users += 1  # only now: what raises is used by nobody
+            self._users.add(connected)
             return connected
 
     def end(self, loaded: LoadedJail) -> None:
@@ -102,8 +102,8 @@ class SharedJail:
         self.launcher.disconnect(loaded)
         loaded.jail.watched.forget()  # a reply may be lost that says what the others would be told
         with self._lock:
-            self._users -= 1
-            if self._users == 0:
+            self._users.discard(loaded)
+            if not self._users:
                 self._close_first()
 
     def close(self) -> None:
@@ -111,10 +111,11 @@ class SharedJail:
         if not self._owner.is_here:
             return
         with self._lock:
-            if self._users == 0:
+            if not self._users:
                 self._close_first()
 
     def _close_first(self) -> None:
-        first, self._first = self._first, None
+        first = self._first
         if first is not None:
-            self.launcher.close(first)
+            self.launcher.close(first)  # what interrupts it leaves it for the next to close
+            self._first = None

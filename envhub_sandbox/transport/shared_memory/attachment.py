@@ -78,8 +78,9 @@ class Attachment:
     def close(self) -> None:
         """Let go of them."""
         self.watch.close()
-        while self._pidfds:
-            os.close(self._pidfds.popitem()[1])
+        for index, pidfd in list(self._pidfds.items()):
+            del self._pidfds[index]  # and nothing is called in between, where a Ctrl-C could come
+            os.close(pidfd)
 
 
 def sleep_for(watch: Watch, shard: LaneShard, deadline: Deadline) -> bool:

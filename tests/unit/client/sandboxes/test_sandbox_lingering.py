@@ -16,7 +16,7 @@ from envhub_sandbox.sandboxes.base import WorkerServer
 from envhub_sandbox.sandboxes.docker import sandbox as docker
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.lingering import Lingering
-from envhub_sandbox.sandboxes.refcount import Sharing
+from envhub_sandbox.sandboxes.refcount import Sharing, Use, Uses
 from envhub_sandbox.session.jails.server_hold import ServerHold
 from tests.support import inside
 from tests.support.processes import eventually
@@ -26,8 +26,8 @@ from tests.support.processes import eventually
 class Server:
     """Remembers what was done with it; its end can be made to last."""
 
-    users: int = 0
     runs: bool = True
+    uses: Uses = field(default_factory=Uses)
     ends: list[str] = field(default_factory=list)
     ending: threading.Event = field(default_factory=threading.Event)
     may_end: threading.Event = field(default_factory=threading.Event)
@@ -45,9 +45,9 @@ class Server:
 
 def given_up(sharing: Sharing[Server], key: str, idle_s: float | None) -> Server:
     """One that was used once."""
-    server = sharing.acquire(key, Server)
-    sharing.release(server, idle_s)
-    return server
+    use = sharing.acquire(key, Server, idle_s)
+    use.release()
+    return use.shared
 
 
 @pytest.fixture
@@ -104,33 +104,34 @@ def test_one_that_has_died_is_not_handed_on(sharing: Sharing[Server]) -> None:
 
 def test_one_that_has_died_in_use_does_not_linger(sharing: Sharing[Server]) -> None:
     """It is ended by the one who gives it back."""
-    server = sharing.acquire("key", Server)
-    server.runs = False
-    sharing.release(server, None)
-    assert server.ends
+    use = sharing.acquire("key", Server, None)
+    use.shared.runs = False
+    use.release()
+    assert use.shared.ends
 
 
 def test_who_asks_while_it_ends_gets_a_fresh_one_at_once(sharing: Sharing[Server]) -> None:
     """From the moment on that its time has come it is nobody's, and nobody waits for its end."""
-    old = sharing.acquire("key", Server)
+    use = sharing.acquire("key", Server, 0.01)
+    old = use.shared
     old.may_end.clear()
-    sharing.release(old, 0.01)
+    use.release()
     assert old.ending.wait(60)
     fresh = sharing.acquire("key", Server)
-    assert fresh is not old
+    assert fresh.shared is not old
     old.may_end.set()
     assert eventually(lambda: bool(old.ends))
-    assert not fresh.ends
+    assert not fresh.shared.ends
 
 
 def test_taken_or_ended_but_never_both(sharing: Sharing[Server]) -> None:
     """Whoever comes in the moment in which the time comes: nobody has one that was ended."""
     for attempt in range(300):
         given_up(sharing, "key", (attempt % 10) * 1e-4)
-        taken = sharing.acquire("key", Server)
-        assert taken.runs
-        assert not taken.ends
-        sharing.release(taken, 1e-4)
+        taken = sharing.acquire("key", Server, 1e-4)
+        assert taken.shared.runs
+        assert not taken.shared.ends
+        taken.release()
     assert eventually(lambda: not _waiting())
 
 
@@ -139,10 +140,10 @@ def test_one_that_has_died_is_ended_by_whoever_asks_next(sharing: Sharing[Server
     dead = given_up(sharing, "key", 600)
     dead.runs = False
     fresh = sharing.acquire("key", Server)
-    assert fresh is not dead
+    assert fresh.shared is not dead
     assert eventually(lambda: bool(dead.ends))
-    assert not fresh.ends
-    sharing.release(fresh)
+    assert not fresh.shared.ends
+    fresh.release()
 
 
 def test_many_at_once_share_what_lingers(sharing: Sharing[Server]) -> None:
@@ -151,10 +152,10 @@ def test_many_at_once_share_what_lingers(sharing: Sharing[Server]) -> None:
 
     def use() -> None:
         for attempt in range(100):
-            server = sharing.acquire("key", Server)
-            if server.ends:
-                wrong.append(server)
-            sharing.release(server, (attempt % 3) * 1e-4)
+            taken = sharing.acquire("key", Server, (attempt % 3) * 1e-4)
+            if taken.shared.ends:
+                wrong.append(taken.shared)
+            taken.release()
 
     threads = [threading.Thread(target=use) for _ in range(4)]
     for thread in threads:
@@ -168,20 +169,21 @@ def test_at_the_end_of_the_process_all_end_and_none_is_kept(
     lingering: Lingering[Server], sharing: Sharing[Server]
 ) -> None:
     """Those that linger, and what is given up afterwards."""
-    idle, used = given_up(sharing, "idle", 600), sharing.acquire("used", Server)
+    idle, used = given_up(sharing, "idle", 600), sharing.acquire("used", Server, 600)
     lingering.stop_all(for_good=True)
     assert idle.ends == [threading.current_thread().name]
-    sharing.release(used, 600)
-    assert used.ends == [threading.current_thread().name]
+    used.release()
+    assert used.shared.ends == [threading.current_thread().name]
 
 
 def test_the_end_waits_for_what_is_ending(
     lingering: Lingering[Server], sharing: Sharing[Server]
 ) -> None:
     """So that nothing is left half ended."""
-    server = sharing.acquire("key", Server)
+    use = sharing.acquire("key", Server, 0.01)
+    server = use.shared
     server.may_end.clear()
-    sharing.release(server, 0.01)
+    use.release()
     assert server.ending.wait(60)
     threading.Timer(0.1, server.may_end.set).start()
     lingering.stop_all()
@@ -203,50 +205,79 @@ def test_a_fork_has_none_and_ends_none(sharing: Sharing[Server]) -> None:
         finally:
             os._exit(code)
     assert os.waitpid(child, 0)[1] == 0
-    assert sharing.acquire("key", Server) is ours
+    assert sharing.acquire("key", Server).shared is ours
+
+
+def hold_of(sharing: Sharing[Server]) -> ServerHold:
+    """A suite's hold on the servers of a sharing."""
+    return ServerHold(lambda: sharing.acquire("key", Server))  # type: ignore[arg-type, return-value]
+
+
+def keep(hold: ServerHold, use: Use[Server]) -> None:
+    """A jail is opened in a server."""
+    hold.keep(cast("WorkerServer", use.shared))
 
 
 def test_a_hold_lasts_from_the_first_jail_to_the_last_environment(
     sharing: Sharing[Server],
 ) -> None:
     """However many jails come and go in between; to leave twice is to leave once."""
-    hold: ServerHold = ServerHold(
-        lambda: sharing.acquire("key", Server),  # type: ignore[arg-type, return-value]
-        sharing.release,  # type: ignore[arg-type]
-    )
+    hold = hold_of(sharing)
     leave_one, leave_two = hold.enter(), hold.enter()
-    server = sharing.acquire("key", Server)
+    use = sharing.acquire("key", Server)
+    server = use.shared
     for _ in range(3):
-        hold.keep(cast("WorkerServer", server))
-    sharing.release(server)
-    assert server.users == 1
+        keep(hold, use)
+    use.release()
+    assert len(server.uses) == 1
     leave_one()
     leave_one()
     assert not server.ends
     leave_two()
     assert server.ends
-    hold.keep(cast("WorkerServer", server))  # nobody is left who could need it
-    assert server.users == 0
+    keep(hold, use)  # nobody is left who could need it
+    assert len(server.uses) == 0
 
 
 def test_a_hold_moves_on_from_a_server_that_has_died(sharing: Sharing[Server]) -> None:
     """It keeps the one that the next jail was opened in."""
-    hold: ServerHold = ServerHold(
-        lambda: sharing.acquire("key", Server),  # type: ignore[arg-type, return-value]
-        sharing.release,  # type: ignore[arg-type]
-    )
+    hold = hold_of(sharing)
     leave = hold.enter()
     dead = sharing.acquire("key", Server)
-    hold.keep(cast("WorkerServer", dead))
-    sharing.release(dead)
-    dead.runs = False
+    keep(hold, dead)
+    dead.release()
+    dead.shared.runs = False
     fresh = sharing.acquire("key", Server)
-    hold.keep(cast("WorkerServer", fresh))
-    assert dead.ends
-    assert fresh.users == 2
-    sharing.release(fresh)
+    keep(hold, fresh)
+    assert dead.shared.ends
+    assert len(fresh.shared.uses) == 2
+    fresh.release()
     leave()
-    assert fresh.ends
+    assert fresh.shared.ends
+
+
+def test_a_hold_whose_end_was_interrupted_ends_with_the_next_leave(
+    sharing: Sharing[Server],
+) -> None:
+    """A Ctrl-C came while it waited for the jails that were still ending."""
+    hold = hold_of(sharing)
+    leave = hold.enter()
+    use = sharing.acquire("key", Server)
+    keep(hold, use)
+
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    hold.partings.add(interrupted)
+    server = use.shared
+    server.stop = interrupted  # type: ignore[method-assign]
+    use.live = False  # the hold's is the last
+    with pytest.raises(KeyboardInterrupt):
+        leave()
+    del server.stop
+    assert not server.ends
+    leave()
+    assert server.ends
 
 
 def test_a_container_changes_hands_only_when_nobody_uses_it(
@@ -263,17 +294,17 @@ def test_a_container_changes_hands_only_when_nobody_uses_it(
         return docker.RepositoryContainer(options, engine, "sha256:0", Path(snapshot), made)
 
     first, second = sandbox(), sandbox()
-    one, two = first.acquire(Path("/")), second.acquire(Path("/"))
-    assert one is not two
-    second.release(two, 0)
-    first.release(one, 600)
-    assert sandbox().acquire(Path("/")) is one
-    first = sandbox()
-    other = first.acquire(Path("/"))
-    first.release(other, 600)
-    assert sandbox("/two").acquire(Path("/")) is not other
-    assert sandbox(network="loopback").acquire(Path("/")) is not other
-    assert sandbox().acquire(Path("/")) is other
+    one, two = first.acquire(Path("/"), idle_s=600), second.acquire(Path("/"))
+    assert one.shared is not two.shared
+    two.release()
+    one.release()
+    again = sandbox().acquire(Path("/"))
+    assert again.shared is one.shared
+    other = sandbox().acquire(Path("/"), idle_s=600)
+    other.release()
+    further = sandbox("/two").acquire(Path("/")), sandbox(network="loopback").acquire(Path("/"))
+    assert other.shared not in [use.shared for use in further]
+    assert sandbox().acquire(Path("/")).shared is other.shared
 
 
 def test_the_setting_takes_nothing_and_for_ever() -> None:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import FrameType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -22,32 +21,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 from tests.attacks.lying_server import env_manifest
 from tests.support import inside
-
-
-def interrupted(file: str | None, line: int, act: Callable[[], object]) -> bool:
-    """Do it, with a Ctrl-C before the ``line``-th line that runs in a file; whether one came."""
-    left = line
-
-    def trace(frame: FrameType, event: str, _: object) -> Any:
-        nonlocal left
-        if frame.f_code.co_filename != file:
-            return None
-        if event == "line":
-            left -= 1
-            if left < 0:
-                sys.settrace(None)
-                raise KeyboardInterrupt
-        return trace
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        act()
-    except KeyboardInterrupt:
-        return True
-    finally:
-        sys.settrace(before)
-    return False
+from tests.support.interrupts import before_line
 
 
 class _Session:
@@ -107,7 +81,7 @@ def test_an_interrupted_request_leaves_no_wait_that_nobody_can_end(
     line = 0
     while True:
         env = SandboxVectorEnv(cast("EnvSession", _Session()))
-        came = interrupted(vector_env.__file__, line, lambda env=env: act(env))  # type: ignore[misc]
+        came = before_line(vector_env.__file__, line, lambda env=env: act(env))  # type: ignore[misc]
         assert env.reset() == (0, {})
         env.close()
         if not came:
@@ -154,7 +128,7 @@ def test_a_runner_is_told_all_after_an_interrupt(what: str, afterwards: tuple[st
             else:
                 lane.tell(b"packet", 1)
 
-        came = interrupted(shard.__file__, line, act)
+        came = before_line(shard.__file__, line, act)
         assert runner.asked(dtype, slot) == expected
         lane.close()
         if not came:

@@ -1,0 +1,86 @@
+"""Ctrl-C anywhere in a start or in a close: nothing is left, and what follows is as ever.
+
+Python looks for signals where a function begins, so these are the moments that are tried.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from envhub_sandbox import make_env
+from tests.support import inside
+from tests.support.interrupts import at_call
+from tests.support.processes import eventually
+from tests.support.samples import sample
+
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+_STARTS, _CLOSES = 41, 13
+"""Calls between two moments: of some 500 in a start, and of some 120 in a close."""
+lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
+
+
+def _held(neighbour: Any) -> tuple[int, int, int]:
+    """Uses of a server and jails in it, and descriptors of ours."""
+    gc.collect()
+    uses, jails = len(inside.server(neighbour).uses), inside.jails(neighbour)
+    return uses, jails, len(os.listdir("/proc/self/fd"))
+
+
+@pytest.fixture
+def nothing_more() -> Iterator[Callable[[], bool]]:
+    """Whether nothing is held beyond what one environment does, which runs beside those tried."""
+    with make_env(sample("echo"), n_envs=2) as suites:
+        suites.env.reset()
+        before = _held(suites.env)
+
+        def as_before() -> bool:
+            now = _held(suites.env)
+            return all(one <= other for one, other in zip(now, before, strict=True))
+
+        yield lambda: eventually(as_before)
+
+
+def _made(lane: str) -> Any:
+    return make_env(sample("echo"), n_envs=2, use_async_envs=True, lane=lane)
+
+
+@lanes
+def test_an_interrupted_start_leaves_nothing_behind(
+    nothing_more: Callable[[], bool], lane: str
+) -> None:
+    """No use of the server, no jail, no descriptor; and what the next reset says is its own."""
+    options = {"token": 5.0, "delay": 0.0}
+    moment, came = 0, True
+    while came:
+        with _made(lane) as suites:
+            came = at_call(moment, suites.env.reset)
+            observations, _ = suites.env.reset(options=options)
+            assert observations.tolist() == [[5.0, 0.0]] * 2
+        assert nothing_more(), moment
+        moment += _STARTS
+    assert moment > 5 * _STARTS
+
+
+@lanes
+def test_an_interrupted_close_leaves_nothing_behind(
+    nothing_more: Callable[[], bool], lane: str
+) -> None:
+    """No use of the server, no jail, no descriptor, once it is closed again, or nobody has it."""
+    moment, came = 0, True
+    while came:
+        suites = _made(lane)
+        suites.env.reset()
+        came = at_call(moment, suites.close)
+        if moment % 2:
+            suites.close()
+            assert nothing_more(), moment
+        del suites
+        assert nothing_more(), moment
+        moment += _CLOSES
+    assert moment > 5 * _CLOSES
