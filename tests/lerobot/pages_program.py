@@ -15,6 +15,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from lerobot.configs import parser
+from lerobot.configs.eval import EvalPipelineConfig
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.envs.configs import EnvConfig, IsaaclabArenaEnv
 from lerobot.envs.factory import make_env
 from lerobot.envs.utils import env_to_policy_features, preprocess_observation
@@ -22,6 +25,7 @@ from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 import envhub_sandbox.integrations.lerobot as ours
 from envhub_sandbox import make_env as sandboxed
 from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.integrations import lerobot_eval
 from envhub_sandbox.integrations.lerobot import waiting
 
 FOUND: dict[str, Any] = {}
@@ -143,6 +147,50 @@ def options() -> None:
     FOUND["not options"] = sorted(set(signature(sandboxed).parameters) - given)
 
 
+def commands() -> None:
+    """The lines of our own pages: what LeRobot's parser makes of each, and that it looks at all."""
+    lines: list[list[str]] = json.loads(sys.argv[2])
+    FOUND["commands"] = [taken(*line) for line in lines]
+    program, *words = lines[0]
+    try:
+        taken(program, *words, "--env.rpeo=robots/reach")
+    except SystemExit:
+        FOUND["misspelt"] = "refused"
+
+
+def taken(program: str, *words: str) -> list[str | None]:
+    """What is played, and by what kind of policy, as that program of LeRobot's understands it."""
+    if program == "lerobot-eval-sandboxed":
+        options, words = lerobot_eval.split([*words])  # type: ignore[assignment]
+        ours.install(**options)
+    made: list[Any] = []
+    kind = TrainPipelineConfig if program == "lerobot-train" else EvalPipelineConfig
+    arguments, sys.argv = sys.argv, [program, *words]
+    try:
+        parser.wrap()(annotated(made.append, kind))()
+    finally:
+        sys.argv = arguments
+    [cfg] = made
+    return [type(cfg.env).__name__, getattr(cfg.env, "repo", None), cfg.policy.type]
+
+
+def annotated(function: Any, kind: type) -> Any:
+    """As LeRobot's ``main`` is: by its annotation the parser knows what to make."""
+
+    def main(cfg: Any) -> None:
+        function(cfg)
+
+    main.__annotations__ = {"cfg": kind}
+    return main
+
+
+def written() -> None:
+    """The block of Python on our own page."""
+    names: dict[str, Any] = {}
+    exec(sys.argv[3], names)
+    FOUND["written"] = shape(names["envs"])
+
+
 def waits() -> None:
     """What told its spaces is used once by whoever asks for the same, and closed by and by."""
     kept = waiting.Waiting(0.02)
@@ -185,6 +233,7 @@ if __name__ == "__main__":
         options,
         waits,
         fails,
+        *((commands, written) if ours.config.ASKS_CONFIGS else ()),
     ):
         part()
     FOUND["plugin"] = __import__("lerobot_env_envhub_sandbox").SandboxedEnvConfig.__name__

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from tests.hub.olah_server import OlahServer
 from tests.lerobot.kit import run
 from tests.lerobot.repositories import publish
+from tests.support import blocks
 
 pytest.importorskip("torch")
 
@@ -52,11 +54,38 @@ FEATURES = {
 }
 
 
+# What our own pages write, and what stands there instead: nobody here has a GPU.
+POLICY = '{"type": "act"}'
+READ_AS = {"org/repo@<commit>": "robots/reach@main", "org/policy": "robots/policy"}
+READ_AS |= {"=...": "=robots/policy", '{"gpu": true}': "{}", '{"gpu": True}': "{}"}
+
+
+def written() -> tuple[list[list[str]], str]:
+    """The commands of LeRobot's, and the Python, that ``blocks.APART`` leaves to this."""
+    here = Path(__file__).relative_to(blocks.CHECKOUT).as_posix()
+    ours = [one for one in blocks.tested(blocks.OWN) if one.listed(blocks.APART) == here]
+    texts = {"sh": "", "python": ""}
+    for one in ours:
+        texts[one.language] += one.text.replace("\\\n", " ")
+    for old, new in READ_AS.items():
+        texts = {language: text.replace(old, new) for language, text in texts.items()}
+    return [shlex.split(line) for line in texts["sh"].splitlines()], texts["python"]
+
+
 def test_the_pages_hold(olah: OlahServer, tmp_path: Path) -> None:
     """With LeRobot's own functions, in one process, which has loaded nothing of the Hub after."""
-    found = run("pages_program.py", olah, tmp_path, json.dumps(publish(olah)))
+    olah.repository("robots/policy").commit({"config.json": POLICY})
+    commits, (commands, python) = publish(olah), written()
+    arguments = json.dumps(commits), json.dumps(commands), python
+    found = run("pages_program.py", olah, tmp_path, *arguments)
     features = found.pop("features")
     features.pop("observation.forces", None)  # LeRobot 0.6 hands it on, 0.4 does not
     assert features == FEATURES
     assert "jail" not in found.pop("stderr")
+    if "commands" in found:  # LeRobot 0.4 has other options, and asks no configuration
+        pinned = f"models/robots/reach@{commits['reach']}"
+        ours = ["SandboxedEnvConfig", pinned, "act"]
+        sandboxed = ["IsaaclabArenaEnv", None, "act"]
+        assert found.pop("commands") == [ours, ours, sandboxed, ours]
+        assert (found.pop("misspelt"), found.pop("written")) == ("refused", ONE)
     assert found == EXPECTED

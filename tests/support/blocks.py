@@ -28,29 +28,31 @@ DRAWN = "the site's build takes it, and the browser draws it"
 
 # What executes blocks of shell and Python that tests/integration/test_hub_blocks.py and its like
 # do not: by document and beginning.
+_CONTAINERS, _LEROBOT = "tests/containers/test_documents.py", "tests/lerobot/test_pages.py"
 APART = {
     ("README.md", "python3 -m venv .venv"): ".ci/steps/readme.sh",
     ("README.md", "./test"): ".ci/steps/readme.sh",
+    ("docs/deployment.md", "docker build"): _CONTAINERS,
+    ("docs/deployment.md", "from envhub_sandbox import DockerSandbox"): _CONTAINERS,
     ("docs/deployment.md", "docker run"): "tests/containers/test_deployment.py",
+    ("docs/lerobot.md", "lerobot-"): _LEROBOT,
+    ("docs/lerobot.md", "from lerobot"): _LEROBOT,
+    ("plugins/lerobot_env_envhub_sandbox/README.md", "lerobot-"): _LEROBOT,
 }
 # Why others are not executed as they stand there.
 _INSTALLS = "installs gigabytes, or into the reader's own interpreter"
 _LONG = "is for minutes to hours; its arguments are taken by its own parser"
-_ENGINE = "needs a container engine: tests/containers"
-_LEROBOT = "needs LeRobot, and for training gigabytes of it: tests/lerobot"
+_DERIVED = (
+    "needs an engine, Debian's mirror and minutes; tests/containers/test_image.py derives others"
+)
 NOT_EXECUTED = {
     ("CONTRIBUTING.md", "python3 -m venv .venv"): _INSTALLS,
     ("CONTRIBUTING.md", ".venv/bin/ruff"): "is what CI does: .ci/steps/lint.sh, .ci/steps/tests.sh",
     ("CONTRIBUTING.md", ".venv/bin/python -m"): _LONG,
     ("benchmarks/README.md", "python -m"): _LONG,
-    ("docs/deployment.md", "docker build"): _ENGINE,
-    ("docs/deployment.md", "envhub image build"): _ENGINE,
-    ("docs/deployment.md", "from envhub_sandbox import DockerSandbox"): _ENGINE,
-    ("docs/lerobot.md", "lerobot-"): _LEROBOT,
-    ("docs/lerobot.md", "from lerobot"): _LEROBOT,
+    ("docs/deployment.md", "envhub image build"): _DERIVED,
     ("docs/lerobot.md", "pip install"): _INSTALLS,
     ("docs/lerobot.md", "python -m tests.lerobot"): _LONG,
-    ("plugins/lerobot_env_envhub_sandbox/README.md", "lerobot-"): _LEROBOT,
 }
 _EVERYWHERE = {"sh": RUN, "": SHOWN, "text": SHOWN, "mermaid": DRAWN}
 TABLE = {

@@ -43,7 +43,8 @@ import os
 from pathlib import Path
 from envhub_sandbox import make_env
 ADDRESS = os.environ["ADDRESS"]
-PRINTED = Path(os.environ["XDG_STATE_HOME"], "envhub-worker", "server.pub").read_text()
+KEY = Path(os.environ["XDG_STATE_HOME"], "envhub-worker", "server.pub")
+PRINTED = KEY.read_text() if KEY.exists() else ""
 """
 _PRELUDE = r"""
 set -euo pipefail
@@ -99,7 +100,13 @@ def executed(document: str) -> list[Block]:
     return [one for one in there if one.language in languages]
 
 
-def execute(blocks: Iterable[Block], hub: StubHub, folder: Path, within: str = "") -> str:
+def execute(
+    blocks: Iterable[Block],
+    hub: StubHub,
+    folder: Path,
+    within: str = "",
+    docker: str = _DOCKER,
+) -> str:
     """Execute blocks of shell and Python; returns what they print.
 
     Args:
@@ -107,6 +114,7 @@ def execute(blocks: Iterable[Block], hub: StubHub, folder: Path, within: str = "
         hub: Has ``org/repo`` at two commits from then on.
         folder: Empty; what is made is below it.
         within: The repository that the reader has gone into, instead of the checkout.
+        docker: The script that is found by that name.
     """
     clone = folder / "clone"
     shutil.copytree(CHECKOUT / "examples", clone / "examples")
@@ -119,7 +127,7 @@ def execute(blocks: Iterable[Block], hub: StubHub, folder: Path, within: str = "
     repository = hub.add("org/repo", texts)
     repository.earlier[APPROVED] = {**new, "env.py": new["env.py"].replace(b"0.05", b"0.1")}
     (clone / within / "references.txt").write_text(f"org/repo@{NEW}\n")
-    return _bash(_script(blocks), clone / within, _environment(folder, hub))
+    return _bash(_script(blocks), clone / within, _environment(folder, hub, docker))
 
 
 def _script(blocks: Iterable[Block]) -> str:
@@ -135,13 +143,13 @@ def _script(blocks: Iterable[Block]) -> str:
     return "\n".join(parts)
 
 
-def _environment(folder: Path, hub: StubHub) -> dict[str, str]:
+def _environment(folder: Path, hub: StubHub, docker: str) -> dict[str, str]:
     theirs = ("ENVHUB_", "HF_", "HUGGING", "PYTEST_", "XDG_")
     kept = {name: text for name, text in os.environ.items() if not name.startswith(theirs)}
     programs = folder / "bin"
     for name in ("bin", "home", "tmp"):
         (folder / name).mkdir()
-    (programs / "docker").write_text(_DOCKER)
+    (programs / "docker").write_text(docker)
     (programs / "docker").chmod(0o755)
     path = [str(programs), str(Path(sys.executable).parent), kept["PATH"]]
     numbers = random.SystemRandom()
