@@ -9,6 +9,7 @@ from typing import Any
 
 from envhub_sandbox.check.plays import Play
 from envhub_sandbox.check.table import CHECKS, Check, Severity
+from envhub_sandbox.check.walls import Walls
 from envhub_worker.protocol.text import printable
 
 _LONGEST = 1_000
@@ -61,6 +62,7 @@ class Report:
         asked: How it was judged, by name, in words of ours.
         plays: What each task gave to look at.
         commit: Of what was judged; of a folder of this machine a hash of its content.
+        walls: What confined it; None where nothing of it ran.
     """
 
     reference: str
@@ -72,6 +74,7 @@ class Report:
     asked: dict[str, str] = field(default_factory=dict)
     plays: dict[str, Play] = field(default_factory=dict)
     commit: str = ""
+    walls: Walls | None = None
     _kept: Counter[str] = field(default_factory=Counter, repr=False)
 
     def judged(self, check: str, found: Collection[str], task: str = "") -> None:

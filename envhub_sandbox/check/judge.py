@@ -23,6 +23,7 @@ from envhub_sandbox.check.plays import Play, facts_of, film
 from envhub_sandbox.check.survey import survey
 from envhub_sandbox.check.table import CHECKS
 from envhub_sandbox.check.traces import Trace
+from envhub_sandbox.check.walls import walls
 from envhub_sandbox.dependencies.choice import chosen
 from envhub_sandbox.dependencies.declared import declared
 from envhub_sandbox.dependencies.prepare import provided
@@ -127,6 +128,7 @@ class _Judge:
     def __init__(self, asked: Asked, snapshot: Snapshot, report: Report) -> None:
         self._asked, self._snapshot, self._report = asked, snapshot, report
         self._files = parsing.read(snapshot)
+        self._unrecorded = ""
 
     def ask(self) -> None:
         self._read()
@@ -202,6 +204,7 @@ class _Judge:
         except _ITS_FAULT as error:
             self._unloaded(error)
             self.denied(error.denied)
+            self._note_walls(None)
             raise _StoppedError from error
         with suites:
             self._report.judged("loads", [])
@@ -214,6 +217,11 @@ class _Judge:
                 asking.film()
                 suites[suite][task].close()
             self._report.provenance = suites.provenance
+            self._note_walls(suites.provenance)
+
+    def _note_walls(self, provenance: Mapping[str, Any] | None) -> None:
+        policy = policy_from(self._asked.arguments.get("policy"), None)
+        self._report.walls = walls(policy.profile, provenance, self._unrecorded)
 
     def _unloaded(self, error: EnvHubError) -> None:
         if isinstance(error, (WorkerDiedError, WorkerTimeoutError)):
@@ -235,11 +243,15 @@ class _Judge:
         With the longer steps that this costs nobody measures a time.
         """
         given = self._asked.arguments
-        if self._is_here:
-            policy = policy_from(given.get("policy"), given.get("limits"))
-            recording = {"policy": replace(policy, record_denials=True), "limits": None}
-            with contextlib.suppress(SandboxUnavailableError):
-                return self.make(num_workers=1, validate=True, **recording)
+        if not self._is_here:
+            self._unrecorded = "only --sandbox process has it recorded"
+            return self.make(num_workers=1, validate=True)
+        policy = policy_from(given.get("policy"), given.get("limits"))
+        recording = {"policy": replace(policy, record_denials=True), "limits": None}
+        try:
+            return self.make(num_workers=1, validate=True, **recording)
+        except SandboxUnavailableError as error:  # of the profile, too: then it is raised again
+            self._unrecorded = str(error)
         return self.make(num_workers=1, validate=True)
 
     @contextmanager

@@ -184,8 +184,9 @@ def _held(report: Report) -> Iterator[str]:
 
 def _judged(report: Report) -> Iterator[str]:
     if report.asked:
+        told = () if report.walls is None else report.walls.lines()
         yield "<h2>How it was judged</h2>"
-        yield from facts(report.asked.items())
+        yield from facts([*report.asked.items(), *(("confined by", line) for line in told)])
 
 
 def _ran(provenance: Mapping[str, Any]) -> Iterator[str]:

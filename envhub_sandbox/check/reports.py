@@ -32,6 +32,7 @@ def document(report: Report, failures: Sequence[Finding]) -> dict[str, Any]:
         "left_out": report.left_out,
         "held": [{"check": check, "task": task} for check, task in report.passed],
         "figures": report.figures,
+        "confinement": None if report.walls is None else report.walls.document(),
         "provenance": report.provenance,
     }
 
@@ -169,6 +170,9 @@ def workflow_commands(report: Report) -> Iterator[str]:
         title = f"envhub check: {one.id}" + (f" ({one.task})" if one.task else "")
         text = f"{one.message}\n{one.check.cure}"
         yield workflow_command(_GITHUB[one.check.severity], title, text, place)
+    if report.walls is not None and report.walls.are_fewer:
+        told = "\n".join(report.walls.lines())
+        yield workflow_command("notice", "envhub check: what confined it", told)
 
 
 def workflow_command(level: str, title: str, text: str, place: str = "") -> str:
@@ -188,6 +192,8 @@ def summary(report: Report, failures: Collection[Finding]) -> str:
     """A table for GitHub's step summary; a stranger's text is no markup there."""
     verdict = f"{len(failures)} findings fail" if failures else "passed"
     lines = [f"### envhub check: {verdict}", "", cell(report.reference), ""]
+    if report.walls is not None:
+        lines += [*(f"- {cell(line)}" for line in report.walls.lines()), ""]
     if report.findings:
         lines += ["| | check | task | finding |", "| --- | --- | --- | --- |"]
     for one in report.findings:

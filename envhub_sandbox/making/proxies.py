@@ -93,7 +93,11 @@ class Proxies:
         return EnvSuites(
             envs,
             lambda: provenance_of(
-                repository.snapshot, manifest, repository.latest_report, repository.installed
+                repository.snapshot,
+                manifest,
+                repository.latest_report,
+                repository.installed,
+                repository.latest_profile,
             ),
             shared.close if shared else lambda: None,
             repository.recipe,

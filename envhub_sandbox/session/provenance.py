@@ -14,6 +14,7 @@ def provenance_of(
     manifest: Manifest | None,
     report: list[dict[str, Any]],
     installed: dict[str, Any] | None = None,
+    profile: str | None = None,
 ) -> dict[str, Any]:
     """The provenance of environments, as plain data.
 
@@ -22,6 +23,7 @@ def provenance_of(
         manifest: What the worker said. Trust: interpreter and packages are its own words.
         report: The layers that confine it, once it runs.
         installed: What was installed for it: our own record.
+        profile: Of its jails, once it runs.
     """
     return {
         "repository": snapshot.repo_id,
@@ -33,5 +35,6 @@ def provenance_of(
         "packages": dict(manifest.packages) if manifest else None,
         "installed": installed,
         "protocol": VERSION,
+        "profile": profile,
         "layers": [dict(layer) for layer in report],
     }

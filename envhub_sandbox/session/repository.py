@@ -74,6 +74,7 @@ class Repository:
         heard: What it has warned of, in any jail.
         latest_report: The layers of the jail that was opened last, for the provenance of what was
             made. Which of them hold for an environment, only its own jail says.
+        latest_profile: Of that jail; in a container it may be less than the policy names.
         recipe: How to make it again.
     """
 
@@ -96,6 +97,7 @@ class Repository:
         self.copy = copy
         self.heard = Heard()
         self.latest_report: list[dict[str, Any]] = []
+        self.latest_profile: str | None = None
         self.recipe: Recipe | None = None
         self.cure: Callable[[], str] = str
         self.installed: dict[str, Any] | None = None
@@ -176,10 +178,11 @@ class Repository:
         assert self.recipe is not None
         manifest = None if loaded is None else loaded.manifest
         report = self.latest_report if loaded is None else loaded.jail.report
+        told = manifest, report, self.installed, self.latest_profile
         crash = Crash(
             error=error,
             label=self.label,
-            provenance=provenance_of(self.snapshot, manifest, report, self.installed),
+            provenance=provenance_of(self.snapshot, *told),
             load=self.arguments.message(),
             options=self.recipe.options,
             task=task,

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+from html import unescape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from envhub_sandbox import make_env
+from envhub_sandbox.check import judge as judging
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.judge import Asked, judge
 from envhub_sandbox.check.table import CHECKS, Severity
-from envhub_sandbox.errors import SnapshotError
+from envhub_sandbox.errors import SandboxUnavailableError, SnapshotError
 from envhub_sandbox.rollouts.pictures import png
 from tests.integration.test_cli_run import envhub
 from tests.support import checks
@@ -407,6 +412,72 @@ def test_wrong_options_say_what_there_is(options: list[str], code: int, says: st
     """Before anything is run."""
     done = envhub("check", EXAMPLES / "cartpole", *options)
     assert (done.returncode, says in " ".join(done.stderr.split())) == (code, True), done.stderr
+
+
+_WITHOUT_NAMESPACES = """
+import json, os, sys
+from pathlib import Path
+from typer.testing import CliRunner
+from envhub_sandbox.cli.app import app
+from envhub_worker.lockdown.mechanisms import namespaces
+
+namespaces.enter_user_namespace(os.getuid(), os.getgid())
+namespaces.forbid_what_is_counted()
+folder = Path(sys.argv[1])
+os.environ["GITHUB_STEP_SUMMARY"] = str(folder / "summary")
+check = ["check", str(folder / "walk"), "--steps=2", "--resets=0", "--n-envs=1"]
+chosen = [*check, "--profile=no-userns"]
+told = []
+for words in (check, [*chosen, f"--html={folder / 'html'}"], [*chosen, "--github", "--json"]):
+    done = CliRunner().invoke(app, words)
+    told.append((done.exit_code, done.stdout, done.stderr))
+(folder / "told").write_text(json.dumps(told))
+"""
+
+
+def test_a_host_without_user_namespaces_is_told_of(tmp_path: Path) -> None:
+    """Nothing weaker is taken by itself; where one names it, each form says what is not there."""
+    text = _HONEST.replace('["rgb_array"]', "[]").replace('= "rgb_array"', "= None")
+    repository(tmp_path / "walk", text)
+    program = [sys.executable, "-c", _WITHOUT_NAMESPACES, str(tmp_path)]
+    done = subprocess.run(program, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    refused, shown, github = json.loads((tmp_path / "told").read_text())
+    assert refused[:2] == [6, ""], refused
+    for words in ("user.max_user_namespaces is 0", "sudo sysctl", "--profile no-userns"):
+        assert words in refused[2]
+    assert (shown[0], github[0]) == (0, 0), (shown, github)
+    told, _, rest = github[1].partition("\n{")
+    found = json.loads("{" + rest.rpartition("\n}")[0] + "}")["confinement"]
+    assert (found["asked"], found["profile"], found["recorded"]) == ("no-userns", "no-userns", True)
+    missing = {one["layer"]: one["why"] for one in found["missing"]}
+    assert {"pid-namespace", "mount-namespace"} <= set(missing)
+    without = f"without pid-namespace: {missing['pid-namespace']}"
+    page, summary = (tmp_path / "html").read_text(), (tmp_path / "summary").read_text()
+    [notice] = obeyed(github[1].splitlines())
+    for text in (shown[1], page, summary, notice, told.replace(notice, "")):
+        assert "profile no-userns, as asked for" in unescape(text)
+        assert without in unescape(text)
+
+
+def test_where_recording_is_refused_it_is_judged_and_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And what was tried is no finding then, as nobody has seen it."""
+
+    def refusing(**given: Any) -> Any:
+        if given["policy"].record_denials:
+            raise SandboxUnavailableError("this host cannot enforce seccomp: no\nlistener")
+        return make_env(**given)
+
+    monkeypatch.setattr(judging, "make_env", refusing)
+    text = _HONEST.replace("class Walk", f"{_TRYING}\n\nclass Walk", 1)
+    report = judged(repository(tmp_path / "walk", text), 2, resets=0)
+    assert report.findings == []
+    assert not [check for check, _ in report.passed if check.startswith("denied-")]
+    assert report.walls is not None
+    last = [*report.walls.lines()][-1]
+    assert last.endswith("is not recorded: this host cannot enforce seccomp: no listener")
 
 
 def test_what_cannot_be_had_is_not_judged(tmp_path: Path) -> None:

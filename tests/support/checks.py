@@ -64,6 +64,11 @@ What you type counts more, and what is about a list (`--all`) means nothing for 
 Both files are yours: they are named, and never looked for, and one that lies in what is judged is
 refused.
 
+Each report but JUnit's and SARIF's says which profile its jails had, which layers did not hold and
+why, and why what it tried was not recorded, where a kernel or a container refuses that. No profile
+but the one that you name, or `strict`, is ever taken: where this host cannot enforce it, nothing is
+judged (exit code 6), and the error says what is missing and what to do.
+
 `--json` prints everything; `--junit FILE` has one test case for each check of each task, `--sarif
 FILE` is SARIF 2.1.0, and `--github` prints annotations and appends to `$GITHUB_STEP_SUMMARY`.
 `--all FILE` judges a list, every night: see [ci.md](ci.md#every-night).

@@ -183,6 +183,7 @@ def check(
         if github:
             from envhub_sandbox.check import reports
 
+            _print_walls(report)
             with heard():
                 annotate(reports.workflow_commands(report), reports.summary(report, failures))
         if json:
@@ -303,6 +304,13 @@ def _write(
             raise UsageError(f"the report cannot be written: {error}") from error
 
 
+def _print_walls(report: Report) -> None:
+    """In the log of a workflow too: what GitHub obeys there is not heard meanwhile."""
+    if report.walls is not None:
+        for line in report.walls.lines():
+            console().print(safe_line(line, 500), style="dim", soft_wrap=True)
+
+
 def _print(report: Report, failures: list[Finding]) -> None:
     from rich.table import Table
 
@@ -328,5 +336,6 @@ def _print(report: Report, failures: list[Finding]) -> None:
             f"{1e3 * figures['step_slowest_s']:.1f} ms",
             style="dim",
         )
+    _print_walls(report)
     held = f"{len(report.passed)} checks hold, {len(report.findings)} findings"
     say(f"{held}, of which {len(failures)} fail it." if failures else f"{held}: passed.")

@@ -141,6 +141,7 @@ class Launcher:
                 jail.before_end = follower.stop
             around = server.layers if isinstance(server, EnclosedServer) else ()
             jail.report = self.repository.latest_report = [*map(dict, around), *jail.report]
+            self.repository.latest_profile = str(order.confinement["profile"])
             if known is None:
                 return self._load(jail, use, deadline)
             loaded = LoadedJail(jail, known.manifest, {}, set(), use, self.close)

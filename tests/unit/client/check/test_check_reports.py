@@ -10,6 +10,8 @@ import pytest
 from envhub_sandbox.check import reports
 from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.check.table import CHECKS, Severity
+from envhub_sandbox.check.walls import walls
+from envhub_worker.protocol.text import printable
 
 _HOSTILE = (
     "x\n::error::forged",
@@ -48,6 +50,39 @@ def test_a_summary_has_no_strangers_markup(text: str) -> None:
     [row] = [line for line in table if line.startswith("| **fails**")]
     assert row.count("|") == 5
     assert not set("<>[]!`") & set(row)
+
+
+@pytest.mark.parametrize("text", _HOSTILE)
+def test_what_confined_it_is_text(text: str) -> None:
+    """Of a server on another host: a line is one, a command is one, and a flood is cut."""
+    made = Report("./walk:env.py")
+    layers = [{"layer": text, "enforced": False, "detail": text}] * 1_000
+    held = {"layer": "seccomp", "enforced": True, "detail": ""}
+    provenance = {"profile": "container", "layers": [held, *layers]}
+    made.walls = walls("strict", provenance, text * 1_000)
+    lines = list(made.walls.lines())
+    assert lines[0] == "profile container, within a container; strict was asked for"
+    assert (len(lines), max(map(len, lines)) < 1_000) == (42, True)
+    assert all(len(line.splitlines()) == 1 and printable(line) == line for line in lines)
+    [command] = reports.workflow_commands(made)
+    assert (len(command.splitlines()), command.startswith("::notice title=")) == (1, True)
+    summary = [line for line in reports.summary(made, []).splitlines() if line.startswith("- ")]
+    assert len(summary) == 42
+    assert not set("<>[]!`|") & set("".join(summary))
+    told = json.loads(json.dumps(reports.document(made, [])))["confinement"]
+    assert (told["asked"], told["profile"], told["recorded"]) == ("strict", "container", False)
+    assert "seccomp" not in {one["layer"] for one in told["missing"]}
+
+
+def test_all_that_there_can_be_is_a_line_and_no_notice() -> None:
+    """As where it did not load, so that nobody knows which layers held."""
+    made = Report("./walk:env.py")
+    for profile in ("strict", ""):
+        made.walls = walls("strict", {"profile": profile, "layers": []}, "")
+        [line] = made.walls.lines()
+        assert line.startswith("profile strict, as asked for")
+        assert list(reports.workflow_commands(made)) == []
+        assert made.walls.document()["recorded"] is True
 
 
 @pytest.mark.parametrize("text", _HOSTILE)

@@ -13,6 +13,7 @@ import pytest
 from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.check.page import page
 from envhub_sandbox.check.plays import Film, Play
+from envhub_sandbox.check.walls import walls
 from envhub_sandbox.rollouts.episodes import Episode
 from envhub_sandbox.rollouts.pictures import png
 from envhub_worker.protocol.text import printable
@@ -81,6 +82,8 @@ def report(text: str) -> Report:
         "layers": [{"layer": text, "enforced": True, "detail": text}],
     }
     made.asked = {"sandbox": text}
+    missing = {"layer": text, "enforced": False, "detail": text}
+    made.walls = walls("strict", {"profile": "no-userns", "layers": [missing]}, text)
     film = Film((png(_FRAME), png(_FRAME)), b"a video", frames=2, fps=25.0, lacks=text)
     made.plays[text] = Play({"observations": text}, memory=[1 << 20, 2 << 20], film=film)
     made.plays[text].step_s = [0.001, 0.002]

@@ -33,7 +33,9 @@ _SIOCGIFFLAGS = 0x8913
 _SIOCSIFFLAGS = 0x8914
 _IFF_UP = 1
 
-_WEAKER = 'Or choose the weaker profile by name: Policy(profile="no-userns").'
+_WEAKER = (
+    'Or choose the weaker profile by name: Policy(profile="no-userns"), or --profile no-userns.'
+)
 
 
 def enter_user_namespace(uid: int, gid: int) -> None:
