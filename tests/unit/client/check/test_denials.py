@@ -8,19 +8,22 @@ from envhub_sandbox.check.denials import sorted_out
 
 
 @pytest.mark.parametrize(
-    ("denied", "network", "files", "kernel"),
+    ("denied", "network", "files", "kernel", "limits"),
     [
-        ((), 0, 0, 0),
-        (("setpriority", "mbind", "socket AF_NETLINK"), 0, 0, 0),
-        (("socket AF_INET", "socket AF_INET6", "socket AF_PACKET"), 3, 0, 0),
-        (("socket AF_UNIX", "ptrace", "mount"), 0, 0, 3),
-        (("ptrace", "ptrace"), 0, 0, 1),
-        (("read /etc/shadow", "unlink /socket AF_INET", "connect /run/x"), 0, 3, 0),
+        ((), 0, 0, 0, 0),
+        (("setpriority", "mbind", "socket AF_NETLINK"), 0, 0, 0, 0),
+        (("socket AF_INET", "socket AF_NETLINK_OTHER", "socket AF_PACKET"), 3, 0, 0, 0),
+        (("socket AF_UNIX", "ptrace", "mount"), 0, 0, 3, 0),
+        (("setpriority OTHER_PROCESS", "kill OTHER_PROCESS"), 0, 0, 2, 0),
+        (("ptrace", "ptrace"), 0, 0, 1, 0),
+        (("read /etc/shadow", "unlink /socket AF_INET", "sendto /run/x"), 0, 3, 0, 0),
+        (("limit PROCESSES", "limit DISK_BYTES"), 0, 0, 0, 2),
+        (("unlink /a OTHER_PROCESS", "read /limit PROCESSES"), 0, 2, 0, 0),
     ],
-    ids=["nothing", "harmless", "network", "kernel", "once", "files"],
+    ids=["nothing", "harmless", "network", "kernel", "others", "once", "files", "limits", "names"],
 )
 def test_attempts_are_sorted(
-    denied: tuple[str, ...], network: int, files: int, kernel: int
+    denied: tuple[str, ...], network: int, files: int, kernel: int, limits: int
 ) -> None:
     """By what they reach for; what libraries do without is none."""
     found = sorted_out(denied)
@@ -28,4 +31,5 @@ def test_attempts_are_sorted(
         "denied-network": network,
         "denied-files": files,
         "denied-kernel": kernel,
+        "limits-reached": limits,
     }
