@@ -18,7 +18,7 @@ from envhub_sandbox import RemoteSandbox, make_env
 from envhub_sandbox.errors import WorkerDiedError
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from tests.containers.kit import IMAGE
-from tests.remote.listening import lasting_port
+from tests.support.ports import lasting_port
 from tests.support.processes import eventually
 from tests.support.samples import sample
 

@@ -17,6 +17,8 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
+from tests.support.ports import lasting_port
+
 _CONFIG = """
 [basic]
 host = "127.0.0.1"
@@ -105,7 +107,7 @@ class OlahServer:
     def __init__(self, home: Path, python: str = sys.executable) -> None:
         self.home = home
         self._log = home / "requests.log"
-        port = _free_port()
+        port = lasting_port()
         self.endpoint = f"http://127.0.0.1:{port}"
         config = home / "olah.toml"
         config.write_text(_CONFIG.format(port=port, home=home))
@@ -146,9 +148,3 @@ class OlahServer:
                 return
         self.stop()
         raise RuntimeError(f"olah did not start:\n{self._log.read_text(errors='replace')}")
-
-
-def _free_port() -> int:
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return int(listener.getsockname()[1])

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import random
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -113,15 +110,6 @@ class Listening:
     def open_jails(self) -> set[tuple[str, int]]:
         """Which ones: the name of a session, and a number."""
         return {(one["session"], jail["jail"]) for one in self.sessions() for jail in one["jails"]}
-
-
-def lasting_port() -> int:
-    """A port below those that the kernel gives to anybody: it is still free between two servers."""
-    while True:
-        number = random.randrange(20_000, 32_000)
-        with contextlib.suppress(OSError), socket.socket() as sock:
-            sock.bind(("127.0.0.1", number))
-            return number
 
 
 @contextmanager

@@ -20,8 +20,9 @@ from envhub_worker.access.drain import Drain
 from envhub_worker.access.quotas import BusyError
 from envhub_worker.access.telling.rate_limited_log import Log
 from envhub_worker.protocol import messages as m
-from tests.remote.listening import WORKER, Listening, lasting_port, listening
+from tests.remote.listening import WORKER, Listening, listening
 from tests.remote.test_clients import peer
+from tests.support.ports import lasting_port
 from tests.support.processes import eventually
 
 _LONG = ("--drain-s", "600")
