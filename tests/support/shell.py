@@ -74,7 +74,10 @@ envhub-worker() {
   done
 }
 
-# The package is installed already: where from has to be one.
+# A virtual environment is made; the package is installed already: where from has to be one.
+python3() {
+  [ "$*" = "-m venv .venv" ] && command python3 "$@" --without-pip
+}
 pip() {
   [ "$*" = "install ." ] && [ -f pyproject.toml ]
 }

@@ -15,6 +15,7 @@ import yaml
 from typer.testing import CliRunner
 
 from envhub_sandbox.cli.app import app
+from tests import libraries
 from tests.support import blocks, options, shell
 from tests.support.blocks import CHECKOUT, DRAWN, HELD, OWN, PARSED, RUN, SHOWN, Block
 
@@ -72,7 +73,7 @@ def commands(text: str) -> Iterator[list[str]]:
     for line in text.splitlines():
         for command in line.split("&&"):
             words = shlex.split(command, comments=True)
-            if words and words[0] != "cd":
+            if words and words[0] not in ("cd", "."):
                 yield [words[0].removeprefix(".venv/bin/"), *words[1:]]
 
 
@@ -147,10 +148,11 @@ def test_what_ci_takes_has_inputs_and_hooks_that_there_are(checkout: Any) -> Non
 
 
 def test_examples_that_pages_show_are_executed(checkout: Any) -> None:
-    """A link to one that stands by itself is the example on the site; RLlib's alone is not run."""
+    """A link to one that stands by itself is the example on the site; RLlib's is run by command."""
     page = (checkout / "docs" / "integrations.md").read_text()
     shown = re.findall(r"^\[examples/([\w/]+\.py)\]\(\.\./examples/\1\)$", page, re.M)
     executed = (checkout / "tests" / "integration" / "test_dropin_examples.py").read_text()
     assert len(shown) == 4
     assert [name for name in shown if f'"{name}"' not in executed] == ["with_rllib.py"]
-    assert "is in no\ntest" in page
+    assert "`python -m tests.libraries rllib`" in page
+    assert libraries.WANTED.keys() == {"rllib", "torchrl"}

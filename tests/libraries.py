@@ -1,0 +1,96 @@
+"""``python -m tests.libraries [LIBRARY...]``: guides for libraries that CI has no room for.
+
+Each in an environment of its own, with the newest releases that go together: the example that the
+guide shows is run as it is. A torch without CUDA is taken from ``$PIP_FIND_LINKS``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from importlib.metadata import requires
+from pathlib import Path
+
+from uv import find_uv_bin
+
+import envhub_sandbox
+import envhub_worker
+
+_EXAMPLES = Path(__file__).parents[1] / "examples"
+# What is installed, whose versions are told, and what the example prints when it has done its work.
+WANTED = {
+    "rllib": (("torch", "ray[rllib]"), ("ray", "gymnasium"), "vector_entry_point: trained on "),
+    "torchrl": (("torch", "torchrl"), ("torchrl", "torch", "gymnasium"), "a rollout of 40 steps"),
+}
+_VERSIONS = """
+import sys
+from importlib.metadata import version
+print(", ".join(f"{name} {version(name)}" for name in sys.argv[1:]))
+"""
+
+
+def make(packages: tuple[str, ...], folder: Path) -> Path:
+    """An interpreter with these packages, and what ours imports."""
+    uv = find_uv_bin()
+    subprocess.run([uv, "venv", "--quiet", "--python", sys.executable, str(folder)], check=True)
+    python = folder / "bin" / "python"
+    install = [uv, "pip", "install", "--quiet", "--python", str(python)]
+    for found in os.environ.get("PIP_FIND_LINKS", "").split():
+        install += ["--find-links", found]
+        without = ["--no-index", "--no-deps", "torch"]
+        subprocess.run([*install, *without], check=False)  # else from the index, and it is large
+    ours = [one for one in requires("envhub-sandbox") or () if "extra ==" not in one]
+    subprocess.run([*install, *packages, *ours], check=True)
+    return python
+
+
+def run(python: Path, library: str, folder: Path) -> bool:
+    """Whether the example of a library does its work; prints what it was run with."""
+    _, told, printed = WANTED[library]
+    paths = {Path(str(one.__file__)).parents[1] for one in (envhub_sandbox, envhub_worker)}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(map(str, paths)),
+        "ENVHUB_CACHE": str(folder / "cache"),
+        "HOME": str(folder),
+        "RAY_TMPDIR": str(folder),
+    }
+    versions = [str(python), "-c", _VERSIONS, *told]
+    print("with", subprocess.run(versions, capture_output=True, text=True).stdout, end="")
+    done = subprocess.run(
+        [str(python), str(_EXAMPLES / f"with_{library}.py")],
+        env=environment,
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    print(done.stdout, flush=True)
+    return done.returncode == 0 and printed in done.stdout
+
+
+def main() -> None:
+    """Run the examples; exits with 1 when one of them failed."""
+    parser = argparse.ArgumentParser(prog="python -m tests.libraries")
+    parser.add_argument("libraries", nargs="*", metavar="library", default=list(WANTED))
+    parser.add_argument("--below", type=Path, help="a folder for the environments, 2 GB each")
+    options = parser.parse_args()
+    if unknown := set(options.libraries) - set(WANTED):
+        parser.error(
+            f"no such library: {', '.join(sorted(unknown))}; there are {', '.join(WANTED)}"
+        )
+    failed = []
+    for library in options.libraries:
+        with tempfile.TemporaryDirectory(prefix="rl-", dir=options.below) as name:
+            folder = Path(name)
+            folder.chmod(0o755)  # jails of root run as another user
+            python = make(WANTED[library][0], folder / "venv")
+            failed += [] if run(python, library, folder) else [library]
+    sys.exit(f"failed: {', '.join(failed)}" if failed else 0)
+
+
+if __name__ == "__main__":
+    main()
