@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -87,14 +88,15 @@ def read(file: IO[bytes], title: str) -> list[Listed]:
 
 def _read_into(found: dict[str, Listed], text: str) -> Iterator[tuple[int, str]]:
     """Take every line; yield where something is wrong, and what."""
-    for number, line in enumerate(text.split("\n"), 1):
+    for number, line in enumerate(re.split("\r\n|\r|\n", text), 1):
         written = line.strip()
         if not written or written.startswith("#"):
             continue
         try:
             reference, meaning = _meaning(written)
         except (EnvHubError, OSError, ValueError) as error:
-            yield number, printable(str(error), _LONGEST)
+            hint = "; a comment has a line of its own" if " #" in written else ""
+            yield number, printable(f"{error}{hint}", _LONGEST)
             continue
         first = found.setdefault(meaning, Listed(reference, meaning, number))
         if first.line != number:
@@ -106,6 +108,8 @@ def _meaning(reference: str) -> tuple[str, str]:
         raise HubReferenceError("this is no reference: too long, or with control characters")
     if is_here(reference):
         folder, path = split_local(reference, DEFAULT_PATH)
+        if path == os.pardir or path.startswith(f"{os.pardir}/") or os.path.isabs(path):
+            raise HubReferenceError(f"{reference}: its entry lies outside of its folder")
         return reference, f"{folder.resolve()}:{path}"
     ref = HubRef.parse(reference)
     return str(ref), str(replace(ref, revision=ref.revision or "main"))

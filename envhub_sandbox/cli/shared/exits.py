@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import sys
 import traceback
@@ -77,7 +78,7 @@ def code_for(error: BaseException) -> Exit:
     if isinstance(error, KeyboardInterrupt):
         return Exit.INTERRUPTED
     if not isinstance(error, EnvHubError):
-        return Exit.BUG
+        return Exit.USAGE if _is_full(error) else Exit.BUG
     from envhub_sandbox.rollouts.video import VideoError  # numpy, which only a failure may cost
 
     if isinstance(error, (UsageError, VideoError)):
@@ -87,6 +88,9 @@ def code_for(error: BaseException) -> Exit:
 
 def describe(error: BaseException) -> str:
     """An error as text for a terminal: escaped, without tracebacks, with the end of the output."""
+    if _is_full(error):
+        where = getattr(error, "filename", None) or "what is printed"
+        return safe_text(f"no space is left for {where}; free some, and try again")
     if not isinstance(error, EnvHubError):
         return safe_text(f"a bug in envhub: {type(error).__name__}: {error}")
     text = str(error)
@@ -96,6 +100,12 @@ def describe(error: BaseException) -> str:
         kept = tail.rstrip().splitlines()[-_TAIL_LINES:]
         text = before + quoted("\n".join(kept)) + after
     return safe_text(text)
+
+
+def _is_full(error: BaseException) -> bool:
+    """Whether a disk of the caller's is full, or his share of it."""
+    full = (errno.ENOSPC, errno.EDQUOT)
+    return isinstance(error, OSError) and error.errno in full and not isinstance(error, EnvHubError)
 
 
 def _has_traceback(error: BaseException) -> bool:
@@ -117,11 +127,21 @@ def reported(*, debug: bool) -> Iterator[None]:
         _discard_output()
         raise typer.Exit(Exit.PIPE) from None
     except KeyboardInterrupt:
-        say("Interrupted.")
+        with _to_whom_it_may_reach():
+            say("Interrupted.")
         raise typer.Exit(Exit.INTERRUPTED) from None
     except Exception as error:
-        _explain(error, debug)
+        with _to_whom_it_may_reach():
+            _explain(error, debug)
         raise typer.Exit(code_for(error)) from None
+
+
+@contextlib.contextmanager
+def _to_whom_it_may_reach() -> Iterator[None]:
+    """Last words change no exit code: Ctrl-C ends the reader of a pipe as well, a disk is full."""
+    with contextlib.suppress(OSError):
+        yield
+    _discard_output()
 
 
 def _explain(error: Exception, debug: bool) -> None:
@@ -136,6 +156,12 @@ def _explain(error: Exception, debug: bool) -> None:
 
 
 def _discard_output() -> None:
-    """Nobody reads: what is still buffered must not fail again when the interpreter ends."""
-    with contextlib.suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    """What is buffered and cannot be written must not fail again when the interpreter ends."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        except ValueError:
+            pass  # it is closed

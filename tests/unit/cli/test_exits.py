@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
 import subprocess
 import sys
@@ -117,6 +119,54 @@ def test_a_bug_of_ours_says_so(capsys: pytest.CaptureFixture[str]) -> None:
     """Nothing is blamed on the environment."""
     assert fail(KeyError("x"), debug=False) == 70
     assert "a bug in envhub: KeyError" in capsys.readouterr().err
+
+
+_ENDS = """
+import sys, typer
+from envhub_sandbox.cli.shared.console import say
+from envhub_sandbox.cli.shared.exits import reported
+
+try:
+    with reported(debug=False):
+        if sys.argv[1] == "interrupted":
+            raise KeyboardInterrupt
+        say("a line about progress")
+        print("x" * 100_000)
+except typer.Exit as end:
+    sys.exit(end.exit_code)
+"""
+
+
+@pytest.mark.parametrize(
+    ("how", "to", "code"),
+    [
+        ("told", "full", Exit.USAGE),
+        ("told", "nobody", Exit.PIPE),
+        ("interrupted", "nobody", Exit.INTERRUPTED),
+        ("interrupted", "full", Exit.INTERRUPTED),
+    ],
+)
+def test_where_nothing_can_be_written_the_code_is_the_same(how: str, to: str, code: Exit) -> None:
+    """Both streams go to a full disk, or to a reader who has ended."""
+    if to == "full":
+        end = os.open("/dev/full", os.O_WRONLY)
+    else:
+        nobody, end = os.pipe()
+        os.close(nobody)
+    try:
+        command = [sys.executable, "-I", "-c", _ENDS, how]
+        done = subprocess.run(command, stdout=end, stderr=end, timeout=120)
+    finally:
+        os.close(end)
+    assert done.returncode == code
+
+
+def test_a_full_disk_is_no_bug() -> None:
+    """Of what is printed, or of a file."""
+    assert describe(OSError(errno.ENOSPC, "full")).startswith("no space is left for what is print")
+    assert "left for /x/y;" in describe(OSError(errno.EDQUOT, "full", "/x/y"))
+    assert code_for(OSError(errno.ENOSPC, "full")) is Exit.USAGE
+    assert code_for(OSError(errno.EBADF, "bad")) is Exit.BUG
 
 
 def test_nothing_is_cut_or_coloured_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
