@@ -48,8 +48,9 @@ Of files that process sees each opening and change by name, and lets the kernel 
 told is that a path was asked for that is not the jail's own, read from the memory of who asks, and
 no more is known. Told is all that would change something, connecting or sending to a socket's file,
 and reading homes, secrets of the system and other processes (libraries look for configurations in
-many another place). Not seen are: who only looks whether a file is there; what a link of its own
-leads to; what is changed by an open descriptor; a datagram that `sendmsg` sends to a socket's file;
+many another place). A link in its own folders is told as where it leads, up to sixteen folders
+down, and another thread may have changed it since. Not seen are: who only looks whether a file is
+there; what is changed by an open descriptor; a datagram that `sendmsg` sends to a socket's file;
 under `no-userns` modes, owners and times, which seem to change. At most 32 paths are told, and 64
 attempts in all. It is told of a repository that does not load, too, and of one whose process dies:
 the worker server, which hears of each attempt before who makes it goes on, remembers them until the

@@ -20,14 +20,17 @@ _WRITING = os.O_WRONLY | os.O_CREAT
 
 
 def ask(
-    call: str, *words: int | bytes, waits: Callable[[], object] = lambda: None
+    call: str,
+    *words: int | bytes,
+    waits: Callable[[], object] = lambda: None,
+    own: Own = _OWN,
 ) -> list[tuple[str, str]]:
     """What a call of this thread's is seen to ask for; bytes stand where their address would."""
     buffers = [ctypes.create_string_buffer(one) for one in words if isinstance(one, bytes)]
     places = iter(buffers)
     registers = [ctypes.addressof(next(places)) if isinstance(one, bytes) else one for one in words]
     padded = (*registers, 0, 0, 0, 0, 0, 0)[:6]
-    return asked(call, padded, threading.get_native_id(), _OWN, waits)
+    return asked(call, padded, threading.get_native_id(), own, waits)
 
 
 @pytest.mark.parametrize(
@@ -130,3 +133,39 @@ def test_nothing_is_read_of_who_has_gone() -> None:
 
     assert ask("unlink", b"/srv/x") == [("unlink", "/srv/x")], "the control"
     assert ask("unlink", b"/srv/x", waits=waits) == []
+
+
+def test_a_link_of_its_own_is_told_as_where_it_leads(tmp_path: Path) -> None:
+    """Where the call follows it; whatever lies there, and whatever lies outside of its folders."""
+    own = Own(changed=(str(tmp_path),), read=(), scratch=(str(tmp_path),))
+    for name, target in (
+        ("key", "/home/other/key"),
+        ("folder", "/home/other"),
+        ("self", "self"),
+        ("twice", "inner/key"),
+        ("mine", "here"),
+    ):
+        os.symlink(target, tmp_path / name)
+    (tmp_path / "inner").mkdir()
+    os.symlink("../folder/key", tmp_path / "inner" / "key")
+
+    def said(call: str, name: str, *more: int) -> list[str]:
+        place = f"{tmp_path}/{name}".encode()
+        at = (_HERE,) if call.endswith("at") else ()
+        return [path for _, path in ask(call, *at, place, *more, own=own)]
+
+    key = ["/home/other/key"]
+    for name in ("key", "folder/key", "twice", "inner/key", "inner/../key", "folder/../other/key"):
+        assert said("open", name, os.O_RDONLY) == key
+    assert said("truncate", "key") == said("chmod", "key") == said("fchmodat", "key") == key
+    assert said("unlink", "folder/key") == key
+    for call, *more in (("unlink",), ("lchown",), ("open", _WRITING | os.O_EXCL), ("rename",)):
+        assert said(call, "key", *more) == []
+    assert said("open", "key", os.O_RDONLY | os.O_NOFOLLOW) == []
+    assert said("utimensat", "key", 0, 0x100) == said("open", "mine", os.O_RDWR) == []
+    assert said("utimensat", "key", 0, 0) == key
+    assert said("open", "self/x", os.O_RDWR)[0].startswith("/..."), "it has no end"
+    deep = tmp_path.joinpath(*["a"] * 20)
+    deep.mkdir(parents=True)
+    os.symlink("/home/other/key", deep / "key")
+    assert said("open", f"{'a/' * 20}key", os.O_RDONLY) == [], "so far down nobody looks"

@@ -57,11 +57,14 @@ _PRIVATE = re.compile(
     re.DOTALL,
 )
 """What nobody reads by chance; libraries look for a configuration in many another place."""
-_DOORS = re.compile(
-    r"/proc/(?:self|thread-self|\d+)(?:/task/\d+)?/(root|cwd|fd/\d+)(/.+)", re.DOTALL
-)
+_DOORS = re.compile(r"/proc/(?:self|thread-self|\d+)(?:/task/\d+)?/(root|cwd|fd/\d+)")
 """Below a process's own entries one is somewhere else."""
-_MOST_DOORS = 8
+_MOST_STEPS = 128
+_DEEPEST = 16
+"""Links are looked at so far below a folder of the jail's own."""
+_NO_FOLLOW = 0x100
+_FLAGS_OF_AT = {"fchmodat2": 3, "utimensat": 3, "fchownat": 4}
+_FOLLOWING = "creat truncate chmod fchmodat chown utime utimes futimesat setxattr removexattr"
 _HARMLESS = ("/var/run/nscd/socket", "/run/nscd/socket")
 """The C library asks there who a user is."""
 
@@ -73,10 +76,12 @@ class Own:
     Attributes:
         changed: Folders and files that they may change.
         read: Those that they may read.
+        scratch: Folders in which they can have made links.
     """
 
     changed: tuple[str, ...] = ()
     read: tuple[str, ...] = ()
+    scratch: tuple[str, ...] = ()
 
 
 def asked(
@@ -100,34 +105,46 @@ def asked(
             still_waits()  # not before it is open: from here on it is this caller's memory
             if call in _ADDRESS:
                 place, size = (words[one] for one in _ADDRESS[call])
-                path = _addressed(memory, place, size, thread)
+                path = _addressed(memory, place, size, thread, own)
                 known = not path or path in _HARMLESS or _is_within(path, own.changed)
                 return [] if known else [(call, _shown(path))]
-            deed = _deed(call, memory, words)
-            paths = [_named(memory, thread, words, *where) for where in NAMED[call]]
+            deed, last = _deed(call, memory, words)
+            paths = [_named(memory, thread, words, own, last, *where) for where in NAMED[call]]
         return [(deed, _shown(path)) for path in paths if path and not _may(deed, path, own)]
     return []
 
 
-def _deed(call: str, memory: BinaryIO, words: Sequence[int]) -> str:
+def _deed(call: str, memory: BinaryIO, words: Sequence[int]) -> tuple[str, bool]:
+    """What it does, and whether it follows a link that stands at the end of a path."""
     if call == "openat2":
         flags = int.from_bytes(os.pread(memory.fileno(), 8, words[2]), sys.byteorder)
     elif call in _FLAGS:
         flags = words[_FLAGS[call]]
+    elif call in _FLAGS_OF_AT:
+        return call, not words[_FLAGS_OF_AT[call]] & _NO_FOLLOW
     else:
-        return "write" if call == "creat" else call
-    return "write" if flags & _CHANGING else "read"
+        return "write" if call == "creat" else call, call in _FOLLOWING.split()
+    makes = os.O_CREAT | os.O_EXCL
+    last = not flags & os.O_NOFOLLOW and flags & makes != makes
+    return "write" if flags & _CHANGING else "read", last
 
 
 def _named(
-    memory: BinaryIO, thread: int, words: Sequence[int], folder: int | None, path: int
+    memory: BinaryIO,
+    thread: int,
+    words: Sequence[int],
+    own: Own,
+    last: bool,
+    folder: int | None,
+    path: int,
 ) -> str:
     """The path that is named; empty where it is none, or has no end."""
     text = _text(memory, words[path])
     if not text:
         return ""
     number = _AT_FDCWD if folder is None else c_int(words[folder])
-    return _absolute(thread, "cwd" if number == _AT_FDCWD else f"fd/{number}", text)
+    base = "cwd" if number == _AT_FDCWD else f"fd/{number}"
+    return _absolute(thread, base, text, own, last=last)
 
 
 def _text(memory: BinaryIO, place: int) -> bytes:
@@ -141,29 +158,75 @@ def _text(memory: BinaryIO, place: int) -> bytes:
     return text if end and len(text) < _LONGEST_PATH else b""
 
 
-def _absolute(thread: int, base: str, text: bytes) -> str:
-    """From where the caller stands; a base that is no folder, as a socket, makes no path."""
+def _absolute(thread: int, base: str, text: bytes, own: Own, *, last: bool) -> str:
+    """Where a path leads from where its caller stands; a base that is no folder makes none.
+
+    What its own folders have of links is followed, at the end only where ``last``; what they lead
+    to is a name, and is not looked for. Another thread may make them others meanwhile.
+    """
     path = os.fsdecode(text)
     if not path.startswith("/"):
         path = os.path.join(os.readlink(f"/proc/{thread}/{base}"), path)
-    for _ in range(_MOST_DOORS):
-        path = os.path.normpath(path)
-        path = path[path.startswith("//") :]
-        door = _DOORS.fullmatch(path)
-        if door is None:
-            return path if path.startswith("/") else ""
-        leads = "" if door[1] == "root" else os.readlink(f"/proc/{thread}/{door[1]}")
-        path = leads + door[2]
-    return f"/...{path}"  # wherever that is: nobody's own
+    done: list[str] = []
+    pending = path.split("/")[::-1]
+    for _ in range(_MOST_STEPS if path.startswith("/") else 0):
+        name = pending.pop()
+        if name == "..":
+            done = done[:-1]
+        elif name not in ("", "."):
+            done.append(name)
+            leads = _leads(thread, f"/{'/'.join(done)}", own, pending, last=last)
+            if leads:
+                done = [] if leads.startswith("/") else done[:-1]
+                pending += leads.split("/")[::-1]
+        if not pending:
+            return f"/{'/'.join(done)}"
+    return f"/...{path}" if path.startswith("/") else ""  # wherever that is: nobody's own
 
 
-def _addressed(memory: BinaryIO, place: int, size: int, thread: int) -> str:
+def _leads(thread: int, path: str, own: Own, pending: Sequence[str], *, last: bool) -> str:
+    """What stands instead of an entry of a process, or of a link in a folder of its own.
+
+    Raises:
+        ValueError: Nothing has a name there, such as below a socket.
+    """
+    door = _DOORS.fullmatch(path)
+    if door is not None and pending:
+        leads = "/" if door[1] == "root" else os.readlink(f"/proc/{thread}/{door[1]}")
+        if not leads.startswith("/"):
+            raise ValueError(leads)
+        return leads
+    if pending or last:
+        for folder in own.scratch:
+            if path.startswith(f"{folder}/"):
+                return _link(thread, folder, path[len(folder) + 1 :].split("/"))
+    return ""
+
+
+def _link(thread: int, folder: str, names: Sequence[str]) -> str:
+    """What a link holds; empty where it is none. The kernel is led through no other for that."""
+    if len(names) > _DEEPEST:
+        return ""
+    place = os.open(f"/proc/{thread}/root{folder}", os.O_PATH | os.O_DIRECTORY)
+    try:
+        for name in names[:-1]:
+            outer = place
+            place = os.open(name, os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=outer)
+            os.close(outer)
+        return os.readlink(names[-1], dir_fd=place)
+    except OSError:
+        return ""
+    finally:
+        os.close(place)
+
+
+def _addressed(memory: BinaryIO, place: int, size: int, thread: int, own: Own) -> str:
     """The socket's file; one without a name in the file system is the jail's own network's."""
     address = os.pread(memory.fileno(), min(size & 0xFFFFFFFF, _SOCKET_ADDRESS), place)
     text = address[2:].partition(b"\0")[0]
     if address[:2] != struct.pack("=H", _AF_UNIX) or not text:
         return ""
-    return _absolute(thread, "cwd", text)
+    return _absolute(thread, "cwd", text, own, last=True)
 
 
 def _may(deed: str, path: str, own: Own) -> bool:

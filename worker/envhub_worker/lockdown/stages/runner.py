@@ -109,5 +109,7 @@ def own(jail: JailContext, pid: int, thread: int) -> Own:
     """What a process may change and read, by the names that it has for it."""
     streams = ("/dev/fd", "/dev/stdin", "/dev/stdout", "/dev/stderr")
     itself = ("/proc/self", "/proc/thread-self", f"/proc/{pid}", f"/proc/{thread}")
-    changed = (*_writable(jail.scratch), *jail.common.devices, *streams, *itself)
-    return Own(changed=changed, read=(*jail.common.trees, jail.spec.snapshot, *changed))
+    scratch = tuple(_writable(jail.scratch))
+    changed = (*scratch, *jail.common.devices, *streams, *itself)
+    read = (*jail.common.trees, jail.spec.snapshot, *changed)
+    return Own(changed=changed, read=read, scratch=scratch)
