@@ -133,9 +133,9 @@ class Launcher:
             client.close()
             wanted.close()
             raise
-        jail.heard = self.repository.heard
-        WORKER.debug("%s: jail %x opened", self.repository.label, jail.number)
-        try:
+        try:  # and nothing is called before it, where a Ctrl-C could come
+            jail.heard = self.repository.heard
+            WORKER.debug("%s: jail %x opened", self.repository.label, jail.number)
             if wanted.sinks:
                 follower = OutputFollower(lambda: self._connected(server), jail.number, wanted)
                 jail.before_end = follower.stop
