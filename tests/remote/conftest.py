@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.remote.listening import Listening, counting, listening
+from tests.support import inside
 
 IMPATIENT_S = 8
 
@@ -24,6 +25,17 @@ def impatient(tmp_path: Path) -> Iterator[Listening]:
     """One that soon ends what belongs to a silent client: later than a loaded machine is silent."""
     with listening(tmp_path / "impatient", "--idle-s", str(IMPATIENT_S)) as found:
         yield found
+
+
+@pytest.fixture
+def wait_no_more(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """Once a server has ended: a close does not wait for its word, of which nothing is proved."""
+
+    def hurry() -> None:
+        for spot in inside.WAITS_FOR_A_SERVER:
+            monkeypatch.setattr(*spot, 0.1)
+
+    return hurry
 
 
 @pytest.fixture

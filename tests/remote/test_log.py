@@ -6,7 +6,7 @@ import json
 import os
 import re
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -121,7 +121,9 @@ def test_no_secret_is_in_a_log(tmp_path: Path) -> None:
     assert not any(key in server.said() for key in (secret, own))
 
 
-def test_the_end_of_a_server_is_the_end_of_what_it_has(tmp_path: Path) -> None:
+def test_the_end_of_a_server_is_the_end_of_what_it_has(
+    tmp_path: Path, wait_no_more: Callable[[], None]
+) -> None:
     """Of its jails, its clients and its note; also when its terminal is closed."""
     alice = keys.generate()
     with logging_server(tmp_path, {"alice": alice}, "--log-format", "json") as server:
@@ -130,6 +132,7 @@ def test_the_end_of_a_server_is_the_end_of_what_it_has(tmp_path: Path) -> None:
             suites.env.reset(seed=1)
             server.process.send_signal(_HANGS_UP)
             assert server.process.wait(60) == 0
+            wait_no_more()
     assert server.noted() == ""
     [opened], [closed] = of(server, "jail_opened"), of(server, "jail_closed")
     assert closed["jail"] == opened["jail"]

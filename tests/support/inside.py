@@ -23,10 +23,12 @@ from envhub_sandbox.check import denials
 from envhub_sandbox.crash import writer
 from envhub_sandbox.dependencies import environments
 from envhub_sandbox.making import making
+from envhub_sandbox.sandboxes import remote
 from envhub_sandbox.sandboxes.docker import sandbox
 from envhub_sandbox.session import env_session
 from envhub_sandbox.session.counters import Ledger
 from envhub_sandbox.session.env_session import EnvSession
+from envhub_sandbox.session.jails import launcher as launcher_module
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.recipe import Recipe
@@ -241,6 +243,8 @@ LATE_REPLY_GRACE: Spot = (env_session, "_GRACE_S")
 """For how long ``reset`` waits for a late reply."""
 CLOSE_PATIENCE: Spot = (env_session, "INTERRUPT_S")
 """For how long ``close`` waits for another thread."""
+WAITS_FOR_A_SERVER: tuple[Spot, Spot] = ((launcher_module, "_CLOSE_S"), (remote, "_CLOSE_S"))
+"""For how long a close waits for a server's word, also where it has gone."""
 MAKER: Spot = (making, "Proxies")
 """What ``make_env`` starts to work with when its arguments have been checked."""
 CONTAINER_MARKS: Spot = (listen, "_CONTAINER_MARKS")
