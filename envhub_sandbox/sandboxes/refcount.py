@@ -66,8 +66,11 @@ class Use(Generic[S]):
         shared.uses.add(self)  # from here on nobody may end it
 
     def release(self) -> None:
-        """Give it back; the last one who does gives up what is shared, unless it has been ended."""
-        if not self.done:
+        """Give it back; the last one who does gives up what is shared, unless it has been ended.
+
+        A fork of whoever took it does nothing: a thread that is not there may have held the lock.
+        """
+        if not self.done and self.key[0] == os.getpid():
             self._sharing.release(self)
 
     def __del__(self) -> None:

@@ -50,3 +50,27 @@ def test_what_a_jail_was_denied_is_known_when_it_is_ended() -> None:
         assert jail.killed
     finally:
         events.close()
+
+
+def test_a_jail_that_cannot_be_heard_any_more_ends_alone() -> None:
+    """Its last words may be lost, as where its server has no descriptors left; that goes on."""
+
+    class Unheard(_Jail):
+        def poll(self) -> list[Any]:
+            raise AssertionError("no room for a descriptor")
+
+    class Told(Nobody):
+        def failed(self, error: Exception) -> None:
+            failures.append(str(error))
+
+    failures: list[str] = []
+    jail: Any = Unheard()
+    silent: Any = _Silent()
+    entry = JailEntry(7, "one", b"", jail, (), silent)
+    events = JailEvents(silent, silent, {7: entry}, silent, Told())
+    try:
+        events.end(entry, whole_jail("protocol"))
+        assert (jail.killed, failures) == (True, ["no room for a descriptor"])
+        assert entry.death is not None
+    finally:
+        events.close()

@@ -248,8 +248,16 @@ class JailEvents:
         self.kill(entry)
 
     def _hear_last(self, entry: JailEntry) -> None:
-        """What it was denied has been told before whatever ends it, on another descriptor."""
-        for event in entry.jail.poll():
+        """What it was denied has been told before whatever ends it, on another descriptor.
+
+        It ends also where that cannot be read: then it may be this that ends it.
+        """
+        try:
+            events = entry.jail.poll()
+        except Exception as error:
+            self._witness.failed(error)
+            return
+        for event in events:
             if isinstance(event, Denied):
                 self._denied(entry, event)
 

@@ -106,6 +106,30 @@ def test_a_fork_starts_its_own() -> None:
     assert os.waitpid(child, 0)[1] == 0
 
 
+def test_a_fork_gives_nothing_back() -> None:
+    """It waits for no lock, not even for one of its own: as it forgets what its parent used."""
+    sharing: Sharing[Server] = Sharing()
+    ours = [sharing.acquire("key", Server)]
+    server = ours[0].shared
+    child = os.fork()
+    if child == 0:  # pragma: no cover
+        held = threading.Event()
+
+        def start() -> Server:
+            held.set()
+            threading.Event().wait()
+            raise AssertionError
+
+        threading.Timer(60, os._exit, [1]).start()  # which ends what hangs
+        threading.Thread(target=sharing.acquire, args=("other", start)).start()
+        code = 0 if held.wait(50) else 1
+        ours[0].release()
+        ours.clear()
+        os._exit(1 if server.ends else code)
+    assert os.waitpid(child, 0)[1] == 0
+    assert (len(server.uses), server.ends) == (1, [])
+
+
 def test_what_nobody_has_any_more_is_given_back() -> None:
     """A Ctrl-C came between the taking and the noting: its own end gives it back, once."""
     sharing: Sharing[Server] = Sharing()
