@@ -73,13 +73,16 @@ class Failures:
             if lease.loaded is not None and (lease.loaded.jail.kept or not died):
                 lease.end()
         if isinstance(error, WorkerDiedError):
-            self.keep_crash(error)
+            self._write_crash(error)  # asked once: a server that says nothing takes its time
         return error
 
     def keep_crash(self, error: WorkerDiedError | WorkerTimeoutError) -> None:
         """Write a crash bundle, and name it in the error."""
+        self._lease.note_denied(error)
+        self._write_crash(error)
+
+    def _write_crash(self, error: WorkerDiedError | WorkerTimeoutError) -> None:
         lease, manifest = self._lease, self._manifest
-        lease.note_denied(error)
         task = {
             "suite": manifest.suite,
             "task": manifest.task,
