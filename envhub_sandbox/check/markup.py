@@ -42,7 +42,8 @@ code, .mono { font-family: ui-monospace, monospace; font-size: .88em }
 table { border-collapse: collapse; width: 100% }
 th, td { border-bottom: 1px solid var(--rule); padding: .35rem .9rem .35rem 0; text-align: left;
   vertical-align: top }
-th { color: var(--dim); font-size: .85rem; font-weight: 600 }
+th { color: var(--dim); font-size: .85rem; font-weight: 600; white-space: nowrap }
+.whole { white-space: nowrap } .broad { display: inline-block; min-width: 12rem }
 tr:last-child td { border-bottom: 0 }
 .findings { list-style: none; margin: 0; padding: 0 }
 .findings li { border-left: .25rem solid; margin: .7rem 0; padding: .1rem 0 .1rem .8rem }

@@ -1,8 +1,20 @@
-"""A page as a browser takes it."""
+"""A page as a parser takes it, and what pages are made of where a stranger chose every word."""
 
 from __future__ import annotations
 
 from html.parser import HTMLParser
+
+import numpy as np
+
+from envhub_sandbox.check.findings import Finding, Report
+from envhub_sandbox.check.many.lines import Listed
+from envhub_sandbox.check.many.results import Result, Verdict
+from envhub_sandbox.check.plays import Film, Play
+from envhub_sandbox.check.walls import walls
+from envhub_sandbox.rollouts.episodes import Episode
+from envhub_sandbox.rollouts.pictures import png
+
+FRAME = np.full((4, 6, 3), 200, np.uint8)
 
 
 class Page(HTMLParser):
@@ -36,3 +48,50 @@ class Page(HTMLParser):
     def names(self) -> set[str]:
         """Which tags there are."""
         return {name for name, _ in self.tags}
+
+
+def report_of(text: str) -> Report:
+    """One in which a repository chose every word that it can, and some that it cannot."""
+    made = Report(text)
+    made.add(Finding("runs", text, task=text, file=text, line=3))
+    made.judged("rewards", [text], text)
+    made.judged("loads", [], text)
+    made.figures[text] = {"steps": 3.0, "step_mean_s": 0.001, "memory_bytes": 1e6}
+    made.provenance = {
+        "repository": text,
+        "commit": text,
+        "interpreter": {text: text},
+        "packages": {text: [text]},
+        "installed": {text: text},
+        "files": {text: text},
+        "layers": [{"layer": text, "enforced": True, "detail": text}],
+    }
+    made.asked = {"sandbox": text}
+    missing = {"layer": text, "enforced": False, "detail": text}
+    made.walls = walls("strict", {"profile": "no-userns", "layers": [missing]}, text)
+    film = Film((png(FRAME), png(FRAME)), b"a video", frames=2, fps=25.0, lacks=text)
+    made.plays[text] = Play({"observations": text}, memory=[1 << 20, 2 << 20], film=film)
+    made.plays[text].step_s = [0.001, 0.002]
+    made.plays[text].episodes = [
+        Episode(sub_env=0, returns=(total, 0.0), length=3, terminated=True, success=None)
+        for total in (1.0, float("inf"))
+    ]
+    return made
+
+
+def results_of(text: str) -> list[Result]:
+    """Results in which every word is somebody's."""
+    one = Listed(text, f"{text}@main", 1)
+    return [
+        Result(
+            listed=one,
+            verdict=Verdict.FAILED,
+            commit=text,
+            found={"error": 1},
+            fails=("runs",),
+            ended=text,
+        ),
+        Result(listed=one, verdict=Verdict.UNJUDGED, said=text, ended="then"),
+        Result(listed=one, verdict=Verdict.WAITING),
+        Result(listed=one, verdict=Verdict.PASSED, found={}),
+    ]

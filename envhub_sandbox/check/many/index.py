@@ -22,7 +22,8 @@ _FORMAT = 1
 _LONGEST = 500
 _SHORT = 18
 """Characters of a commit that people compare."""
-_HEADS = ("", "reference", "commit", "error", "warning", "note", "seconds", "judged")
+_REFERENCE = '<span class="broad">reference</span>'
+_HEADS = ("", _REFERENCE, "commit", "error", "warning", "note", "seconds", "judged")
 _STYLES = {
     Verdict.FAILED: "error",
     Verdict.UNJUDGED: "warning",
@@ -82,12 +83,12 @@ def _cells(one: Result) -> tuple[str, ...]:
     said = f'<span class="cure">{markup.text(printable(why, _LONGEST))}</span>' if why else ""
     found = one.found or {}
     return (
-        f'<span class="{_STYLES[one.verdict]}">{one.verdict.value}</span>',
+        f'<span class="whole {_STYLES[one.verdict]}">{one.verdict.value}</span>',
         f"{reference}{said}",
-        markup.text(one.commit[:_SHORT]),
+        f'<span class="mono">{markup.text(one.commit[:_SHORT])}</span>',
         *(f"{found.get(level.value, 0)}" if one.is_judged else "" for level in Severity),
         f"{one.seconds:.1f}" if one.ended else "",
-        markup.text(one.ended),
+        f'<span class="whole">{markup.text(one.ended)}</span>',
     )
 
 

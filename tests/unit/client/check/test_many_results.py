@@ -25,7 +25,7 @@ from envhub_sandbox.check.many.results import (
     link,
 )
 from envhub_worker.protocol.text import printable
-from tests.support.pages import Page
+from tests.support.pages import Page, results_of
 
 _ONE = Listed("org/repo", "org/repo@main", 1)
 _HOSTILE = (
@@ -187,24 +187,6 @@ def test_a_folder_with_other_things_is_refused(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["index.html"]
 
 
-def of_all(text: str) -> list[Result]:
-    """Results in which every word is somebody's."""
-    one = Listed(text, f"{text}@main", 1)
-    return [
-        Result(
-            listed=one,
-            verdict=Verdict.FAILED,
-            commit=text,
-            found={"error": 1},
-            fails=("runs",),
-            ended=text,
-        ),
-        Result(listed=one, verdict=Verdict.UNJUDGED, said=text, ended="then"),
-        Result(listed=one, verdict=Verdict.WAITING),
-        Result(listed=one, verdict=Verdict.PASSED, found={}),
-    ]
-
-
 def shape(page: Page) -> list[tuple[str, tuple[tuple[str, str | None], ...]]]:
     """Its tags, but for where links lead, which is a name of ours."""
     return [
@@ -219,8 +201,8 @@ def test_an_index_has_the_tags_of_ours_alone(text: str) -> None:
 
     The control is a page that did not escape.
     """
-    quiet = index.page(of_all("walk"))
-    found = Page(index.page(of_all(text)))
+    quiet = index.page(results_of("walk"))
+    found = Page(index.page(results_of(text)))
     assert shape(found) == shape(Page(quiet))
     assert printable(text, 500)[:200] in found.text
     for tag, attributes in found.tags:
@@ -232,7 +214,7 @@ def test_an_index_has_the_tags_of_ours_alone(text: str) -> None:
 
 def test_an_index_runs_nothing() -> None:
     """And a browser is told so."""
-    found = Page(index.page(of_all("walk")))
+    found = Page(index.page(results_of("walk")))
     assert "script" not in found.names
     [policy] = [dict(attrs)["content"] for _, attrs in found.tags if "http-equiv" in dict(attrs)]
     assert str(policy).startswith("default-src 'none'")
@@ -241,7 +223,7 @@ def test_an_index_runs_nothing() -> None:
 
 def test_an_index_shows_first_what_fails() -> None:
     """And in the document they stand as in the list."""
-    made = list(reversed(of_all("walk")))
+    made = list(reversed(results_of("walk")))
     text = Page(index.page(made)).text
     words = ["failed", "not judged", "waiting", "passed"]
     body = text[text.rindex("judged\n") :] if "judged\n" in text else text
@@ -254,7 +236,7 @@ def test_an_index_shows_first_what_fails() -> None:
 @pytest.mark.parametrize("text", _HOSTILE)
 def test_other_forms_are_well_formed_too(text: str) -> None:
     """JUnit's file, annotations and the summary of a workflow."""
-    made = of_all(text)
+    made = results_of(text)
     report, failures = reports.read(told(text))
     root = ElementTree.fromstring(index.junit(made, lambda _: (report, failures)))
     assert [one.attrib["errors"] for one in root] == ["0", "1", "1", "0"]

@@ -7,16 +7,13 @@ import hashlib
 import re
 from html.parser import HTMLParser
 
-import numpy as np
 import pytest
 
-from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.check.page import page
 from envhub_sandbox.check.plays import Film, Play
-from envhub_sandbox.check.walls import walls
-from envhub_sandbox.rollouts.episodes import Episode
 from envhub_sandbox.rollouts.pictures import png
 from envhub_worker.protocol.text import printable
+from tests.support.pages import FRAME, report_of
 
 _HOSTILE = (
     "<script>alert(1)</script>",
@@ -29,7 +26,6 @@ _HOSTILE = (
     "<" * 100_000,
 )
 _QUIET = "walk"
-_FRAME = np.full((4, 6, 3), 200, np.uint8)
 _DRAWN = frozenset({"svg", "rect", "line", "polyline", "polygon", "text"})
 _OURS = frozenset(
     {
@@ -65,42 +61,13 @@ class _Read(HTMLParser):
         self.odd.append(data)
 
 
-def report(text: str) -> Report:
-    """One in which a repository chose every word that it can, and some that it cannot."""
-    made = Report(text)
-    made.add(Finding("runs", text, task=text, file=text, line=3))
-    made.judged("rewards", [text], text)
-    made.judged("loads", [], text)
-    made.figures[text] = {"steps": 3.0, "step_mean_s": 0.001, "memory_bytes": 1e6}
-    made.provenance = {
-        "repository": text,
-        "commit": text,
-        "interpreter": {text: text},
-        "packages": {text: [text]},
-        "installed": {text: text},
-        "files": {text: text},
-        "layers": [{"layer": text, "enforced": True, "detail": text}],
-    }
-    made.asked = {"sandbox": text}
-    missing = {"layer": text, "enforced": False, "detail": text}
-    made.walls = walls("strict", {"profile": "no-userns", "layers": [missing]}, text)
-    film = Film((png(_FRAME), png(_FRAME)), b"a video", frames=2, fps=25.0, lacks=text)
-    made.plays[text] = Play({"observations": text}, memory=[1 << 20, 2 << 20], film=film)
-    made.plays[text].step_s = [0.001, 0.002]
-    made.plays[text].episodes = [
-        Episode(sub_env=0, returns=(total, 0.0), length=3, terminated=True, success=None)
-        for total in (1.0, float("inf"))
-    ]
-    return made
-
-
 @pytest.mark.parametrize("text", _HOSTILE)
 def test_a_page_has_the_tags_of_ours_alone(text: str) -> None:
     """The very same as with a harmless text, attributes included; and the text is there to read.
 
     The control is the text itself: as markup it would be something else than text.
     """
-    made, quiet = report(text), report(_QUIET)
+    made, quiet = report_of(text), report_of(_QUIET)
     found = _Read(page(made, made.findings))
     assert found.tags == _Read(page(quiet, quiet.findings)).tags
     assert found.odd == []
@@ -110,14 +77,14 @@ def test_a_page_has_the_tags_of_ours_alone(text: str) -> None:
 
 def test_the_control_would_be_told() -> None:
     """A page that did not escape has other tags."""
-    made = report(_QUIET)
+    made = report_of(_QUIET)
     text = page(made, made.findings)
     assert _Read(text.replace(_QUIET, _HOSTILE[0])).tags != _Read(text).tags
 
 
 def test_a_page_needs_and_runs_nothing() -> None:
     """No script, no link, no picture from elsewhere; and a browser is told so."""
-    made = report("http://example.com/x.js")
+    made = report_of("http://example.com/x.js")
     found = _Read(page(made, []))
     attributes = {name for tag, attrs in found.tags for name, _ in attrs if tag not in _DRAWN}
     assert attributes == {
@@ -139,11 +106,11 @@ def test_a_page_needs_and_runs_nothing() -> None:
 
 def test_what_was_played_can_be_seen() -> None:
     """Pictures, a film, and a plot of each thing."""
-    found = _Read(page(report(_QUIET), []))
+    found = _Read(page(report_of(_QUIET), []))
     tags = [tag for tag, _ in found.tags]
     assert (tags.count("img"), tags.count("video"), tags.count("svg")) == (2, 1, 4)
     shown = [dict(attrs)["src"] for tag, attrs in found.tags if tag == "img"]
-    assert shown == [f"data:image/png;base64,{base64.b64encode(png(_FRAME)).decode()}"] * 2
+    assert shown == [f"data:image/png;base64,{base64.b64encode(png(FRAME)).decode()}"] * 2
     words = "".join(found.words)
     for told in ("Return, component 1 of 2, per episode", "mean 1", "Length of episodes", "Memory"):
         assert told in words
@@ -151,7 +118,7 @@ def test_what_was_played_can_be_seen() -> None:
 
 def test_pictures_are_no_reason_for_a_page_of_any_size() -> None:
     """What does not fit any more is left out, and the page says so."""
-    made = report(_QUIET)
+    made = report_of(_QUIET)
     for number in range(30):
         film = Film((b"s" * (1 << 20),), b"v" * (2 << 20), frames=9, fps=3.0)
         made.plays[f"task {number}"] = Play(film=film)
@@ -163,9 +130,9 @@ def test_pictures_are_no_reason_for_a_page_of_any_size() -> None:
 
 def test_what_makes_no_film_is_told() -> None:
     """Two kinds: pictures alone, and nothing at all."""
-    made = report(_QUIET)
+    made = report_of(_QUIET)
     made.plays = {
-        "one": Play(film=Film((png(_FRAME),), frames=1, lacks="pip install it")),
+        "one": Play(film=Film((png(FRAME),), frames=1, lacks="pip install it")),
         "two": Play(film=Film(lacks="render() failed")),
     }
     words = "".join(_Read(page(made, [])).words)
@@ -175,7 +142,7 @@ def test_what_makes_no_film_is_told() -> None:
 
 def test_a_page_is_bounded() -> None:
     """However much a repository says."""
-    made = report(_QUIET)
+    made = report_of(_QUIET)
     for number in range(5_000):
         made.judged("runs", ["x" * 100_000], f"{number}")
         made.judged("loads", [], "t" * 1_000)
