@@ -1,10 +1,15 @@
-"""Some of the hostile payloads and samples, judged; ``tests.support.judged`` has them all."""
+"""Some of the hostile payloads, samples and mutants, judged.
+
+``tests.support.judged`` and ``tests.support.mutants`` have them all.
+"""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
-from tests.support import judged
+from tests.support import judged, mutants
 from tests.support.samples import SAMPLES
 
 
@@ -33,3 +38,11 @@ def test_a_sample_is_judged_as_it_is(name: str) -> None:
     """Honest ones pass, and of others what fails is what is wrong with them."""
     found = judged.failing(name)
     assert judged.is_as_it_stands(name, found), [one.text for one in found]
+
+
+@pytest.mark.parametrize(("name", "fault"), [("counter", "wrong dtype"), ("cartpole", "unseeded")])
+def test_a_fault_in_a_sample_is_told_by_its_check(tmp_path: Path, name: str, fault: str) -> None:
+    """And by no other."""
+    itself = mutants.told_of(str(judged.sample(name)))
+    found = mutants.told_of(mutants.mutant(name, fault, tmp_path), fault)
+    assert found - itself == mutants.FAULTS[fault].told_in(name) != set()

@@ -207,13 +207,13 @@ FAILING = {
     "wrong_types": ("loads", "what it returns is no environment"),
 }
 """The others: the check that fails, and why it is right to."""
-_ENTRIES = {"sub_folder": ":envs-v1/pick-cube.py"}
+ENTRIES = {"sub_folder": ":envs-v1/pick-cube.py"}
 
 
 def failing(name: str) -> list[Finding]:
     """What fails of a sample."""
     arguments = {"n_envs": 2, "timeouts": _TIMEOUTS}
-    reference = f"{sample(name)}{_ENTRIES.get(name, '')}"
+    reference = f"{sample(name)}{ENTRIES.get(name, '')}"
     report = judge(Asked(reference=reference, arguments=arguments, steps=10, resets=2))
     return report.failures(Severity.ERROR)
 
