@@ -7,13 +7,15 @@ silently did nothing would be a hole.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from numbers import Real
 from typing import Any, TypeVar
 
 from envhub_sandbox.errors import PolicyError
+from envhub_sandbox.option_names import option_name
 from envhub_worker.protocol.confinement import NETWORKS, PROFILES, Confinement, Limits
+from envhub_worker.protocol.text import parse_size
 
 __all__ = [
     "NETWORKS",
@@ -62,7 +64,7 @@ class Timeouts:
                 continue
             if value is not None and not (_is_number(value) and value > 0):
                 raise PolicyError(
-                    f"timeouts: {item.name} is {value!r}; it takes seconds above 0, or None"
+                    f"{option_name(item.name)} is {value!r}; it takes seconds above 0, or None"
                 )
 
 
@@ -75,8 +77,9 @@ class Policy:
             ``"container"`` are weaker and must be asked for by name (``docs/threat-model.md``).
         network: ``"none"``, ``"loopback"`` (its own, empty one) or ``"host"``.
         readable: Further absolute paths that the jail may read.
-        gpu: Grant the render, NVIDIA's and AMD's device nodes and the driver's libraries; where
-            there are none, no jail can be had.
+        gpu: ``True`` grants all GPUs, ``[0, 2]`` those, counted as ``nvidia-smi`` does (NVIDIA's by
+            PCI address, then others): the device nodes for computing and rendering, and of
+            ``/sys`` the devices' own folders. Where one is missing, no jail can be had.
         environment: Names of environment variables whose values the jail may see.
         limits: Hard caps.
         restart: What happens after the worker has died: ``"never"``; a fresh one at the next
@@ -100,7 +103,7 @@ class Policy:
     profile: str = "strict"
     network: str = "none"
     readable: tuple[str, ...] = ()
-    gpu: bool = False
+    gpu: bool | Sequence[int] = False
     environment: tuple[str, ...] = ()
     limits: Limits = field(default_factory=Limits)
     restart: str = "never"
@@ -121,11 +124,10 @@ class Policy:
         object.__setattr__(self, "output", _path("output", self.output))
         if self.crash_folder is not None:
             object.__setattr__(self, "crash_folder", _path("crash_folder", self.crash_folder))
-        if not isinstance(self.gpu, bool):
-            raise PolicyError(f"policy: gpu is {self.gpu!r}; it is True or False")
+        object.__setattr__(self, "gpu", _gpu(self.gpu))
         if not isinstance(self.record_denials, bool):
             raise PolicyError(
-                f"policy: record_denials is {self.record_denials!r}; it is True or False"
+                f"{option_name('record_denials')} is {self.record_denials!r}; it is True or False"
             )
         # frozen: this is how a field gets the form that the rest relies on
         object.__setattr__(self, "readable", _texts("readable", self.readable))
@@ -133,7 +135,9 @@ class Policy:
         object.__setattr__(self, "limits", _checked(self.limits))
         for path in self.readable:
             if not os.path.isabs(path):
-                raise PolicyError(f"policy: readable holds {path!r}; it takes absolute paths")
+                raise PolicyError(
+                    f"{option_name('readable')} holds {path!r}; it takes absolute paths"
+                )
 
     def confinement(self) -> Confinement:
         """What travels to the worker; the named environment variables get their values here."""
@@ -142,7 +146,7 @@ class Policy:
             profile=self.profile,
             network=self.network,
             readable=self.readable,
-            gpu=self.gpu,
+            gpu=_gpu(self.gpu),
             environment=granted,
             limits=self.limits,
             record_denials=self.record_denials,
@@ -172,7 +176,7 @@ def policy_from(
         chosen = replace(policy.limits, **named)
     elif policy.limits not in (Limits(), chosen):
         raise PolicyError(
-            "limits is given beside the limits of the policy: give one of them, or limits={...} "
+            "limits is given beside the limits of the policy: give one of them, or a mapping "
             "with those that are to be other than the policy's"
         )
     return replace(policy, limits=chosen)
@@ -209,23 +213,34 @@ def _from(cls: type[T], value: T | Mapping[str, Any] | None, what: str) -> T:
 
 def _one_of(name: str, value: str, known: tuple[str, ...]) -> None:
     if value not in known:
-        raise PolicyError(f"policy: {name} is {value!r}; it is one of {', '.join(known)}")
+        raise PolicyError(f"{option_name(name)} is {value!r}; it is one of {', '.join(known)}")
 
 
 def _count(name: str, value: object) -> None:
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise PolicyError(f"policy: {name} is {value!r}; it takes a whole number, 0 or more")
+        raise PolicyError(f"{option_name(name)} is {value!r}; it takes a whole number, 0 or more")
 
 
 def _path(name: str, value: object) -> str:
     if not isinstance(value, (str, os.PathLike)) or not os.fspath(value):
-        raise PolicyError(f"policy: {name} is {value!r}; it takes a path")
+        raise PolicyError(f"{option_name(name)} is {value!r}; it takes a path")
     return str(os.fspath(value))
 
 
 def _seconds(name: str, value: Any) -> None:
     if not (_is_number(value) and 0 <= value < float("inf")):
-        raise PolicyError(f"policy: {name} is {value!r}; it takes seconds, 0 or more")
+        raise PolicyError(f"{option_name(name)} is {value!r}; it takes seconds, 0 or more")
+
+
+def _gpu(value: object) -> bool | tuple[int, ...]:
+    if isinstance(value, bool):
+        return value
+    indices = value if isinstance(value, (list, tuple)) else ()
+    if not indices or any(type(index) is not int or index < 0 for index in indices):
+        raise PolicyError(
+            f"{option_name('gpu')} is {value!r}; it takes True, False or a list of indices"
+        )
+    return tuple(sorted(set(indices)))
 
 
 _OPTIONAL_LIMITS = frozenset({"cpu_s", "file_bytes"})
@@ -234,7 +249,7 @@ _OPTIONAL_LIMITS = frozenset({"cpu_s", "file_bytes"})
 def _texts(name: str, value: object) -> tuple[str, ...]:
     # a plain str is a sequence too, of letters
     if not isinstance(value, (list, tuple)) or not all(isinstance(item, str) for item in value):
-        raise PolicyError(f"policy: {name} is {value!r}; it takes a tuple of strings")
+        raise PolicyError(f"{option_name(name)} is {value!r}; it takes a tuple of strings")
     return tuple(value)
 
 
@@ -249,8 +264,13 @@ def _checked(limits: Limits) -> Limits:
 def _whole(name: str, value: Any) -> Any:
     if value is None and name in _OPTIONAL_LIMITS:
         return None
+    if isinstance(value, str) and name.endswith("_bytes"):
+        try:
+            value = parse_size(value)
+        except ValueError as error:
+            raise PolicyError(f"{option_name(name)} is {value!r}; {error}") from None
     if not (_is_number(value) and value > 0 and value // 1 == value):
-        raise PolicyError(f"limits: {name} is {value!r}; it takes a whole number above 0")
+        raise PolicyError(f"{option_name(name)} is {value!r}; it takes a whole number above 0")
     return int(value)
 
 

@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import gymnasium
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -27,6 +28,9 @@ settings.load_profile("ci" if "ENVHUB_CI" in os.environ else "local")
 # A store is trusted only where nobody else can move it: not in a /tmp that is not sticky.
 if folders.why_distrusted(Path(tempfile.gettempdir()), Path("/nowhere")):
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", "/var/tmp")
+
+# Gymnasium colours its warnings also where nobody looks, such as in the summary of a run.
+gymnasium.logger.colorize = lambda text, *_, **__: text
 
 # What a shell starts in the background ignores Ctrl-C, and so would every client of our tests.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:

@@ -6,6 +6,7 @@ move are no change, and a line that was changed is told again.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from envhub_sandbox.hub.hashing import differing
 from envhub_sandbox.hub.listing import FileRecord
 from envhub_sandbox.locks.drift import of_tasks
 from envhub_sandbox.locks.fingerprint import Task
-from envhub_worker.protocol.text import printable
+from envhub_worker.protocol.text import printable, size_text
 
 _MOST_BYTES = 1 << 20
 _LONGEST = 500
@@ -59,8 +60,12 @@ def changes(then: Static, now: Static) -> list[Change]:
         *_value("python", _python(then), _python(now)),
         *_named("package", _packages(then), _packages(now)),
         *_named("import", _imports(then), _imports(now)),
-        *_findings(then, now),
+        *sorted(_findings(then, now), key=_rank),
     ]
+
+
+def _rank(change: Change) -> int:
+    return 0 if change.finding is None else change.finding.check.severity.rank
 
 
 def _files(then: Static, now: Static) -> Iterator[Change]:
@@ -71,7 +76,7 @@ def _files(then: Static, now: Static) -> Iterator[Change]:
     moved = {was.get(one.digest) for path, one in after.items() if path not in before}
     for path in sorted({*before, *after}):
         if path in other:
-            sizes = f"{before[path].size} bytes, now {after[path].size}"
+            sizes = f"{size_text(before[path].size)}, now {size_text(after[path].size)}"
             yield Change("file", "changed", _shown(f"{path}: {sizes}"))
         elif path in gone and path not in moved:
             yield Change("file", "gone", _shown(path))
@@ -82,7 +87,7 @@ def _files(then: Static, now: Static) -> Iterator[Change]:
 def _new(record: FileRecord, was: Mapping[str, str]) -> Change:
     if record.digest in was:
         return Change("file", "renamed", _shown(f"{record.path}: was {was[record.digest]}"))
-    return Change("file", "new", _shown(f"{record.path}: {record.size} bytes"))
+    return Change("file", "new", _shown(f"{record.path}: {size_text(record.size)}"))
 
 
 def _shown(text: str) -> str:
@@ -151,7 +156,7 @@ def _lines(path: Path) -> list[str]:
             text = file.read(_MOST_BYTES).decode("utf-8", "replace")
     except OSError:
         return []
-    return [line.strip() for line in text.split("\n")]
+    return [line.strip() for line in re.split("\r\n|\r|\n", text)]
 
 
 def environments(then: Sequence[Task], now: Sequence[Task]) -> list[Change]:

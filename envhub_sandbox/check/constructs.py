@@ -25,7 +25,7 @@ _MODULES = {
     **dict.fromkeys(("subprocess", "pty"), _PROCESS),
     **dict.fromkeys(("pickle", "dill", "joblib", "cloudpickle", "marshal", "shelve"), _PICKLE),
     **dict.fromkeys(("ctypes", "cffi"), _NATIVE),
-    **dict.fromkeys(("builtins", "runpy"), _DYNAMIC),
+    **dict.fromkeys(("builtins", "runpy", "zipimport", "imp", "code", "codeop"), _DYNAMIC),
 }
 _CALLS = dict.fromkeys(("eval", "exec", "compile", "__import__"), _DYNAMIC)
 """Only where they are called: the first is a common name for an argument."""
@@ -41,6 +41,14 @@ _NAMES = {
     "asyncio.open_connection": _NETWORK,
     "importlib.import_module": _DYNAMIC,
     "importlib.util.spec_from_file_location": _DYNAMIC,
+    "importlib.util.spec_from_loader": _DYNAMIC,
+    "importlib.machinery.SourceFileLoader": _DYNAMIC,
+    "importlib.machinery.SourcelessFileLoader": _DYNAMIC,
+    "importlib.machinery.ExtensionFileLoader": _NATIVE,
+    "codecs.register": _DYNAMIC,
+    "site.addsitedir": _DYNAMIC,
+    "sys.meta_path": _DYNAMIC,
+    "sys.path_hooks": _DYNAMIC,
     "types.CodeType": _DYNAMIC,
     "torch.load": _PICKLE,
     "pandas.read_pickle": _PICKLE,

@@ -16,20 +16,25 @@ from envhub_sandbox.check.findings import Finding
 
 BEGINNING = 8192
 """Bytes by which a file's kind is told."""
+ENDING = (1 << 16) + 22
+"""Bytes in which a zip archive's end is looked for, whatever stands before it; so Python does."""
 LARGE = 10 << 20
-_MAGIC = (
-    (b"\x7fELF", "machine code"),
-    (b"MZ", "machine code"),
-    (b"!<arch>\n", "machine code"),
-    (b"\0asm", "machine code"),
-    *((magic, "machine code") for magic in (b"\xfe\xed\xfa\xce", b"\xfe\xed\xfa\xcf")),
-    *((magic, "machine code") for magic in (b"\xce\xfa\xed\xfe", b"\xcf\xfa\xed\xfe")),
-    (b"\xca\xfe\xba\xbe", "machine code"),
-    (b"version https://git-lfs.github.com/spec/", "LFS pointer"),
+_MACHINE_CODE = (
+    *(b"\x7fELF", b"MZ", b"!<arch>\n", b"\0asm", b"\xca\xfe\xba\xbe"),
+    *(b"\xfe\xed\xfa\xce", b"\xfe\xed\xfa\xcf", b"\xce\xfa\xed\xfe", b"\xcf\xfa\xed\xfe"),
+)
+_LFS = tuple(
+    b"version " + url
+    for url in (
+        *(b"https://git-lfs.github.com/spec/", b"https://hawser.github.com/spec/"),
+        b"http://git-media.io/v/",
+    )
 )
 _ARCHIVES = (b"PK\x03\x04", b"\x1f\x8b", b"\xfd7zXZ\0", b"BZh", b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf")
+_ZIP_END = b"PK\x05\x06"
 _SUFFIXES = {
     **dict.fromkeys((".so", ".dylib", ".dll", ".pyd", ".o", ".a"), "machine code"),
+    ".py": "Python",
     **dict.fromkeys((".pyc", ".pyo"), "compiled Python"),
     **dict.fromkeys((".pkl", ".pickle", ".joblib", ".pt", ".pth", ".ckpt"), "pickle"),
 }
@@ -38,7 +43,7 @@ _NO_ARCHIVES = (".npz", ".keras")
 """Archives by their first bytes, which hold arrays."""
 _SAID = {
     "machine code": ("source-native", "a file of machine code"),
-    "compiled Python": ("source-native", "compiled Python, which need not be what its source says"),
+    "compiled Python": ("source-compiled", "compiled Python"),
     "pickle": ("source-pickle", "a file that is, or may hold, a pickle"),
     "archive": ("source-unread", "an archive: nothing in it has been read"),
     "LFS pointer": ("source-unread", "a pointer of git LFS, without the file that it means"),
@@ -58,21 +63,32 @@ _MOST_HIDDEN = 20
 """Of one file."""
 
 
-def kind_of(name: str, beginning: bytes) -> str:
+def kind_of(name: str, beginning: bytes, ending: bytes = b"") -> str:
     """In a word or two: ``"Python"``, ``"text"``, ``"binary"``, or what is worth a look."""
     suffix = Path(name).suffix.lower()
-    found = next((kind for magic, kind in _MAGIC if beginning.startswith(magic)), None)
-    if found or suffix in _SUFFIXES:
-        return found or _SUFFIXES[suffix]
+    if beginning.lstrip().startswith(_LFS):
+        return "LFS pointer"
+    if suffix in _SUFFIXES:  # before what it begins with: "MZ = 1" is Python
+        return _SUFFIXES[suffix]
+    if beginning.startswith(_MACHINE_CODE):
+        return "machine code"
     if _PICKLE.match(beginning):
         return "pickle"
-    if (beginning.startswith(_ARCHIVES) or beginning[257:262] == b"ustar") and (
-        suffix not in _NO_ARCHIVES
-    ):
+    if _is_archive(beginning, ending) and (suffix not in _NO_ARCHIVES or _may_hold_code(ending)):
         return "archive"
-    if suffix == ".py":
-        return "Python"
     return "text" if _is_text(beginning) else "binary"
+
+
+def _is_archive(beginning: bytes, ending: bytes) -> bool:
+    of_a_kind = beginning.startswith(_ARCHIVES) or beginning[257:262] == b"ustar"
+    return of_a_kind or _ZIP_END in ending
+
+
+def _may_hold_code(ending: bytes) -> bool:
+    """Whether a zip's directory names modules, or is too large to be looked at."""
+    end = ending.rfind(_ZIP_END)
+    begin = end - int.from_bytes(ending[end + 12 : end + 16], "little")
+    return end >= 0 and (begin < 0 or re.search(rb"\.(pyc?|so)", ending[begin:end]) is not None)
 
 
 def _is_text(beginning: bytes) -> bool:
@@ -84,9 +100,12 @@ def _is_text(beginning: bytes) -> bool:
     return b"\0" not in beginning
 
 
-def of_kind(name: str, kind: str) -> Iterator[Finding]:
-    """What a kind by itself gives reason to look at."""
-    if kind in _SAID:
+def of_kind(name: str, kind: str, *, is_folder: bool) -> Iterator[Finding]:
+    """What a kind by itself gives reason to look at, in a repository or a folder that is here."""
+    if kind == "LFS pointer" and is_folder:
+        message = "a pointer of git LFS: the file that its commit has has not been judged"
+        yield Finding("source-uncommitted", message, file=name)
+    elif kind in _SAID:
         check, message = _SAID[kind]
         yield Finding(check, message, file=name)
 

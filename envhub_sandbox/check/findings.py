@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from bisect import insort
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
 from envhub_sandbox.check.plays import Play
-from envhub_sandbox.check.table import CHECKS, Check, Severity
+from envhub_sandbox.check.table import CHECKS, CURES, Check, Severity
 from envhub_sandbox.check.walls import Walls
-from envhub_worker.protocol.text import printable
+from envhub_worker.protocol.text import counted, duration_text, printable
 
 _LONGEST = 1_000
 _MOST = 500
 """Findings: a repository of ten thousand files is no reason for as many lines."""
+_SHOWN = 40
 _OF_EACH = 20
 """Of one check, which are kept whatever there is of others: no flood of notes hides an error."""
 
@@ -28,6 +30,8 @@ class Finding:
         message: What was seen, printable and of bounded length.
         task: ``"suite / task"``; empty where it is about the whole repository.
         file, line: Where it stands in the repository; empty and 0 where it stands nowhere.
+        cause: The class of the error that it is about, or how a process ended; may be empty.
+            Trust: the worker's word.
     """
 
     id: str
@@ -35,6 +39,7 @@ class Finding:
     task: str = ""
     file: str = ""
     line: int = 0
+    cause: str = ""
 
     @property
     def text(self) -> str:
@@ -47,6 +52,11 @@ class Finding:
         """What did not hold."""
         return CHECKS[self.id]
 
+    @property
+    def cure(self) -> str:
+        """What an author changes: by the error, where that says more than the check."""
+        return CURES.get(self.cause, self.check.cure)
+
 
 @dataclass
 class Report:
@@ -54,7 +64,7 @@ class Report:
 
     Attributes:
         reference: What was judged, pinned.
-        findings: In the order in which they were found.
+        findings: The most severe first; those of one severity as they were found.
         passed: Checks that were made, by id and task, and found nothing.
         figures: Of each task that was played: plain numbers.
         provenance: What ran, if anything did.
@@ -63,6 +73,8 @@ class Report:
         plays: What each task gave to look at.
         commit: Of what was judged; of a folder of this machine a hash of its content.
         walls: What confined it; None where nothing of it ran.
+        waiting: Tasks that have not been judged to their end.
+        unmade: Checks that were not made of anything, where a deadline ended it.
     """
 
     reference: str
@@ -75,20 +87,24 @@ class Report:
     plays: dict[str, Play] = field(default_factory=dict)
     commit: str = ""
     walls: Walls | None = None
+    waiting: list[str] = field(default_factory=list)
+    unmade: list[str] = field(default_factory=list)
     _kept: Counter[str] = field(default_factory=Counter, repr=False)
 
-    def judged(self, check: str, found: Collection[str], task: str = "") -> None:
+    def judged(
+        self, check: str, found: Collection[str], task: str = "", *, cause: str = ""
+    ) -> None:
         """A check was made: it found this, or nothing. Trust: texts from the worker."""
         for message in found:
-            self.add(Finding(check, message, task))
+            self.add(Finding(check, message, task, cause=cause))
         if not found:
             self.passed.append((check, task))
 
-    def add(self, finding: Finding) -> None:
-        """Add what was found, made printable."""
+    def add(self, finding: Finding) -> Finding | None:
+        """Add what was found, made printable; None where there is no room for it."""
         if len(self.findings) >= _MOST and self._kept[finding.id] >= _OF_EACH:
             self.left_out += 1
-            return
+            return None
         self._kept[finding.id] += 1
         kept = Finding(
             finding.id,
@@ -96,10 +112,42 @@ class Report:
             printable(finding.task, 200),
             printable(finding.file, 500),
             finding.line,
+            finding.cause,
         )
-        self.findings.append(kept)
+        insort(self.findings, kept, key=lambda one: one.check.severity.rank)
+        return kept
 
     def failures(self, fail_on: Severity, allowed: Collection[str] = ()) -> list[Finding]:
         """The findings that weigh enough, without those that are allowed."""
         found = (one for one in self.findings if one.id not in allowed)
         return [one for one in found if one.check.severity.reaches(fail_on)]
+
+    def stopped(self, seconds: float, at: str) -> None:
+        """A deadline has ended it: what was not judged is a finding.
+
+        Args:
+            seconds: Of the deadline.
+            at: What was done then.
+        """
+        made = {one.id for one in self.findings} | {check for check, _ in self.passed}
+        self.unmade = [check for check in CHECKS if check not in made and check != "deadline"]
+        left = [*self.unmade, *(f"all of {task}" for task in self.waiting)]
+        more = [f"and {len(left) - _SHOWN} more"] if len(left) > _SHOWN else []
+        shown = ", ".join([*left[:_SHOWN], *more])
+        text = f"ended after {duration_text(seconds)}, at: {at}. Not judged: {shown or 'its end'}"
+        self.judged("deadline", [text])
+
+    @staticmethod
+    def is_unjudged(failures: Collection[Finding]) -> bool:
+        """Whether nothing fails but that there was no time to judge all of it."""
+        return bool(failures) and all(one.id == "deadline" for one in failures)
+
+    def verdict(self, failures: Collection[Finding]) -> str:
+        """What came of it, in a sentence."""
+        held = counted(len({one for one, _ in self.passed}), "check holds", "checks hold")
+        found = counted(len(self.findings) + self.left_out, "finding")
+        if not failures:
+            return f"{held}, {found}: passed"
+        if self.is_unjudged(failures):
+            return f"{held}, {found}; not judged to its end"
+        return f"{held}, {found}, of which {counted(len(failures), 'fails', 'fail')} it"

@@ -46,6 +46,7 @@ from envhub_sandbox.hub.snapshot import Snapshot, named
 from envhub_sandbox.policy import policy_from
 from envhub_sandbox.session.recipe import pinned
 from envhub_sandbox.vector.suites import EnvSuites
+from envhub_worker.protocol.text import size_text
 
 _PICTURED = 12
 """Tasks of which a page has pictures: a suite may have hundreds."""
@@ -86,8 +87,12 @@ class Asked:
     pictures: bool = False
 
 
-def judge(asked: Asked) -> Report:
+def judge(asked: Asked, report: Report | None = None) -> Report:
     """Judge a repository.
+
+    Args:
+        asked: What is judged, and how.
+        report: Takes what is found as it is found, so that an interrupt loses none of it.
 
     Raises:
         EnvHubError: It could not be judged: it could not be had, this host cannot confine it, or
@@ -96,9 +101,11 @@ def judge(asked: Asked) -> Report:
     asked.tell(f"reading {asked.reference}")
     where = {name: asked.arguments.get(name) for name in ("hub_cache_dir", "token", "endpoint")}
     snapshot = named(asked.reference, **where)
-    report = Report(pinned(snapshot), commit=snapshot.commit)
+    report = Report(asked.reference) if report is None else report
+    report.reference, report.commit = pinned(snapshot), snapshot.commit
     report.asked = _told(asked)
     _Judge(asked, snapshot, report).ask()
+    report.judged("deadline", [])
     return report
 
 
@@ -120,8 +127,18 @@ def _told(asked: Asked) -> dict[str, str]:
 def _limit(name: str, value: int) -> str:
     words = name.replace("_", " ")
     if name.endswith("_bytes"):
-        return f"{words.removesuffix(' bytes')} {value / (1 << 20):g} MiB"
-    return f"{words} {value}"
+        return f"{words.removesuffix(' bytes')} {size_text(value)}"
+    return f"{words} {value:,}"
+
+
+def _cause(error: EnvHubError) -> str:
+    """What an error is about, as ``CURES`` names it. Trust: the worker's word."""
+    if isinstance(error, WorkerDiedError):
+        return error.reason
+    if isinstance(error, WorkerTimeoutError):
+        return "timeout"
+    remote = error if isinstance(error, RemoteEnvError) else error.__cause__
+    return remote.type_name.rpartition(".")[2] if isinstance(remote, RemoteEnvError) else ""
 
 
 class _Judge:
@@ -208,16 +225,24 @@ class _Judge:
             raise _StoppedError from error
         with suites:
             self._report.judged("loads", [])
-            for suite, task in self._asked.tasks(suites):
-                self._asked.tell(f"{suite} / {task}")
-                asking = _Task(self, suites, suite, task)
-                with self._stopping(f"{suite} / {task}", asking):
-                    asking.ask()
-                asking.denied()
-                asking.film()
-                suites[suite][task].close()
-            self._report.provenance = suites.provenance
-            self._note_walls(suites.provenance)
+            try:
+                self._ask_tasks(suites)
+            finally:  # also where an interrupt ends it
+                self._report.provenance = suites.provenance
+                self._note_walls(suites.provenance)
+
+    def _ask_tasks(self, suites: EnvSuites) -> None:
+        tasks = self._asked.tasks(suites)
+        self._report.waiting = [f"{suite} / {task}" for suite, task in tasks]
+        for suite, task in tasks:
+            self._asked.tell(f"{suite} / {task}")
+            asking = _Task(self, suites, suite, task)
+            with self._stopping(f"{suite} / {task}", asking):
+                asking.ask()
+            asking.denied()
+            asking.film()
+            suites[suite][task].close()
+            self._report.waiting.pop(0)
 
     def _note_walls(self, provenance: Mapping[str, Any] | None) -> None:
         policy = policy_from(self._asked.arguments.get("policy"), None)
@@ -225,9 +250,9 @@ class _Judge:
 
     def _unloaded(self, error: EnvHubError) -> None:
         if isinstance(error, (WorkerDiedError, WorkerTimeoutError)):
-            self._report.judged("survives", [f"while it loaded: {error}"])
+            self._report.judged("survives", [f"while it loaded: {error}"], cause=_cause(error))
         elif not isinstance(error, DependencyError):  # also a name that a terminal would obey
-            self._report.judged("loads", [str(error)])
+            self._report.judged("loads", [str(error)], cause=_cause(error))
         elif not self._found("imports"):  # where it stands has been said already
             self._report.judged("imports", [str(error)])
 
@@ -264,11 +289,13 @@ class _Judge:
         except CustomSpaceError as error:  # of actions
             self._report.judged("runs", [str(error)], task)
         except RemoteEnvError as error:
-            self._report.judged("runs", [f"{error.type_name}: {error.message}"], task)
+            found = [f"{error.type_name}: {error.message}"]
+            self._report.judged("runs", found, task, cause=_cause(error))
         except (LoadError, DependencyError, RemoteProtocolError) as error:
-            self._report.judged("loads", [f"not as it did at first: {error}"], task)
+            found = [f"not as it did at first: {error}"]
+            self._report.judged("loads", found, task, cause=_cause(error))
         except (WorkerDiedError, WorkerTimeoutError) as error:
-            self._report.judged("survives", [str(error)], task)
+            self._report.judged("survives", [str(error)], task, cause=_cause(error))
         else:
             for check in ("observation-space", "runs", "survives"):
                 self._report.judged(check, [], task)

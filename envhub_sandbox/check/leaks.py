@@ -6,6 +6,8 @@ import itertools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from envhub_worker.protocol.text import size_text
+
 _ROUNDS = 3
 _LEAST = {"processes": 2, "threads": 2, "memory_bytes": 1 << 20}
 """What a round has to add. Pools that are filled once, and the allocator, add less or once."""
@@ -46,9 +48,9 @@ def grown(seen: Sequence[Usage], resets: int) -> Iterator[tuple[str, str]]:
         steps = [after - before for before, after in itertools.pairwise(counts)]
         grows = bool(steps) and min(steps) >= _LEAST[what]
         if grows and not told:
-            unit = "bytes of memory" if what == "memory_bytes" else what
-            each = ", ".join(map(str, counts))
-            yield check, f"{unit} after each {resets} resets: {each}"
+            is_memory = what == "memory_bytes"
+            each = ", ".join(map(size_text if is_memory else str, counts))
+            yield check, f"{'memory' if is_memory else what} after each {resets} resets: {each}"
         told = told or grows
 
 

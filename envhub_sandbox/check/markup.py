@@ -43,7 +43,7 @@ table { border-collapse: collapse; width: 100% }
 th, td { border-bottom: 1px solid var(--rule); padding: .35rem .9rem .35rem 0; text-align: left;
   vertical-align: top }
 th { color: var(--dim); font-size: .85rem; font-weight: 600; white-space: nowrap }
-.whole { white-space: nowrap } .broad { display: inline-block; min-width: 12rem }
+.whole { white-space: nowrap }
 tr:last-child td { border-bottom: 0 }
 .findings { list-style: none; margin: 0; padding: 0 }
 .findings li { border-left: .25rem solid; margin: .7rem 0; padding: .1rem 0 .1rem .8rem }
@@ -53,7 +53,7 @@ dt { color: var(--dim) } dd { margin: 0 }
 summary { cursor: pointer; margin: .8rem 0 }
 figure { margin: 0 } figcaption { color: var(--dim); font-size: .85rem }
 figcaption strong { color: var(--ink) }
-.plots { display: grid; gap: 1.2rem 1.6rem; grid-template-columns: repeat(auto-fit,
+.plots { display: grid; gap: 1.2rem 1.6rem; grid-template-columns: repeat(auto-fill,
   minmax(min(100%, 22rem), 1fr)); margin: 1rem 0 .4rem }
 .pictures { display: grid; gap: .8rem 1.2rem; grid-template-columns: repeat(auto-fit,
   minmax(min(100%, 17rem), 1fr)); margin: 1rem 0 }
@@ -66,7 +66,10 @@ svg text { fill: var(--dim); font: 12px system-ui, sans-serif }
 .bar { fill: var(--bar) } .area { fill: var(--area) }
 .line { fill: none; stroke: var(--bar); stroke-width: 1.6 }
 .grid { stroke: var(--rule) } .mark { stroke: var(--mark); stroke-dasharray: 3 3 }
-@media (max-width: 34rem) { dl { grid-template-columns: 1fr } dd { margin-bottom: .5rem } }
+@media (max-width: 34rem) { dl { grid-template-columns: 1fr } dd { margin-bottom: .5rem }
+  table, tbody, tr, td { display: block } tr { border-bottom: 1px solid var(--rule);
+  padding: .6rem 0 } td { border: 0; padding: .1rem 0 } td:empty, tr:has(th) { display: none }
+  td::before { color: var(--dim); content: attr(data-head) " "; font-size: .85rem } }
 """
 _HASH = base64.b64encode(hashlib.sha256(_STYLE.encode()).digest()).decode()
 _POLICY = (
@@ -123,12 +126,16 @@ def folded(summary: str, inside: Iterable[str]) -> Iterator[str]:
 
 
 def table(heads: Iterable[str], rows: Collection[tuple[str, ...]]) -> Iterator[str]:
-    """A table of cells that are HTML already, as many rows as a browser bears."""
-    yield (
-        '<div class="wide"><table>\n<tr>' + "".join(f"<th>{head}</th>" for head in heads) + "</tr>"
-    )
+    """A table of cells that are HTML already, as many rows as a browser bears.
+
+    On a phone each row is a paragraph, with the head of its column before each cell.
+    """
+    names = [text(head) for head in heads]
+    top = "".join(f"<th>{name}</th>" for name in names)
+    yield f'<div class="wide"><table>\n<tr>{top}</tr>'
     for row in list(rows)[:_MOST_ROWS]:
-        yield "<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>"
+        cells = zip(names, row, strict=True)
+        yield "<tr>" + "".join(f'<td data-head="{name}">{cell}</td>' for name, cell in cells)
     yield "</table></div>"
     if len(rows) > _MOST_ROWS:
         yield f"<p>{len(rows) - _MOST_ROWS} more are left out.</p>"

@@ -14,8 +14,9 @@ import numpy as np
 from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.check.markup import data, document, facts, folded, table, text
 from envhub_sandbox.check.plays import Film, Play
-from envhub_sandbox.check.plots import bars, course, finite, histogram, milliseconds, number
+from envhub_sandbox.check.plots import bars, course, finite, histogram, number
 from envhub_sandbox.check.table import CHECKS
+from envhub_worker.protocol.text import counted, duration_text, size_text
 
 _MOST_PAIRS, _LONGEST_WORD = 1_000, 160
 """Of files and of packages, each with what is said of it."""
@@ -36,31 +37,27 @@ def page(report: Report, failures: Collection[Finding]) -> str:
 def _head(report: Report, failures: Collection[Finding]) -> Iterator[str]:
     style, verdict = "passed", "passed"
     if failures:
-        style, verdict = "error", f"not passed, by {_findings_of(len(failures))}"
+        style, verdict = "error", f"failed by {counted(len(failures), 'finding')}"
+    if report.is_unjudged(failures):
+        style, verdict = "warning", "not judged to its end"
     yield f'<p class="dim">envhub check <span class="badge {style}">{verdict}</span></p>'
     yield f"<h1>{text(report.reference)}</h1>"
-    left_out = f", {report.left_out} more are left out" if report.left_out else ""
-    findings = f"{_findings_of(len(report.findings))}{left_out}"
+    left_out = f"; {report.left_out} of them are left out here" if report.left_out else ""
     when = f" Judged at {report.asked['judged at']}." if "judged at" in report.asked else ""
-    held = f"{len(report.passed)} checks hold, {findings}."
-    yield f'<p class="dim">{text(held + when)}</p>'
-
-
-def _findings_of(count: int) -> str:
-    return f"{count} finding" if count == 1 else f"{count} findings"
+    yield f'<p class="dim">{text(report.verdict(failures) + left_out + "." + when)}</p>'
 
 
 def _findings(report: Report, failures: Collection[Finding]) -> Iterator[str]:
     if not report.findings:
         return
     yield '<h2>Findings</h2>\n<ul class="findings">'
-    for one in sorted(report.findings, key=lambda one: one not in failures):
+    for one in report.findings:
         severity = one.check.severity.value
         mark = f"{severity}, fails it" if one in failures else severity
         where = f' <span class="dim">{text(one.task)}</span>' if one.task else ""
         badge = f'<span class="badge">{mark}</span>'
         yield f'<li class="{severity}">{badge} <code>{one.id}</code>{where}'
-        yield f'<p>{text(one.text)}</p><span class="cure">{text(one.check.cure)}</span></li>'
+        yield f'<p>{text(one.text)}</p><span class="cure">{text(one.cure)}</span></li>'
     yield "</ul>"
 
 
@@ -98,14 +95,15 @@ def _pictures(film: Film) -> Iterator[str]:
     if film.video:
         source = data("video/mp4", film.video)
         yield f'<figure><video controls loop muted playsinline src="{source}"></video>'
-        yield f"<figcaption>{film.frames} frames, {number(film.fps)} a second</figcaption></figure>"
+        frames = f"{counted(film.frames, 'frame')}, {number(film.fps)} a second"
+        yield f"<figcaption>{frames}</figcaption></figure>"
     yield '<div class="stills">'
     for index, still in enumerate(film.stills):
         alt = f"rendered frame {index + 1} of {len(film.stills)}"
         yield f'<img alt="{alt}" src="{data("image/png", still)}">'
     yield "</div></div>"
     if film.lacks:
-        what = "No film" if film.stills else "No picture"
+        what = "The film ends early" if film.video else "No film" if film.stills else "No picture"
         yield f'<p class="dim">{what}: {text(film.lacks)}</p>'
 
 
@@ -145,7 +143,7 @@ def _mean(values: Sequence[float]) -> str:
 
 
 def _median(seconds: Sequence[float]) -> str:
-    return f"median {milliseconds(float(np.median(seconds)))}" if seconds else ""
+    return f"median {duration_text(float(np.median(seconds)))}" if seconds else ""
 
 
 def _figures(report: Report) -> Iterator[str]:
@@ -158,15 +156,15 @@ def _figures(report: Report) -> Iterator[str]:
         (text(task), *(_figure(name, row.get(name)) for name in names))
         for task, row in report.figures.items()
     ]
-    yield from table(("task", *map(text, heads)), rows)
+    yield from table(("task", *heads), rows)
 
 
 def _figure(name: str, value: float | None) -> str:
     if value is None:
         return ""
     if name.endswith("_bytes"):
-        return f"{value * 2.0**-20:.1f} MiB"
-    return milliseconds(value) if name.endswith("_s") else f"{value:g}"
+        return size_text(value)
+    return duration_text(value) if name.endswith("_s") else f"{value:g}"
 
 
 def _held(report: Report) -> Iterator[str]:
@@ -178,7 +176,7 @@ def _held(report: Report) -> Iterator[str]:
         for check, of in tasks.items()
     ]
     yield "<h2>Checks that hold</h2>"
-    what = "1 check holds" if len(rows) == 1 else f"{len(rows)} checks hold"
+    what = counted(len(rows), "check holds", "checks hold")
     yield from folded(what, table(("check", "what holds", "tasks"), rows))
 
 

@@ -2,18 +2,23 @@
 
 ``parsing.py`` runs this file by its path, alone in a fresh interpreter: it imports the standard
 library and nothing else. Stdin has each file behind its length (four bytes, big endian), stdout
-gets one line of JSON for each, in the same order: what it imports, calls, uses and names, or
-``null``. Names are followed to what they were imported as in that file, and no further.
+gets one line of JSON for each, in the same order: what it imports, calls, uses and names, or its
+encoding where that is another than UTF-8, nothing of what is no Python, ``null`` of what was too
+much. Names are followed to what they were
+imported as in that file, and no further.
 """
 
 from __future__ import annotations
 
 import ast
+import codecs
+import io
 import json
 import re
 import resource
 import signal
 import sys
+import tokenize
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -28,6 +33,7 @@ MOST = 10_000
 LONGEST = 1024
 """Of a module, as a path of a file can be."""
 _LONGEST_TEXT = 200
+_READ_AS = ("utf-8", "utf-8-sig", "ascii")
 _DEEPEST = 8
 _OUTSIDE = re.compile(
     r"~/.*|/(etc|home|proc|root|sys|boot|run|var)(/.*)?|(.*/)?\.(ssh|aws|netrc|kube|gnupg)(/.*)?"
@@ -52,13 +58,35 @@ def bound() -> None:
 
 
 def described(data: bytes) -> dict[str, Any] | None:
-    """What a file says; None of what is no Python (of this version)."""
+    """What a file says; nothing of what is no Python of this version, None of what is too much."""
+    named = encoding(data)
+    if named not in _READ_AS:
+        return {"encoding": named[:_LONGEST_TEXT]}
     try:
-        # as text: of bytes, a stranger's own first line would choose the codec, and some take hours
-        tree = ast.parse(data.decode("utf-8-sig"))
+        # the bytes: what ``import`` compiles; a decoded text can be another program
+        tree = ast.parse(data)
         return {kind: rows[:MOST] for kind, rows in _rows(tree).items()}
-    except (SyntaxError, ValueError, RecursionError, MemoryError):
+    except (RecursionError, MemoryError):
         return None
+    except (SyntaxError, ValueError):
+        return {}
+
+
+def encoding(data: bytes) -> str:
+    """The encoding by which Python reads a file; empty where it has none that there is.
+
+    Nothing is decoded by a codec that a stranger's first lines choose: some take hours, and some
+    make code of a comment. Python ends lines at a carriage return, too, before it looks for the
+    encoding, and ``tokenize`` does not.
+    """
+    lines = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    try:
+        named = codecs.lookup(tokenize.detect_encoding(io.BytesIO(lines).readline)[0]).name
+        if named in _READ_AS:
+            data.decode("utf-8")  # Python does not mind what else a comment holds
+    except (SyntaxError, UnicodeDecodeError):
+        return ""
+    return named
 
 
 def _rows(tree: ast.Module) -> dict[str, list[Any]]:

@@ -59,21 +59,26 @@ class Parsed:
         fetches: Of ``getattr``: of what, and by which name; None for one that is computed.
         texts: ``"outside"`` with a text that names a place beyond, or ``"wordless"``; its length.
         entries: The arguments of each ``make_env``.
+        encoding: Where it is neither UTF-8 nor ASCII, and so has not been read: its name, or an
+            empty one where there is none.
+        is_python: Of this version.
     """
 
-    imports: tuple[Named, ...]
+    imports: tuple[Named, ...] = ()
     calls: tuple[tuple[str, int], ...] = ()
     uses: tuple[tuple[str, int], ...] = ()
     fetches: tuple[tuple[str, str | None, int], ...] = ()
     texts: tuple[tuple[str, str, int, int], ...] = ()
     entries: tuple[tuple[str, int], ...] = ()
+    encoding: str | None = None
+    is_python: bool = True
 
 
 def read(snapshot: Snapshot) -> dict[str, Parsed | None]:
-    """Every Python file of a snapshot; None for those that cannot be read.
+    """Every Python file of a snapshot; None for those that have not been read.
 
-    That is: larger than a person writes, no Python of this version, beyond what all may take, or
-    what the parser has not survived.
+    That is: larger than a person writes, beyond what all may take, or what the parser has not
+    survived.
     """
     names = sorted(one.path for one in snapshot.files if one.path.endswith(".py"))
     found: dict[str, Parsed | None] = dict.fromkeys(names)
@@ -108,7 +113,7 @@ def content(path: Path, most: int) -> bytes | None:
 
 
 def parsed(texts: Mapping[str, bytes]) -> dict[str, Parsed | None]:
-    """What each text is; None where it is no Python, or was too much for a child."""
+    """What each text is; None where it was too much for a child."""
     found: dict[str, Parsed | None] = dict.fromkeys(texts)
     waiting = list(texts)
     for _ in range(MOST_LOST):
@@ -153,6 +158,8 @@ def _run(given: IO[bytes], taken: IO[bytes]) -> None:
 def _answer(row: Any) -> Parsed | None:
     if row is None:
         return None
+    if not row or "encoding" in row:
+        return Parsed(is_python=bool(row), **row)
     imports = (
         Named(level, module, tuple(names), unguarded, line)
         for level, module, names, unguarded, line in row["imports"]

@@ -8,8 +8,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from envhub_worker.protocol.text import duration_text, size_text
+
 _WIDTH, _HEIGHT = 460, 150
 _LEFT, _RIGHT, _TOP, _BOTTOM = 6, 6, 18, 20
+_WIDEST = 40
 _MOST_BARS = 64
 _BINS = 32
 _LARGEST = 1e100
@@ -30,7 +33,7 @@ def bars(name: str, values: Sequence[float]) -> str:
     groups = [known[at : at + each] for at in range(0, len(known), each)]
     heights = [float(np.mean(group)) for group in groups]
     low, high = _range([0.0, *heights])
-    wide = (_WIDTH - _LEFT - _RIGHT) / len(heights)
+    wide = min((_WIDTH - _LEFT - _RIGHT) / len(heights), _WIDEST)
     shown = []
     for index, value in enumerate(heights):
         top, base = sorted((_y(value, low, high), _y(0.0, low, high)))
@@ -58,7 +61,7 @@ def histogram(name: str, seconds: Sequence[float]) -> str:
         if count:
             top = _y(count, 0.0, most)
             box = (_LEFT + (index + 0.05) * wide, top, 0.9 * wide, _y(0.0, 0.0, most) - top)
-            span = f"{milliseconds(edges[index])} to {milliseconds(edges[index + 1])}"
+            span = f"{duration_text(edges[index])} to {duration_text(edges[index + 1])}"
             shown.append(_bar(box, f"{span}: {count}"))
     length = math.log(edges[-1] / edges[0])
     for share, word in ((0.5, "median"), (0.99, "99 %")):
@@ -68,7 +71,7 @@ def histogram(name: str, seconds: Sequence[float]) -> str:
         aside = -4 if anchor == "end" else 4
         shown.append(_line(at, _TOP - 4, at, _HEIGHT - _BOTTOM, "mark"))
         shown.append(_word(at + aside, _TOP - 4 + (0 if share < 0.9 else 12), word, anchor))
-    ends = [(0.0, milliseconds(known.min())), (1.0, milliseconds(known.max()))]
+    ends = [(0.0, duration_text(known.min())), (1.0, duration_text(known.max()))]
     return _svg(name, [*shown, *_below(ends)])
 
 
@@ -101,7 +104,7 @@ def course(name: str, values: Sequence[float], parts: Sequence[tuple[int, str]])
             ends.append((share, word))
             if share < 1:
                 shown.append(_line(_x(share), _TOP, _x(share), _HEIGHT - _BOTTOM, "mark"))
-    highest = f"{float(known.max()) * 2.0**-20:.1f} MiB"
+    highest = size_text(float(known.max()))
     shown.append(_word(_LEFT, _TOP - 5, f"up to {highest}", "start"))
     return _svg(name, [*shown, *_below(ends)])
 
@@ -113,13 +116,6 @@ def number(value: float) -> str:
     if 1_000 <= abs(value) < 1e6:
         return f"{value:,.0f}"
     return f"{value:.3g}"
-
-
-def milliseconds(seconds: float) -> str:
-    """A time in few characters."""
-    if seconds >= 1:
-        return f"{number(seconds)} s"
-    return f"{number(seconds * 1e3)} ms" if seconds >= 1e-3 else f"{seconds * 1e6:.0f} µs"
 
 
 def finite(values: Sequence[float]) -> NDArray[np.float64]:

@@ -30,6 +30,7 @@ def document(report: Report, failures: Sequence[Finding]) -> dict[str, Any]:
         "passed": not failures,
         "findings": [_finding(one, failures) for one in report.findings],
         "left_out": report.left_out,
+        "unjudged": {"checks": report.unmade, "tasks": report.waiting},
         "held": [{"check": check, "task": task} for check, task in report.passed],
         "figures": report.figures,
         "confinement": None if report.walls is None else report.walls.document(),
@@ -42,7 +43,7 @@ def _finding(one: Finding, failures: Sequence[Finding]) -> dict[str, Any]:
         "check": one.id,
         "severity": one.check.severity.value,
         "message": one.message,
-        "cure": one.check.cure,
+        "cure": one.cure,
         "task": one.task or None,
         "file": one.file or None,
         "line": one.line or None,
@@ -60,10 +61,12 @@ def read(told: Mapping[str, Any]) -> tuple[Report, list[Finding]]:
     failures = []
     for row in told["findings"]:
         place = (_str(row["task"] or ""), _str(row["file"] or ""), int(row["line"] or 0))
-        report.add(Finding(CHECKS[row["check"]].id, _str(row["message"]), *place))
-        failures += report.findings[-1:] if row["fails"] is True else []
+        kept = report.add(Finding(CHECKS[row["check"]].id, _str(row["message"]), *place))
+        failures += [kept] if kept is not None and row["fails"] is True else []
     report.passed = [(CHECKS[row["check"]].id, _str(row["task"])) for row in told["held"]]
     report.left_out = int(told["left_out"])
+    report.unmade = [CHECKS[check].id for check in told["unjudged"]["checks"]]
+    report.waiting = [_str(task) for task in told["unjudged"]["tasks"]]
     if told["passed"] is not (not failures):
         raise ValueError("the findings are not what the verdict says")
     return report, failures
@@ -90,18 +93,17 @@ def suite(report: Report, failures: Sequence[Finding]) -> ElementTree.Element:
     """A report as one of JUnit's suites."""
     asked = dict.fromkeys([*((one.id, one.task) for one in report.findings), *report.passed])
     failed = dict.fromkeys((one.id, one.task) for one in failures)
+    unjudged = [*((check, "") for check in report.unmade), *(("*", one) for one in report.waiting)]
     made = ElementTree.Element(
         "testsuite",
         name=xml_text(report.reference),
-        tests=str(len(asked)),
+        tests=str(len(asked) + len(unjudged)),
         failures=str(len(failed)),
         errors="0",
-        skipped="0",
+        skipped=str(len(unjudged)),
     )
     for check, task in asked:
-        case = ElementTree.SubElement(
-            made, "testcase", classname=xml_text(task or "repository"), name=check
-        )
+        case = _case(made, check, task)
         found = [one for one in report.findings if (one.id, one.task) == (check, task)]
         text = "\n".join(one.text for one in found)
         if (check, task) in failed:
@@ -109,7 +111,14 @@ def suite(report: Report, failures: Sequence[Finding]) -> ElementTree.Element:
             ElementTree.SubElement(case, "failure", message=words).text = xml_text(text)
         elif found:
             ElementTree.SubElement(case, "system-out").text = xml_text(text)
+    for check, task in unjudged:
+        ElementTree.SubElement(_case(made, check, task), "skipped", message="not judged")
     return made
+
+
+def _case(suite: ElementTree.Element, check: str, task: str) -> ElementTree.Element:
+    where = xml_text(task or "repository")
+    return ElementTree.SubElement(suite, "testcase", classname=where, name=check)
 
 
 def xml_text(text: str) -> str:
@@ -131,6 +140,7 @@ def sarif(report: Report, failures: Sequence[Finding]) -> str:
     run = {
         "tool": {"driver": {"name": "envhub check", "rules": rules}},
         "results": [_result(one, failures) for one in report.findings],
+        "invocations": [{"executionSuccessful": not (report.unmade or report.waiting)}],
         "columnKind": "unicodeCodePoints",
     }
     return json.dumps({"$schema": _SCHEMA, "version": "2.1.0", "runs": [run]}, indent=2) + "\n"
@@ -168,7 +178,7 @@ def workflow_commands(report: Report) -> Iterator[str]:
         place = f"file={_property(one.file)}," if one.file else ""
         place += f"line={one.line}," if one.line else ""
         title = f"envhub check: {one.id}" + (f" ({one.task})" if one.task else "")
-        text = f"{one.message}\n{one.check.cure}"
+        text = f"{one.message}\n{one.cure}"
         yield workflow_command(_GITHUB[one.check.severity], title, text, place)
     if report.walls is not None and report.walls.are_fewer:
         told = "\n".join(report.walls.lines())
@@ -190,8 +200,7 @@ def _property(text: str) -> str:
 
 def summary(report: Report, failures: Collection[Finding]) -> str:
     """A table for GitHub's step summary; a stranger's text is no markup there."""
-    verdict = f"{len(failures)} findings fail" if failures else "passed"
-    lines = [f"### envhub check: {verdict}", "", cell(report.reference), ""]
+    lines = [f"### envhub check: {report.verdict(failures)}", "", cell(report.reference), ""]
     if report.walls is not None:
         lines += [*(f"- {cell(line)}" for line in report.walls.lines()), ""]
     if report.findings:

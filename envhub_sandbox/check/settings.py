@@ -15,6 +15,7 @@ from envhub_sandbox.errors import EnvHubError, PolicyError
 from envhub_sandbox.hub.local import split_local
 from envhub_sandbox.hub.reference import DEFAULT_PATH
 from envhub_sandbox.hub.snapshot import is_here
+from envhub_worker.protocol.text import size_text
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -88,7 +89,7 @@ def _read(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise PolicyError(f"{path} cannot be read: {error.strerror}") from error
     if len(data) > _MOST_BYTES:
-        raise PolicyError(f"{path} is larger than {_MOST_BYTES} bytes")
+        raise PolicyError(f"{path} is larger than {size_text(_MOST_BYTES)}")
     try:
         document: dict[str, Any] = tomllib.loads(data.decode("utf-8"))
     except (ValueError, RecursionError) as error:

@@ -78,7 +78,7 @@ def static(snapshot: Snapshot) -> Static:
         entries=() if entry is None else entry.entries,
         imports=source.imports(snapshot, parsed),
         declared=says,
-        findings=[_printable(one) for one in findings],
+        findings=sorted(map(_printable, findings), key=lambda one: one.check.severity.rank),
     )
 
 

@@ -7,6 +7,7 @@ sandbox's. What could not be read is found, too.
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -16,15 +17,19 @@ from envhub_sandbox.check.constructs import constructs, long_lines
 from envhub_sandbox.check.findings import Finding
 from envhub_sandbox.check.parsing import MOST_BYTES, Parsed
 from envhub_sandbox.errors import SnapshotError
-from envhub_sandbox.hub import local
+from envhub_sandbox.hub.checkout import Checkout
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
+from envhub_sandbox.hub.local import LocalFolder
 
 _MOST_BYTES_OF_TEXT = 1 << 20
 _MOST_BYTES_IN_ALL = 32 << 20
 _MOST_OF_A_FILE = 100
 _MOST = 20_000
 """Findings: as many as there may be files."""
+_OF_EACH = 20
+"""Of one check, which are kept whatever there is of others."""
 _LONGEST_LINK = 1024
+_SHOWN_IGNORED = 10
 
 
 @dataclass(frozen=True)
@@ -51,10 +56,14 @@ class Survey:
 
     files: list[File] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
+    _kept: Counter[str] = field(default_factory=Counter, repr=False)
 
     def add(self, found: Iterable[Finding]) -> None:
         """Take what was found in one place, as far as there is room."""
-        self.findings += itertools.islice(found, max(_MOST - len(self.findings), 0))
+        for one in found:
+            self._kept[one.id] += 1
+            if len(self.findings) < _MOST or self._kept[one.id] <= _OF_EACH:
+                self.findings.append(one)
 
 
 def survey(snapshot: Snapshot, parsed: Mapping[str, Parsed | None]) -> Survey:
@@ -66,17 +75,21 @@ def survey(snapshot: Snapshot, parsed: Mapping[str, Parsed | None]) -> Survey:
     """
     found = Survey()
     found.add(_papers(snapshot))
-    found.add(_links(snapshot))
+    found.add(_in_place(snapshot))
+    found.add(_in_front(snapshot))
     left = _MOST_BYTES_IN_ALL
     for record in sorted(snapshot.files, key=lambda one: one.path):
         path = snapshot.root / record.path
-        kind = contents.kind_of(record.path, _bytes(path, contents.BEGINNING))
+        ending = _bytes(path, contents.ENDING, max(record.size - contents.ENDING, 0))
+        kind = contents.kind_of(record.path, _bytes(path, contents.BEGINNING), ending)
         found.files.append(File(record, kind))
-        found.add(contents.of_kind(record.path, kind))
+        found.add(contents.of_kind(record.path, kind, is_folder=snapshot.repo_type == "local"))
         found.add(_in_name(record))
-        if kind == "Python" and record.path in parsed:
+        if record.path in parsed:
             found.add(_in_code(record, parsed[record.path]))
-        if kind in ("Python", "text") and record.size <= min(left, _MOST_BYTES_OF_TEXT):
+        if parsed.get(record.path) is not None:
+            found.add(_in_text(record, path, is_code=True))
+        elif kind in ("Python", "text") and record.size <= min(left, _MOST_BYTES_OF_TEXT):
             left -= record.size
             found.add(_in_text(record, path, is_code=kind == "Python"))
     if len(found.findings) >= _MOST:
@@ -84,9 +97,10 @@ def survey(snapshot: Snapshot, parsed: Mapping[str, Parsed | None]) -> Survey:
     return found
 
 
-def _bytes(path: Path, most: int) -> bytes:
+def _bytes(path: Path, most: int, start: int = 0) -> bytes:
     try:
         with path.open("rb") as file:
+            file.seek(start)
             return file.read(most)
     except OSError:
         return b""
@@ -106,10 +120,16 @@ def _in_text(record: FileRecord, path: Path, *, is_code: bool) -> Iterator[Findi
 
 def _in_code(record: FileRecord, parsed: Parsed | None) -> Iterator[Finding]:
     if parsed is None:
-        larger = f"it is larger than {MOST_BYTES >> 10} KiB, and has not been read"
-        other = "it is no UTF-8 or no Python of this version, or more than is read of a repository"
-        yield _unread(record, larger if record.size > MOST_BYTES else other)
+        larger = f"it is larger than {MOST_BYTES >> 10} KiB"
+        other = "it is more than can be read of a file, or of a repository"
+        message = larger if record.size > MOST_BYTES else other
+        yield Finding("source-unparsed", message, file=record.path)
         return
+    if not parsed.is_python:
+        yield _unread(record, "it is no Python of this version")
+    if parsed.encoding is not None:
+        named = f"Python reads it as {parsed.encoding}" if parsed.encoding else "it is no UTF-8"
+        yield Finding("source-encoding", f"{named}, and it has not been read", file=record.path)
     found = constructs(record.path, parsed)
     yield from itertools.islice(found, _MOST_OF_A_FILE)
     if next(found, None) is not None:
@@ -120,14 +140,25 @@ def _unread(record: FileRecord, why: str) -> Finding:
     return Finding("source-unread", why, file=record.path)
 
 
-def _links(snapshot: Snapshot) -> Iterator[Finding]:
-    """Files under another's name; git's links arrive from the Hub as texts that name their target.
-
-    Those of a folder are followed when it is copied, and lead nowhere else.
-    """
-    if snapshot.repo_type == "local":
-        yield from _links_of_folder(snapshot)
+def _in_place(snapshot: Snapshot) -> Iterator[Finding]:
+    """Links, and where a folder is not what its commit is."""
+    if snapshot.repo_type != "local":
+        yield from _links(snapshot)
         return
+    try:
+        here = LocalFolder.at(snapshot.repo_id)
+        if here.checkout is None:
+            yield from _links_of_folder(here)
+        else:
+            yield from _links(snapshot)
+            yield from _uncommitted(here.checkout, snapshot)
+            yield from _left_out(here)
+    except OSError as error:
+        raise SnapshotError(f"{snapshot.label}: it has changed meanwhile: {error}") from error
+
+
+def _links(snapshot: Snapshot) -> Iterator[Finding]:
+    """Links of git's, which come from the Hub, and so from a checkout, as files with their text."""
     there = {record.path for record in snapshot.files}
     there |= {str(parent) for path in there for parent in PurePosixPath(path).parents}
     for record in snapshot.files:
@@ -137,15 +168,46 @@ def _links(snapshot: Snapshot) -> Iterator[Finding]:
             yield Finding("source-link", message, file=record.path)
 
 
-def _links_of_folder(snapshot: Snapshot) -> Iterator[Finding]:
-    root = Path(snapshot.repo_id).resolve()
-    try:
-        for file in local.scan(root):
-            if file.source != root / file.path:
-                target = file.source.relative_to(root)
-                yield Finding("source-link", f"a link to {target}", file=file.path)
-    except OSError as error:
-        raise SnapshotError(f"{snapshot.label}: it has changed meanwhile: {error}") from error
+def _links_of_folder(here: LocalFolder) -> Iterator[Finding]:
+    """Links were followed when the folder was copied, and lead nowhere else."""
+    for file in here.files():
+        if file.source != here.root / file.path:
+            target = file.source.relative_to(here.root)
+            yield Finding("source-link", f"a link to {target}", file=file.path)
+
+
+def _uncommitted(checkout: Checkout, snapshot: Snapshot) -> Iterator[Finding]:
+    for name in checkout.held_back:
+        message = "git does not look at it for changes, so its commit may have another version"
+        yield Finding("source-uncommitted", message, file=name)
+    for name, attribute in checkout.converted(record.path for record in snapshot.files):
+        message = f"git commits it with other bytes, by {attribute} in .gitattributes"
+        yield Finding("source-uncommitted", message, file=name)
+
+
+def _left_out(here: LocalFolder) -> Iterator[Finding]:
+    ignored = []
+    for one in here.left_out():
+        if one.is_repository:
+            message = "a git repository of its own: the commit around it has none of its files"
+            yield Finding("source-uncommitted", message, file=one.path)
+        else:
+            ignored.append(one.path)
+    if ignored:
+        more = len(ignored) - _SHOWN_IGNORED
+        shown = ", ".join([*ignored[:_SHOWN_IGNORED], *([f"{more} more"] if more > 0 else [])])
+        yield Finding("source-ignored", f"git leaves out {shown}")
+
+
+def _in_front(snapshot: Snapshot) -> Iterator[Finding]:
+    """Extension modules that Python imports rather than the source beside them."""
+    there = {record.path for record in snapshot.files}
+    for path in sorted(path for path in there if path.endswith(".so")):
+        folder, slash, name = path.rpartition("/")
+        source = f"{folder}{slash}{name.partition('.')[0]}.py"
+        if source in there:
+            message = f"machine code that runs in place of {source}"
+            yield Finding("source-compiled", message, file=path)
 
 
 def _target(snapshot: Snapshot, record: FileRecord, there: set[str]) -> str | None:

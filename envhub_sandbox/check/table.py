@@ -16,10 +16,14 @@ class Severity(str, Enum):
     WARNING = "warning"
     NOTE = "note"
 
+    @property
+    def rank(self) -> int:
+        """Its place among the others, 0 for the worst."""
+        return list(Severity).index(self)
+
     def reaches(self, other: Severity) -> bool:
         """Whether it weighs at least as much."""
-        order = list(Severity)
-        return order.index(self) <= order.index(other)
+        return self.rank <= other.rank
 
 
 @dataclass(frozen=True)
@@ -67,7 +71,8 @@ CHECKS: dict[str, Check] = {
             "runs",
             _E,
             "reset and step raise nothing, for actions sampled from the action space.",
-            "Take every member of the action space in every state, or make the space smaller.",
+            "Mend what raises it: reset has to work at any time, and step for every member of the "
+            "action space.",
         ),
         Check(
             "survives",
@@ -87,6 +92,13 @@ CHECKS: dict[str, Check] = {
             "Each sub-environment gives observations of the dtype and shape that its space says; "
             "Gymnasium casts what it puts into a batch, and so hides it.",
             "Return what observation_space says: for a float32 Box, np.asarray(..., np.float32).",
+        ),
+        Check(
+            "deadline",
+            _E,
+            "All of it was judged within --deadline.",
+            "Load, reset and step faster; or judge less of it (--task, --steps, --resets), or give "
+            "it longer (--deadline).",
         ),
         Check(
             "rewards",
@@ -224,6 +236,38 @@ CHECKS: dict[str, Check] = {
             "Depend on a package that brings the library along.",
         ),
         Check(
+            "source-compiled",
+            _E,
+            "It brings nothing compiled that runs in place of its source, whatever that says.",
+            "Delete __pycache__, each .pyc, and each .so beside a .py of its name; in git with "
+            "git rm -r --cached, and name them in .gitignore.",
+        ),
+        Check(
+            "source-encoding",
+            _E,
+            "Python reads its code as UTF-8; another encoding can make code of a comment.",
+            "Save it as UTF-8, and name no encoding in its first two lines.",
+        ),
+        Check(
+            "source-unparsed",
+            _E,
+            "All of its Python has been read: files of up to 256 KiB, and 16 MiB in all.",
+            "Put data into files of their own, and write what nests less deeply.",
+        ),
+        Check(
+            "source-uncommitted",
+            _E,
+            "The folder has what its commit has: no git repositories within it, no files that git "
+            "does not look at or converts, no pointers of git LFS in place of files.",
+            "Commit the files themselves, fetch them (git lfs pull), or have the commit judged.",
+        ),
+        Check(
+            "source-ignored",
+            _N,
+            "Git ignores nothing in the folder. What it ignores is not judged, loaded or pushed.",
+            "Nothing, where it needs none of it; git add --force what it needs.",
+        ),
+        Check(
             "source-outside",
             _N,
             "Its code names no places beyond its own: homes, /etc, /proc, other programs' tokens.",
@@ -251,8 +295,36 @@ CHECKS: dict[str, Check] = {
         Check(
             "source-unread",
             _N,
-            "All that could run of it has been read.",
-            "Write Python as UTF-8, in files of up to 256 KiB, and bring no archives.",
+            "Each file could be read: no archives, and no Python of another version.",
+            "Bring no archives, and delete what no Python can run.",
         ),
     )
 }
+
+_DECLARE = (
+    "Declare the package that the error names in requirements.txt, with the extra that it asks for."
+)
+_BRING = "Bring data along in the repository: a sandbox has no network."
+_MEMORY = "Use less memory, or say in the card how much it needs: its user raises --memory."
+_TIME = "Do less at once, or say in the card how long it takes: its user raises --timeout."
+CURES = {
+    **dict.fromkeys(("DependencyNotInstalled", "ImportError", "ModuleNotFoundError"), _DECLARE),
+    **dict.fromkeys(
+        ("NameNotFound", "NamespaceNotFound", "UnregisteredEnv", "VersionNotFound"),
+        "Import the package that registers this id, and declare it in requirements.txt.",
+    ),
+    **dict.fromkeys(("ConnectionError", "HTTPError", "URLError", "gaierror"), _BRING),
+    **dict.fromkeys(("MemoryError", "out-of-memory"), _MEMORY),
+    **dict.fromkeys(("TimeoutError", "timeout"), _TIME),
+    "FileNotFoundError": "Bring the file along in the repository, and find it from "
+    "Path(__file__).parent.",
+    "PermissionError": "Write to the working folder, to tempfile or to the home that it is given.",
+    "NotImplementedError": "Implement the method that raises it.",
+    "ResetNeeded": "Let every sub-environment be reset before it is stepped or rendered.",
+    "cpu-limit": "Compute less, or say in the card how much: its user raises --cpu-time.",
+    "disk-limit": "Write less, or say in the card how much: its user raises --disk.",
+    "signal": "Look for a fault in native code: faulthandler.enable() prints where it is.",
+    "exit": "Raise an exception instead of ending the process.",
+}
+"""What cures a finding whose error says more than its check, by the error's class or the process's
+end."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
@@ -23,9 +24,11 @@ from envhub_sandbox.cli.init.init import init
 from envhub_sandbox.cli.inspect.inspect import inspect
 from envhub_sandbox.cli.run.run import run
 from envhub_sandbox.cli.shared.exits import EXIT_CODES
+from envhub_sandbox.cli.shared.program import Command, Program
 
 app = typer.Typer(
     name="envhub",
+    cls=Program,
     help="Run anybody's Gymnasium environment from the Hugging Face Hub, without letting its code "
     "into your process.",
     epilog=EXIT_CODES,
@@ -57,18 +60,22 @@ def envhub(
     """What stands before a command."""
 
 
-app.command("run", epilog=EXIT_CODES)(run)
-app.command("inspect", epilog=EXIT_CODES)(inspect)
-app.command("check", epilog=EXIT_CODES)(check)
-app.command("diff", epilog=EXIT_CODES)(diff.diff)
-app.command("prefetch", epilog=EXIT_CODES)(prefetch.prefetch)
-app.command("lock", epilog=EXIT_CODES)(lock.lock)
-app.command("verify", epilog=EXIT_CODES)(lock.verify)
-app.command("init")(init)
-app.command("push", epilog=EXIT_CODES)(push.push)
-app.command("replay", epilog=EXIT_CODES)(replay.replay)
-app.command("doctor")(doctor)
+_COMMANDS: dict[str, Callable[..., None]] = {
+    "run": run,
+    "inspect": inspect,
+    "check": check,
+    "diff": diff.diff,
+    "prefetch": prefetch.prefetch,
+    "lock": lock.lock,
+    "verify": lock.verify,
+    "init": init,
+    "push": push.push,
+    "replay": replay.replay,
+    "doctor": doctor,
+    "gc": gc.gc,
+    "version": version.version,
+}
+for name, command in _COMMANDS.items():
+    app.command(name, cls=Command, epilog=EXIT_CODES)(command)
 app.add_typer(cache.app, name="cache")
 app.add_typer(image.app, name="image")
-app.command("gc")(gc.gc)
-app.command("version")(version.version)

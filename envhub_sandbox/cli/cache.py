@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say, size_of
+from envhub_sandbox.cli.shared.console import print_json, say, show_rows
 from envhub_sandbox.cli.shared.exits import UsageError, reported
+from envhub_sandbox.cli.shared.program import Command
+from envhub_worker.protocol.text import counted, size_text
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from envhub_sandbox.dependencies.environments import Environment
 
 app = typer.Typer(
@@ -83,7 +83,7 @@ def _repository(name: str) -> str:
     return prefix + "/".join(parts) if parts else name
 
 
-@app.command("list")
+@app.command("list", cls=Command)
 def list_(
     json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
@@ -106,7 +106,8 @@ def list_(
 
 def _told(found: list[Stored], made: list[Environment]) -> str:
     total = sum(one.size for one in found) + sum(one.size for one in made)
-    return f"{len(found)} snapshots, {len(made)} environments, {size_of(total)}"
+    snapshots, environments = counted(len(found), "snapshot"), counted(len(made), "environment")
+    return f"{snapshots}, {environments}, {size_text(total)}"
 
 
 def _environment_data(made: list[Environment]) -> list[dict[str, Any]]:
@@ -124,12 +125,11 @@ def _environment_data(made: list[Environment]) -> list[dict[str, Any]]:
 
 
 def _print_environments(made: list[Environment]) -> None:
-    table = _table("environment", "Python", "packages", "last used")
-    for one in made:
-        used = time.strftime("%F", time.localtime(one.used))
-        pins = safe_line(" ".join(one.pins), 300)
-        table.add_row(one.key[:12], safe_line(one.version), pins, used, size_of(one.size))
-    console().print(table)
+    rows = [
+        (one.key[:12], one.version, _day(one.used), size_text(one.size), " ".join(one.pins))
+        for one in made
+    ]
+    show_rows([("environment", "Python", "last used", "size", "packages"), *rows], right=(3,))
 
 
 def _data(found: list[Stored]) -> list[dict[str, Any]]:
@@ -146,27 +146,18 @@ def _data(found: list[Stored]) -> list[dict[str, Any]]:
 
 
 def _print(found: list[Stored]) -> None:
-    table = _table("repository", "commit", "revision", "last used")
-    for one in found:
-        used = time.strftime("%F", time.localtime(one.used))
-        revision = safe_line(one.revision or "", 40)
-        table.add_row(safe_line(one.repository), one.commit, revision, used, size_of(one.size))
-    console().print(table)
+    rows = [
+        (one.repository, one.commit, one.revision or "", _day(one.used), size_text(one.size))
+        for one in found
+    ]
+    show_rows([("repository", "commit", "revision", "last used", "size"), *rows], right=(4,))
 
 
-def _table(*titles: str) -> Table:
-    """These columns, and the size of each row."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for title in titles:
-        table.add_column(title, overflow="fold")
-    table.add_column("size", justify="right")
-    return table
+def _day(seconds: float) -> str:
+    return time.strftime("%F", time.localtime(seconds))
 
 
-@app.command("remove", no_args_is_help=True)
+@app.command("remove", cls=Command, no_args_is_help=True)
 def remove(
     names: Annotated[
         list[str] | None,

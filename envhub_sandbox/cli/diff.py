@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import print_json, say
+from envhub_sandbox.cli.shared.console import print_json, say, show
 from envhub_sandbox.cli.shared.exits import Exit, reported
-from envhub_sandbox.cli.shared.findings import FailOn, level, show, show_finding
+from envhub_sandbox.cli.shared.findings import FailOn, level, show_finding
 from envhub_sandbox.cli.shared.progress import Bar
+from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
     from envhub_sandbox.check.compare import Change
@@ -94,4 +95,4 @@ def _print(then: str, now: str, found: list[Change]) -> None:
             show(f"{mark}{one.what}", one.text)
         else:
             show_finding(one.finding, mark)
-    say(f"{len(found)} changes." if found else "Nothing differs.")
+    say(f"{counted(len(found), 'change')}." if found else "Nothing differs.")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say
+from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import Exit, reported
 
 
@@ -38,7 +38,7 @@ def gc(
             print_json({"found": items, "unasked": unasked})
         for one in () if json else found:
             done = "removed" if one in removed else "found" if dry_run else "could not remove"
-            console().print(f"{done}: {one.kind} {safe_line(one.name, 300)}", soft_wrap=True)
+            out(f"{done}: {one.kind} {safe_line(one.name, 300)}")
         for engine, why in unasked.items():
             reason = safe_line(why, 500)
             say(f"{engine} could not be asked, so its containers are not known: {reason}")

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say
+from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import reported
+from envhub_sandbox.cli.shared.program import Command
 from envhub_sandbox.cli.shared.progress import Bar
+from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.declared import Declared
@@ -27,7 +29,7 @@ def images() -> None:
     """Container images for repositories."""
 
 
-@app.command("build")
+@app.command("build", cls=Command)
 def build(
     ref: opt.Ref,
     base: Annotated[
@@ -70,8 +72,8 @@ def build(
         if json:
             print_json(made)
             return
-        console().print(safe_line(made["image"], 300), soft_wrap=True)
-        say(f"{len(made['packages'])} packages, lock sha256:{made['lock']}")
+        out(safe_line(made["image"], 300))
+        say(f"{counted(len(made['packages']), 'package')}, lock sha256:{made['lock']}")
         say(f"Use it: envhub run {safe_line(ref)} --sandbox docker:{made['image']}")
 
 

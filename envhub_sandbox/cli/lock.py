@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say
+from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import UsageError, reported
 from envhub_sandbox.cli.shared.progress import Bar
+from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.choice import Choice
@@ -233,7 +234,8 @@ def _print(
         )
         return
     for line in changes:
-        console().print(safe_line(line, 500), soft_wrap=True)
+        out(safe_line(line, 500))
     if was_there and not changes:
         say("Nothing has changed.")
-    say(f"{len(made.packages)} packages for {made.runner}, {len(made.files)} files, in {path}")
+    count, files = counted(len(made.packages), "package"), counted(len(made.files), "file")
+    say(f"{count} for {made.runner}, {files}, in {path}")

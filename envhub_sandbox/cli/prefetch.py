@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say, size_of
+from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import reported
 from envhub_sandbox.cli.shared.progress import Bar
+from envhub_worker.protocol.text import counted, size_text
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.environments import Environment
@@ -81,9 +82,9 @@ def _document(snapshot: Snapshot, environment: Environment | None) -> dict[str, 
 def _print(snapshot: Snapshot, environment: Environment | None) -> None:
     from envhub_sandbox.session.recipe import pinned
 
-    console().print(safe_line(pinned(snapshot), 300), soft_wrap=True)
+    out(safe_line(pinned(snapshot), 300))
     if environment is None:
         say("It runs in this interpreter, which has all that it declares.")
         return
-    packages = f"{len(environment.pins)} packages, {size_of(environment.size)}"
+    packages = f"{counted(len(environment.pins), 'package')}, {size_text(environment.size)}"
     say(f"{packages}, for Python {environment.version}, in {environment.home}")

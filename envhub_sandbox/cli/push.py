@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say
+from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import UsageError, reported
 from envhub_sandbox.cli.shared.progress import Bar
+from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
     from envhub_sandbox.hub.reference import HubRef
@@ -23,6 +24,9 @@ _SECRETS = frozenset(
     {".env", ".git-credentials", ".netrc", ".pypirc", "id_ed25519", "id_rsa", "credentials.json"}
 )
 _SECRET_SUFFIXES = (".pem", ".key")
+_COMPILED = (".pyc", ".pyo")
+_OF_THE_HUB = ".gitattributes"
+"""What it puts into a repository that it makes."""
 
 
 def push(
@@ -61,26 +65,38 @@ def push(
         from envhub_sandbox.hub.snapshot import local
 
         target = HubRef.parse(ref)
+        others: list[str] = []
         with Bar(quiet=json) as bar:
             bar.begin(f"reading {folder}")
             snapshot = local(folder)
-            _refuse_secrets(snapshot)
+            _refuse_unfit(snapshot)
             bar.begin("checking it in a sandbox")
             _check(folder, snapshot, env_kwargs or [], dependencies)
             if not dry_run:
                 bar.begin(f"uploading to {ref}")
-                target = _publish(snapshot, target, token, endpoint, message, private)
-        _tell(snapshot, target, dry_run, as_json=json)
+                target, others = _publish(snapshot, target, token, endpoint, message, private)
+        _tell(snapshot, target, others, dry_run, as_json=json)
 
 
-def _refuse_secrets(snapshot: Snapshot) -> None:
+def _refuse_unfit(snapshot: Snapshot) -> None:
     for file in snapshot.files:
-        name = file.path.rpartition("/")[2]
-        if name in _SECRETS or name.endswith(_SECRET_SUFFIXES):
-            raise UsageError(
-                f"{snapshot.repo_id} holds {file.path!r}, which looks like a secret, and what is "
-                "once on the Hub stays in its history; put it elsewhere"
-            )
+        why = _unfit(file.path)
+        if why:
+            raise UsageError(f"{snapshot.repo_id} holds {file.path!r}, {why}")
+
+
+def _unfit(path: str) -> str:
+    *folders, name = path.split("/")
+    if name in _SECRETS or name.endswith(_SECRET_SUFFIXES):
+        return (
+            "which looks like a secret, and what is once on the Hub stays in its history; put it "
+            "elsewhere"
+        )
+    if name.endswith(_COMPILED):
+        return "which is compiled Python, and runs in place of its source; delete it"
+    if ".cache" in folders:
+        return "and huggingface_hub uploads nothing below .cache; delete that folder"
+    return ""
 
 
 def _check(folder: str, snapshot: Snapshot, env_kwargs: list[str], dependencies: str) -> None:
@@ -118,8 +134,11 @@ def _publish(
     endpoint: str | None,
     message: str,
     private: bool,
-) -> HubRef:
-    """Upload the copy in the store, and see that it has arrived; gives the pinned reference.
+) -> tuple[HubRef, list[str]]:
+    """Upload the copy in the store, and see that it has arrived.
+
+    Returns:
+        The pinned reference, and the files of its commit that the folder does not have.
 
     Raises:
         RepositoryUnavailableError: The Hub refused.
@@ -147,7 +166,9 @@ def _publish(
             f"{where}: commit {commit} does not have {', '.join(missing[:_SHOWN])} as the folder "
             "has it, so it is not what was checked; does a .gitignore leave that out?"
         )
-    return replace(target, revision=commit, path=snapshot.path)
+    mine = {file.path for file in snapshot.files} | {_OF_THE_HUB}
+    others = [file.path for file in found if file.path not in mine]
+    return replace(target, revision=commit, path=snapshot.path), others
 
 
 @contextlib.contextmanager
@@ -162,15 +183,20 @@ def _explained(what: str, also: str = "") -> Iterator[None]:
         raise RepositoryUnavailableError(text) from failure.__cause__
 
 
-def _tell(snapshot: Snapshot, target: HubRef, dry_run: bool, *, as_json: bool) -> None:
+def _tell(
+    snapshot: Snapshot, target: HubRef, others: list[str], dry_run: bool, *, as_json: bool
+) -> None:
     files = [file.path for file in snapshot.files]
     if as_json:
-        told: dict[str, Any] = {"reference": str(target), "published": not dry_run, "files": files}
-        print_json(told)
+        document: dict[str, Any] = {"reference": str(target), "published": not dry_run}
+        print_json({**document, "files": files, "not_checked": others})
         return
     if dry_run:
-        console().print("\n".join(map(safe_line, files)), soft_wrap=True)
+        out("\n".join(map(safe_line, files)))
         say("It loads and steps. Nothing was uploaded.")
         return
-    console().print(safe_line(str(target), 300), soft_wrap=True)
-    say(f"{len(files)} files. Use it: envhub run {safe_line(str(target), 300)}")
+    out(safe_line(str(target), 300))
+    say(f"{counted(len(files), 'file')}. Use it: envhub run {safe_line(str(target), 300)}")
+    if others:
+        shown = ", ".join(map(safe_line, others[:_SHOWN]))
+        say(f"{len(others)} more of the repository, which were not checked: {shown}")

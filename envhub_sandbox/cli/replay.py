@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import console, print_json, safe_line, safe_text, say
+from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, say
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
 from envhub_sandbox.cli.shared.progress import Bar
 
@@ -82,7 +82,7 @@ class _Replay:
         from envhub_sandbox.crash.replay import Verdict
 
         if self._sandbox == "none":
-            raise UsageError("a replay without a sandbox would take this process along")
+            raise UsageError("this command needs a sandbox; leave out --sandbox none")
         bundle = load_bundle(self._folder)
         self._refuse_wishes(bundle)
         for doubt in bundle.doubts:
@@ -164,17 +164,13 @@ class _Replay:
         if self._as_json:
             print_json(self._document(bundle, replayed))
             return
-        out = console()
-        out.print(safe_line(bundle.label, 400), style="bold", soft_wrap=True)
-        out.print(
-            f"then:  {_how(bundle.death)}, {_where(len(bundle.requests), bundle.steps)}",
-            soft_wrap=True,
-        )
+        out(safe_line(bundle.label, 400), "bold")
+        out(f"then:  {_how(bundle.death)}, {_where(len(bundle.requests), bundle.steps)}")
         now = "nothing died" if replayed.death is None else _how(replayed.death)
-        out.print(f"now:   {now}, {_where(replayed.requests, replayed.steps)}", soft_wrap=True)
+        out(f"now:   {now}, {_where(replayed.requests, replayed.steps)}")
         if replayed.note:
-            out.print(safe_text(replayed.note), soft_wrap=True)
-        out.print(_SAID[replayed.verdict.value], soft_wrap=True)
+            out(safe_text(replayed.note))
+        out(_SAID[replayed.verdict.value])
 
     def _document(self, bundle: Bundle, replayed: Replayed) -> dict[str, Any]:
         return {

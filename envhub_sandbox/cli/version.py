@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from envhub_sandbox.cli.shared.console import print_json
+from envhub_sandbox.cli.shared.console import out, print_json
 from envhub_sandbox.cli.shared.exits import reported
 
 _PACKAGES = ("gymnasium", "numpy", "huggingface_hub", "pyzmq", "msgpack", "imageio-ffmpeg")
@@ -23,7 +23,7 @@ def version(
             print_json(found)
         else:
             for name, text in found.items():
-                typer.echo(f"{name:<16} {text or 'not installed'}")
+                out(f"{name:<16} {text or 'not installed'}")
 
 
 def versions() -> dict[str, str | int | None]:

@@ -289,7 +289,7 @@ def _requested(entry: _Sent | Requested) -> Requested:
     """An entry as a recording has it."""
     if isinstance(entry, Requested):
         return entry
-    messages = [m.unpack(frames, tensors=to_tensor)[1] for frames in entry.frames]
+    messages = [m.unpack(frames, tensors=to_tensor) for frames in entry.frames]
     return encoded(whole(messages, entry.bounds))
 
 
@@ -309,7 +309,7 @@ def encoded(message: m.Message) -> Requested:
     """A message as it can be kept: without anything pickled."""
     name = type(message).__name__.lower()
     try:
-        frames, exact = m.pack(message, 0, pickler=_refuse), True
+        frames, exact = m.pack(message, pickler=_refuse), True
     except EnvHubError:
         frames, exact = _inert(message), False
     return Requested(name, [bytes(frame) for frame in frames], exact)
@@ -318,9 +318,9 @@ def encoded(message: m.Message) -> Requested:
 def _inert(message: m.Message) -> list[Buffer]:
     """The same with descriptions in place of what only pickle could carry."""
     try:
-        return m.pack(message, 0)
+        return m.pack(message)
     except EnvHubError:
-        return m.pack(m.Done(), 0)
+        return m.pack(m.Done())
 
 
 def _refuse(value: object) -> bytes:

@@ -178,7 +178,7 @@ def _load(folder: Path) -> m.Load:
 
 def _packets(folder: Path, name: str) -> Iterator[m.Message]:
     for packet in PacketReader().feed(_read(folder, name)):
-        yield m.unpack(packet.frames, tensors=to_tensor)[1]
+        yield m.unpack(packet.frames, tensors=to_tensor)
 
 
 def _requests(folder: Path, index: list[Any], packets: Iterator[m.Message]) -> Iterator[m.Message]:

@@ -208,7 +208,7 @@ class _Requests:
 
 
 def _text(request: Requested) -> str:
-    return one_line(repr(m.unpack(request.frames)[1]), 200)
+    return one_line(repr(m.unpack(request.frames)), 200)
 
 
 def _packet(frames: Sequence[Buffer]) -> bytes:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from envhub_sandbox.errors import DependencyError, PackageIntegrityError, PackagesTooLargeError
+from envhub_worker.protocol.text import size_text
 
 BYTES_VARIABLE = "ENVHUB_ENVIRONMENT_BYTES"
 FILES_VARIABLE = "ENVHUB_ENVIRONMENT_FILES"
@@ -55,7 +56,7 @@ class Bounds:
             PackagesTooLargeError: It is.
         """
         if size > self.bytes:
-            told = f"{size / 2**20:,.0f} MiB; at most {self.bytes / 2**20:,.0f} MiB"
+            told = f"{size_text(size)}; at most {size_text(self.bytes)}"
             raise PackagesTooLargeError(
                 f"{what} {told} are installed. No environment was made. If you want it, set "
                 f"{BYTES_VARIABLE} to more bytes"

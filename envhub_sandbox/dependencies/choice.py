@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from envhub_sandbox.errors import PolicyError
+from envhub_sandbox.option_names import option_name
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.declared import Wanted
@@ -74,9 +75,9 @@ def chosen(
 
 def _both() -> PolicyError:
     return PolicyError(
-        "python and dependencies both say where packages come from; give python=PATH for the "
-        "packages of an interpreter of yours, or dependencies={'python': '3.12'} for the "
-        "repository's own"
+        f"{option_name('python')} and {option_name('dependencies')} both say where packages come "
+        f"from; give {option_name('python', 'PATH')} for the packages of an interpreter of yours, "
+        f"or {option_name('dependencies', {'python': '3.12'})} for the repository's own"
     )
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from envhub_sandbox.dependencies.choice import Choice
 from envhub_sandbox.errors import RequirementError
 from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.option_names import option_name
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.declared import Declared
@@ -56,7 +57,7 @@ def _advice(
     own: bool,
     found: Declared | None,
 ) -> str:
-    extra = "dependencies={'extra': ['NAME-OF-THE-PACKAGE']}"
+    extra = option_name("dependencies", {"extra": ["NAME-OF-THE-PACKAGE"]})
     if place == "docker":
         if own:
             return (
@@ -64,7 +65,8 @@ def _advice(
             )
         return (
             f"It ran in a container, with the image's packages: it gets others with {extra}, or "
-            "with an image that has them (envhub image build REF, then sandbox='docker:IMAGE')"
+            "with an image that has them (envhub image build REF, then "
+            f"{option_name('sandbox', 'docker:IMAGE')})"
         )
     if place == "remote":
         if own:
@@ -83,8 +85,9 @@ def _advice(
         return f"It ran in an environment of its own; the package joins it with {extra}"
     if choice.where == "host" and found is not None and found.wanted:
         return (
-            f"It ran in this interpreter ({sys.executable}), as dependencies='host' says; leave "
-            "that out, and it gets an environment of its own"
+            f"It ran in this interpreter ({sys.executable}), as "
+            f"{option_name('dependencies', 'host')} says; leave that out, and it gets an "
+            "environment of its own"
         )
     return (
         f"It ran in this interpreter ({sys.executable}); it gets an environment of its own, and "

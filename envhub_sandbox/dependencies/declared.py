@@ -20,6 +20,7 @@ from packaging.specifiers import InvalidSpecifier, SpecifierSet
 
 from envhub_sandbox.dependencies.files import LOOKED_AT, PROJECT, REQUIREMENTS, SCRIPT
 from envhub_sandbox.errors import RequirementError
+from envhub_sandbox.option_names import option_name
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -35,10 +36,6 @@ MAX_DOTS = 2000
 _HASH = re.compile(r"--hash[= ](sha256:[0-9a-f]{64}|sha384:[0-9a-f]{96}|sha512:[0-9a-f]{128})")
 _QUOTED = re.compile(r"'[^']*'|\"[^\"]*\"")
 _CLOSES = "# ///"
-_ADVICE = (
-    "If you trust it, install the packages into an interpreter of your own and give that with "
-    "python=..., or take this one as it is with dependencies='host'"
-)
 
 
 @dataclass(frozen=True)
@@ -114,12 +111,12 @@ def one(text: str, where: str) -> Wanted:
         raise RequirementError(
             f"{where} is {text[:200]!r}. Only plain requirements such as 'numpy>=2' are taken, "
             "with hashes or without: options, links, paths and files can build and run code while "
-            f"they are installed. {_ADVICE}"
+            f"they are installed. {_advice()}"
         ) from error
     if requirement.url is not None:
         raise RequirementError(
             f"{where} takes {requirement.name} from {requirement.url[:200]!r}; only packages of "
-            f"the index are installed. {_ADVICE}"
+            f"the index are installed. {_advice()}"
         )
     return Wanted(requirement, where, tuple(one[1] for one in found if one))
 
@@ -215,17 +212,17 @@ def _project(path: Path) -> Declared | None:
 
 def _toml(text: str, where: str) -> dict[str, Any]:
     if len(text) > MAX_BYTES or text.count(".") > MAX_DOTS:
-        raise RequirementError(f"{where} is too long: {len(text)} characters. {_ADVICE}")
+        raise RequirementError(f"{where} is too long: {len(text)} characters. {_advice()}")
     try:
         data: dict[str, Any] = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise RequirementError(f"{where} is no TOML: {str(error)[:200]}. {_ADVICE}") from error
+        raise RequirementError(f"{where} is no TOML: {str(error)[:200]}. {_advice()}") from error
     return data
 
 
 def _list(found: object, where: str) -> tuple[Wanted, ...]:
     if not isinstance(found, list) or not all(isinstance(item, str) for item in found):
-        raise RequirementError(f"dependencies in {where} is no list of texts. {_ADVICE}")
+        raise RequirementError(f"dependencies in {where} is no list of texts. {_advice()}")
     _bounded(len(found), where)
     return tuple(one(item, f"{item[:80]!r} in {where}") for item in found)
 
@@ -238,14 +235,14 @@ def _specifier(found: object, where: str) -> str:
     except InvalidSpecifier as error:
         raise RequirementError(
             f"requires-python in {where} is {str(found)[:80]!r}, which is no set of versions such "
-            f"as '>=3.11'. {_ADVICE}"
+            f"as '>=3.11'. {_advice()}"
         ) from error
 
 
 def _bounded(count: int, where: str) -> None:
     if count > MAX_REQUIREMENTS:
         raise RequirementError(
-            f"{where} has {count} requirements; at most {MAX_REQUIREMENTS} are read. {_ADVICE}"
+            f"{where} has {count} requirements; at most {MAX_REQUIREMENTS} are read. {_advice()}"
         )
 
 
@@ -257,5 +254,15 @@ def _text(path: Path, name: str) -> str:
     except (OSError, UnicodeDecodeError) as error:
         raise RequirementError(f"{name} cannot be read: {error}") from error
     if len(data) > MAX_BYTES:
-        raise RequirementError(f"{name} is too long; at most {MAX_BYTES} bytes are read. {_ADVICE}")
+        raise RequirementError(
+            f"{name} is too long; at most {MAX_BYTES} bytes are read. {_advice()}"
+        )
     return text
+
+
+def _advice() -> str:
+    return (
+        "If you trust it, install the packages into an interpreter of your own and give that with "
+        f"{option_name('python', 'PATH')}, or take this one as it is with "
+        f"{option_name('dependencies', 'host')}"
+    )

@@ -19,6 +19,7 @@ from packaging.version import InvalidVersion, Version
 
 from envhub_sandbox.dependencies import uv
 from envhub_sandbox.errors import DependencyError, InterpreterUnavailableError
+from envhub_sandbox.option_names import option_name
 
 _ASK_S = 60.0
 _FIND_S = 120.0
@@ -97,7 +98,8 @@ def find(asked: str, declared: str = "") -> Interpreter:
     raise InterpreterUnavailableError(
         f"{why}, and this machine has none that is 3.10 or later and fits; this one is "
         f"{ours.version} ({ours.path}). Install one ('uv python install' does), or name one: "
-        "dependencies={'python': '/path/to/python3'}. None is downloaded by itself"
+        f"{option_name('dependencies', {'python': '/path/to/python3'})}. None is downloaded by "
+        "itself"
     )
 
 

@@ -12,6 +12,7 @@ from packaging.utils import canonicalize_name
 from envhub_sandbox.dependencies import index, interpreters, uv
 from envhub_sandbox.dependencies.declared import Wanted, one
 from envhub_sandbox.errors import PackageIntegrityError, ResolutionError
+from envhub_sandbox.option_names import option_name
 
 WORKERS = ("cloudpickle>=3", "gymnasium>=0.29", "msgpack>=1.0.5", "numpy>=1.26")
 """What the worker's jails import besides: the repository's versions must be among these.
@@ -158,8 +159,8 @@ def _what_to_change(said: str, every: Sequence[Wanted]) -> str:
         [
             "What is required of these packages:",
             *lines,
-            "Change one of them in the repository; or ask for another Python, dependencies="
-            "{'python': '3.12'}; or install what fits into an interpreter of your own and give "
-            "that with python=...",
+            "Change one of them in the repository; or ask for another Python, "
+            f"{option_name('dependencies', {'python': '3.12'})}; or install what fits into an "
+            f"interpreter of your own and give that with {option_name('python', 'PATH')}",
         ]
     )

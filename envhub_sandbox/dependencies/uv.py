@@ -25,6 +25,7 @@ from envhub_sandbox.errors import (
     PackagesTooLargeError,
     ResolutionError,
 )
+from envhub_sandbox.option_names import option_name
 from envhub_worker.protocol.text import printable
 
 NO_BUILDS = ("--no-config", "--no-build")
@@ -40,8 +41,7 @@ _KEPT_LINES = 400
 
 _NO_INDEX = (
     "The package index did not answer. Look at the network, or name a mirror that can be reached "
-    "in UV_INDEX_URL or in pip's settings; what was made here before works offline, and "
-    "dependencies='host' takes the packages of this interpreter as they are"
+    "in UV_INDEX_URL or in pip's settings; what was made here before works offline"
 )
 
 # What uv says, and what that means for the user; the first that is found counts.
@@ -220,7 +220,7 @@ def command() -> str:
         raise DependencyError(
             "uv resolves and installs packages, and is not found: neither among this interpreter's "
             "packages nor on PATH. Run: pip install uv. Or take the packages of this one as they "
-            "are, with dependencies='host'"
+            f"are, with {option_name('dependencies', 'host')}"
         )
     _check_release(found)
     return found
@@ -247,8 +247,14 @@ def _error(what: str, said: str) -> DependencyError:
     text = _in_the_users_words(said)[-_SHOWN:]
     for pattern, kind, meaning in _MEANINGS:
         if re.search(pattern, said):
-            return kind(f"{what}.{f' {meaning}.' if meaning else ''}\n{text}")
+            cure = f" {meaning}{_offline() if meaning == _NO_INDEX else ''}." if meaning else ""
+            return kind(f"{what}.{cure}\n{text}")
     return DependencyError(f"{what}; uv says:\n{text}")
+
+
+def _offline() -> str:
+    host = option_name("dependencies", "host")
+    return f", and {host} takes the packages of this interpreter as they are"
 
 
 def _in_the_users_words(said: str) -> str:

@@ -130,7 +130,7 @@ def missing_entry(path: str, files: tuple[FileRecord, ...]) -> tuple[str, str]:
     names = [file.path for file in files if file.path.endswith(".py")]
     what = f"has no file {path!r}"
     if not names:
-        return what, "It has no .py file at all: is it an environment?"
+        return what, "It has no .py file at all, so it is no environment"
     close = difflib.get_close_matches(path, names, n=1) or names
     shown = ", ".join(repr(name) for name in names[:_SHOWN_FILES])
     more = f" and {len(names) - _SHOWN_FILES} more" if len(names) > _SHOWN_FILES else ""

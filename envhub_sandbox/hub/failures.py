@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from enum import Enum, auto
 from typing import NamedTuple
 
+from envhub_sandbox.option_names import option_name
+
 _LONGEST_QUOTE = 200
 
 
@@ -70,16 +72,16 @@ class Subject(NamedTuple):
         return f"{self.endpoint}/{prefix}{self.repo_id}"
 
 
-_LOG_IN = "log in with `hf auth login` (`huggingface-cli login` before 1.0) or pass `token`"
+_LOG_IN = "log in with `hf auth login` (`huggingface-cli login` before 1.0) or pass a token"
 
-# kind -> what happened, what to do. The fields are those of Subject, and `said`, `status`, `wait`.
+# kind -> what happened, what to do. The fields are those of Subject, and those of ``explain``.
 _WORDS: dict[Kind, tuple[str, str]] = {
     Kind.NO_REPOSITORY: (
         "there is no {repo_type} repository {repo_id} that you may see ({status})",
         f"Check the spelling and the owner; if it is private, {_LOG_IN}",
     ),
     Kind.NO_REVISION: (
-        "the {repo_type} repository {repo_id} has no revision {revision!r}",
+        "the {repo_type} repository {repo_id} has no revision {revision}",
         "Check the branch, tag or commit at {url}/commits/main",
     ),
     Kind.NO_ENTRY: (
@@ -96,14 +98,14 @@ _WORDS: dict[Kind, tuple[str, str]] = {
     ),
     Kind.UNAUTHORIZED: (
         "the Hub refused your token (401){said}",
-        f"It may be expired or of another endpoint: {_LOG_IN}; token=False sends none",
+        f"It may be expired or of another endpoint: {_LOG_IN}; {{no_token}} sends none",
     ),
     Kind.FORBIDDEN: (
         "your token may not read the {repo_type} repository {repo_id} (403){said}",
         "Give the token read access to it at {endpoint}/settings/tokens, or ask its owner",
     ),
     Kind.NO_TOKEN: (
-        "token=True was given, but no token is stored on this machine",
+        "a stored token was asked for, but no token is stored on this machine",
         f"To store one, {_LOG_IN}",
     ),
     Kind.RATE_LIMITED: (
@@ -151,10 +153,12 @@ def explain(error: BaseException, subject: Subject, secrets: tuple[str, ...] = (
     fields = {
         **subject._asdict(),
         "url": subject.url,
+        "revision": repr(subject.revision) if subject.revision else "'main' (is it empty?)",
         "status": getattr(response, "status_code", "not found"),
         "said": _said(response),
         "wait": _wait(response),
         "reason": type(source).__name__,
+        "no_token": option_name("token", False),
     }
     what, advice = (text.format(**fields) for text in _WORDS[kind])
     return HubFailure(kind, redact(what, secrets), redact(advice, secrets))

@@ -14,6 +14,7 @@ from typing import Protocol, TypeVar
 
 from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
 from envhub_sandbox.hub.grammar import has_control_characters
+from envhub_worker.protocol.text import size_text
 
 MAX_NAME_BYTES = 255  # NAME_MAX of every common file system.
 MAX_PATH_BYTES = 1024  # Leaves room below PATH_MAX (4096) for the store and for a jail's root.
@@ -125,7 +126,7 @@ def within_limits(files: Iterable[_File], limits: SnapshotLimits, title: str) ->
         taken.append(file)
         total += file.size
         if file.size > limits.max_file_bytes:
-            what = f"the file {file.path!r} has {file.size} bytes"
+            what = f"the file {file.path!r} has {size_text(file.size)}"
             raise _too_large(title, what, "max_file_bytes", limits.max_file_bytes)
         if len(taken) > limits.max_files:
             raise _too_large(title, "it has too many files", "max_files", limits.max_files)
@@ -135,9 +136,10 @@ def within_limits(files: Iterable[_File], limits: SnapshotLimits, title: str) ->
 
 
 def _too_large(title: str, what: str, name: str, limit: int) -> SnapshotTooLargeError:
+    shown = f" ({size_text(limit)})" if name.endswith("_bytes") else ""
     return SnapshotTooLargeError(
-        f"{title}: {what}, over the limit {name}={limit}. If you trust it with the disk space, "
-        "fetch it once, which make_env then uses: envhub_sandbox.hub.snapshot.fetch("
+        f"{title}: {what}, over the limit {name}={limit}{shown}. If you trust it with the disk "
+        "space, fetch it once, which make_env then uses: envhub_sandbox.hub.snapshot.fetch("
         f"HubRef.parse(...), limits=SnapshotLimits({name}=...))"
     )
 

@@ -1,8 +1,9 @@
 """A folder of this machine as the files of a snapshot, so that authors can try before they push.
 
-Left out, as ``git`` and the Hub would: version control, caches, virtual environments, sockets
-and pipes. Links that stay inside the folder are copied as what they point to; a link that leaves
-it is refused, since the jail must see nothing but the folder.
+In a git checkout these are the files that git would commit, as it would commit them: a link is a
+file that holds the link's text. Elsewhere it is every file; links that stay inside the folder are
+copied as what they point to, and a link that leaves it is refused, since the jail must see nothing
+but the folder. ``.git`` is in no commit, and left out everywhere, as are sockets and pipes.
 """
 
 from __future__ import annotations
@@ -10,29 +11,159 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import stat
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 from envhub_sandbox.errors import RepositoryUnavailableError, SnapshotError
+from envhub_sandbox.hub.checkout import Checkout, read_checkout
 from envhub_sandbox.hub.hashing import SHA256, Mismatch, copy_verified, digest_of
 from envhub_sandbox.hub.listing import MAX_DEPTH, FileRecord
 
-LEFT_OUT = frozenset(
-    {
-        *(".git", ".hg", ".svn", ".DS_Store", ".ipynb_checkpoints", ".cache", "__pycache__"),
-        *(".mypy_cache", ".pytest_cache", ".ruff_cache", ".tox", ".venv", "node_modules"),
-    }
-)
-_LEFT_OUT_SUFFIXES = (".pyc", ".pyo")
+_GIT = ".git"
 
 
 class LocalFile(NamedTuple):
-    """A file to copy: its name in the snapshot, and where its bytes are."""
+    """A file of a folder.
+
+    Attributes:
+        path: Its name in the snapshot.
+        source: Where its bytes are.
+        size: In bytes.
+        link: The text of a link that git would commit, which is then its content.
+    """
 
     path: str
     source: Path
     size: int
+    link: bytes | None = None
+
+
+class LeftOut(NamedTuple):
+    """What lies in a checkout and is in no commit of it.
+
+    Attributes:
+        path: Its name; of a folder with a slash at its end.
+        is_repository: It is a repository of its own, of which git commits a pointer. Otherwise
+            git ignores it.
+    """
+
+    path: str
+    is_repository: bool
+
+
+@dataclass(frozen=True)
+class LocalFolder:
+    """A folder of this machine.
+
+    Attributes:
+        root: Its path, without links.
+        checkout: What git says of it; None where every file counts.
+    """
+
+    root: Path
+    checkout: Checkout | None
+
+    def __str__(self) -> str:
+        return f"local folder {self.root}"
+
+    @classmethod
+    def at(cls, folder: str | Path) -> LocalFolder:
+        """The folder at a path."""
+        root = Path(os.path.realpath(folder))
+        return cls(root, read_checkout(root))
+
+    def files(self) -> Iterator[LocalFile]:
+        """Yield the files of the snapshot. Names are relative, with ``/``.
+
+        Raises:
+            SnapshotError: A link leaves the folder, is broken or leads to a loop.
+        """
+        return (one for one in self._found() if isinstance(one, LocalFile))
+
+    def left_out(self) -> Iterator[LeftOut]:
+        """Yield what lies here and is not in the snapshot; empty folders aside."""
+        found = (one for one in self._found() if isinstance(one, LeftOut))
+        return (one for one in found if not _is_empty_folder(self.root / one.path))
+
+    def _found(self) -> Iterator[LocalFile | LeftOut]:
+        if self.checkout is None:
+            return self._all(self.root, "", (self.root,))
+        return self._committed(self.checkout, self.root, "")
+
+    def _committed(
+        self, checkout: Checkout, folder: Path, prefix: str
+    ) -> Iterator[LocalFile | LeftOut]:
+        for item in self._items(folder, prefix):
+            name, path = prefix + item.name, Path(item.path)
+            mode = item.stat(follow_symlinks=False).st_mode
+            if stat.S_ISDIR(mode) and name in checkout.folders:
+                yield from self._committed(checkout, path, f"{name}/")
+            elif stat.S_ISDIR(mode):
+                yield LeftOut(f"{name}/", is_repository=name in checkout.files)
+            elif not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
+                continue  # git knows no sockets, pipes and devices
+            elif name not in checkout.files:
+                yield LeftOut(name, is_repository=False)
+            elif stat.S_ISLNK(mode):
+                if name in checkout.untracked:
+                    self._refuse_environment(path, name)
+                text = os.fsencode(os.readlink(path))
+                yield LocalFile(name, path, len(text), text)
+            else:
+                yield LocalFile(name, path, item.stat(follow_symlinks=False).st_size)
+
+    def _all(self, folder: Path, prefix: str, above: tuple[Path, ...]) -> Iterator[LocalFile]:
+        for item in self._items(folder, prefix):
+            name = prefix + item.name
+            source = self._inside(item, name)
+            if source.is_dir():
+                if source in above:
+                    raise SnapshotError(f"{self}: the link {name!r} leads to a loop")
+                yield from self._all(source, f"{name}/", (*above, source))
+            elif source.is_file():
+                yield LocalFile(name, source, source.stat().st_size)
+
+    def _items(self, folder: Path, prefix: str) -> list[os.DirEntry[str]]:
+        if prefix.count("/") >= MAX_DEPTH:
+            raise SnapshotError(f"{self}: {prefix!r} is over {MAX_DEPTH} folders deep")
+        with os.scandir(folder) as listing:
+            return sorted((one for one in listing if one.name != _GIT), key=lambda one: one.name)
+
+    def _inside(self, item: os.DirEntry[str], name: str) -> Path:
+        if not item.is_symlink():
+            return Path(item.path)
+        try:
+            source = Path(os.path.realpath(item.path, strict=True))
+        except OSError as error:
+            raise SnapshotError(f"{self}: the link {name!r} leads nowhere; remove it") from error
+        if not source.is_relative_to(self.root) or _GIT in source.relative_to(self.root).parts:
+            self._refuse_environment(Path(item.path), name)
+            raise SnapshotError(
+                f"{self}: the link {name!r} leaves the folder (to {source}), and a sandbox sees "
+                "nothing else of this machine; put a copy in its place"
+            )
+        return source
+
+    def _refuse_environment(self, link: Path, name: str) -> None:
+        """A virtual environment is no part of a repository, and has links to its interpreter."""
+        inside = (one for one in link.parents if one.is_relative_to(self.root))
+        found = next((one for one in inside if (one / "pyvenv.cfg").is_file()), None)
+        if found is not None:
+            raise SnapshotError(
+                f"{self}: {name!r} belongs to a virtual environment. Move {found} elsewhere, or "
+                f"have git leave it out: name '{found.name}/' in .gitignore, after 'git init' "
+                "where this is no checkout yet"
+            )
+
+
+def _is_empty_folder(path: Path) -> bool:
+    try:
+        return path.is_dir() and not os.listdir(path)
+    except OSError:
+        return False  # what may not be read may hold anything
 
 
 def split_local(text: str, path: str) -> tuple[Path, str]:
@@ -62,58 +193,14 @@ def split_local(text: str, path: str) -> tuple[Path, str]:
     )
 
 
-def scan(folder: Path) -> Iterator[LocalFile]:
-    """Yield the files below a folder, links resolved. Names are relative, with ``/``.
-
-    Raises:
-        SnapshotError: A link leaves the folder, is broken or leads to a loop.
-    """
-    real = Path(os.path.realpath(folder))
-    yield from _scan(real, real, "", (real,))
-
-
-def _scan(root: Path, folder: Path, prefix: str, above: tuple[Path, ...]) -> Iterator[LocalFile]:
-    if len(above) > MAX_DEPTH:
-        raise SnapshotError(f"local folder {root}: {prefix!r} is over {MAX_DEPTH} folders deep")
-    with os.scandir(folder) as listing:
-        items = sorted(listing, key=lambda item: item.name)
-    for item in items:
-        name = prefix + item.name
-        if item.name in LEFT_OUT or item.name.endswith(_LEFT_OUT_SUFFIXES):
-            continue
-        source = _inside(root, item, name)
-        if source.is_dir():
-            if source in above:
-                raise SnapshotError(f"local folder {root}: the link {name!r} leads to a loop")
-            if not (source / "pyvenv.cfg").exists():
-                yield from _scan(root, source, f"{name}/", (*above, source))
-        elif source.is_file():
-            yield LocalFile(name, source, source.stat().st_size)
-
-
-def _inside(root: Path, item: os.DirEntry[str], name: str) -> Path:
-    if not item.is_symlink():
-        return Path(item.path)
-    try:
-        source = Path(os.path.realpath(item.path, strict=True))
-    except OSError as error:
-        raise SnapshotError(
-            f"local folder {root}: the link {name!r} leads nowhere; remove it"
-        ) from error
-    if root != source and root not in source.parents:
-        raise SnapshotError(
-            f"local folder {root}: the link {name!r} leaves the folder (to {source}), and a "
-            "sandbox sees nothing else of this machine; put a copy in its place"
-        )
-    return source
-
-
 def hash_files(files: tuple[LocalFile, ...], title: str) -> tuple[FileRecord, ...]:
     """The records of files, by reading all of them."""
     return tuple(FileRecord(file.path, file.size, _digest(file, title)) for file in files)
 
 
 def _digest(file: LocalFile, title: str) -> str:
+    if file.link is not None:
+        return f"{SHA256}:{hashlib.sha256(file.link).hexdigest()}"
     try:
         return digest_of(file.source, SHA256, file.size)
     except (OSError, Mismatch) as error:
@@ -128,11 +215,15 @@ def content_commit(files: tuple[FileRecord, ...]) -> str:
 
 def copier(files: tuple[LocalFile, ...], title: str) -> Callable[[FileRecord, Path], None]:
     """A function that copies one file into the store, or says that it changed meanwhile."""
-    sources = {file.path: file.source for file in files}
+    found = {file.path: file for file in files}
 
     def copy(record: FileRecord, target: Path) -> None:
+        file = found[record.path]
+        if file.link is not None:
+            target.write_bytes(file.link)
+            return
         try:
-            copy_verified(sources[record.path], target, record)
+            copy_verified(file.source, target, record)
         except Mismatch as error:
             raise SnapshotError(
                 f"{title}: {record.path!r} changed while it was copied; try again"

@@ -14,7 +14,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-from envhub_sandbox.errors import HubReferenceError, RepositoryUnavailableError, SnapshotError
+from envhub_sandbox.errors import (
+    HubReferenceError,
+    RepositoryUnavailableError,
+    SnapshotError,
+    SnapshotTooLargeError,
+)
 from envhub_sandbox.hub import store as store
 from envhub_sandbox.hub.candidate import Candidate, missing_entry
 from envhub_sandbox.hub.client import HubClient, Repository, checked_endpoint, checked_token
@@ -29,10 +34,10 @@ from envhub_sandbox.hub.listing import (
 )
 from envhub_sandbox.hub.local import (
     LocalFile,
+    LocalFolder,
     content_commit,
     copier,
     hash_files,
-    scan,
     split_local,
 )
 from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef, is_local
@@ -41,6 +46,10 @@ __all__ = ["FileRecord", "Snapshot", "SnapshotLimits", "fetch", "local"]
 
 _SHOWN_COMMITS = 5
 _LOCAL_COPIES_DAYS = 14.0
+_ALL_COUNTS = (
+    "It is in no git checkout, so every file in it counts. Move away what does not belong to the "
+    "repository, or run 'git init' there and name it in .gitignore"
+)
 T = TypeVar("T")
 
 
@@ -87,7 +96,7 @@ def commit_of(
     """
     if is_here(reference):
         root, _ = split_local(reference, DEFAULT_PATH)
-        return content_commit(_found_here(root, DEFAULT_LIMITS)[1])
+        return content_commit(_found_here(LocalFolder.at(root), DEFAULT_LIMITS)[1])
     ref = HubRef.parse(reference)
     if ref.is_pinned and ref.revision is not None:
         return ref.revision
@@ -208,6 +217,8 @@ def local(
 ) -> Snapshot:
     """Copy a folder of this machine into the store, by content: unchanged is the same snapshot.
 
+    In a git checkout that is what git would commit, and elsewhere every file; see ``hub.local``.
+
     Args:
         folder: A folder, ``folder:path/env.py``, or a ``.py`` file (whose folder is taken).
         path: The entry file in the folder, unless ``folder`` names one.
@@ -216,13 +227,14 @@ def local(
     Raises:
         RepositoryUnavailableError: There is no such folder or entry file.
         SnapshotTooLargeError: Over the limits.
-        SnapshotError: A link leaves the folder, or a file cannot be read.
+        SnapshotError: A link leaves the folder, a file cannot be read, or has a name that the Hub
+            cannot have.
     """
     root, path = split_local(str(folder), path)
-    title = f"local folder {root}"
-    found, files = _found_here(root, limits)
+    here, title = LocalFolder.at(root), f"local folder {root}"
+    found, files = _found_here(here, limits)
     if all(file.path != path for file in files):
-        what, advice = missing_entry(path, files)
+        what, advice = _left_out(here, path) or missing_entry(path, files)
         raise RepositoryUnavailableError(f"{title} {what}. {advice}")
     slot = store.Slot(store.local_folder(), content_commit(files), title)
     if store.load_whole(slot) is None:
@@ -233,14 +245,28 @@ def local(
     return Snapshot(str(root), "local", slot.commit, path, slot.tree, files)
 
 
+def _left_out(here: LocalFolder, path: str) -> tuple[str, str] | None:
+    """What to say of an entry that is there, and that git would not commit."""
+    for one in here.left_out():
+        if f"{path}/".startswith(f"{one.path.rstrip('/')}/"):
+            what = f"has the file {path!r}, but git would not commit it"
+            if one.is_repository:
+                return what, f"{one.path} is a git repository of its own; name that one"
+            return what, f"Run 'git add --force {path}', or take it out of .gitignore"
+    return None
+
+
 def _found_here(
-    root: Path, limits: SnapshotLimits
+    here: LocalFolder, limits: SnapshotLimits
 ) -> tuple[tuple[LocalFile, ...], tuple[FileRecord, ...]]:
-    title = f"local folder {root}"
     try:
-        found = within_limits(scan(root), limits, title)
+        found = within_limits(here.files(), limits, str(here))
     except OSError as error:
-        raise SnapshotError(f"{title}: it cannot be read: {error}") from error
-    files = hash_files(found, title)
-    check_names(files, title)
+        raise SnapshotError(f"{here}: it cannot be read: {error}") from error
+    except SnapshotTooLargeError as error:
+        if here.checkout is None:
+            error.args = (f"{error}. {_ALL_COUNTS}",)
+        raise
+    files = hash_files(found, str(here))
+    check_names(files, str(here))
     return found, files

@@ -20,6 +20,7 @@ from envhub_sandbox.hub.grammar import (
     is_local,
     join,
 )
+from envhub_sandbox.option_names import option_name
 
 _TYPE_OF_PREFIX = {prefix: kind for kind in REPO_TYPES for prefix in (kind, f"{kind}s")}
 _HUB_HOSTS = frozenset({"huggingface.co", "www.huggingface.co", "hf.co", "www.hf.co"})
@@ -133,12 +134,14 @@ def _read_url(url: str, _: str) -> Parts:
         raise Wrong("this URL cannot be read", GRAMMAR) from None
     if "@" in split.netloc:
         plain = f"{split.scheme}://{split.netloc.rpartition('@')[2]}{split.path}"
-        raise Wrong("the URL has a user or token in it", f"{plain!r}, and pass token=...")
+        raise Wrong(
+            "the URL has a user or token in it", f"{plain!r}, and pass {option_name('token')}"
+        )
     steps = [step for step in split.path.split("/") if step]
     if split.netloc.lower() not in _HUB_HOSTS:
         repo = "/".join(steps[:2]) or "owner/name"
         endpoint = f"{split.scheme}://{split.netloc}"
-        mirror = f"{repo!r}, with endpoint={endpoint!r} if that is a mirror of the Hub"
+        mirror = f"{repo!r}, with {option_name('endpoint', endpoint)} if that mirrors the Hub"
         raise Wrong("this host is not the Hugging Face Hub", mirror)
     return _read_page(steps)
 

@@ -11,6 +11,8 @@ import sys
 from importlib.util import find_spec
 from typing import Any
 
+from envhub_sandbox.option_names import on_lerobots_command_line, use_option_names
+
 _PREFIX = "--sandbox."
 
 
@@ -28,7 +30,8 @@ def main() -> None:
     sys.argv[1:] = rest
     from lerobot.scripts.lerobot_eval import main as evaluate
 
-    evaluate()
+    with use_option_names(on_lerobots_command_line(_PREFIX)):
+        evaluate()
 
 
 def split(arguments: list[str]) -> tuple[dict[str, Any], list[str]]:

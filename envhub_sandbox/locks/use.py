@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox.errors import DependencyError, LockError, PolicyError, name_source
 from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.option_names import option_name
 
 if TYPE_CHECKING:  # they cost time, and mostly there is no lock
     from envhub_sandbox.dependencies.environments import Environment
@@ -25,11 +26,14 @@ def opened(
         PolicyError: The other arguments say something else.
     """
     if python is not None or dependencies != "auto":
-        raise PolicyError("lock says which packages there are; leave out python and dependencies")
+        raise PolicyError(
+            f"{option_name('lock')} says which packages there are; leave out "
+            f"{option_name('python')} and {option_name('dependencies')}"
+        )
     if sandbox != "process":
         raise PolicyError(
-            "lock is for sandbox='process'; an image is locked by its digest, and on another host "
-            "whoever runs the server chooses its packages"
+            f"{option_name('lock')} is for {option_name('sandbox', 'process')}; an image is locked "
+            "by its digest, and on another host whoever runs the server chooses its packages"
         )
     from envhub_sandbox.locks import lockfile
 

@@ -12,6 +12,7 @@ from typing import Any, SupportsIndex
 import numpy as np
 
 from envhub_sandbox.errors import PolicyError
+from envhub_sandbox.option_names import option_name
 from envhub_worker.protocol.limits import MAX_NUM_ENVS
 
 _OURS = ("n_envs", "use_async_envs")
@@ -116,8 +117,8 @@ def check_executable(python: str) -> None:
     """
     if python and not (os.path.isfile(python) and os.access(python, os.X_OK)):
         raise PolicyError(
-            f"python is {python!r}, which is no program; it takes the path of an interpreter, such "
-            "as '.venv/bin/python'"
+            f"{option_name('python')} is {python!r}, which is no program; it takes the path of an "
+            "interpreter, such as '.venv/bin/python'"
         )
 
 
@@ -130,6 +131,6 @@ def check_readable(paths: Iterable[str]) -> None:
     for path in paths:
         if not os.path.exists(path):
             raise PolicyError(
-                f"policy: readable holds {path!r}, and there is no such file or folder on this "
-                "machine"
+                f"{option_name('readable')} holds {path!r}, and there is no such file or folder on "
+                "this machine"
             )

@@ -20,6 +20,7 @@ from envhub_sandbox.making.config import plain_config
 from envhub_sandbox.making.options import Options
 from envhub_sandbox.making.places import reference_of, sandbox_of
 from envhub_sandbox.making.proxies import Proxies
+from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy, Timeouts, policy_from, timeouts_from
 from envhub_sandbox.sandboxes import inprocess
 from envhub_sandbox.sandboxes.base import Provided, Provider, Sandbox
@@ -97,8 +98,8 @@ def _wanted(sandbox: str | Sandbox, options: Options) -> _Wanted:
     place = sandbox_of(sandbox, options.server_key)
     if choice.where == "own" and sandbox != "process" and not isinstance(place, Provider):
         raise PolicyError(
-            "dependencies={...} is for sandbox='process', for containers and for servers on other "
-            "hosts; this place has packages of its own"
+            f"packages by {option_name('dependencies')} are for this machine, for containers and "
+            "for servers on other hosts; this place has packages of its own"
         )
     runtime = Runtime(arguments.interpreter(python))
     if sandbox == "process":

@@ -6,6 +6,7 @@ import os
 from typing import Any
 
 from envhub_sandbox.errors import PolicyError
+from envhub_sandbox.option_names import option_name
 from envhub_sandbox.sandboxes.base import Sandbox
 
 
@@ -38,7 +39,8 @@ def sandbox_of(sandbox: str | Sandbox, server_key: str | None) -> Sandbox:
         return RemoteSandbox(sandbox, server_key=server_key)
     if server_key is not None:
         raise PolicyError(
-            "server_key is for sandbox='tcp://HOST:PORT'; a RemoteSandbox has its own"
+            f"{option_name('server_key')} is for {option_name('sandbox', 'tcp://HOST:PORT')}; a "
+            "RemoteSandbox has its own"
         )
     if not isinstance(sandbox, str):
         if not callable(getattr(sandbox, "acquire", None)):

@@ -18,7 +18,6 @@ from envhub_sandbox.errors import (
     DependencyError,
     PolicyError,
     RemoteProtocolError,
-    VersionMismatchError,
     name_source,
 )
 from envhub_sandbox.hub.snapshot import Snapshot
@@ -76,13 +75,6 @@ class Order:
             ServerBusyError: Others of the same key are at it.
             WorkerTimeoutError: It took too long.
         """
-        if client.version < m.FIRST_WITH_MADE_PACKAGES_VERSION:
-            if not self.message.always:
-                return None  # as before there was any other way
-            raise VersionMismatchError(
-                f"the worker speaks protocol {client.version}, and packages on another host need "
-                f"{m.FIRST_WITH_MADE_PACKAGES_VERSION}: upgrade the worker"
-            )
         try:
             return self._made(client, deadline, tell)
         except (DependencyError, PolicyError) as error:

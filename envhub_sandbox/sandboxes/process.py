@@ -20,6 +20,7 @@ import envhub_worker.protocol
 from envhub_sandbox import parent
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.log import WORKER
+from envhub_sandbox.option_names import option_name
 from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.lingering import Lingering
 from envhub_sandbox.sandboxes.refcount import Sharing, Use, Uses
@@ -96,8 +97,9 @@ class ProcessSandbox:
         """The server for this process, started if there is none."""
         if not sys.platform.startswith("linux"):
             raise SandboxUnavailableError(
-                f"sandbox='process' needs Linux, and this is {sys.platform}: nothing here can "
-                "confine a process. Run the worker in a container or on a Linux host."
+                f"{option_name('sandbox', 'process')} needs Linux, and this is {sys.platform}: "
+                "nothing here can confine a process. Run the worker in a container or on a Linux "
+                "host."
             )
         return self._servers.acquire(store, partial(_start, store, runtime), idle_s)
 

@@ -28,6 +28,7 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes import upload
 from envhub_sandbox.sandboxes.base import ServerUse
@@ -168,13 +169,15 @@ def check_policy(policy: Policy, runtime: Runtime) -> None:
         )
     if runtime.python:
         raise PolicyError(
-            f"python={runtime.python!r} is an interpreter of this machine, and a remote server has "
-            "its own: start it in the environment or image that the repository needs"
+            f"{option_name('python', runtime.python)} is an interpreter of this machine, and a "
+            "remote server has its own: start it in the environment or image that the repository "
+            "needs"
         )
     if policy.readable:
         raise PolicyError(
-            f"readable={policy.readable!r} are paths of this machine, and a remote server shows "
-            "its jails the repository's files only: put what is needed into the repository"
+            f"{option_name('readable', list(policy.readable))} are paths of this machine, and a "
+            "remote server shows its jails the repository's files only: put what is needed into "
+            "the repository"
         )
 
 
@@ -225,9 +228,9 @@ def _server_key(endpoint: str, given: str | None) -> bytes:
     if not text:
         raise SandboxUnavailableError(
             f"the public key of {endpoint} is not known, and without it anybody could pretend to "
-            f"be that server. It prints its key when it starts; pass it as server_key=, set "
-            f"{SERVER_KEY_VARIABLE}, or write '{address_of(endpoint)} KEY' into "
-            f"{config_folder() / 'known_hosts'}"
+            "be that server. It prints its key when it starts; pass it with "
+            f"{option_name('server_key')}, set {SERVER_KEY_VARIABLE}, or write "
+            f"'{address_of(endpoint)} KEY' into {config_folder() / 'known_hosts'}"
         )
     return _parsed(text, "server_key")
 

@@ -79,16 +79,11 @@ def ask(sandbox: RemoteSandbox) -> ServerFacts:
     """
     begun, deadline = monotonic(), Deadline(_WAIT_S)
     with _connection(sandbox) as client:
-        greeting = m.Hello(m.OLDEST_VERSION, m.VERSION, _LOOKER)
+        greeting = m.Hello(m.VERSION, _LOOKER)
         welcome = expect(client.request(greeting, deadline=deadline)[0], m.Welcome)
         answered_s = monotonic() - begun
-        client.version = welcome.version
         sessions = expect(client.request(m.GetSessions(), deadline=deadline)[0], m.Sessions)
-    found = [
-        one["server"] for one in sessions.sessions if isinstance(one, dict) and "server" in one
-    ]
-    told = found[0] if found and isinstance(found[0], dict) else {}
-    return facts_of(welcome, answered_s, told)
+    return facts_of(welcome, answered_s, sessions.server)
 
 
 @contextlib.contextmanager

@@ -13,7 +13,6 @@ from typing import Any
 from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.lease import Lease
 from envhub_worker.protocol.lifecycle import State
-from envhub_worker.protocol.messages.base import FIRST_WITH_WATCHES_VERSION
 
 _MOST = 64
 """Names of one environment that are taken note of."""
@@ -64,7 +63,7 @@ class Attributes:
     def wanted(self, name: str) -> bool:
         """It is going to be asked for: whether it is to be watched from now on."""
         lane, steps = self._lease.lane, self._counters.steps
-        if lane is None or lane.jail.client.version < FIRST_WITH_WATCHES_VERSION:
+        if lane is None:
             return False
         asked = self._asked.get(name)
         if asked is None:

@@ -54,7 +54,7 @@ class ManifestCache:
             if not folders.is_ours_alone(self._path.parent):
                 return None
             [packet] = PacketReader().feed(self._path.read_bytes())
-            _, message = m.unpack(packet.frames)
+            message = m.unpack(packet.frames)
             if isinstance(message, m.Loaded):
                 return decode_manifest(
                     message.manifest, max_elements=max_elements, generator=generator
@@ -69,7 +69,7 @@ class ManifestCache:
         """Remember a manifest. A cache that cannot be written is no error."""
         if self._path is None:
             return
-        data = b"".join(map(bytes, pack_packet(1, m.pack(m.Loaded(value), 1))))
+        data = b"".join(map(bytes, pack_packet(1, m.pack(m.Loaded(value)))))
         with contextlib.suppress(OSError):
             folders.make_private(self._path.parent)
             fd, temporary = tempfile.mkstemp(dir=self._path.parent)
@@ -91,7 +91,7 @@ def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, runtime: Runt
     a miss, and no harm.
     """
     try:
-        arguments = b"".join(map(bytes, m.pack(load, 0, pickler=pickles.lasting)))
+        arguments = b"".join(map(bytes, m.pack(load, pickler=pickles.lasting)))
     except (EnvHubError, TypeError):
         return None
     facts = (

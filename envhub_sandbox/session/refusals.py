@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
+from envhub_sandbox.option_names import option_name
 from envhub_sandbox.transport.forks import foreign
 from envhub_worker.protocol.lifecycle import State
 
@@ -44,7 +43,7 @@ def refusal(
         text = f"cannot {operation}: the reply to the last request is late; call reset() first"
         return WorkerTimeoutError(text, request=operation)
     if state is State.DEAD:
-        text = f"cannot {operation}: the worker process has died; {_ADVICE.get(restart, _RESET)}"
+        text = f"cannot {operation}: the worker process has died; {_advice(restart)}"
         return WorkerDiedError(text, request=operation)
     if state is State.EXPIRED:
         return expiry(operation, "it was idle for too long")
@@ -55,7 +54,9 @@ def refusal(
     return WorkerError(f"cannot {operation}: the environment is {state.value}")
 
 
-_RESET = "call reset() first"
-_ADVICE: Mapping[str, str] = {
-    "never": "make the environment again, or use policy={'restart': 'on_reset'} and call reset()"
-}
+def _advice(restart: str) -> str:
+    if restart != "never":
+        return "call reset() first"
+    return (
+        f"make the environment again, or use {option_name('restart', 'on_reset')} and call reset()"
+    )

@@ -22,6 +22,7 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.hub.store import cache_root
 from envhub_sandbox.log import CRASHES
+from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy, Timeouts
 from envhub_sandbox.session.author_lines import point_out
 from envhub_sandbox.session.jails.loaded import LoadedJail
@@ -146,7 +147,7 @@ class Repository:
             startup_s = self.timeouts.startup_s
             late = WorkerTimeoutError(
                 f"make_env has not finished after {startup_s} s and was ended; give it longer "
-                "with timeouts={'startup_s': ...}, or make it again",
+                f"with {option_name('startup_s', 2 * (startup_s or 1))}, or make it again",
                 request="make_env",
                 timeout_s=startup_s,
             )

@@ -29,8 +29,6 @@ from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _NOW = int(zmq.NOBLOCK)
 _MORE_NOW = int(zmq.SNDMORE) | _NOW
-_FAR_VERSION = 2
-_FIRST_OF_VERSION_2 = 17
 SESSION = secrets.token_bytes(16)
 _contexts: dict[int, zmq.Context[zmq.Socket[bytes]]] = {}
 
@@ -65,7 +63,6 @@ class WorkerClient:
         far: The server's key and ours, where it is on another host.
 
     Attributes:
-        version: The protocol's version that was agreed on; 0 before ``hello``.
         patience_s: How long the server keeps the jails of a client that says nothing; 0: for ever.
         torn: Whether an interrupt may have left half a message, which the next would be taken into.
     """
@@ -97,7 +94,6 @@ class WorkerClient:
         self._latest: Buffer = b""
         self.torn = False
         self._compression = ""
-        self.version = 0
         self.patience_s = 0
         self.stale_replies = 0
         self.sent_bytes = 0
@@ -105,27 +101,21 @@ class WorkerClient:
 
     def hello(self, deadline: Deadline) -> m.Welcome:
         """Agree on a protocol version."""
-        self._compression, self.version = "", 0  # any server reads how this is said
+        self._compression = ""
         session = SESSION if self._far is None else far_session()
-        greeting = m.Hello(m.OLDEST_VERSION, m.VERSION, session)
+        greeting = m.Hello(m.VERSION, session)
         reply, _ = self.request(greeting, deadline=deadline)
         welcome = expect(reply, m.Welcome)
-        if not m.OLDEST_VERSION <= welcome.version <= m.VERSION:
+        if welcome.version != m.VERSION:
             raise VersionMismatchError(
-                f"this client speaks protocol {m.OLDEST_VERSION} to {m.VERSION}, the worker chose "
-                f"{welcome.version}"
+                f"this client speaks protocol {m.VERSION}, the worker {welcome.version}: install "
+                "the same release of envhub-sandbox on both sides"
             )
-        self.version = welcome.version
         if self._link is not None:
             self._agree(deadline)
         return welcome
 
     def _agree(self, deadline: Deadline) -> None:
-        if self.version < _FAR_VERSION:
-            raise VersionMismatchError(
-                f"the worker speaks protocol {self.version}, and a server on another host needs "
-                f"{_FAR_VERSION}: upgrade the worker"
-            )
         reply, _ = self.request(m.Agree(compression.available()), deadline=deadline)
         agreed = expect(reply, m.Agreed)
         if agreed.compression not in ("", *compression.available()):
@@ -141,14 +131,8 @@ class WorkerClient:
     def send(self, message: m.Message, payload: Sequence[Buffer] = ()) -> int:
         """Send a request; returns its id."""
         self.check_process()
-        if self.version == 1 and _FIRST_OF_VERSION_2 <= message.kind < m.FIRST_RUNNER_KIND:
-            raise VersionMismatchError(
-                f"the worker speaks protocol 1, and {type(message).__name__} needs 2: upgrade it"
-            )
         request_id = next(self._ids)
-        numbered = self.version >= m.FIRST_NUMBERED_VERSION
-        header = m.pack_header(message, request_id, numbered=numbered)
-        self._send(request_id, [*header, *payload])
+        self._send(request_id, [*m.pack_header(message, request_id), *payload])
         return request_id
 
     def _send(self, request_id: int, frames: list[Buffer]) -> None:
@@ -179,7 +163,7 @@ class WorkerClient:
             if self._link is not None:
                 with UNTRUSTED:
                     frames = compression.unpack_frames(frames, self._limits)
-            reply_id, reply, _ = m.unpack_header(frames[0], limits=self._limits)
+            reply_id, reply = m.unpack_header(frames[0], limits=self._limits)
             if reply_id != request_id:
                 self._sent.pop(reply_id, None)
                 self.stale_replies += 1
@@ -199,7 +183,7 @@ class WorkerClient:
         Without its payload; raises as ``receive`` does.
         """
         if self._latest:
-            reply_id, reply, _ = m.unpack_header(self._latest, limits=self._limits)
+            reply_id, reply = m.unpack_header(self._latest, limits=self._limits)
             if reply_id == request_id:
                 return reply
         return self.receive(request_id, deadline)[0]

@@ -6,9 +6,10 @@ import contextlib
 import os
 import signal
 
+from envhub_sandbox.option_names import option_name
+
 _KILLED_IN_A_CONTAINER = 128
 """And the signal's number: an engine's exit code, where the container's program got one."""
-_NEXT = "The next make_env, or with policy={'restart': 'on_reset'} the next reset(), starts another"
 
 
 def how(process_fd: int) -> str:
@@ -21,15 +22,20 @@ def how(process_fd: int) -> str:
     with contextlib.suppress(OSError):  # another has waited for it, or it is no process
         told = os.waitid(os.P_PIDFD, process_fd, os.WEXITED | os.WNOHANG | os.WNOWAIT)
     if told is None:
-        return f". {_NEXT}"
+        return f". {_next()}"
     if told.si_code in (os.CLD_KILLED, os.CLD_DUMPED):
-        return f" by {_named(told.si_status)}{_culprit(told.si_status)}. {_NEXT}"
+        return f" by {_named(told.si_status)}{_culprit(told.si_status)}. {_next()}"
     number = told.si_status - _KILLED_IN_A_CONTAINER
     if number in signal.valid_signals():
-        where = "; the container's own limit is DockerSandbox(memory=...)"
+        where = "; the container's own limit is DockerSandbox(memory=...) in Python"
         why = _culprit(number) + (where if number == signal.SIGKILL else "")
-        return f" with its container, by {_named(number)}{why}. {_NEXT}"
-    return f", with exit code {told.si_status}. {_NEXT}"
+        return f" with its container, by {_named(number)}{why}. {_next()}"
+    return f", with exit code {told.si_status}. {_next()}"
+
+
+def _next() -> str:
+    fresh = option_name("restart", "on_reset")
+    return f"The next make_env, or with {fresh} the next reset(), starts another"
 
 
 def _named(number: int) -> str:

@@ -32,8 +32,6 @@ _CAUSE_S = 10.0
 _CAUSE_POLL_S = 0.01
 _UNSEEN_S = 5.0
 """For how long a Ctrl-C waits for the jail that it came before."""
-_FIRST_WITH_FRAMED_PICKLES = 6
-"""The version of the protocol."""
 
 
 class RunnersDiedError(WorkerDiedError):
@@ -131,9 +129,8 @@ class JailHandle:
     def pack_noting(self, message: m.Message) -> tuple[list[Buffer], bool]:
         """The frames of a message to a runner, and whether nothing had to be pickled for them."""
         # the only way in for the caller's own objects; nothing is ever unpickled here
-        new = self.client.version >= _FIRST_WITH_FRAMED_PICKLES
-        pickler = _Noting(pickles.framed if new else pickles.pickled)
-        return m.pack(message, 0, pickler=pickler, limits=self._limits), pickler.plain
+        pickler = _Noting(pickles.framed)
+        return m.pack(message, pickler=pickler, limits=self._limits), pickler.plain
 
     def send(self, operation: str, requests: Sequence[tuple[int, m.Message]]) -> int:
         """Send one message to each of some runners, in one request; returns its id."""
@@ -178,7 +175,7 @@ class JailHandle:
 
     def _unpack(self, frames: Sequence[Buffer]) -> m.Message:
         own = self.heard.take(self.watched.take(frames))
-        return m.unpack(own, limits=self._limits, tensors=to_tensor, things=Described)[1]
+        return m.unpack(own, limits=self._limits, tensors=to_tensor, things=Described)
 
     def exchange(
         self, operation: str, requests: Sequence[tuple[int, m.Message]], deadline: Deadline

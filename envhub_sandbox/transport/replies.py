@@ -6,6 +6,7 @@ fixed tables, with texts that are cut and made printable.
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from envhub_sandbox.errors import (
@@ -29,11 +30,14 @@ from envhub_sandbox.errors import (
     load_error,
     remote_error,
 )
+from envhub_sandbox.option_names import option_name
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.confinement import Reason
 from envhub_worker.protocol.messages.busy import ERROR, Busy
 from envhub_worker.protocol.text import continued, printable, quoted
+
+_PROFILE = re.compile('profile "(strict|no-userns|container)"')
 
 # --- what was asked for ------------------------------------------------------------------------
 
@@ -66,7 +70,7 @@ def check(reply: m.Message) -> None:
     """
     if isinstance(reply, m.Raised):
         raise raised(reply)
-    if not m.is_of_runner(reply.kind):
+    if reply.kind < m.FIRST_RUNNER_KIND:
         raise RemoteProtocolError(f"a runner sent {type(reply).__name__}")
 
 
@@ -86,12 +90,17 @@ def typed(reply: m.Message, kind: type[m.M]) -> m.M:
 # --- what a server says ---------------------------------------------------------------------
 
 
+def _named(fix: str) -> str:
+    """What to do, with a profile written as an option of the place that the user is at."""
+    return _PROFILE.sub(lambda found: option_name("profile", found[1]), fix)
+
+
 def refusal(reply: m.Refused) -> Exception:
     """The error for a refused request. Trust: text from the worker."""
     message = printable(reply.message)
     if reply.error == "SandboxUnavailableError":
         layer = f"{printable(reply.missing)}: " if reply.missing else ""
-        fix = f"\n{printable(reply.fix)}" if reply.fix else ""
+        fix = f"\n{_named(printable(reply.fix))}" if reply.fix else ""
         return SandboxUnavailableError(f"this host cannot enforce {layer}{message}{fix}")
     if reply.error == "WorkerDiedError":
         return WorkerDiedError(message, reason="gone")

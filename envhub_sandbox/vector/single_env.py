@@ -18,7 +18,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from envhub_sandbox.vector.folding import folded, folds
 from envhub_sandbox.vector.infos import of_one
-from envhub_worker.protocol.manifest.names import is_servable
+from envhub_worker.protocol.manifest.names import absent, is_servable
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _PLAIN = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
@@ -156,10 +156,24 @@ class SingleEnv(gym.Env[Any, Any]):
 
     def __getattr__(self, name: str) -> Any:
         """An attribute or a method of the environment, whichever of its wrappers has it."""
-        vector = self.__dict__.get("_vector")
-        if vector is None or not is_servable(name):
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        return vector.envs[0].get_wrapper_attr(name)
+        if "_vector" not in self.__dict__ or not is_servable(name):
+            raise absent(self, name, "get_wrapper_attr")
+        return self._inner.get_wrapper_attr(name)
+
+    def has_wrapper_attr(self, name: str) -> bool:
+        """Whether the environment, or a wrapper of it, has an attribute of that name."""
+        return self._is_own(name) or bool(self._inner.has_wrapper_attr(name))
+
+    def get_wrapper_attr(self, name: str) -> Any:
+        """That attribute, also under names that ``__getattr__`` does not serve (``size``)."""
+        return getattr(self, name) if self._is_own(name) else self._inner.get_wrapper_attr(name)
+
+    @property
+    def _inner(self) -> Any:
+        return self._vector.envs[0]  # type: ignore[attr-defined]
+
+    def _is_own(self, name: str) -> bool:
+        return name in self.__dict__ or hasattr(type(self), name)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # copy and deepcopy, too: another one like it, with processes of its own

@@ -40,6 +40,9 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
         self._on_close = on_close
         self._recipe = recipe
 
+    def __missing__(self, suite: str) -> Any:
+        raise KeyError(f"there is no suite {suite!r}; there are: {', '.join(map(repr, self))}")
+
     def __reduce__(self) -> tuple[Any, ...]:
         if self._recipe is None:
             raise TypeError("environments that run in this process cannot be pickled")

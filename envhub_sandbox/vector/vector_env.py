@@ -29,7 +29,7 @@ from envhub_sandbox.vector.shown import environment_html
 from envhub_sandbox.vector.sub_environment import MessageFor as OneMessageFor
 from envhub_sandbox.vector.sub_environment import SubEnvironment
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.manifest.names import is_servable
+from envhub_worker.protocol.manifest.names import absent, is_servable
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _NOT_CALLED = frozenset({"reset", "step", "close"})
@@ -401,7 +401,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         # asked for when a property of that name fails.
         ours = not is_servable(name) or hasattr(type(self), name)
         if manifest is None or ours or name not in manifest.attributes:
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            raise absent(self, name, "get_attr")
         self._asking.refuse_if_busy(name)
         reply = self._asking.own("get attribute", m.GetOwn, name)
         if isinstance(reply, m.Value):

@@ -51,24 +51,22 @@ class Asked:
         request: The message for the runner, or for the server where there is no runner in it.
         relayed: Whether it was for the runner.
         honest: The honest answer.
-        numbered: Whether the client's id stands in front of its message.
     """
 
     request_id: int
     request: m.Message
     relayed: bool
     honest: m.Message
-    numbered: bool
 
     def answer(self, message: m.Message | Frames, request_id: int | None = None) -> Frames:
         """An answer to this request: the server's own, or the runner's wrapped as it is relayed."""
         number = self.request_id if request_id is None else request_id
         if not self.relayed:
             assert isinstance(message, m.Message)
-            return m.pack_header(message, number, numbered=self.numbered)
+            return m.pack_header(message, number)
         frames = m.pack(message) if isinstance(message, m.Message) else message
         relayed = m.Relayed((len(frames),))
-        return [*m.pack_header(relayed, number, numbered=self.numbered), *frames]
+        return [*m.pack_header(relayed, number), *frames]
 
 
 @dataclass
@@ -103,12 +101,12 @@ class LyingServer:
 
     def _answers(self, frames: list[bytes]) -> list[Frames]:
         self.heard += b"".join(frames)
-        request_id, request, numbered = m.unpack_header(frames[0])
+        request_id, request = m.unpack_header(frames[0])
         relayed = isinstance(request, m.Relay)
         if relayed:
-            _, request = m.unpack(frames[1:], unpickler=lambda data: data)
+            request = m.unpack(frames[1:], unpickler=lambda data: data)
         self.asked.append(request)
-        asked = Asked(request_id, request, relayed, honest(request), numbered)
+        asked = Asked(request_id, request, relayed, honest(request))
         lie = self.lies.get(type(request))
         return lie(asked) if lie else [asked.answer(asked.honest)]
 

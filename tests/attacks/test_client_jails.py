@@ -57,7 +57,7 @@ class Plain(gym.Env):
         return np.zeros(3, np.float32), 0.0, False, False, {{}}
 
 def lie(self, packet):
-    request_id, request = m.unpack(packet.frames)
+    request = m.unpack(packet.frames)
     if not isinstance(request, m.Step):
         return honest(self, packet)
     if MODE == "frames":
@@ -66,7 +66,7 @@ def lie(self, packet):
         time.sleep(600)
     if MODE == "exit":
         os._exit(0)
-    answer = m.pack(m.Value(None), request_id)
+    answer = m.pack(m.Value(None))
     stream = next(fd for fd in range(3, 64) if is_stream(fd))
     one = b"".join(map(bytes, runner.pack_packet(packet.request_id, answer)))
     if MODE == "twice":
@@ -134,7 +134,7 @@ def test_pickles_from_a_jail_are_never_loaded(
     canary = home / "executed"
     evil: Any = Canary(canary)
     done = step_done(**{place: {"a": evil} if place == "info" else evil})
-    frames = m.pack(done, 1, pickler=cloudpickle.dumps)
+    frames = m.pack(done, pickler=cloudpickle.dumps)
     assert any(str(canary).encode() in bytes(frame) for frame in frames)
     lies_to(arena, liar(home, "frames", frames))
     assert not canary.exists()
@@ -149,10 +149,10 @@ BOMBS: dict[str, list[Buffer]] = {
     ),
     "lists a million deep": message(b"\x93\x30\x01" + b"\x91" * 1_000_000 + b"\xc0"),
     "an array that claims four billion": message(b"\x93\x30\x01\xdd\xff\xff\xff\xff"),
-    "four thousand frames": [*m.pack(m.Value(None), 1), *[b"x"] * 4000],
-    "a frame too many": [*m.pack(step_done(), 1), b"x" * MIB],
-    "a wrong shape": m.pack(step_done(observation=np.zeros((2, 99), np.float32)), 1),
-    "the server's own words": m.pack(m.JailOpened(1, (1,), ()), 1),
+    "four thousand frames": [*m.pack(m.Value(None)), *[b"x"] * 4000],
+    "a frame too many": [*m.pack(step_done()), b"x" * MIB],
+    "a wrong shape": m.pack(step_done(observation=np.zeros((2, 99), np.float32))),
+    "the server's own words": m.pack(m.JailOpened(1, (1,), ())),
 }
 
 

@@ -93,7 +93,7 @@ def relayed(answer: m.Message | Frames) -> Callable[[Asked], list[Frames]]:
 
 def pickled(answer: m.Message) -> Frames:
     """An answer in which every object that has no form of its own is a pickle."""
-    return m.pack(answer, 1, pickler=cloudpickle.dumps)
+    return m.pack(answer, pickler=cloudpickle.dumps)
 
 
 def peak_growth(action: Callable[[], object]) -> int:
@@ -235,7 +235,7 @@ def test_wrong_arrays_are_refused(liar: LyingServer, folder: str, what: str) -> 
 
 def described(value: object) -> Frames:
     """An answer to Load with a hand-made manifest."""
-    return m.pack(m.Loaded(value), 1)  # type: ignore[arg-type]
+    return m.pack(m.Loaded(value))  # type: ignore[arg-type]
 
 
 def changed(**fields: Any) -> dict[str, Any]:
@@ -431,8 +431,8 @@ DOCUMENTS: dict[str, Callable[[], Frames]] = {
     "an array of objects by hand": lambda: packed([m.Value.kind, 1, ext(1, b"|O8")]),
     "an array of void by hand": lambda: packed([m.Value.kind, 1, ext(1, b"V2000000000")]),
     "an array that is not there": lambda: packed([m.Value.kind, 1, ext(1, b"\x0b\x01" + b"\xff")]),
-    "frames that nobody mentioned": lambda: [*m.pack(m.Value(None), 1), b"x" * 4096],
-    "a thousand frames": lambda: [*m.pack(m.Value(None), 1), *[b"x"] * 5000],
+    "frames that nobody mentioned": lambda: [*m.pack(m.Value(None)), b"x" * 4096],
+    "a thousand frames": lambda: [*m.pack(m.Value(None)), *[b"x"] * 5000],
     "a number of a megabyte": lambda: packed([m.Value.kind, 1, ext(3, b"\x7f" * MIB)]),
     "a text of ten megabytes": lambda: packed([m.Value.kind, 1, "x" * (10 * MIB)]),
 }
@@ -469,7 +469,7 @@ def test_malformed_answers_of_the_server_are_refused(
         m.Value(None),
         m.Loaded({}),
         m.Step(1, None),
-        m.Hello(1, 1, b""),
+        m.Hello(m.VERSION, b""),
         m.Died(1, "exit", 0, None, "", "", ""),
         m.Refused("SandboxUnavailableError", "x", "y", "z"),
         m.JailOpened(1, (), ()),
@@ -557,8 +557,10 @@ def test_parts_that_do_not_add_up_are_refused(
     liar: LyingServer, folder: str, parts: tuple[int, ...]
 ) -> None:
     """The server's count of frames has to fit what came, and what was asked."""
-    frames = m.pack(step_done(), 1)
-    liar.lies[m.Step] = lambda asked: [[*m.pack(m.Relayed(parts), asked.request_id), *frames]]
+    frames = m.pack(step_done())
+    liar.lies[m.Step] = lambda asked: [
+        [*m.pack_header(m.Relayed(parts), asked.request_id), *frames]
+    ]
     with opened(liar, folder) as suites:
         suites.env.reset()
         refuses(lambda: suites.env.step(ACTIONS))

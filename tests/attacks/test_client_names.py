@@ -21,17 +21,30 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import VectorWrapper
+from gymnasium.vector.utils import batch_space
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
+from envhub_sandbox.vector.single_env import SingleEnv
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.manifest.names import GYMNASIUMS, PROBED
+from envhub_worker.protocol.spaces.spaces import encode_space
 from tests.attacks.harness import Arena
-from tests.attacks.lying_server import Asked, Frames, LyingServer, lying, manifest
+from tests.attacks.lying_server import (
+    ACTION,
+    OBSERVATION,
+    Asked,
+    Frames,
+    LyingServer,
+    lying,
+    manifest,
+)
 from tests.attacks.test_client_lies import opened, relayed
 from tests.attacks.test_client_values import SCRIPT, spec_of
-from tests.support import inside
+from tests.support import curious, inside
+from tests.support.curious import do
 from tests.support.protocol_names import names_that_libraries_call
 from tests.support.repositories import write_repository
 
@@ -70,6 +83,14 @@ def greedy(liar: LyingServer, folder: str, answer: Lie | None = None, **fields: 
 
 
 Lie = Callable[[Asked], list[Frames]]
+
+
+OF_ONE: dict[str, Any] = {
+    "num_envs": 1,
+    "observation_space": encode_space(batch_space(OBSERVATION, 1)),
+    "action_space": encode_space(batch_space(ACTION, 1)),
+}
+"""What a manifest says of a vector environment of one."""
 
 
 class Naive:
@@ -258,6 +279,46 @@ def test_no_name_that_a_library_calls_reaches_the_wire(liar: LyingServer, folder
             Naive(env, "__array_interface__").__array_interface__  # noqa: B018
             assert "__array_interface__" in asked_for(liar)
         liar.asked.clear()
+
+
+def test_what_libraries_do_with_any_object_reaches_no_worker(
+    liar: LyingServer, folder: str
+) -> None:
+    """Converting, printing, plotting, logging, copying and comparing asks a worker for nothing."""
+    listed = (*sorted(PROBED), "hub_config", "task_description")
+    answer = relayed(m.Value((1,)))
+    liar.lies |= {m.GetOne: answer, m.Call: answer, m.CallOne: answer, m.GetRandom: answer}
+    with greedy(liar, folder, answer, attributes=listed, **OF_ONE) as suites:
+        env = suites.env
+        for thing in (env, env.envs[0], SingleEnv(env), VectorWrapper(env)):
+            for act in curious.ACTS:
+                do(act, thing)
+                assert not asked_for(liar) - GYMNASIUMS, act  # properties that dir() names
+            env.hub_config  # noqa: B018
+            assert "hub_config" in asked_for(liar), "the control failed: nothing can be asked"
+            liar.asked.clear()
+        # the control: a proxy that serves what is listed is asked
+        for act in curious.ACTS:
+            do(act, Naive(env, *listed))
+        assert asked_for(liar) >= {"shape", "ndim", "size", "index", "keys"}
+
+
+def test_what_libraries_look_for_is_served_to_who_names_it(liar: LyingServer, folder: str) -> None:
+    """``size`` is an attribute of many environments: asked for by name, it is what it is."""
+    liar.lies |= {m.GetOne: relayed(m.Value(8)), m.Call: relayed(m.Value((8,)))}
+    liar.lies[m.CallOne] = relayed(m.Value(True))
+    with greedy(liar, folder, attributes=("size", "to"), **OF_ONE) as suites:
+        env = suites.env
+        single = SingleEnv(env)
+        for thing, ask in ((env, "get_attr"), (single, "get_wrapper_attr"), (env.envs[0], "get_w")):
+            with pytest.raises(AttributeError, match=rf"{ask}.*'size'"):
+                thing.size  # noqa: B018
+        assert not asked_for(liar)
+        assert env.get_attr("size") == env.call("size") == (8,)
+        assert env.envs[0].get_wrapper_attr("size") == single.get_wrapper_attr("size") == 8
+        assert gym.Wrapper(single).get_wrapper_attr("size") == 8
+        assert single.has_wrapper_attr("size")
+        assert single.get_wrapper_attr("spec") is single.spec
 
 
 def test_the_clients_own_names_are_nobody_elses(liar: LyingServer, folder: str) -> None:

@@ -95,14 +95,16 @@ def test_a_hostile_client_and_its_environment_forge_nothing(tmp_path: Path, form
     listed.write_text(f"{key_text(MALLORY.public)} {name}\n")
     options = ("--authorized-clients", str(listed), "--log-format", form)
     with listening(tmp_path / "server", *options) as server, peer(server, MALLORY) as mallory:
-        assert isinstance(mallory.ask(m.Hello(1, 2, b"\n" + FORGED[form].encode()[:40])), m.Welcome)
+        assert isinstance(
+            mallory.ask(m.Hello(m.VERSION, b"\n" + FORGED[form].encode()[:40])), m.Welcome
+        )
         snapshot = brought(mallory, code)
         for lie in lies(form):
             died_in(mallory, server, lie, snapshot)
-            mallory.refused(m.OpenJail("x", "", snapshot, lie, asdict(Confinement()), 1))
-            mallory.refused(m.OpenJail("x", "", lie, "env.py", asdict(Confinement()), 1))
+            mallory.refused(m.OpenJail("x", "", "", snapshot, lie, asdict(Confinement()), 1))
+            mallory.refused(m.OpenJail("x", "", "", lie, "env.py", asdict(Confinement()), 1))
             weak = {**asdict(Confinement()), "profile": lie}
-            mallory.refused(m.OpenJail("x", "", snapshot, "env.py", weak, 1))
+            mallory.refused(m.OpenJail("x", "", "", snapshot, "env.py", weak, 1))
     said = server.said()
     assert not forged(said, form)
     assert said.isascii()
@@ -124,9 +126,9 @@ def brought(client: Peer, code: bytes) -> str:
 def died_in(client: Peer, server: Listening, name: str, snapshot: str) -> None:
     """A jail of this name was opened, ran the file, and died of it."""
     before = server.said().count("jail_died")
-    opened = client.ask(m.OpenJail(name, "", snapshot, "env.py", asdict(Confinement()), 1))
+    opened = client.ask(m.OpenJail(name, "", "", snapshot, "env.py", asdict(Confinement()), 1))
     assert isinstance(opened, m.JailOpened), opened
-    load = [bytes(frame) for frame in m.pack(m.Load(1, False, None, {}), 1)]
+    load = [bytes(frame) for frame in m.pack(m.Load(1, False, None, {}))]
     client.tell(m.Relay(opened.jail, "make_env", ((opened.runners[0], len(load)),)), *load)
     assert client.socket.poll(60_000)
     client.socket.recv_multipart()

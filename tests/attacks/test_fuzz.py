@@ -21,6 +21,7 @@ from envhub_sandbox.hub.listing import Snapshot
 from envhub_sandbox.transport import results
 from envhub_sandbox.transport.values import described
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.limits import WireLimits
 from tests.fuzz import child, traffic
 from tests.fuzz.oracle import WrongError, fits
 from tests.support import inside
@@ -120,12 +121,12 @@ def test_observations_that_are_not_checked_are_noticed(
 def test_a_memory_that_fails_is_noticed(
     recorded: Recorded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is read once and never again is noticed; so it was with keys that are no text."""
+    """What is read as another message the second time is noticed."""
     assert first_wrong(recorded, "unpack") == ""
     for spot in inside.FORMS:
         monkeypatch.setattr(*spot, m.templates.Forms())
-    monkeypatch.setattr(m.templates, "Incoming", forgetful)
-    assert first_wrong(recorded, "unpack") == "another end"
+    monkeypatch.setattr(m.templates, "Incoming", Forgetful)
+    assert first_wrong(recorded, "unpack") == "another message"
 
 
 def test_specs_that_are_not_read_as_facts_are_noticed(
@@ -156,9 +157,15 @@ def test_warnings_that_are_not_checked_are_noticed(
     assert first_wrong(recorded, "warnings") in ("a giant", "no text")
 
 
-def forgetful(*_: object) -> None:
-    """In the place of what reads a document that is known."""
-    raise TypeError("unhashable type: 'list'")
+class Forgetful:
+    """In the place of what reads a document that is known: it has lost the fields."""
+
+    def __init__(self, document: bytes, make: type[m.Message], limits: WireLimits) -> None:
+        self.limits, self.make = limits, make
+
+    def message(self, *_: object) -> m.Message:
+        """One of that kind."""
+        return self.make(*[None] * len(self.make.FIELDS))
 
 
 SPACE = spaces.Dict({"x": spaces.Box(-1, 1, (2,)), "t": spaces.Tuple([spaces.Discrete(3)])})

@@ -255,10 +255,12 @@ def test_runners_without_numbers_are_refused(liar: LyingServer, tmp_path: Path, 
 @pytest.mark.parametrize("parts", [1, 2, 3])
 def test_as_many_answers_as_runners(liar: LyingServer, tmp_path: Path, parts: int) -> None:
     """One runner was asked."""
-    frames = m.pack(step_done(), 1)
+    frames = m.pack(step_done())
 
     def lie(asked: Asked) -> list[Frames]:
-        return [[*m.pack(m.Relayed((len(frames),) * parts), asked.request_id), *frames * parts]]
+        return [
+            [*m.pack_header(m.Relayed((len(frames),) * parts), asked.request_id), *frames * parts]
+        ]
 
     liar.lies[m.Step] = lie
     with opened(liar, tmp_path / "it") as suites:

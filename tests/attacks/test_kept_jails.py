@@ -63,7 +63,7 @@ def forged():
     return m.StepDone(row.reshape(1, 1), row, no, no, {{}})
 
 def packet(packet_id, message):
-    return b"".join(map(bytes, runner.pack_packet(packet_id, m.pack(message, 0))))
+    return b"".join(map(bytes, runner.pack_packet(packet_id, m.pack(message))))
 
 def stream():
     return next(fd for fd in range(3, 64) if is_socket(fd))
@@ -105,7 +105,7 @@ def remember(self, request):
     return reply
 
 def lie(self, received):
-    request_id, request = m.unpack(received.frames)
+    request = m.unpack(received.frames)
     if isinstance(request, m.Build):
         state["liar"] = request.start == 1
         if state["liar"] and Path(tempfile.gettempdir(), "done").exists():
@@ -114,11 +114,11 @@ def lie(self, received):
         return honest(self, received)
     number = received.request_id
     if MODE == "forge":
-        return m.pack(forged(), request_id)
+        return m.pack(forged())
     if MODE == "died":
-        return m.pack(m.Died(1, "signal", None, "SIGKILL", "", "", "step"), request_id)
+        return m.pack(m.Died(1, "signal", None, "SIGKILL", "", "", "step"))
     if MODE == "partly":
-        return m.pack(m.RelayedPartly((1, 1), (0,)), request_id)
+        return m.pack(m.RelayedPartly((1, 1), (0,)))
     if MODE == "twice":
         os.write(stream(), packet(number, forged()) + packet(number + 1, forged()))
         time.sleep(600)

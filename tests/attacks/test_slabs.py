@@ -159,7 +159,7 @@ def test_an_impossible_header_is_refused(shard: LaneShard, outcome: int, length:
 )
 def test_an_impossible_answer_is_refused(shard: LaneShard, outcome: int, length: int) -> None:
     """A message has one answer, of a length that fits its area."""
-    shard.tell(b"".join(pack_packet(0, m.pack(m.Render(1), 0))), 0)
+    shard.tell(b"".join(pack_packet(0, m.pack(m.Render(1)))), 0)
     words = f"struct.pack('QQ', {outcome}, {length})"
     attack(shard, f"os.pwrite(reply, {words}, {slabs.OUTCOME * 8})")
     with pytest.raises(RemoteProtocolError):
@@ -172,7 +172,7 @@ def _packets(*frames: bytes) -> str:
 
 def answers(shard: LaneShard, answer: str) -> None:
     """Tell the jail something; it answers with these bytes, a Python literal."""
-    shard.tell(b"".join(pack_packet(0, m.pack(m.Render(1), 0))), 0)
+    shard.tell(b"".join(pack_packet(0, m.pack(m.Render(1)))), 0)
     attack(
         shard,
         f"answer = {answer}\n"
@@ -187,7 +187,7 @@ def answers(shard: LaneShard, answer: str) -> None:
         repr(bytes(64)),
         repr(b"\xff" * 64),
         _packets(b"\x80\x04."),
-        _packets(*[bytes(m.pack(m.Value(1), 0)[0])] * 2),
+        _packets(*[bytes(m.pack(m.Value(1))[0])] * 2),
         repr(b"\x01\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0" + b"\xff" * 7 + b"\x0f"),
     ],
     ids=["zeros", "ones", "pickle", "two", "endless"],
@@ -201,7 +201,7 @@ def test_garbage_for_an_answer_is_refused(shard: LaneShard, answer: str) -> None
 
 def test_an_honest_answer_is_read(shard: LaneShard) -> None:
     """The control of the two above."""
-    answer = _packets(bytes(m.pack(m.Value((1, "two")), 0)[0]))
+    answer = _packets(bytes(m.pack(m.Value((1, "two")))[0]))
     answers(shard, answer)
     assert shard.answer() == m.Value((1, "two"))
 

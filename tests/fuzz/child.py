@@ -57,7 +57,7 @@ def lie(name: str, number: int, seed: int, corpus: list[Frames], messages: list[
 
 def decoded(corpus: list[Frames]) -> list[m.Message]:
     """The messages of a recording."""
-    return [m.unpack(frames, things=Described)[1] for frames in corpus]
+    return [m.unpack(frames, things=Described) for frames in corpus]
 
 
 def run(job: dict[str, Any], say: Callable[[str], None], note: Callable[[str], None]) -> int:

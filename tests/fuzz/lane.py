@@ -60,11 +60,11 @@ def lane(dice: Dice) -> None:
     words = ours.reply[: slabs.HEADER_BYTES].view(np.uint64)
     if rng.random() < 0.3:
         ours.batch[:] = np.frombuffer(rng.randbytes(ours.batch.nbytes), np.uint8)
-    message = rng.choice([one for one in dice.messages if m.is_of_runner(one.kind)])
+    message = rng.choice([one for one in dice.messages if one.kind >= m.FIRST_RUNNER_KIND])
     if rng.random() < 0.4:
         size = rng.choice((1, COUNT))
         message = m.Value({"a": np.ones(size), "_a": np.ones(size, bool), "n": np.ones((size, 2))})
-    frames = [bytes(frame) for frame in m.pack(spoiled_message(dice, message), 0)]
+    frames = [bytes(frame) for frame in m.pack(spoiled_message(dice, message))]
     if rng.random() < 0.3:
         frames = dice.spoiler.frames(frames, dice.corpus)
     if len(frames) > 1 and rng.random() < 0.8:

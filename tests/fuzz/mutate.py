@@ -18,8 +18,17 @@ SMALL = WireLimits(items=20_000, header_bytes=1 << 20)
 _NUMBERS = (0, 1, -1, 2, 7, 2**31, 2**63 - 1, -(2**63), 2**64 - 1, 2**200)
 _FLOATS = (0.0, -0.0, 1.5, float("nan"), float("inf"), -6e4)
 _TEXTS = ("", "a", "_a", "final_obs", "_final_obs", "\x1b[2J", "x" * 600, "bit_generator", "é\0")
+_KEYS = (
+    *(0, -1, None, True, 1.5, 2j, b"b", range(3), 2**80, np.int8(3), np.str_("a")),
+    *(np.datetime64("2024-05-06"), RemoteObject("a.B", "c"), RemoteEnum("a.E", "L", [1])),
+)
 _DTYPES = ("?", "i1", "u1", "i4", "i8", "u8", "f2", "f4", "f8", "c16", "U3", "S2", "M8[s]", "O")
 _SHAPES = ((), (0,), (1,), (2,), (3,), (4,), (3, 1), (0, 2**20), (2, 2), (3, 0), (1,) * 32)
+
+
+def _member(value: object) -> RemoteEnum:
+    """A member of an enumeration, whose value need not be one that can be hashed."""
+    return RemoteEnum("a.E", "M", value)
 
 
 class Spoiler:
@@ -63,9 +72,9 @@ class Spoiler:
         if act < 0.08:
             del made[key]
         elif act < 0.16:
-            made[self._key()] = made.pop(key)
+            made[self.key()] = made.pop(key)
         elif act < 0.24:
-            made[self._key()] = self.junk(depth + 1)
+            made[self.key()] = self.junk(depth + 1)
         else:
             made[key] = self.value(made[key], depth + 1)
         return made
@@ -106,11 +115,11 @@ class Spoiler:
             made.reshape(-1)[:] = self.rng.choice((0, 1, 100))
         return made
 
-    def _key(self) -> Any:
-        plain = (*_TEXTS, 0, -1, None, True, 1.5, b"b", range(3), 2**80)
-        made = self.rng.choice(plain)
-        if self.rng.random() < 0.3:
-            made = self.rng.choice(((made, 1), frozenset({made}), ((),), RemoteObject("a.B", "c")))
+    def key(self) -> Any:
+        """Anything that can be a key."""
+        made = self.rng.choice((*_TEXTS, *_KEYS))
+        while self.rng.random() < 0.3:
+            made = self.rng.choice(((made, 1), frozenset({made}), ((),), _member({made: made})))
         return made
 
     def junk(self, depth: int = 0) -> Any:
@@ -131,7 +140,7 @@ class Spoiler:
         if act == 7 and depth < 12:
             return tuple(self.junk(depth + 1) for _ in range(rng.randrange(4)))
         if act == 8 and depth < 12:
-            return {self._key(): self.junk(depth + 1) for _ in range(rng.randrange(4))}
+            return {self.key(): self.junk(depth + 1) for _ in range(rng.randrange(4))}
         if act == 9:
             return rng.choice(
                 (set(), {1, "a"}, frozenset({(1, 2)}), range(0, -9, -2), slice(1, None))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import re
 from typing import Any
 
 import gymnasium as gym
@@ -95,9 +96,14 @@ def alike(one: Any, other: Any) -> bool:
     if isinstance(one, (list, tuple)):
         return len(one) == len(other) and all(map(alike, one, other))
     if isinstance(one, dict):
-        return repr(list(one)) == repr(list(other)) and all(
-            map(alike, one.values(), other.values())
-        )
+        return alike(list(one.items()), list(other.items()))
     if isinstance(one, np.random.Generator):  # whose repr is an address
         return alike(one.bit_generator.state, other.bit_generator.state)
-    return repr(one) == repr(other)
+    if isinstance(one, (set, frozenset)):  # of which equal ones may have another order
+        return sorted(map(_text, one)) == sorted(map(_text, other))
+    return _text(one) == _text(other)
+
+
+def _text(value: Any) -> str:
+    """Its ``repr`` without addresses."""
+    return re.sub("0x[0-9A-F]+", "", repr(value))

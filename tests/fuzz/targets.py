@@ -30,7 +30,7 @@ from envhub_sandbox.transport.values.generators import generator
 from envhub_sandbox.transport.warned import MOST, Heard
 from envhub_sandbox.vector import from_manifest
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import decode
+from envhub_worker.protocol.codec.codec import decode, encode
 from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.manifest.manifest import decode_env, decode_manifest
@@ -114,19 +114,24 @@ def parts(message: m.Message) -> list[Any]:
 def unpack(dice: Dice) -> None:
     """A message that comes again, under other ids, is what it was the first time, or refused."""
     frames = dice.rng.choice(dice.corpus)
+    if dice.rng.random() < 0.2:
+        spoiler = dice.spoiler
+        frames = [*map(bytes, m.pack(m.Value({spoiler.key(): spoiler.key()})))]
     for _ in range(dice.often()):
         frames = dice.spoiler.frames(frames, dice.corpus)
-    first = attempt(lambda: m.unpack(frames, things=Described)[1])
+    first = attempt(lambda: m.unpack(frames, things=Described))
     for _ in range(3):
-        again = attempt(lambda: m.unpack(frames, things=Described)[1])
+        again = attempt(lambda: m.unpack(frames, things=Described))
         demand(type(first) is type(again) or is_error(first) == is_error(again) == 1, "another end")
         demand(is_error(first) or alike(parts(first), parts(again)), "another message")
     if is_error(first):
         raise first
     plain = decode(frames, things=Described)
-    demand(alike(parts(first), plain[2:]), "not what the codec says")  # type: ignore[index]
+    demand(alike(parts(first), plain[1:]), "not what the codec says")  # type: ignore[index]
     usable(parts(first))
-    m.pack(first, 1)
+    whole = [*map(bytes, encode([first.kind, *parts(first)]))]
+    for _ in range(3):
+        demand([*map(bytes, m.pack(first))] == whole, "packed in another way")
 
 
 def attempt(action: Callable[[], Any]) -> Any:
@@ -354,7 +359,7 @@ def relay(dice: Dice) -> None:
         m.JailOpened(1, tuple(range(runners)), ()),
     ]  # fmt: skip
     if rng.random() < 0.3:
-        runner_replies[0] = [bytes(frame) for frame in m.pack(died, 1)]
+        runner_replies[0] = [bytes(frame) for frame in m.pack(died)]
     reply = spoiled_message(dice, rng.choice(answers))
     payload = [frame for frames in runner_replies for frame in frames]
     if rng.random() < 0.3:
@@ -363,7 +368,7 @@ def relay(dice: Dice) -> None:
     jail = JailHandle(server, 1, range(runners), [], DEFAULT_LIMITS)
     jail.kept = rng.random() < 0.5
     if isinstance(reply, m.JailOpened):
-        asked = m.OpenJail("", "", "", "", {}, runners)
+        asked = m.OpenJail("", "", "", "", "", {}, runners)
         opened = open_jail(server, asked, DEFAULT_LIMITS, Deadline(None))
         demand(len({*opened.runners}) == runners, "other runners")
         return
@@ -402,10 +407,10 @@ def warnings(dice: Dice) -> None:
 def spoiled_message(dice: Dice, message: m.Message) -> m.Message:
     """A message, spoiled, as far as its class permits it."""
     fields = dice.inside(parts(message))
-    frames = attempt(lambda: m.pack(type(message)(*fields), 1))
+    frames = attempt(lambda: m.pack(type(message)(*fields)))
     if is_error(frames):
         raise NotSentError
-    found: m.Message = m.unpack(frames)[1]
+    found: m.Message = m.unpack(frames)
     return found
 
 

@@ -31,16 +31,16 @@ def recording(found: dict[tuple[object, ...], Frames]) -> Iterator[None]:
 
     def listen(frames: Sequence[Any], **options: Any) -> Any:
         copied = [bytes(frame) for frame in frames]
-        number, message = unpack(frames, **options)
+        message = unpack(frames, **options)
         key = (message.kind, *map(len, copied))
         if len(found) < _MOST and sum(map(len, copied)) < _LARGEST:
             found.setdefault(key, copied)
-        return number, message
+        return message
 
     def listen_to_header(frame: Any, **options: Any) -> Any:
-        header = unpack_header(frame, **options)
-        listen(m.pack(header.message))
-        return header
+        number, message = unpack_header(frame, **options)
+        listen(m.pack(message))
+        return number, message
 
     m.unpack, m.unpack_header = listen, listen_to_header
     try:

@@ -279,6 +279,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send_json(url)
 
     def _commit(self, repository: StubRepository, name: str) -> None:
+        repository.earlier[repository.commit] = dict(repository.files)
         for line in map(json.loads, self._body.splitlines()):
             if line["key"] == "file":
                 value = line["value"]

@@ -21,6 +21,7 @@ from envhub_sandbox.errors import SandboxUnavailableError, SnapshotError
 from envhub_sandbox.rollouts.pictures import png
 from tests.integration.test_cli_run import envhub
 from tests.support import checks
+from tests.support.ci import obeyed
 from tests.support.repositories import write_repository
 from tests.support.samples import EXAMPLES
 
@@ -202,6 +203,23 @@ def test_a_fault_is_told_by_its_check_alone(check: str, tmp_path: Path) -> None:
     assert {one.id for one in report.findings} == {check}
 
 
+_UNINSTALLED = "raise gym.error.DependencyNotInstalled('pygame is not installed')"
+
+
+@pytest.mark.parametrize(
+    ("check", "old"),
+    [("runs", "self.count += 1"), ("runs", "super().reset(seed=seed)"), ("loads", "class Walk")],
+)
+def test_advice_follows_from_the_error(check: str, old: str, tmp_path: Path) -> None:
+    """A package that Gymnasium misses is declared, whatever was asked for when it was missed."""
+    new = f"{_UNINSTALLED}\n\n{old}" if old == "class Walk" else _UNINSTALLED
+    report = judged(repository(tmp_path / "walk", _HONEST.replace(old, new, 1)), 2, resets=0)
+    [finding] = report.findings
+    assert finding.id == check
+    assert "pygame is not installed" in finding.message
+    assert "requirements.txt" in finding.cure
+
+
 def test_an_autoreset_that_comes_a_step_late_is_told(tmp_path: Path) -> None:
     """By the check that names it, and by no other."""
     text = _HONEST.replace("def make_env", _OFF_BY_ONE + "\ndef first_make_env")
@@ -355,22 +373,8 @@ def test_the_command_line_judges(tmp_path: Path) -> None:
     assert (refused.returncode, "'nothing'" in refused.stderr) == (2, True), refused.stderr
     allowed = envhub("check", folder, "--steps", "5", "--allow", "runs", "--github")
     assert allowed.returncode == 0, allowed.stderr
-    [command] = obeyed(allowed.stdout.splitlines())
+    [command] = obeyed(allowed.stdout)
     assert command.startswith("::error title=envhub check%3A runs")
-
-
-def obeyed(lines: list[str]) -> list[str]:
-    """The commands that GitHub's runner would obey, as it reads a step's output."""
-    found, token = [], ""
-    for line in lines:
-        text = line.strip()
-        if token:
-            token = "" if text == f"::{token}::" else token
-        elif text.startswith("::stop-commands::"):
-            token = text.removeprefix("::stop-commands::")
-        elif text.startswith("::") or "##[" in text:
-            found.append(text)
-    return found
 
 
 def test_a_repository_gives_github_no_commands(tmp_path: Path) -> None:
@@ -385,8 +389,8 @@ def test_a_repository_gives_github_no_commands(tmp_path: Path) -> None:
     done = envhub("check", folder, "--steps", "5", "--github")
     assert done.returncode == 1, done.stderr
     assert "forged" in done.stdout, "the control: it is there"
-    assert obeyed(done.stderr.splitlines()) == []
-    commands = obeyed(done.stdout.splitlines())
+    assert obeyed(done.stderr) == []
+    commands = obeyed(done.stdout)
     assert [one.partition(" ")[0] for one in commands] == ["::error"]
     assert commands[0].startswith("::error title=envhub check%3A runs")
 
@@ -454,7 +458,7 @@ def test_a_host_without_user_namespaces_is_told_of(tmp_path: Path) -> None:
     assert {"pid-namespace", "mount-namespace"} <= set(missing)
     without = f"without pid-namespace: {missing['pid-namespace']}"
     page, summary = (tmp_path / "html").read_text(), (tmp_path / "summary").read_text()
-    [notice] = obeyed(github[1].splitlines())
+    [notice] = obeyed(github[1])
     for text in (shown[1], page, summary, notice, told.replace(notice, "")):
         assert "profile no-userns, as asked for" in unescape(text)
         assert without in unescape(text)

@@ -46,7 +46,7 @@ _STUCK = "import time\ntime.sleep(3600)\n"
 
 
 def index(folder: Path) -> list[dict[str, Any]]:
-    """What stands in the index, in the order of the list."""
+    """What stands in the index: what fails, what could not be judged, what passed."""
     read: list[dict[str, Any]] = json.loads((folder / "index.json").read_text())["results"]
     return read
 
@@ -73,12 +73,13 @@ def test_a_list_is_judged_and_then_what_has_changed(tmp_path: Path) -> None:
     first = envhub("check", *options, "--jobs", "2", "--junit", junit)
     assert first.returncode == 1, first.stderr
     assert verdicts(out) == {"honest": "passed", "broken": "failed", "empty": "not judged"}
-    honest, failed, empty = index(out)
+    failed, empty, honest = index(out)
     assert failed["fails"] == ["runs"]
+    assert failed["why"] == ["runs: RuntimeError: it broke"]
     assert "no file 'env.py'" in empty["said"]
     suites = ElementTree.parse(junit).getroot()
-    assert [suite.attrib["failures"] for suite in suites] == ["0", "1", "0"]
-    assert [suite.attrib["errors"] for suite in suites] == ["0", "0", "1"]
+    assert [suite.attrib["failures"] for suite in suites] == ["1", "0", "0"]
+    assert [suite.attrib["errors"] for suite in suites] == ["0", "1", "0"]
     page = Page((out / "index.html").read_text())
     links = [dict(attributes)["href"] for tag, attributes in page.tags if tag == "a"]
     assert sorted(map(str, links)) == sorted([honest["page"], failed["page"]])
@@ -89,9 +90,9 @@ def test_a_list_is_judged_and_then_what_has_changed(tmp_path: Path) -> None:
     second = envhub("check", *options)
     assert second.returncode == 1, second.stderr
     assert verdicts(out) == {"honest": "passed", "broken": "failed", "empty": "not judged"}
-    assert index(out)[0] == honest, "it was not judged again"
+    assert index(out)[2] == honest, "it was not judged again"
     assert second.stderr.count("as it was judged before") == 1
-    assert index(out)[1]["commit"] != failed["commit"]
+    assert index(out)[0]["commit"] != failed["commit"]
     assert "it broke again" in (out / str(failed["page"])).read_text()
 
 

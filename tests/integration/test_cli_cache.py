@@ -74,7 +74,7 @@ def test_remove_takes_only_what_is_named(stored: list[str]) -> None:
     """By the beginning of its commit."""
     done = RUNNER.invoke(app, ["cache", "remove", stored[1][:20]])
     assert done.exit_code == 0
-    assert "Removed 1 snapshots" in done.stderr
+    assert "Removed 1 snapshot" in done.stderr
     assert [one.commit for one in stored_snapshots()] == [stored[0], stored[2]]
 
 
@@ -132,7 +132,7 @@ def test_environments_are_listed(environment: str) -> None:
     assert found["bytes"] > 0
     done = RUNNER.invoke(app, ["cache", "list"])
     assert environment[:12] in done.stdout
-    assert "1 snapshots, 1 environments" in done.stderr
+    assert "1 snapshot, 1 environment" in done.stderr
 
 
 @pytest.mark.parametrize("named", [True, False])
@@ -145,7 +145,7 @@ def test_environments_are_removed(environment: str, named: bool) -> None:
     kept = RUNNER.invoke(app, ["cache", "remove", "--unused-for", "4"])
     assert "0 environments" in kept.stderr
     words = [environment[:9]] if named else ["--unused-for", "2"]
-    assert "1 environments" in RUNNER.invoke(app, ["cache", "remove", *words]).stderr
+    assert "1 environment" in RUNNER.invoke(app, ["cache", "remove", *words]).stderr
     assert environments.every() == []
     assert not half.exists()
 

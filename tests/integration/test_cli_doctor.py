@@ -14,7 +14,8 @@ from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.doctor import doctor as doctor_command
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.policy import PROFILES
-from envhub_worker.lockdown.root_plan import gpu_devices, real_host
+from envhub_worker.lockdown.gpus import gpu_devices
+from envhub_worker.lockdown.root_plan import real_host
 
 RUNNER = CliRunner()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.init.init import repository_name
 from envhub_sandbox.cli.init.starter import starter
 from envhub_sandbox.cli.shared.exits import UsageError
+from envhub_sandbox.hub.local import LocalFolder
 
 ENVHUB = [sys.executable, "-I", "-m", "envhub_sandbox"]
 PLUGIN = "envhub_sandbox.pytest_plugin"
@@ -45,8 +47,9 @@ def test_a_new_repository_passes_its_own_tests(tmp_path: Path) -> None:
     made = run(tmp_path, *ENVHUB, "init", "my-env")
     assert (made.returncode, made.stdout) == (0, "./my-env\n")
     folder = tmp_path / "my-env"
-    found = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
-    assert found == set(starter("my-env", 2026))
+    paths = {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()}
+    assert {str(path) for path in paths if path.parts[0] != ".git"} == set(starter("my-env", 2026))
+    assert ((folder / ".git").is_dir()) == (shutil.which("git") is not None)
     (folder / "test_more.py").write_text(_MORE)
     done = pytest_run(folder, "--strict-markers", "--envhub-ref", ".")
     assert done.returncode == 0, done.stdout
@@ -68,6 +71,18 @@ def test_those_of_the_test_win(tmp_path, monkeypatch, request):
     monkeypatch.chdir(tmp_path)
     assert request.getfixturevalue("envhub_env").num_envs == 3
 """
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
+def test_within_a_checkout_none_is_made(tmp_path: Path) -> None:
+    """Its files are a part of that one; what its tests leave behind is a part of none."""
+    subprocess.run(["git", "init", "--quiet", tmp_path], check=True)
+    assert run(tmp_path, *ENVHUB, "init", "my-env").returncode == 0
+    assert not (tmp_path / "my-env/.git").exists()
+    (tmp_path / "my-env/__pycache__").mkdir()
+    (tmp_path / "my-env/__pycache__/env.pyc").write_text("")
+    here = LocalFolder.at(tmp_path / "my-env")
+    assert {one.path for one in here.files()} == set(starter("my-env", 2026))
 
 
 def test_a_fixture_without_a_reference_says_what_is_missing(tmp_path: Path) -> None:

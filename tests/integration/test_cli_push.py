@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -13,6 +14,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.init.starter import starter
 from tests.hub.stub_hub import StubHub
+from tests.integration.test_cli_run import envhub
 
 TOKEN = "hf_of_the_author"
 
@@ -95,6 +97,8 @@ LIES = "return np.array([self.puck, 7], np.float32)"
         ("env.py", ("import numpy as np", "import numpy as np\n1 / 0"), 4, "ZeroDivisionError"),
         ("env.py", ("return np.array([self.puck, self.goal], np.float32)", LIES), 1, "obs"),
         (".env", ("", "HF_TOKEN=x"), 2, "looks like a secret"),
+        ("lib/__pycache__/env.cpython-311.pyc", ("", "x"), 2, "is compiled Python"),
+        ("lib/.cache/huggingface/x", ("", "x"), 2, "uploads nothing below .cache"),
     ],
 )
 def test_what_fails_is_not_published(
@@ -108,12 +112,47 @@ def test_what_fails_is_not_published(
 ) -> None:
     """The Hub is not even asked; the text leads to the author's own line."""
     text = (mine / path).read_text() if (mine / path).exists() else ""
+    (mine / path).parent.mkdir(parents=True, exist_ok=True)
     (mine / path).write_text(text.replace(*change))
     done = push()
     assert (done.returncode, done.stdout) == (code, "")
     assert said in done.stderr
     assert code != 4 or f'File "{mine}/env.py", line' in done.stderr
     assert stub_hub.requests == []
+
+
+def test_from_a_checkout_what_git_would_commit_is_published(
+    push: Push, stub_hub: StubHub, mine: Path
+) -> None:
+    """And what it ignores stays here."""
+    subprocess.run(["git", "init", "--quiet", str(mine)], check=True)
+    (mine / "__pycache__").mkdir()
+    (mine / "__pycache__/env.pyc").write_text("x")
+    done = push()
+    assert done.returncode == 0, done.stderr
+    files = stub_hub.repositories["model", "org/my-env"].files
+    assert set(files) == set(starter("my-env", 2026))
+
+
+def test_files_that_the_repository_has_beside_are_named(push: Push, stub_hub: StubHub) -> None:
+    """The pin that is printed has them, and nothing of them was checked."""
+    stub_hub.add("org/my-env", {"old.py": "import os", "LICENSE": "MIT"})
+    done = push()
+    assert done.returncode == 0, done.stderr
+    assert "1 more of the repository, which were not checked: old.py" in done.stderr
+    beside = json.loads(push("--json").stdout)["not_checked"]
+    assert beside == ["old.py"]
+
+
+def test_two_pushed_commits_are_compared(push: Push, stub_hub: StubHub, mine: Path) -> None:
+    """By the references that were printed."""
+    first = push().stdout.strip()
+    (mine / "env.py").write_text((mine / "env.py").read_text() + "\nimport subprocess\n")
+    second = push().stdout.strip()
+    done = envhub("diff", first, second, "--endpoint", stub_hub.endpoint)
+    assert done.returncode == 7, done.stderr
+    assert "source-process: env.py:" in done.stdout
+    assert "2 changes" in done.stderr
 
 
 def test_a_hub_that_refuses_is_a_message(push: Push, stub_hub: StubHub) -> None:

@@ -697,7 +697,7 @@ def test_host_without_user_namespaces_is_refused_with_a_fix() -> None:
     """Nothing degrades: the layer, the reason, the fix, the weaker profile by name."""
     said = on_restricted_host(NO_USER_NAMESPACES, "strict")
     assert said.startswith("user-namespace | user.max_user_namespaces is 0 | Run: sudo sysctl")
-    assert 'Policy(profile="no-userns")' in said
+    assert 'by its name: profile "no-userns"' in said
 
 
 def test_weaker_profile_runs_on_a_host_without_user_namespaces() -> None:

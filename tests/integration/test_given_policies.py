@@ -8,7 +8,8 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
-from envhub_worker.lockdown.root_plan import gpu_devices, real_host
+from envhub_worker.lockdown.gpus import gpu_devices
+from envhub_worker.lockdown.root_plan import real_host
 
 REPOSITORY = """
 import os
@@ -54,7 +55,5 @@ def test_a_gpu_that_is_not_there_is_told(folder: Path) -> None:
         with make_env(folder, policy={"gpu": True}) as suites:
             suites.env.reset(seed=1)
         return
-    with pytest.raises(
-        SandboxUnavailableError, match=r"there is none here.*\n.*leave gpu=True out"
-    ):
+    with pytest.raises(SandboxUnavailableError, match=r"there is none here.*\n.*grant no GPU"):
         make_env(folder, policy={"gpu": True})

@@ -132,6 +132,13 @@ def test_missing_revision_in_both_types_is_told_for_both(stub_hub: StubHub, get:
     assert "the space repository org/repo has no revision 'v9'" in message
 
 
+def test_an_empty_repository_has_no_revision(stub_hub: StubHub, get: Fetch) -> None:
+    """The error names the revision that was asked for, also where the caller named none."""
+    stub_hub.repositories["model", "org/repo"].refs.clear()
+    message = str(failure(get, "org/repo"))
+    assert "the model repository org/repo has no revision 'main' (is it empty?)" in message
+
+
 @pytest.mark.parametrize(
     ("status", "stall"), [(401, False), (429, False), (500, False), (0, False), (0, True)]
 )

@@ -9,6 +9,7 @@ import json
 import os
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import fields
 from inspect import signature
 from typing import Any
@@ -139,6 +140,23 @@ def fails() -> None:
         ours.SandboxedEnvConfig(repo="robots/cartpole", endpoint="http://me:secret@127.0.0.1:9")
     except EnvHubError as error:
         FOUND["login"] = "secret" not in str(error)
+    FOUND["cures"] = [
+        said(lambda: ours.SandboxedEnvConfig(repo="robots/missing"), "--env.dependencies='{"),
+        said(
+            lambda: ours.SandboxedEnvConfig(repo="robots/reach", policy={"profile": "lax"}),
+            "--env.policy: profile is 'lax'",
+        ),
+        said(lambda: sandboxed("robots/missing"), "dependencies={'extra'"),
+    ]
+
+
+def said(make: Callable[[], object], words: str) -> bool:
+    """Whether what is raised says this, and no other spelling of an option."""
+    try:
+        make()
+    except EnvHubError as error:
+        return words in str(error) and (words.startswith("--") == ("--env." in str(error)))
+    return False
 
 
 def options() -> None:

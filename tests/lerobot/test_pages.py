@@ -44,6 +44,7 @@ EXPECTED = {
     "no repository": ["OSError"],
     "option": True,
     "login": True,
+    "cures": [True, True, True],
     "executed here": False,
 }
 FEATURES = {

@@ -24,7 +24,7 @@ MIB = 1 << 20
 def client(server: Listening) -> Iterator[Peer]:
     """A client that has said Hello, and keeps no rule after that."""
     with peer(server, keys.load(server.state / "client.key")) as found:
-        assert isinstance(found.ask(m.Hello(1, 2, b"unruly")), m.Welcome)
+        assert isinstance(found.ask(m.Hello(m.VERSION, b"unruly")), m.Welcome)
         yield found
 
 
@@ -39,8 +39,8 @@ def good(server: Listening, repository: Path) -> Iterator[Any]:
 
 def raw(client: Peer, number: int, *fields: object) -> list[bytes]:
     """A header that no function of ours would write, as it travels."""
-    document = msgpack.packb([*fields[:1], number, *fields[1:]])
-    return [len(document).to_bytes(4, "little") + document]
+    document = msgpack.packb(fields)
+    return [number.to_bytes(8, "big") + len(document).to_bytes(4, "little") + document]
 
 
 @pytest.mark.parametrize("size", [0, 31, 33, 255, 3 * MIB])
@@ -54,8 +54,8 @@ def test_a_hash_of_another_length_is_refused(client: Peer, good: Any, size: int)
 def test_a_long_text_is_not_sent_back_whole(client: Peer, good: Any) -> None:
     """What is refused is named in a few words."""
     for request in (
-        m.OpenJail("x" * MIB, "", "y" * MIB, "env.py", {"profile": "z" * MIB}, 1),
-        m.OpenJail("x", "", "sha256:" + "y" * MIB, "e/" * MIB, {}, 1),
+        m.OpenJail("x" * MIB, "", "", "y" * MIB, "env.py", {"profile": "z" * MIB}, 1),
+        m.OpenJail("x", "", "", "sha256:" + "y" * MIB, "e/" * MIB, {}, 1),
         m.OfferSnapshot((("p" * MIB, 1, b"h" * 32),)),
         m.OfferSnapshot((("\x1b" * MIB, 1, b"h" * 32),)),
     ):
@@ -63,7 +63,7 @@ def test_a_long_text_is_not_sent_back_whole(client: Peer, good: Any) -> None:
 
 
 def malformed() -> dict[str, list[object]]:
-    """Fields after the id, by what is wrong with them; the kind comes first."""
+    """A kind and fields, by what is wrong with them."""
     nested: list[object] = []
     for _ in range(100):
         nested = [nested]
@@ -86,7 +86,7 @@ def test_a_malformed_request_is_refused(client: Peer, good: Any, what: str) -> N
     client.number += 1
     client.socket.send_multipart(raw(client, client.number, *malformed()[what]))
     assert client.socket.poll(30_000), "no answer"
-    number, reply = m.unpack(client.socket.recv_multipart()[:1])
+    number, reply = m.unpack_header(client.socket.recv_multipart()[0])
     assert number == client.number
     assert isinstance(reply, m.Refused)
 

@@ -57,13 +57,13 @@ class Peer:
     def tell(self, message: m.Message, *payload: bytes) -> None:
         """Send a request."""
         self.number += 1
-        self.socket.send_multipart([*m.pack(message, self.number), *payload])
+        self.socket.send_multipart([*m.pack_header(message, self.number), *payload])
 
     def ask(self, message: m.Message, *payload: bytes) -> m.Message:
         """Send a request; its reply."""
         self.tell(message, *payload)
         assert self.socket.poll(30_000)
-        return m.unpack(self.socket.recv_multipart()[:1])[1]
+        return m.unpack_header(self.socket.recv_multipart()[0])[1]
 
     def refused(self, message: m.Message, *payload: bytes) -> m.Refused:
         """The refusal of a request."""
@@ -90,7 +90,7 @@ def peer(server: Listening, pair: KeyPair, *, routing_id: bytes = b"") -> Iterat
 def mallory(shared: Listening) -> Iterator[Peer]:
     """She has said Hello, under Alice's session: what she claims to be is worth nothing."""
     with peer(shared, MALLORY) as found:
-        assert isinstance(found.ask(m.Hello(1, 2, far_session())), m.Welcome)
+        assert isinstance(found.ask(m.Hello(m.VERSION, far_session())), m.Welcome)
         yield found
 
 
@@ -141,6 +141,7 @@ def test_a_jail_cannot_be_asked_more_than_a_policy_may(
     order = {
         "name": "x",
         "python": "",
+        "packages": "",
         "snapshot": "sha256:" + "0" * 64,
         "entry": "env.py",
         "confinement": asdict(Confinement()),
@@ -159,7 +160,7 @@ def test_more_bytes_than_may_be_in_flight_are_refused(alice: Any, mallory: Peer)
 
 def test_what_is_no_request_is_refused(mallory: Peer) -> None:
     """Replies, descriptors, and messages for runners."""
-    replies = m.Done(), m.Welcome(2, "", 1), m.Sessions(({"client": "nobody"},))
+    replies = m.Done(), m.Welcome(2, "", 1), m.Sessions(({"client": "nobody"},), {})
     for message in (*replies, m.Deposit(b"", 1, 1), m.Close(1)):
         assert "is no request" in mallory.refused(message).message
 
@@ -175,7 +176,7 @@ def test_noise_with_a_key_is_dropped(shared: Listening, alice: Any) -> None:
 def test_a_claimed_routing_id_is_nobodys_name(shared: Listening) -> None:
     """The same id under two keys, one after the other: the second is not taken for the first."""
     with peer(shared, ALICE, routing_id=b"the same") as first:
-        assert isinstance(first.ask(m.Hello(1, 2, b"one")), m.Welcome)
+        assert isinstance(first.ask(m.Hello(m.VERSION, b"one")), m.Welcome)
         assert isinstance(first.ask(m.GetStatus()), m.Status)
     with peer(shared, MALLORY, routing_id=b"the same") as second:
         assert second.refused(m.GetStatus()).error == "HelloError"
@@ -187,6 +188,6 @@ def test_a_key_has_so_many_sessions_and_no_more(tmp_path: Path) -> None:
         pair = keys.load(server.state / "client.key")
         with peer(server, pair) as one, peer(server, pair) as two, peer(server, pair) as three:
             for found, name in ((one, b"one"), (two, b"two"), (three, b"one")):
-                assert isinstance(found.ask(m.Hello(1, 2, name)), m.Welcome)
-            assert "2 sessions" in three.refused(m.Hello(1, 2, b"three")).message
+                assert isinstance(found.ask(m.Hello(m.VERSION, name)), m.Welcome)
+            assert "2 sessions" in three.refused(m.Hello(m.VERSION, b"three")).message
             assert len(server.sessions()) == 2

@@ -55,7 +55,7 @@ def test_what_runs_goes_on_and_nothing_new_comes_in(tmp_path: Path, repository: 
                 make_env(repository, n_envs=2, sandbox=server.sandbox())
             assert caught.value.quota == "draining"
             with peer(server, pair) as stranger:
-                refused = stranger.refused(m.Hello(1, 2, b"new"))
+                refused = stranger.refused(m.Hello(m.VERSION, b"new"))
                 assert (refused.error, refused.missing) == ("ServerBusyError", "draining")
             assert suites.env.step(np.array([0]))[0].tolist() == [[1.0]]
             assert server.process.poll() is None

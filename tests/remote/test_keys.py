@@ -220,13 +220,13 @@ def test_status_says_what_jails_do(server: Listening, repository: Path) -> None:
         command = [*WORKER, "status", "--state-dir", str(server.state)]
         done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
         assert "the one client" in done.stdout
-        assert "1 sessions" in done.stdout  # nor is whoever asks one of them
+        assert "1 session" in done.stdout  # nor is whoever asks one of them
         assert "repository:env.py: waiting" in done.stdout
         client = [*WORKER, "status", "--endpoint", server.endpoint, "--server-key", server.public]
         command = [*client, "--key", str(server.state / "client.key")]
         done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
         assert "operator" not in done.stdout
-        assert "1 sessions" in done.stdout
+        assert "1 session" in done.stdout
 
 
 def test_health_asks_the_server_and_not_only_its_port(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ from tests.support.samples import sample
 def order(python: str = "", **policy: Any) -> tuple[m.OpenJail, Confinement]:
     """What a client asks for."""
     confinement = Confinement(**policy)
-    return m.OpenJail("x", python, "sha256:0", "env.py", asdict(confinement), 1), confinement
+    return m.OpenJail("x", python, "", "sha256:0", "env.py", asdict(confinement), 1), confinement
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_a_policy_needs_the_operators_permission(
 def test_packages_of_the_repositorys_own_are_not_for_other_hosts() -> None:
     """A folder there cannot be named, however it is asked for; the text says what to do."""
     asked, confinement = order()
-    wanted = m.OpenJailWith("x", "", asked.snapshot, "env.py", asked.confinement, 1, "/packages")
+    wanted = m.replace(asked, packages="/packages")
     with pytest.raises(RefusedError, match="folders of the remote server") as caught:
         check_policy(wanted, confinement, Permissions())
     assert caught.value.error == "PolicyError"

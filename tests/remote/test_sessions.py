@@ -96,7 +96,7 @@ def test_connections_that_have_gone_take_no_session(narrow: Listening) -> None:
 
     def is_welcome(name: bytes) -> bool:
         with peer(narrow, pair) as found:
-            return isinstance(found.ask(m.Hello(1, 2, name)), m.Welcome)
+            return isinstance(found.ask(m.Hello(m.VERSION, name)), m.Welcome)
 
     for name in (b"one", b"two", b"three"):
         assert eventually(lambda: is_welcome(name))  # noqa: B023
@@ -112,7 +112,7 @@ def test_status_takes_no_place_of_a_client(narrow: Listening, repository: Path) 
     for _ in range(2):
         asked = subprocess.run(command, capture_output=True, text=True, timeout=60)
         assert asked.returncode == 0, asked.stderr
-        assert "1 jails" in asked.stdout
+        assert "1 jail" in asked.stdout
     client.communicate(timeout=120)
     assert client.returncode == 0
     assert program(narrow, repository, "closes").communicate(timeout=120)[0] == b"ready\n"

@@ -130,7 +130,7 @@ def _greets(context: zmq.Context[Any], server: Listening, *, with_keys: bool) ->
             peer.setsockopt(zmq.CURVE_SECRETKEY, pair.secret)
             peer.setsockopt(zmq.CURVE_PUBLICKEY, pair.public)
         peer.connect(server.endpoint)
-        peer.send_multipart(m.pack(m.Hello(1, 2, b"stranger"), 1))
+        peer.send_multipart(m.pack_header(m.Hello(m.VERSION, b"stranger"), 1))
         return bool(peer.poll(60_000 if with_keys else 1_000))
 
 

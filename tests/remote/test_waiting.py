@@ -141,11 +141,11 @@ def test_a_session_is_waited_for_like_a_jail(tmp_path: Path) -> None:
         pair = keys.load(server.state / "client.key")
         with peer(server, pair) as waiting:
             with peer(server, pair) as first:
-                assert isinstance(first.ask(m.Hello(1, 2, b"first")), m.Welcome)
-                refused = waiting.refused(m.Hello(1, 2, b"waiting"))
+                assert isinstance(first.ask(m.Hello(m.VERSION, b"first")), m.Welcome)
+                refused = waiting.refused(m.Hello(m.VERSION, b"waiting"))
                 assert (refused.error, refused.missing) == ("ServerBusyError", "sessions")
                 assert Busy.read(refused.missing, refused.fix).used == 1
-            hello = m.Hello(1, 2, b"waiting")
+            hello = m.Hello(m.VERSION, b"waiting")
             assert eventually(lambda: isinstance(waiting.ask(hello), m.Welcome))
 
 

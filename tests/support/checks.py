@@ -20,13 +20,26 @@ three times with seeded random actions, in the sandbox, each time in fresh proce
 observation held against its space, once more, and spread over two processes.
 
 Exit code 0: nothing fails. 1: a finding weighs as much as `--fail-on` says (`error` by default),
-and `--allow ID` does not permit it. 2: a wrong option. Others (see `envhub check --help`): it could
+and `--allow ID` does not permit it. 2: a wrong option. 10: nothing fails, but `--deadline SECONDS`
+(15 minutes by default) ended it before all was judged. Others (see `envhub check --help`): it could
 not be judged, because it could not be had, a server was full, or this host cannot confine it.
+
+The deadline is for all of it: download, installation, reading and every play. Where it comes, the
+report has what was found until then, and the check `deadline` says what was done at that time and
+what was not judged: checks that were made of nothing, and tasks that were not played to their end.
+JUnit has these as skipped, SARIF says that the run was not successful. The most severe findings
+stand first in every form.
 
 A check passes because a comparison of ours found nothing, never because the repository says so.
 What is found in source is a hint for a person: who wants to hide a call can, and the walls are the
 sandbox's. Files are parsed in a child whose time and memory
-the kernel bounds; one that ends it is not read.
+the kernel bounds; one that ends it is not read, and fails (`source-unparsed`). They are parsed from
+their bytes, as Python does, and one whose first two lines choose another encoding than UTF-8 is not
+decoded: it fails (`source-encoding`). So does compiled Python (`source-compiled`).
+
+A folder is judged as its commit would be ([snapshots.md](snapshots.md#the-store)). Where git would
+commit something else than what lies there, that fails (`source-uncommitted`). What it ignores is in
+no commit, is not loaded and not pushed: it is named in a note (`source-ignored`).
 
 How long resets and steps take, and what the jail holds in the end, are figures of the report, for
 they say as much of the machine; only steps that take a second are a finding (`--slow-step`). What

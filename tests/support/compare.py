@@ -96,11 +96,13 @@ def assert_same_space(expected: gym.Space[Any], actual: gym.Space[Any], what: st
 
 
 def _mappings(expected: dict[Any, Any], actual: dict[Any, Any], path: str) -> Iterator[str]:
-    if list(expected) != list(actual):
+    if len(expected) != len(actual) or any(
+        next(differences(*keys), None) for keys in zip(expected, actual, strict=True)
+    ):
         yield f"{path}: expected keys {list(expected)}, got {list(actual)}"
         return
-    for key, value in expected.items():
-        yield from differences(value, actual[key], f"{path}[{key!r}]")
+    for key, value, found in zip(expected, expected.values(), actual.values(), strict=True):
+        yield from differences(value, found, f"{path}[{key!r}]")
 
 
 def _sequences(expected: Any, actual: Any, path: str) -> Iterator[str]:

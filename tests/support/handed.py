@@ -27,6 +27,7 @@ class Level(enum.Enum):
 
     LOW = "low"
     HIGH = ("high", 2)
+    MAPPED = {"high": [2]}  # noqa: RUF012
 
 
 class Code(enum.IntEnum):
@@ -195,6 +196,7 @@ PICKLED: dict[str, Any] = {
     "subclass of ndarray": np.arange(3).view(OwnArray),
     "deep inside": {"a": [(1, {"b": Level.LOW})]},
     "key": {Level.LOW: 1, Point(1, 2): 2},
+    "keys of any class": {Level.MAPPED: 1, (Level.MAPPED, 2): 2, range(2): 3, 1.5: 4, 2j: {b"": 5}},
     "in an array": _objects(),
     "structured": np.array([(1, (2.0, 3.0)), (4, (5.0, 6.0))], STRUCTURED),
     "np.void": np.array([(1, (2.0, 3.0))], STRUCTURED)[0],

@@ -116,6 +116,11 @@ ATTACKS = {
     "ptrace_poke": Attack(_KERNEL, "tried ptrace", {**_MEMORY, "word": 1}),
     "raid": Attack(_FILES, "write /home/other/file", {"paths": ["/home/other/file"], **_TEXT}),
     "raw_icmp": Attack(_NETWORK, "tried socket AF_INET", {"host": "127.0.0.1", **_WORD}),
+    "reach_devices": Attack(
+        _FILES,
+        "write /dev/nvidia0",
+        {"nodes": ["/dev/nvidia0"], "folders": ["/sys/class/net"]},
+    ),
     "read_by_handle": Attack(
         _KERNEL, "tried open_by_handle_at", {"handle": "00" * 8, "kind": 1, "mounts": ["."]}
     ),
@@ -141,6 +146,7 @@ ATTACKS = {
         _NETWORK, "tried socket AF_ALG", {"family": 38, "kind": 5, "protocol": 0}
     ),
     "spin": Attack("survives", "step", {"seconds": 60}),
+    "stack_filters": Attack(_KERNEL, "tried prctl", {"way": "prctl"}),
     "stat_file": Attack("runs", "No such file", _OUTSIDE, unseen="who only looks is not seen"),
     "stop_processes": Attack(_KERNEL, "tried kill of", {"pids": [os.getpid()], "own": False}),
     "tcp": Attack(_NETWORK, "tried socket AF_INET", _PORT),

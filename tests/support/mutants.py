@@ -143,7 +143,7 @@ _MISSING = "import not_to_be_had\n"
 def mutant(name: str, fault: str, folder: Path) -> str:
     """A sample with a fault, as a reference."""
     made = folder / name
-    shutil.copytree(sample(name), made)
+    shutil.copytree(sample(name), made, ignore=shutil.ignore_patterns("__pycache__"))
     entry = ENTRIES.get(name, "")
     file = made / (entry.removeprefix(":") or "env.py")
     prelude = _PRELUDE.replace("FAULT", FAULTS[fault].body)

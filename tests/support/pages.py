@@ -88,7 +88,7 @@ def results_of(text: str) -> list[Result]:
             verdict=Verdict.FAILED,
             commit=text,
             found={"error": 1},
-            fails=("runs",),
+            fails=(("runs", text),),
             ended=text,
         ),
         Result(listed=one, verdict=Verdict.UNJUDGED, said=text, ended="then"),

@@ -12,6 +12,7 @@ _ATTACKS = (
     "bombs.py::test_memory_bomb_stops_at_the_limit[strict-heap",
     "bombs.py::test_fork_bomb_stops_at_the_limit[strict-fork",
     "bombs.py::test_disk_cannot_be_filled[strict",
+    "checkouts.py::",
     "client_jails.py::test_pickles_from_a_jail_are_never_loaded[strict",
     "client_jails.py::test_bombs_from_a_jail_are_refused[strict",
     "client_lies.py::",

@@ -12,9 +12,11 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import envhub_sandbox
 import envhub_worker
+from envhub_sandbox.option_names import option_name
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "troubleshooting.md"
 _HEAD = """# Troubleshooting
@@ -100,6 +102,7 @@ _NO_MESSAGES = {"Option", "Argument", "Typer", "add_argument", "add_parser", "Ch
 _NO_FILES = (
     "envhub_sandbox/check/markup.py",
     "envhub_sandbox/check/page.py",
+    "envhub_sandbox/check/table.py",
     "envhub_sandbox/check/survey.py",
     "envhub_sandbox/cli/init/starter.py",
     "envhub_sandbox/cli/doctor/doctor.py",
@@ -160,8 +163,9 @@ def messages() -> Iterator[Message]:
 
 def of_source(source: str, place: str) -> Iterator[Message]:
     """Those of one module."""
-    reader = _Reader()
-    reader.visit(ast.parse(source))
+    reader, module = _Reader(), ast.parse(source)
+    reader.note_functions(module)
+    reader.visit(module)
     for before, text in reader.found:
         cure = _CURE.search(text)
         if cure is None or _NO_ERRORS.search(text) or len(re.findall(r"[^\W_]+", text)) < 3:
@@ -180,8 +184,16 @@ class _Reader(ast.NodeVisitor):
         self.found: list[tuple[str, str]] = []
         self._named: dict[str, str] = {}
 
+    def note_functions(self, module: ast.Module) -> None:
+        """What functions return that are one text, which others are made of."""
+        for node in module.body:
+            last = node.body[-1] if isinstance(node, ast.FunctionDef) else None
+            if isinstance(node, ast.FunctionDef) and isinstance(last, ast.Return) and last.value:
+                self._named[f"{node.name}()"] = self._text(last.value) or "…"
+
     def visit_Assign(self, node: ast.Assign) -> None:
         text = self._text(node.value)
+        text = _option(node.value) or text
         if text is not None and isinstance(node.targets[0], ast.Name):
             self._named[node.targets[0].id] = text
         self.visit(node.value)
@@ -241,7 +253,30 @@ class _Reader(ast.NodeVisitor):
         assert isinstance(part, ast.FormattedValue)
         if isinstance(part.value, ast.Name):
             return self._named.get(part.value.id, "…")
+        name = getattr(getattr(part.value, "func", None), "id", "")
+        return _option(part.value) or self._named.get(f"{name}()", "…")
+
+
+def _option(node: ast.expr) -> str | None:
+    """An option as Python has it, where its name is asked for; None of anything else."""
+    if not isinstance(node, ast.Call) or getattr(node.func, "id", "") != "option_name":
+        return None
+    key, *value = [_literal(one) for one in node.args]
+    return None if isinstance(key, _Varying) else option_name(key, *value)
+
+
+class _Varying:
+    """What is different each time."""
+
+    def __repr__(self) -> str:
         return "…"
+
+
+def _literal(node: ast.expr) -> Any:
+    try:
+        return ast.literal_eval(node)
+    except ValueError:
+        return _Varying()
 
 
 def _row(message: Message) -> tuple[str, str]:

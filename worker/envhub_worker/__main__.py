@@ -47,13 +47,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     # jails of root are another user, who must get through to what we make; what is private says so
     os.umask(0o022)
     argv = sys.argv[1:] if argv is None else argv
-    arguments = _parser(all_commands=argv[:1] != ["serve"]).parse_args(argv)
+    parser, names = _parser(all_commands=argv[:1] != ["serve"])
+    _check_command(parser, names, argv)
+    arguments = parser.parse_args(argv)
     run: Callable[[argparse.Namespace], int] = arguments.run
     return run(arguments)
 
 
-def _parser(*, all_commands: bool) -> argparse.ArgumentParser:
-    """``all_commands``: with those that take long to import, which a client would wait for."""
+def _parser(*, all_commands: bool) -> tuple[argparse.ArgumentParser, list[str]]:
+    """The parser, and its commands; ``all_commands``: with those that take long to import."""
     parser = argparse.ArgumentParser(
         prog="envhub-worker", description="Executes environments from the Hub under confinement."
     )
@@ -63,7 +65,18 @@ def _parser(*, all_commands: bool) -> argparse.ArgumentParser:
     serving.set_defaults(run=serve.run)
     if all_commands:
         _add_others(commands)
-    return parser
+    return parser, list(commands.choices)
+
+
+def _check_command(parser: argparse.ArgumentParser, names: list[str], argv: Sequence[str]) -> None:
+    """Say which command is meant, where one is much like what was typed."""
+    if not argv or argv[0] in names:
+        return
+    import difflib
+
+    near = difflib.get_close_matches(argv[0], names, 1)
+    if near:
+        parser.error(f"there is no command {argv[0]!r}; did you mean {near[0]!r}?")
 
 
 def _add_others(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -144,15 +144,13 @@ class Server:
         try:
             if self._compression(identity, key):
                 frames[:] = compression.unpack_frames(frames, self._limits)
-            header = m.unpack_header(frames[0], limits=self._limits)
+            number, request = m.unpack_header(frames[0], limits=self._limits)
         except Exception as error:
             self._refuse_unread(identity, key, frames[0], error)
             return
-        asker = Asker(identity, header.number, key=key, numbered=header.numbered)
-        if session is not None:
-            asker = asker._replace(session=session.owner, version=session.version)
+        asker = Asker(identity, number, b"" if session is None else session.owner, key)
         try:
-            self._dispatch(asker, header.message, arrived)
+            self._dispatch(asker, request, arrived)
         except RefusedError as refused:
             self.refuse(asker, refused.error, refused.message, refused.missing, refused.fix)
         except Exception as error:
@@ -162,11 +160,10 @@ class Server:
 
     def _refuse_unread(self, identity: bytes, key: bytes, frame: Any, error: Exception) -> None:
         """A request that cannot be read: as long as its id can be, its sender need not wait."""
-        found = m.id_of(frame)
-        if found is None:
+        number = m.id_of(frame)
+        if number is None:
             return  # not our protocol
-        number, numbered = found
-        asker = Asker(identity, number, b"", key, numbered)
+        asker = Asker(identity, number, b"", key)
         known = isinstance(error, ProtocolError)
         said = str(error) if known else type(error).__name__
         self.refuse(asker, "LocalProtocolError", f"the request cannot be read: {said}")
@@ -195,7 +192,7 @@ class Server:
     def reply(self, asker: Asker, message: m.Message, payload: Sequence[Buffer] = ()) -> None:
         """Answer a request."""
         self._gate.answered(asker)
-        header = m.pack_header(message, asker.request_id, numbered=asker.numbered)
+        header = m.pack_header(message, asker.request_id)
         frames = [*header, *payload]
         agreed = self._compression(asker.identity, asker.key)
         if agreed:
@@ -216,21 +213,16 @@ class Server:
         self._gate.refused(asker, refused)
 
     def _hello(self, asker: Asker, request: m.Hello, arrived: Arrived) -> None:
-        version = min(m.VERSION, request.newest)
-        if version < max(m.OLDEST_VERSION, request.oldest):
-            side = "client" if request.newest < m.OLDEST_VERSION else "worker"
+        if request.version != m.VERSION:
             raise RefusedError(
                 "VersionMismatchError",
-                f"the client speaks protocol {request.oldest} to {request.newest}, this worker "
-                f"{m.OLDEST_VERSION} to {m.VERSION}: upgrade the {side}",
+                f"the client speaks protocol {request.version}, this worker {m.VERSION}: install "
+                "the same release of envhub-sandbox on both sides",
             )
         if not request.session:
             raise RefusedError("LocalProtocolError", "a session has a name")
         self._gate.greet(Greeting(arrived, request.session, self._sessions, self._jails))
-        session = self._sessions.find(arrived.identity, arrived.key)
-        if session is not None:
-            session.version = version
-        self.reply(asker, m.Welcome(version, __version__, os.getpid()))
+        self.reply(asker, m.Welcome(m.VERSION, __version__, os.getpid()))
 
     def _agree(self, asker: Asker, request: m.Agree) -> None:
         """Answer before it holds, so that the answer itself can be read."""
@@ -242,7 +234,6 @@ class Server:
 
 _HANDLERS: dict[type[m.Message], Callable[[Jails, Asker, Any], None]] = {
     m.OpenJail: Jails.open,
-    m.OpenJailWith: Jails.open,
     m.StartRunners: Jails.start_more,
     m.KeepJail: Jails.keep,
     m.ExpireIdle: Jails.expire,

@@ -16,14 +16,14 @@ from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.check.many.lines import Listed
 from envhub_sandbox.check.many.results import Result, Verdict, link
 from envhub_sandbox.check.table import Severity
-from envhub_worker.protocol.text import printable
+from envhub_worker.protocol.text import counted, duration_text, printable
 
 _FORMAT = 1
 _LONGEST = 500
 _SHORT = 18
 """Characters of a commit that people compare."""
-_REFERENCE = '<span class="broad">reference</span>'
-_HEADS = ("", _REFERENCE, "commit", "error", "warning", "note", "seconds", "judged")
+_HEADS = ("verdict", "repository", "findings", "took", "judged", "commit")
+_LEVELS = [level.value for level in Severity]
 _STYLES = {
     Verdict.FAILED: "error",
     Verdict.UNJUDGED: "warning",
@@ -33,9 +33,15 @@ _STYLES = {
 
 
 def document(results: Iterable[Result]) -> dict[str, Any]:
-    """Everything, as plain data, in the order of the list."""
-    rows = [_row(one) for one in results]
+    """Everything, as plain data."""
+    rows = [_row(one) for one in ordered(results)]
     return {"format": _FORMAT, "counts": _counts(row["verdict"] for row in rows), "results": rows}
+
+
+def ordered(results: Iterable[Result]) -> list[Result]:
+    """What fails, then what could not be judged; those of one verdict as the list has them."""
+    order = list(Verdict)
+    return sorted(results, key=lambda one: order.index(one.verdict))
 
 
 def _counts(verdicts: Iterable[str]) -> dict[str, int]:
@@ -50,22 +56,22 @@ def _row(one: Result) -> dict[str, Any]:
         "verdict": one.verdict.value,
         "commit": one.commit or None,
         "findings": {level.value: (one.found or {}).get(level.value, 0) for level in Severity}
-        if one.is_judged
+        if one.has_report
         else None,
-        "fails": list(one.fails),
+        "fails": list(dict.fromkeys(check for check, _ in one.fails)),
+        "why": one.why,
         "seconds": round(one.seconds, 3),
         "judged": one.ended or None,
         "said": printable(one.said, _LONGEST) or None,
-        "report": link(one.listed, "json") if one.is_judged else None,
-        "page": link(one.listed, "html") if one.is_judged else None,
+        "report": link(one.listed, "json") if one.has_report else None,
+        "page": link(one.listed, "html") if one.has_report else None,
     }
 
 
 def page(results: Sequence[Result]) -> str:
-    """One page that needs nothing else and runs nothing: what fails comes first."""
-    order = list(Verdict)
+    """One page that needs nothing else and runs nothing."""
     title = f"envhub check: {told(results)}"
-    rows = [_cells(one) for one in sorted(results, key=lambda one: order.index(one.verdict))]
+    rows = [_cells(one) for one in ordered(results)]
     return markup.document(title, [f"<h1>{title}</h1>", *markup.table(_HEADS, rows)])
 
 
@@ -77,18 +83,19 @@ def told(results: Iterable[Result]) -> str:
 
 def _cells(one: Result) -> tuple[str, ...]:
     """A row of HTML: a link leads to a file whose name is ours."""
-    reference, why = markup.text(one.listed.reference), ", ".join(one.fails) or one.said
-    if one.is_judged:
+    reference = markup.text(one.listed.reference)
+    if one.has_report:
         reference = f'<a href="{markup.text(link(one.listed, "html"))}">{reference}</a>'
-    said = f'<span class="cure">{markup.text(printable(why, _LONGEST))}</span>' if why else ""
+    why = "".join(f'<span class="cure">{markup.text(line)}</span>' for line in one.why)
     found = one.found or {}
+    told = [counted(found[level], level) for level in _LEVELS if found.get(level)]
     return (
         f'<span class="whole {_STYLES[one.verdict]}">{one.verdict.value}</span>',
-        f"{reference}{said}",
-        f'<span class="mono">{markup.text(one.commit[:_SHORT])}</span>',
-        *(f"{found.get(level.value, 0)}" if one.is_judged else "" for level in Severity),
-        f"{one.seconds:.1f}" if one.ended else "",
-        f'<span class="whole">{markup.text(one.ended)}</span>',
+        f"<strong>{reference}</strong>{why}",
+        ", ".join(told) or ("none" if one.has_report else ""),
+        f'<span class="whole">{duration_text(one.seconds)}</span>' if one.ended else "",
+        f"{markup.text(one.ended[:16].replace('T', ' '))} UTC" if one.ended else "",
+        f'<span class="mono">{markup.text(one.commit[:_SHORT])}</span>' if one.commit else "",
     )
 
 
@@ -98,12 +105,12 @@ def junit(
     """A suite for each reference: its checks as test cases, or why there are none as an error.
 
     Args:
-        results: In the order of the list.
+        results: All of them.
         report: What was kept of a reference.
     """
     root = ElementTree.Element("testsuites", name="envhub check")
-    for one in results:
-        found = report(one.listed) if one.is_judged else None
+    for one in ordered(results):
+        found = report(one.listed) if one.has_report else None
         made = _unjudged(one) if found is None else reports.suite(*found)
         made.set("time", f"{one.seconds:.3f}")
         root.append(made)
@@ -125,18 +132,17 @@ def _unjudged(one: Result) -> ElementTree.Element:
 
 def workflow_commands(results: Iterable[Result]) -> Iterator[str]:
     """One of GitHub's annotations for each reference that did not pass."""
-    for one in results:
+    for one in ordered(results):
         if one.verdict is not Verdict.PASSED:
-            words = ", ".join(one.fails) or printable(one.said, _LONGEST) or one.verdict.value
+            words = "\n".join([one.verdict.value, *one.why])
             title = f"envhub check: {printable(one.listed.reference, _LONGEST)}"
-            yield reports.workflow_command("error", title, f"{one.verdict.value}: {words}")
+            yield reports.workflow_command("error", title, words)
 
 
 def summary(results: Sequence[Result]) -> str:
     """A table for GitHub's step summary; a stranger's text is no markup there."""
     lines = [f"### envhub check: {told(results)}", "", "| | reference | |", "| --- | --- | --- |"]
-    for one in results:
-        why = ", ".join(one.fails) or printable(one.said, _LONGEST)
-        cells = (printable(one.listed.reference, _LONGEST), why)
+    for one in ordered(results):
+        cells = (printable(one.listed.reference, _LONGEST), "; ".join(one.why))
         lines.append(f"| {one.verdict.value} | {' | '.join(map(reports.cell, cells))} |")
     return "\n".join(lines) + "\n"

@@ -15,7 +15,7 @@ from envhub_sandbox.hub.grammar import has_control_characters
 from envhub_sandbox.hub.local import split_local
 from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef
 from envhub_sandbox.hub.snapshot import is_here
-from envhub_worker.protocol.text import printable
+from envhub_worker.protocol.text import printable, size_text
 
 MOST_BYTES = 1 << 20
 MOST = 2_000
@@ -67,7 +67,7 @@ def read(file: IO[bytes], title: str) -> list[Listed]:
     """
     data = file.read(MOST_BYTES + 1)
     if len(data) > MOST_BYTES:
-        raise HubReferenceError(f"{title} is larger than {MOST_BYTES} bytes; divide it")
+        raise HubReferenceError(f"{title} is larger than {size_text(MOST_BYTES)}; divide it")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -24,9 +24,11 @@ from envhub_sandbox.check import reports
 from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.check.many.lines import Listed
 from envhub_sandbox.check.parsing import content
+from envhub_worker.protocol.text import printable
 
 MOST_BYTES = 32 << 20
 """Of one report, and of one page."""
+_LONGEST = 500
 _MARK = ".envhub-check"
 _RUNNING = ".running"
 _REPORTS = "reports"
@@ -58,25 +60,38 @@ class Result:
         verdict: Ours.
         commit: Which was judged; empty if none was.
         found: How many findings of each severity.
-        fails: The checks that fail it.
+        fails: What fails it: a check, and what was found. Trust: the latter is a stranger's text.
         seconds: What that took.
         ended: When, as ISO 8601 has it.
-        said: Why it could not be judged. Trust: partly a stranger's text.
+        said: Why it was not judged, or not to its end. Trust: partly a stranger's text.
     """
 
     listed: Listed
     verdict: Verdict = Verdict.WAITING
     commit: str = ""
     found: Mapping[str, int] | None = None
-    fails: tuple[str, ...] = ()
+    fails: tuple[tuple[str, str], ...] = ()
     seconds: float = 0.0
     ended: str = ""
     said: str = ""
 
     @property
+    def why(self) -> list[str]:
+        """Why it has not passed, a line for each check that fails it."""
+        first = dict(reversed(self.fails))
+        checks = dict.fromkeys(check for check, _ in self.fails)
+        lines = [f"{check}: {first[check]}" for check in checks]
+        return [printable(line, _LONGEST) for line in lines or [self.said] if line]
+
+    @property
     def is_judged(self) -> bool:
-        """Whether there is a report of it."""
+        """Whether it need not be judged again."""
         return self.verdict in (Verdict.PASSED, Verdict.FAILED)
+
+    @property
+    def has_report(self) -> bool:
+        """Whether there is a report: also of one that a deadline has ended."""
+        return self.found is not None
 
 
 class Results:
@@ -241,14 +256,16 @@ def write(path: Path, data: bytes) -> None:
 def _result(
     listed: Listed, report: Report, failures: list[Finding], *, seconds: float, ended: str
 ) -> Result:
+    unjudged = report.is_unjudged(failures)
     return Result(
         listed=listed,
-        verdict=Verdict.FAILED if failures else Verdict.PASSED,
+        verdict=Verdict.UNJUDGED if unjudged else Verdict.FAILED if failures else Verdict.PASSED,
         commit=report.commit,
         found=Counter(one.check.severity.value for one in report.findings),
-        fails=tuple(dict.fromkeys(one.id for one in failures)),
+        fails=() if unjudged else tuple((one.id, one.text) for one in failures),
         seconds=seconds,
         ended=ended,
+        said=failures[0].message if unjudged else "",
     )
 
 

@@ -19,7 +19,7 @@ from typing import Any, Generic, TypeVar
 
 from envhub_sandbox import parent
 from envhub_sandbox.errors import WorkerStartupError
-from envhub_worker.protocol.text import printable
+from envhub_worker.protocol.text import printable, size_text
 
 _TICK_S = 0.1
 _MOST_BYTES = 32 << 20
@@ -130,7 +130,7 @@ class _Running(Generic[T]):
         if time.monotonic() - self._begun > most_s:
             return f"there was no verdict within {most_s:g} s (--deadline)"
         if any(self._file(name).stat().st_size > _MOST_BYTES for name in ("out", "err")):
-            return f"it printed more than {_MOST_BYTES} bytes"
+            return f"it printed more than {size_text(_MOST_BYTES)}"
         return ""
 
     def _complaint(self, code: int | None) -> str:

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-import secrets
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,12 +11,14 @@ import typer
 
 from envhub_sandbox.cli.check import options as own
 from envhub_sandbox.cli.check import outside
+from envhub_sandbox.cli.check.deadline import DeadlineReached, deadline_alarm
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say
+from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
-from envhub_sandbox.cli.shared.findings import STYLES, annotate, level
+from envhub_sandbox.cli.shared.findings import STYLES, annotate, level, show_finding
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_sandbox.cli.shared.select import select
+from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
     from envhub_sandbox.check.findings import Finding, Report
@@ -65,7 +63,11 @@ def check(
     seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="Of each play.")] = 0,
     fail_on: Annotated[
         str,
-        typer.Option(metavar="error|warning|note", help="The least finding that fails it."),
+        typer.Option(
+            metavar="|".join(STYLES),
+            help="The least finding that fails it.",
+            autocompletion=lambda: list(STYLES),
+        ),
     ] = "error",
     settings: Annotated[
         Path | None,
@@ -105,7 +107,7 @@ def check(
     output: own.Output = None,
     jobs: own.Jobs = None,
     memory_budget: own.MemoryBudget = None,
-    deadline: own.Deadline = None,
+    deadline: own.Deadline = own.DEADLINE_S,
     again: own.Again = False,
     suite: opt.Suite = None,
     task: opt.Task = None,
@@ -145,8 +147,10 @@ def check(
 
     [bold]envhub check --all references.txt --output judged[/bold]
     """
-    with _unheard(github) as heard, reported(debug=debug):
-        make = opt.MakeOptions.of(ctx, ref=ref or "")
+    with reported(debug=debug):
+        make = opt.MakeOptions.of(ctx)
+        if not math.isfinite(deadline):
+            raise UsageError(f"--deadline is {deadline}; it takes seconds, such as 900")
         least, allowed = level(fail_on), _known(allow or ())
         if listed is not None:
             _refuse_beside_a_list(ref=ref, sarif=sarif, html=html)
@@ -165,27 +169,32 @@ def check(
                 arguments=many.handed_on(ctx),
                 debug=debug,
             )
-            many.show(
-                many.judge_all(wanted), json=json, junit=junit, heard=heard if github else None
-            )
+            many.print_judged(many.judge_all(wanted), json=json, junit=junit, github=github)
             return
         if ref is None:
             raise UsageError("name a repository, or a list of them: --all FILE --output DIR")
         if any(opt.is_typed(ctx, name) for name in own.OF_A_LIST):
-            raise UsageError(
-                "--output, --jobs, --memory-budget, --deadline and --again are for --all FILE"
-            )
+            raise UsageError("--output, --jobs, --memory-budget and --again are for --all FILE")
         outside.refuse_the_judged({"--settings": settings, "--policy": policy}, ref)
-        play = _Play(seed, steps, resets, slow_step, suite, task, html is not None)
-        report = _judge(make, policy, play, quiet=json or github)
+        report = _judge(
+            make,
+            policy,
+            deadline,
+            quiet=json or github,
+            seed=seed,
+            steps=steps,
+            resets=resets,
+            slow_step_s=slow_step,
+            tasks=lambda envs: [one[:2] for one in select(envs, suite, task)],
+            pictures=html is not None,
+        )
         failures = report.failures(least, allowed)
         _write(report, failures, junit=junit, sarif=sarif, html=html)
         if github:
             from envhub_sandbox.check import reports
 
             _print_walls(report)
-            with heard():
-                annotate(reports.workflow_commands(report), reports.summary(report, failures))
+            annotate(reports.workflow_commands(report), reports.summary(report, failures))
         if json:
             from envhub_sandbox.check.reports import document
 
@@ -193,33 +202,7 @@ def check(
         elif not github:
             _print(report, failures)
         if failures:
-            raise typer.Exit(Exit.ENVIRONMENT)
-
-
-@contextlib.contextmanager
-def _unheard(github: bool) -> Iterator[Callable[[], AbstractContextManager[None]]]:
-    """Let GitHub obey nothing that is printed: warnings and errors hold a stranger's text.
-
-    It obeys any line of stdout and stderr that looks like a command. Both are one stream here, for
-    of two nobody knows which it reads first.
-    """
-    if not github:
-        yield contextlib.nullcontext
-        return
-    token = secrets.token_hex(16)
-
-    @contextlib.contextmanager
-    def heard() -> Iterator[None]:
-        typer.echo(f"\n::{token}::")
-        yield
-        typer.echo(f"::stop-commands::{token}")
-
-    with contextlib.redirect_stderr(sys.stdout):
-        typer.echo(f"::stop-commands::{token}")
-        try:
-            yield heard
-        finally:
-            typer.echo(f"\n::{token}::")
+            raise typer.Exit(Exit.UNJUDGED if report.is_unjudged(failures) else Exit.ENVIRONMENT)
 
 
 def _refuse_beside_a_list(**options: object) -> None:
@@ -243,46 +226,34 @@ def _known(names: Sequence[str]) -> Sequence[str]:
     return names
 
 
-@dataclass(frozen=True)
-class _Play:
-    """How much is played, and of which tasks."""
-
-    seed: int
-    steps: int
-    resets: int
-    slow_step_s: float
-    suites: list[str] | None
-    tasks: list[str] | None
-    pictures: bool
-
-
-def _judge(make: opt.MakeOptions, policy: Path | None, play: _Play, *, quiet: bool) -> Report:
+def _judge(
+    make: opt.MakeOptions, policy: Path | None, deadline_s: float, *, quiet: bool, **play: Any
+) -> Report:
+    """What comes of it until the deadline; ``play`` is what else ``Asked`` says."""
     arguments = make.arguments()
-    del arguments["cfg"], arguments["validate"], arguments["num_workers"]
+    del arguments["cfg"]
     arguments["prewarm"] = 0  # a jail that nobody has asked for yet would be one more at once
     from envhub_sandbox.check import settings
+    from envhub_sandbox.check.findings import Report
     from envhub_sandbox.check.judge import Asked, judge
 
     if policy is not None:
         arguments["policy"] = settings.merged(settings.policy(policy), arguments["policy"])
 
-    def chosen(envs: Any) -> list[tuple[str, Any]]:
-        return [(suite, task) for suite, task, _ in select(envs, play.suites, play.tasks)]
-
+    report, doing = Report(make.ref), ["starting"]
     with Bar(quiet=quiet) as bar:
-        tell: Callable[[str], None] = bar.begin
-        asked = Asked(
-            reference=make.ref,
-            arguments=arguments,
-            seed=play.seed,
-            steps=play.steps,
-            resets=play.resets,
-            slow_step_s=play.slow_step_s,
-            tasks=chosen,
-            tell=tell,
-            pictures=play.pictures,
-        )
-        return judge(asked)
+
+        def tell(what: str) -> None:
+            doing.append(what)
+            bar.begin(what)
+
+        asked = Asked(reference=make.ref, arguments=arguments, tell=tell, **play)
+        try:
+            with deadline_alarm(deadline_s):
+                judge(asked, report)
+        except DeadlineReached:
+            report.stopped(deadline_s, doing[-1])
+    return report
 
 
 def _write(
@@ -305,37 +276,23 @@ def _write(
 
 
 def _print_walls(report: Report) -> None:
-    """In the log of a workflow too: what GitHub obeys there is not heard meanwhile."""
-    if report.walls is not None:
-        for line in report.walls.lines():
-            console().print(safe_line(line, 500), style="dim", soft_wrap=True)
+    """In the log of a workflow, too."""
+    for line in () if report.walls is None else report.walls.lines():
+        out(safe_line(line, 500), "dim")
 
 
 def _print(report: Report, failures: list[Finding]) -> None:
-    from rich.table import Table
-
-    out = console()
-    out.print(safe_line(report.reference, 300), style="bold", soft_wrap=True)
-    grid = Table.grid(padding=(0, 2))
-    grid.add_column(no_wrap=True)
-    grid.add_column(no_wrap=True)
-    grid.add_column(overflow="fold")
+    out(safe_line(report.reference, 300), "bold")
     for one in report.findings:
-        severity = one.check.severity.value
-        where = f"{one.task}: " if one.task else ""
-        text = safe_line(f"{where}{one.text}", 500)
-        grid.add_row(severity, one.id, text, style=STYLES[severity])
-        if one in failures:
-            grid.add_row("", "", one.check.cure, style="dim")
-    if report.findings:
-        out.print(grid)
+        show_finding(one, fails=one in failures)
     for task, figures in report.figures.items():
-        out.print(
-            f"{safe_line(task)}: {figures['steps']:.0f} steps, {figures['episodes']:.0f} episodes, "
+        steps = counted(int(figures["steps"]), "step")
+        episodes = counted(int(figures["episodes"]), "episode")
+        out(
+            f"{safe_line(task)}: {steps}, {episodes}, "
             f"a step takes {1e3 * figures['step_mean_s']:.2f} ms, the slowest "
             f"{1e3 * figures['step_slowest_s']:.1f} ms",
-            style="dim",
+            "dim",
         )
     _print_walls(report)
-    held = f"{len(report.passed)} checks hold, {len(report.findings)} findings"
-    say(f"{held}, of which {len(failures)} fail it." if failures else f"{held}: passed.")
+    say(f"{report.verdict(failures)}.")

@@ -5,11 +5,9 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import math
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
@@ -31,7 +29,7 @@ from envhub_sandbox.check.settings import merged, policy
 from envhub_sandbox.check.table import CHECKS
 from envhub_sandbox.cli.check.outside import refuse_the_judged
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say, size_of
+from envhub_sandbox.cli.shared.console import print_json, safe_line, say, show
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_sandbox.cli.shared.findings import annotate
 from envhub_sandbox.cli.shared.memory import free_bytes
@@ -39,11 +37,13 @@ from envhub_sandbox.cli.version import versions
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import commit_of
 from envhub_sandbox.policy import policy_from
+from envhub_worker.protocol.text import duration_text, size_text
 
 if TYPE_CHECKING:
     from envhub_sandbox.check.many.lines import Listed
 
-_HOUR_S = 3600.0
+_GRACE_S = 60.0
+"""For a judgement that ends itself at its deadline and writes its report; then it is ended."""
 _JAILS = 2
 """Of one judgement at once: the one that is played, and the one that it is compared with."""
 _COLOURS = {Verdict.PASSED: "green", Verdict.FAILED: "red", Verdict.UNJUDGED: "yellow"}
@@ -74,7 +74,7 @@ class Wanted:
     output: Path | None
     jobs: int | None
     memory_budget: str | None
-    deadline: float | None
+    deadline: float
     again: bool
     make: opt.MakeOptions
     settings: Path | None
@@ -109,8 +109,6 @@ def judge_all(wanted: Wanted) -> Judged:
     """
     if wanted.output is None:
         raise UsageError("--all needs --output DIR, where reports and their index go")
-    if wanted.deadline is not None and not math.isfinite(wanted.deadline):
-        raise UsageError(f"--deadline is {wanted.deadline}; it takes seconds, such as 3600")
     listed = _listed(wanted.file)
     places = {"--settings": wanted.settings, "--policy": wanted.policy, "--output": wanted.output}
     for one in listed:
@@ -137,8 +135,8 @@ def _judge_in(running: Path, judged: Judged, wanted: Wanted, jobs: int, policy: 
         lambda one, place, ourselves: _command(wanted, one, place, ourselves, policy),
         folder=running,
         jobs=jobs,
-        most_s=_HOUR_S if wanted.deadline is None else wanted.deadline,
-        variables=_variables(wanted.make.token),
+        most_s=wanted.deadline + _GRACE_S,
+        variables=_variables(wanted.make.given["token"]),
     )
     try:
         with contextlib.closing(ended):
@@ -148,20 +146,14 @@ def _judge_in(running: Path, judged: Judged, wanted: Wanted, jobs: int, policy: 
         judged.write()
 
 
-def show(
-    judged: Judged,
-    *,
-    json: bool,
-    junit: Path | None,
-    heard: Callable[[], AbstractContextManager[None]] | None,
-) -> None:
+def print_judged(judged: Judged, *, json: bool, junit: Path | None, github: bool) -> None:
     """Print what has come of a list, and end with its code.
 
     Args:
         judged: It.
         json: Print the index as JSON.
         junit: JUnit's file.
-        heard: Within it, GitHub obeys what is printed; None where it is not asked for.
+        github: Print annotations.
 
     Raises:
         UsageError: A file cannot be written.
@@ -170,12 +162,11 @@ def show(
     results = list(judged.of.values())
     if junit is not None:
         judged.report(junit)
-    if heard is not None:
-        with heard():
-            annotate(index.workflow_commands(results), index.summary(results))
+    if github:
+        annotate(index.workflow_commands(results), index.summary(results))
     if json:
         print_json(index.document(results))
-    elif heard is None:
+    elif not github:
         judged.print()
     if judged.exit is not Exit.OK:
         raise typer.Exit(judged.exit)
@@ -211,7 +202,7 @@ class Judged:
     def _judged(self, ended: Ended[Listed]) -> Result:
         now = datetime.now(timezone.utc).isoformat(timespec="seconds")
         said = ended.said.removeprefix("Error: ")
-        if ended.code in (Exit.OK, Exit.ENVIRONMENT):
+        if ended.code in (Exit.OK, Exit.ENVIRONMENT, Exit.UNJUDGED):
             with contextlib.suppress(ValueError, RecursionError, ForeignResultError):
                 return self.results.keep(
                     ended.order,
@@ -232,11 +223,10 @@ class Judged:
         """One line about what is finished."""
         self._done.add(listed)
         one = self.of[listed]
-        why = ", ".join(one.fails) or one.said
         words = (
             f"[{len(self._done)}/{len(self.of)}] {one.verdict.value:<10} {listed.reference}",
-            how or f"{one.seconds:.1f} s",
-            *([why] if why else ()),
+            how or duration_text(one.seconds),
+            *one.why,
         )
         say(safe_line("; ".join(words), 300), style=_COLOURS.get(one.verdict))
 
@@ -259,13 +249,11 @@ class Judged:
 
     def print(self) -> None:
         """What did not pass, and how many did."""
-        out = console()
-        for one in self.of.values():
+        for one in index.ordered(self.of.values()):
             if one.verdict is not Verdict.PASSED:
-                line = f"{one.verdict.value:<10} {one.listed.reference}"
-                why = ", ".join(one.fails) or one.said
-                out.print(safe_line(line, 300), style=_COLOURS.get(one.verdict), soft_wrap=True)
-                out.print(f"{'':<10} {safe_line(why, 300)}", style="dim", soft_wrap=True)
+                show(one.verdict.value, one.listed.reference, _COLOURS.get(one.verdict))
+                for line in one.why:
+                    show("", line, "dim")
         say(f"{index.told(self.of.values())}.")
 
     @property
@@ -300,7 +288,7 @@ def _jobs(wanted: Wanted) -> int:
     says = {} if wanted.policy is None else policy(wanted.policy)
     one = policy_from(merged(says, given), None).limits.memory_bytes
     each, budget = _JAILS * one, opt.read_size("--memory-budget", wanted.memory_budget)
-    needs = f"a judgement may take {size_of(each)}: {_JAILS} jails of {size_of(one)}"
+    needs = f"a judgement may take {size_text(each)}: {_JAILS} jails of {size_text(one)}"
     if budget is None:
         budget = max(each, free_bytes() or 0)
     elif budget < each:
@@ -311,7 +299,7 @@ def _jobs(wanted: Wanted) -> int:
     asked = wanted.jobs or max(1, len(os.sched_getaffinity(0)) // 2)
     jobs = min(asked, budget // each)
     if wanted.jobs is not None and jobs < wanted.jobs:
-        say(f"{jobs} at once: {needs}, of {size_of(budget)}; see --memory and --memory-budget.")
+        say(f"{jobs} at once: {needs}, of {size_text(budget)}; see --memory and --memory-budget.")
     return jobs
 
 
@@ -336,9 +324,7 @@ def _means(listed: Listed, make: opt.MakeOptions) -> str:
     try:
         return commit_of(
             listed.reference,
-            hub_cache_dir=make.hub_cache_dir,
-            token=make.token,
-            endpoint=make.endpoint,
+            **{name: make.given[name] for name in ("hub_cache_dir", "token", "endpoint")},
         )
     except EnvHubError:
         return "nobody knows"  # whoever judges it says why
@@ -349,6 +335,7 @@ def _command(
 ) -> list[str]:
     command = [sys.executable, "-I", "-m", "envhub_sandbox.cli.check.child", str(ourselves)]
     command += ["check", "--json", f"--html={place / 'page.html'}", *wanted.arguments]
+    command += [f"--deadline={wanted.deadline}"]
     command += [] if wanted.policy is None else [f"--policy={policy}"]
     command += ["--debug"] if wanted.debug else []
     return [*command, "--", listed.reference]

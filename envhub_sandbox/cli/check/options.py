@@ -13,7 +13,7 @@ SETTINGS = (
     *("jobs", "memory_budget", "deadline"),
 )
 """What may stand in ``[check]`` of ``--settings FILE``, by the names in Python."""
-OF_A_LIST = ("output", "jobs", "memory_budget", "deadline", "again")
+OF_A_LIST = ("output", "jobs", "memory_budget", "again")
 """What means nothing for one repository; it may stand in a file that is for both."""
 _PANEL = "A list"
 
@@ -51,13 +51,15 @@ MemoryBudget = Annotated[
         rich_help_panel=_PANEL,
     ),
 ]
+DEADLINE_S = 900.0
 Deadline = Annotated[
-    float | None,
+    float,
     typer.Option(
+        "--deadline",
         metavar="SECONDS",
         min=1,
-        help="With --all: how long one judgement may take as a whole; an hour by default.",
-        rich_help_panel=_PANEL,
+        help="How long one judgement may take as a whole; then the report says what was not "
+        "judged.",
     ),
 ]
 Again = Annotated[

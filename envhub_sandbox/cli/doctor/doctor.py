@@ -21,12 +21,13 @@ from typing import Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli.shared.console import console, print_json, safe_line, safe_text
+from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, show
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, describe, reported
 from envhub_sandbox.cli.shared.memory import free_bytes
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_sandbox.cli.version import versions
 from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError
+from envhub_worker.protocol.confinement import PROFILES
 
 _ENV_PY = '''"""Does nothing: `envhub doctor` runs it to see what confines it."""
 
@@ -85,7 +86,9 @@ def doctor(
     profile: Annotated[
         str,
         typer.Option(
-            metavar="strict|no-userns|container", help="The profile that decides the exit code."
+            metavar="|".join(PROFILES),
+            help="The profile that decides the exit code.",
+            autocompletion=lambda: list(PROFILES),
         ),
     ] = "strict",
     json: Annotated[
@@ -113,7 +116,7 @@ def doctor(
     about to end or refuses.
     """
     with reported(debug=debug):
-        from envhub_sandbox.policy import PROFILES, Policy
+        from envhub_sandbox.policy import Policy
 
         Policy(profile=profile)  # refuses a name that there is not, before anything is tried
         if server is not None:
@@ -237,48 +240,39 @@ def _finding(
 
 
 def _print(findings: list[Finding]) -> None:
-    from rich.table import Table
-
-    out = console()
     facts = host()
     user = "root" if facts["root"] else "a plain user"
-    out.print(f"{facts['system']} on {facts['machine']}, as {user}, {facts['python']}")
+    out(f"{facts['system']} on {facts['machine']}, as {user}, {facts['python']}")
     for finding in findings:
-        out.print()
+        out()
         if finding.problem is not None:
-            out.print(f"{finding.profile}: not available here", style="bold red")
+            out(f"{finding.profile}: not available here", "bold red")
             for line in safe_text(finding.problem).splitlines():
-                out.print(f"  {line}", soft_wrap=True)
+                out(f"  {line}")
             continue
-        out.print(
+        out(
             f"{finding.profile}: available (first step after {finding.first_step_s:.2f} s)",
-            style="bold green",
+            "bold green",
         )
-        grid = Table.grid(padding=(0, 2))
-        grid.add_column(no_wrap=True)
-        grid.add_column(no_wrap=True)
-        grid.add_column(overflow="fold")
         for layer in finding.layers:
-            mark = "  holds" if layer.get("enforced") else "  none"
-            grid.add_row(mark, safe_line(layer.get("layer")), safe_line(layer.get("detail"), 300))
-        out.print(grid)
+            mark = "holds" if layer.get("enforced") else "none"
+            show(f"  {mark:6} {safe_line(layer.get('layer'))}", layer.get("detail"), width=26)
 
 
 def _print_missing(probed: dict[str, Any]) -> None:
-    out = console()
     if probed["gpu"] is not None:
         nodes = ", ".join(map(safe_line, probed["gpu"]))
-        out.print()
-        out.print(f"GPU: {nodes or 'none here, and a policy with gpu=True is refused'}")
+        out()
+        out(f"GPU: {nodes or 'none here, and a policy with gpu=True is refused'}")
     missing = [layer for layer in probed["layers"] if not layer["available"]]
     if missing:
-        out.print()
-        out.print("Layers that are missing here, each tried by itself:", style="bold")
+        out()
+        out("Layers that are missing here, each tried by itself:", "bold")
     for layer in missing:
-        out.print(f"  {safe_line(layer['layer'])}: {safe_line(layer['detail'])}", soft_wrap=True)
+        out(f"  {safe_line(layer['layer'])}: {safe_line(layer['detail'])}")
         for line in safe_text(layer["fix"]).splitlines():
-            out.print(f"    {line}", soft_wrap=True)
+            out(f"    {line}")
     if probed["apparmor_profile"]:
-        out.print()
-        out.print("An AppArmor profile that permits user namespaces to this interpreter:")
-        out.print(safe_text(probed["apparmor_profile"]), soft_wrap=True, markup=False)
+        out()
+        out("An AppArmor profile that permits user namespaces to this interpreter:")
+        out(safe_text(probed["apparmor_profile"]))

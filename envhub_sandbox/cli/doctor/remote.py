@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from envhub_sandbox.cli.shared.console import console, print_json, safe_line
+from envhub_sandbox.cli.shared.console import out, print_json, safe_line
 from envhub_sandbox.cli.shared.exits import Exit
 from envhub_sandbox.sandboxes.remote import RemoteSandbox
 from envhub_sandbox.sandboxes.server_facts import ServerFacts, ask
+from envhub_worker.protocol.text import size_text
 
 _USED = {
     "sessions": "sessions",
@@ -33,7 +34,7 @@ def examine(server: RemoteSandbox, profile: str, *, json: bool) -> Exit:
         told = {**asdict(facts), "endpoint": server.endpoint}
         print_json({"server": told, "profile": profile, "problem": problem, "code": code})
     else:
-        _print(server, facts, problem)
+        print_facts(server, facts, problem)
     return code
 
 
@@ -48,34 +49,42 @@ def _verdict(facts: ServerFacts, profile: str) -> tuple[Exit, str | None]:
     )
 
 
-def _print(server: RemoteSandbox, facts: ServerFacts, problem: str | None) -> None:
-    out = console()
+def print_facts(server: RemoteSandbox, facts: ServerFacts, problem: str | None) -> None:
+    """Print what a server says, and what keeps it from having a jail. Trust: the server's word."""
     let_in = "asks for no key" if server.insecure_loopback else "knows our key"
-    out.print(
+    out(
         f"{safe_line(server.endpoint)}: envhub-worker {facts.version}, protocol {facts.protocol}; "
         f"it {let_in}, and answered after {facts.answered_s:.2f} s"
     )
     if not facts.told:
-        out.print("It is older than this client, and does not say what it can enforce.")
+        out("It is older than this client, and does not say what it can enforce.")
     else:
         granted = [name for name in ("network", "gpu") if getattr(facts, name)]
-        out.print(
+        out(
             f"Python {facts.python}; jails there can have the profile {facts.profile} at most, and "
             f"a policy may ask for {facts.weakest_profile} at least"
             + (f", and for: {', '.join(granted)}" if granted else "")
             + ("; it installs what repositories declare" if facts.dependencies else "")
         )
     for line in _quotas(facts):
-        out.print(f"  {line}")
+        out(f"  {line}")
     if problem is not None:
-        out.print(problem, style="bold red")
+        out(problem, "bold red")
 
 
 def _quotas(facts: ServerFacts) -> list[str]:
     used: dict[str, Any] = facts.used
     return [
-        f"{safe_line(name)}: {used.get(_USED.get(name, ''), 0)} of {limit}"
+        f"{_name(name)}: {_amount(name, used.get(_USED[name], 0))} of {_amount(name, limit)}"
         if name in _USED
-        else f"{safe_line(name)}: at most {limit}"
+        else f"{_name(name)}: at most {_amount(name, limit)}"
         for name, limit in facts.quotas.items()
     ]
+
+
+def _name(quota: str) -> str:
+    return safe_line(quota.removesuffix("_bytes").replace("_", " "))
+
+
+def _amount(quota: str, amount: Any) -> str:
+    return size_text(amount) if quota.endswith("_bytes") else f"{amount:,}"

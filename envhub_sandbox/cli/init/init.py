@@ -11,8 +11,9 @@ import typer
 
 from envhub_sandbox.cli.init.starter import starter
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import console, safe_line, say
+from envhub_sandbox.cli.shared.console import out, safe_line, say
 from envhub_sandbox.cli.shared.exits import UsageError, reported
+from envhub_sandbox.hub.checkout import make_checkout
 
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,94}[A-Za-z0-9])?", re.ASCII)
 
@@ -26,13 +27,16 @@ def init(
 ) -> None:
     """Write a new environment's repository: env.py, requirements, card, licence, test, CI workflow.
 
+    In no git checkout, and where there is git, the folder becomes one.
+
     [bold]envhub init my-env && envhub run ./my-env --validate[/bold]
     """
     with reported(debug=debug):
         name = repository_name(folder)
         _write(folder, starter(name, time.localtime().tm_year))
+        make_checkout(folder)
         shown = safe_line(str(folder) if folder.is_absolute() else f"./{folder}")
-        console().print(shown, soft_wrap=True)
+        out(shown)
         say(f"Try it: envhub run {shown} --validate. Publish it: envhub push {shown} OWNER/{name}")
 
 

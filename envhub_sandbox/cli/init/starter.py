@@ -158,6 +158,7 @@ permissions:
 jobs:
   sandboxed:
     runs-on: ubuntu-latest
+    timeout-minutes: 30
     steps:
     - uses: actions/checkout@v4
     - uses: actions/setup-python@v5
@@ -171,7 +172,14 @@ jobs:
     - run: pytest --envhub-ref .
 """
 
+_IGNORED = """\
+__pycache__/
+.pytest_cache/
+.venv/
+"""
+
 _FILES = {
+    ".gitignore": _IGNORED,
     "env.py": _ENV,
     "requirements.txt": _REQUIREMENTS,
     "README.md": _CARD,

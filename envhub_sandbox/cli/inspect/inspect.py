@@ -9,7 +9,7 @@ import typer
 
 from envhub_sandbox.cli.inspect.static import check_options, inspect_static
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import console, print_json, safe_line
+from envhub_sandbox.cli.shared.console import out, print_json, safe_line, show
 from envhub_sandbox.cli.shared.exits import reported
 from envhub_sandbox.cli.shared.findings import FailOn
 from envhub_sandbox.cli.shared.progress import Bar
@@ -40,12 +40,12 @@ def inspect(
     python: opt.Python = None,
     dependencies: opt.Dependencies = "auto",
     lock: opt.Lock = None,
-    sandbox: opt.SandboxName = "process",
+    sandbox: opt.SandboxOrNone = "process",
     server_key: opt.ServerKey = None,
     trust: opt.Trust = False,
     profile: opt.Profile = None,
     network: opt.Network = None,
-    gpu: opt.Gpu = False,
+    gpu: opt.Gpu = None,
     readable: opt.Readable = None,
     variables: opt.Variables = None,
     memory: opt.Memory = None,
@@ -117,22 +117,17 @@ def describe_env(suite: str, task: Any, env: Any) -> dict[str, Any]:
 
 
 def _print(found: list[dict[str, Any]], provenance: dict[str, Any], *, in_process: bool) -> None:
-    from rich.table import Table
-
-    out = console()
     for env in found:
         title = f"{env['suite']} / {env['task']}"
-        out.print(title if env["spec_id"] is None else f"{title}  ({env['spec_id']})", style="bold")
-        grid = Table.grid(padding=(0, 2))
-        grid.add_column(style="dim", no_wrap=True)
-        grid.add_column(overflow="fold")
-        grid.add_row("  sub-environments", str(env["num_envs"]))
-        grid.add_row("  observations", env["single_observation_space"])
-        grid.add_row("  actions", env["single_action_space"])
-        grid.add_row("  autoreset mode", env["autoreset_mode"] or "not stated")
-        grid.add_row("  render mode", env["render_mode"] or "None")
-        for key, value in env["metadata"].items():
-            grid.add_row(f"  {safe_line(key, 40)}", safe_line(value, 300))
-        out.print(grid)
-    out.print()
-    print_provenance(out, provenance, in_process=in_process)
+        out(title if env["spec_id"] is None else f"{title}  ({env['spec_id']})", "bold")
+        told = {
+            "sub-environments": env["num_envs"],
+            "observations": env["single_observation_space"],
+            "actions": env["single_action_space"],
+            "autoreset mode": env["autoreset_mode"] or "not stated",
+            "render mode": env["render_mode"] or "None",
+        }
+        for name, value in (*told.items(), *env["metadata"].items()):
+            show(f"  {safe_line(name, 40)}", value, width=19)
+    out()
+    print_provenance(provenance, in_process=in_process)

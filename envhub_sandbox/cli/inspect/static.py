@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from envhub_sandbox.cli.shared.console import print_json, size_of
+from envhub_sandbox.cli.shared.console import print_json, show
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
-from envhub_sandbox.cli.shared.findings import level, show, show_finding
+from envhub_sandbox.cli.shared.findings import level, show_finding
 from envhub_sandbox.cli.shared.options import is_typed
 from envhub_sandbox.cli.shared.progress import Bar
+from envhub_worker.protocol.text import size_text
 
 if TYPE_CHECKING:
     from envhub_sandbox.check.findings import Finding
@@ -117,13 +118,13 @@ def _print_files(read: Static) -> None:
 
     kinds = Counter(one.kind for one in read.files)
     told = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
-    total = size_of(sum(one.record.size for one in read.files))
+    total = size_text(sum(one.record.size for one in read.files))
     show("files", f"{len(read.files)}, {total}: {told}")
     # what is large or no text first: that is what nobody would read
     odd = [one for one in read.files if one.record.size >= LARGE or one.kind not in _PLAIN]
     rest = [one for one in read.files if one not in odd]
     for one in (shown := [*odd, *rest][:_SHOWN]):
         large = ", large" if one.record.size >= LARGE else ""
-        show("  file", f"{one.record.path}: {one.kind}, {size_of(one.record.size)}{large}")
+        show("  file", f"{one.record.path}: {one.kind}, {size_text(one.record.size)}{large}")
     if len(shown) < len(read.files):
         show("  file", f"and {len(read.files) - len(shown)} more, which --json has")

@@ -12,7 +12,7 @@ import typer
 
 from envhub_sandbox.cli.shared import logs
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import console, print_json, safe_line, say
+from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import code_for, describe, reported
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_sandbox.cli.shared.report import (
@@ -73,12 +73,12 @@ def run(
     lock: opt.Lock = None,
     num_workers: opt.NumWorkers = None,
     validate: opt.Validate = False,
-    sandbox: opt.SandboxName = "process",
+    sandbox: opt.SandboxOrNone = "process",
     server_key: opt.ServerKey = None,
     trust: opt.Trust = False,
     profile: opt.Profile = None,
     network: opt.Network = None,
-    gpu: opt.Gpu = False,
+    gpu: opt.Gpu = None,
     readable: opt.Readable = None,
     variables: opt.Variables = None,
     memory: opt.Memory = None,
@@ -230,7 +230,7 @@ class _Run:
         play = self._play
         document: dict[str, Any] = {
             "reference": self._make.ref,
-            "sandbox": self._make.sandbox,
+            "sandbox": self._make.given["sandbox"],
             "policy": play.policy,
             "seed": play.seed,
             "episodes": play.episodes,
@@ -255,19 +255,19 @@ class _Run:
         return self._make_env_s + self._results[0].rollout.first_step_s
 
     def _print_text(self) -> None:
-        out = console()
-        print_results(out, self._results)
+        print_results(self._results)
+        out()
         if self._provenance is not None:
-            print_provenance(out, self._provenance, in_process=self._make.in_process)
+            print_provenance(self._provenance, in_process=self._make.in_process)
         play = self._play
-        out.print(
-            f"{play.policy} actions, seed {play.seed}, --n-envs {self._make.n_envs}; "
+        out(
+            f"{play.policy} actions, seed {play.seed}, --n-envs {self._make.given['n_envs']}; "
             f"first step after {self._time_to_first_step():.2f} s",
-            style="dim",
+            "dim",
         )
         for result in self._results:
             if result.video is not None:
-                out.print(f"wrote {safe_line(result.video)}", soft_wrap=True)
+                out(f"wrote {safe_line(result.video)}")
         stopped = [result for result in self._results if not result.rollout.complete]
         if stopped:
             say(f"{len(stopped)} of {len(self._results)} tasks were stopped by --steps.")

@@ -1,11 +1,20 @@
-"""What the command line prints, and how text from a worker gets there without doing harm."""
+"""The only place that writes to stdout and stderr: what a stranger chose is text and no more.
+
+Control characters are escaped, rich's markup is not read, and no line is folded: a terminal wraps
+what is long by itself, and what is folded begins lines. CI systems obey what they find in a log:
+GitHub ``::name::`` at the beginning of a line, GitHub and Azure ``##[name]`` and ``##vso[name]``
+anywhere, GitLab ``section_start:``. ``guarded`` breaks all of these, whoever writes them, warnings
+and the errors of the option parser included. ``command`` is the only way around it.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from envhub_worker.protocol.text import printable
@@ -14,8 +23,80 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 _PLAIN_WIDTH = 120
-"""Columns where there is no terminal to ask."""
-_LINE = 200
+"""Columns where there is no terminal to ask; only progress bars and boxes obey it."""
+_LINE, _LONGEST = 200, 2_000
+_MOST = 1 << 20
+"""Characters of one text: a flood is no message."""
+_BREAK = "\n\r\v\f\x1c-\x1e\x85\u2028\u2029"
+_SPACE = rf"(?:[^\S{_BREAK}]|\x1b\[[0-9;?]*[A-Za-z])*"
+"""What a CI system skips before a command; a terminal's colours count as nothing."""
+_COMMAND = re.compile(
+    rf"(?:\A|(?<=[{_BREAK}])){_SPACE}:(?P<colon>:)"
+    r"|##\w{0,16}(?P<bracket>\[)|section_(?:start|end)(?P<section>:)"
+)
+_TAIL = 32
+"""Characters of a line that the next write may make a command of."""
+
+
+def neutralised(text: str, after: str = "") -> str:
+    """Text that no CI system obeys: one character of each command is written as an escape.
+
+    Args:
+        text: What is written.
+        after: What stands in the same line already; it is no part of the result.
+    """
+
+    def broken(found: re.Match[str]) -> str:
+        char = found[found.lastgroup or 0]
+        return f"{found[0][:-1]}\\x{ord(char):02x}"
+
+    return _COMMAND.sub(broken, after + text)[len(after) :]
+
+
+class _SafeStream:
+    """A text stream on which CI systems find no commands, however many writes one is made of."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+        self._line = ""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Write text that no CI system obeys."""
+        written = neutralised(text, self._line)
+        self._stream.write(written)
+        self._line = _end_of_line(self._line + written)
+        return len(text)
+
+    def writelines(self, lines: Sequence[str]) -> None:
+        """Write them one after the other."""
+        for line in lines:
+            self.write(line)
+
+    def command(self, line: str) -> None:
+        """Write a command of ours on a line of its own."""
+        begin = "\n" if self._line else ""
+        self._stream.write(f"{begin}{line[:2]}{neutralised(line[2:], 'x')}\n")
+        self._line = ""
+
+
+def _end_of_line(text: str) -> str:
+    """As much of the last line as decides whether the next write completes a command."""
+    line = re.split(f"[{_BREAK}]", text)[-1]
+    start = re.sub(rf"\A{_SPACE}", "", line)
+    return start if start in ("", ":") else f"x{start[-_TAIL:]}"
+
+
+@contextlib.contextmanager
+def guarded() -> Iterator[None]:
+    """Let CI systems obey nothing of what is written to stdout and stderr while it lasts."""
+    with (
+        contextlib.redirect_stdout(_SafeStream(sys.stdout)),
+        contextlib.redirect_stderr(_SafeStream(sys.stderr)),
+    ):
+        yield
 
 
 def console(*, stderr: bool = False) -> Console:
@@ -36,9 +117,42 @@ def console(*, stderr: bool = False) -> Console:
     )
 
 
+def out(text: str = "", style: str | None = None) -> None:
+    """Print a result on stdout."""
+    console().print(safe_text(text, _MOST), style=style, soft_wrap=True)
+
+
 def say(text: str, style: str | None = None) -> None:
     """Print a message on stderr."""
-    console(stderr=True).print(text, style=style, soft_wrap=True)
+    console(stderr=True).print(safe_text(text, _MOST), style=style, soft_wrap=True)
+
+
+def show(word: str, text: object = "", style: str | None = None, *, width: int = 11) -> None:
+    """Print a line on stdout: a word of ours, and what may be a stranger's."""
+    out(f"{word:{width}} {safe_line(text, _LONGEST)}".rstrip(), style)
+
+
+def show_rows(rows: Sequence[Sequence[str]], *, right: Collection[int] = ()) -> None:
+    """Print a table on stdout, a line each row, the first of which has the names of the columns.
+
+    Args:
+        rows: Cells, which may be a stranger's.
+        right: Columns of numbers.
+    """
+    lines = [[safe_line(cell) for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    for number, line in enumerate(lines):
+        cells = [
+            cell.rjust(width) if column in right else cell.ljust(width)
+            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ]
+        out("  ".join(cells).rstrip(), None if number else "bold")
+
+
+def command(line: str) -> None:
+    """Print one of GitHub's workflow commands, which begins with ``::``, on stdout."""
+    stream: Any = sys.stdout
+    stream.command(line)
 
 
 def safe_text(text: object, limit: int = 16_384) -> str:
@@ -52,21 +166,17 @@ def safe_line(text: object, limit: int = _LINE) -> str:
     return line if len(line) <= limit else f"{line[: limit - 1]}…"
 
 
-def size_of(count: float) -> str:
-    """Bytes in a unit that people read."""
-    for unit in ("B", "KiB", "MiB"):
-        if count < 1024:
-            return f"{count:.0f} {unit}"
-        count /= 1024
-    return f"{count:.1f} GiB"
-
-
 def print_json(document: Mapping[str, Any]) -> None:
     """Print one document on stdout, as JSON that every parser takes."""
     text = json.dumps(plain(document), indent=2, allow_nan=False, ensure_ascii=True)
-    # GitHub's runner obeys it wherever it stands in a line; it can stand in texts alone
-    sys.stdout.write(text.replace("##[", "#\\u0023[") + "\n")
+    # what CI systems obey in the middle of a line can only stand in texts, where JSON has escapes
+    text = re.sub(r"#(?=#\w{0,16}\[)|_(?=(?:start|end):)", lambda one: _escaped(one[0]), text)
+    sys.stdout.write(f"{text}\n")
     sys.stdout.flush()
+
+
+def _escaped(char: str) -> str:
+    return f"\\u{ord(char):04x}"
 
 
 def plain(value: Any) -> Any:

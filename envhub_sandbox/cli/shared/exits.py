@@ -46,7 +46,7 @@ EXIT_CODES = (
     "repository did not load, or a package is missing; 5 the worker died, took too long, or has "
     "no room; 6 this host cannot enforce the policy; 7 a replay that ended in another way, or "
     "elsewhere, or what differs, or is not as it was locked; 8 a replay in which nothing died; 9 a "
-    "container engine could not be asked; 10 none of a list fails, some could not be judged; 70 "
+    "container engine could not be asked; 10 nothing fails, but not all could be judged; 70 "
     "a bug of ours; 130 interrupted; 141 broken pipe; 143 terminated."
 )
 

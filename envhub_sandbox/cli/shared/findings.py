@@ -1,8 +1,4 @@
-"""What was read of a repository, line by line: its words are a stranger's on each of them.
-
-A line begins with a word of ours, and none is wrapped: what a terminal or GitHub's runner obeys
-stands at a line's beginning, or is ``##[``, which is broken up.
-"""
+"""Findings as lines, ``--fail-on``, and what GitHub is told of findings."""
 
 from __future__ import annotations
 
@@ -13,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from envhub_sandbox.cli.shared.console import console, safe_line
+from envhub_sandbox.cli.shared.console import command, show
 from envhub_sandbox.cli.shared.exits import UsageError
 
 if TYPE_CHECKING:
@@ -21,28 +17,25 @@ if TYPE_CHECKING:
     from envhub_sandbox.check.table import Severity
 
 STYLES = {"error": "red", "warning": "yellow", "note": "dim"}
-_WIDTH = 11
 
 FailOn = Annotated[
     str | None,
     typer.Option(
         "--fail-on",
-        metavar="error|warning|note",
+        metavar="|".join(STYLES),
+        autocompletion=lambda: list(STYLES),
         help="Exit with 1 if something is found that weighs as much.",
     ),
 ]
 
 
-def show(word: str, text: str = "", style: str | None = None) -> None:
-    """Print a line: a word of ours, and what may be a stranger's."""
-    line = safe_line(text, 500).replace("##[", "#\\x23[")
-    console().print(f"{word:{_WIDTH}} {line}".rstrip(), style=style, soft_wrap=True)
-
-
-def show_finding(one: Finding, mark: str = "") -> None:
-    """Print what was found."""
+def show_finding(one: Finding, mark: str = "", *, fails: bool = False) -> None:
+    """Print what was found, and what cures it where it fails the whole."""
     severity = one.check.severity.value
-    show(f"{mark}{severity}", f"{one.id}: {one.text}", STYLES[severity])
+    where = f"{one.task}: " if one.task else ""
+    show(f"{mark}{severity}", f"{one.id}: {where}{one.text}", STYLES[severity])
+    if fails:
+        show("", one.cure, "dim")
 
 
 def level(name: str) -> Severity:
@@ -61,7 +54,7 @@ def level(name: str) -> Severity:
 def annotate(commands: Iterable[str], summary: str) -> None:
     """Print GitHub's workflow commands, and append to its step's summary."""
     for line in commands:
-        typer.echo(line)
+        command(line)
     if path := os.environ.get("GITHUB_STEP_SUMMARY"):
         with Path(path).open("a", encoding="utf-8") as file:
             file.write(summary)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import re
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import typer
@@ -16,10 +15,18 @@ import typer
 from envhub_sandbox.cli.shared.exits import ForeignError, UsageError
 from envhub_sandbox.cli.shared.logs import output_policy
 from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.option_names import OPTION_NAMES
+from envhub_worker.protocol.confinement import NETWORKS, PROFILES
 from envhub_worker.protocol.limits import MAX_NUM_ENVS
+from envhub_worker.protocol.text import parse_size
 
 _CODE, _LIMITS, _HUB = "How it is built", "What it may do", "Where it comes from"
-_UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
+
+
+def _one_of(*values: str) -> Callable[[], list[str]]:
+    """What a shell completes."""
+    return lambda: list(values)
+
 
 Ref = Annotated[
     str,
@@ -73,6 +80,7 @@ Dependencies = Annotated[
     str,
     typer.Option(
         metavar="auto|host|PATH|JSON",
+        autocompletion=_one_of("auto", "host"),
         help="Where its packages come from: an environment of its own where this interpreter lacks "
         "some; this interpreter; another, or a virtual environment; or one of its own, adjusted: "
         '\'{"extra": ["scipy"], "python": "3.12", "exclude_newer": "2026-01-31"}\'.',
@@ -107,8 +115,19 @@ SandboxName = Annotated[
     str,
     typer.Option(
         "--sandbox",
+        metavar="process|docker[:IMAGE]|tcp://HOST:PORT",
+        help="Where it runs.",
+        autocompletion=_one_of("process", "docker", "tcp://"),
+        rich_help_panel=_LIMITS,
+    ),
+]
+SandboxOrNone = Annotated[
+    str,
+    typer.Option(
+        "--sandbox",
         metavar="process|docker[:IMAGE]|tcp://HOST:PORT|none",
         help="Where it runs; 'none' is this process, unprotected.",
+        autocompletion=_one_of("process", "docker", "tcp://", "none"),
         rich_help_panel=_LIMITS,
     ),
 ]
@@ -132,17 +151,29 @@ Trust = Annotated[
 Profile = Annotated[
     str | None,
     typer.Option(
-        metavar="strict|no-userns|container",
+        metavar="|".join(PROFILES),
         help="Which layers must hold; strict by default.",
+        autocompletion=_one_of(*PROFILES),
         rich_help_panel=_LIMITS,
     ),
 ]
 Network = Annotated[
     str | None,
-    typer.Option(metavar="none|loopback|host", help="None by default.", rich_help_panel=_LIMITS),
+    typer.Option(
+        metavar="|".join(NETWORKS),
+        help="None by default.",
+        autocompletion=_one_of(*NETWORKS),
+        rich_help_panel=_LIMITS,
+    ),
 ]
 Gpu = Annotated[
-    bool, typer.Option("--gpu", help="Grant the GPU's device nodes.", rich_help_panel=_LIMITS)
+    str | None,
+    typer.Option(
+        "--gpu",
+        metavar="all|N[,N]",
+        help="Grant all GPUs, or those, as nvidia-smi counts them.",
+        rich_help_panel=_LIMITS,
+    ),
 ]
 Readable = Annotated[
     list[str] | None,
@@ -208,56 +239,32 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on s
 Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks.")]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class MakeOptions:
-    """What the command line says about ``make_env``; field by field as its options.
+    """What a command line says about ``make_env``.
 
-    Those with a default are not options of every command.
+    Attributes:
+        ref: The reference.
+        given: The values of the options that the command has, by keys of ``OPTION_NAMES``.
     """
 
     ref: str
-    n_envs: int
-    use_async: bool
-    env_kwargs: Sequence[str] | None
-    python: str | None
-    dependencies: str
-    sandbox: str
-    server_key: str | None
-    profile: str | None
-    memory: str | None
-    disk: str | None
-    processes: int | None
-    cpu_time: int | None
-    timeout: float | None
-    token: str | None
-    endpoint: str | None
-    hub_cache_dir: str | None
-    lock: str | None = None
-    num_workers: int | None = None
-    validate: bool = False
-    trust: bool = False
-    network: str | None = None
-    gpu: bool = False
-    readable: Sequence[str] | None = None
-    variables: Sequence[str] | None = None
-    worker_output: str | None = None
+    given: Mapping[str, Any]
 
     @classmethod
-    def of(cls, context: typer.Context, **others: Any) -> MakeOptions:
-        """What a command was given: a parameter's field has its name.
-
-        Args:
-            context: The command's.
-            **others: Fields that it says in another way.
-        """
-        names = {one.name for one in fields(cls)}
-        given = {name: value for name, value in context.params.items() if name in names}
-        return cls(**{**given, **others})
+    def of(cls, context: Any) -> MakeOptions:
+        """What a command was given."""
+        values = {
+            name: context.params[one.name] for one in context.command.params for name in one.opts
+        }
+        commands = {key: one.command for key, one in OPTION_NAMES.items()}
+        given = {key: values[name] for key, name in commands.items() if name in values}
+        return cls(context.params["ref"] or "", given)
 
     @property
     def in_process(self) -> bool:
         """Whether the repository's code runs in this process."""
-        return self.sandbox == "none"
+        return bool(self.given["sandbox"] == "none")
 
     def arguments(self) -> dict[str, Any]:
         """The arguments of ``make_env``.
@@ -265,31 +272,25 @@ class MakeOptions:
         Raises:
             UsageError: An option cannot be read.
         """
-        if self.in_process and not self.trust:
+        if self.in_process and "trust_remote_code" not in self.given:
+            raise UsageError("this command needs a sandbox; leave out --sandbox none")
+        if self.in_process and not self.given["trust_remote_code"]:
             raise UsageError(
                 f"--sandbox none runs the code of {self.ref} in this process, with everything that "
                 "you may do. If you trust it, add --trust-remote-code. Otherwise leave out "
                 "--sandbox none: the sandbox needs no trust."
             )
-        return {
-            "cfg": self.ref,
-            "n_envs": self.n_envs,
-            "use_async_envs": self.use_async,
-            "hub_cache_dir": self.hub_cache_dir,
-            "trust_remote_code": self.trust,
-            "sandbox": None if self.in_process else self.sandbox,
-            "server_key": self.server_key,
-            "env_kwargs": read_env_kwargs(self.env_kwargs or ()),
-            "policy": self._policy(),
-            "timeouts": self._timeouts(),
-            "token": self.token,
-            "endpoint": self.endpoint,
-            "python": self.python,
-            "dependencies": read_dependencies(self.dependencies),
-            "lock": self.lock,
-            "num_workers": self.num_workers,
-            "validate": self.validate,
-        }
+        made: dict[str, Any] = {"cfg": self.ref, "policy": {}, "limits": {}, "timeouts": {}}
+        for key, value in self.given.items():
+            one = OPTION_NAMES[key]
+            value = _READERS.get(key, lambda given: given)(value)
+            if not one.field:
+                made[one.argument] = value
+            elif value or type(value) in (int, float):  # else the library's default holds
+                made[one.argument][key] = value
+        if limits := made.pop("limits"):
+            made["policy"]["limits"] = limits
+        return made
 
     @contextlib.contextmanager
     def explained(self) -> Iterator[None]:
@@ -303,37 +304,24 @@ class MakeOptions:
             text = f"{self.ref}: {type(error).__name__}: {error}"
             raise ForeignError(text) from error
 
-    def _policy(self) -> dict[str, Any]:
-        limits = {
-            "memory_bytes": read_size("--memory", self.memory),
-            "disk_bytes": read_size("--disk", self.disk),
-            "processes": self.processes,
-            "cpu_s": self.cpu_time,
-        }
-        policy = {
-            "profile": self.profile,
-            "network": self.network,
-            "gpu": self.gpu or None,
-            "readable": tuple(self.readable or ()) or None,
-            "environment": tuple(self.variables or ()) or None,
-            "output": output_policy(self.worker_output),
-            "limits": _given(limits) or None,
-        }
-        return _given(policy)
 
-    def _timeouts(self) -> dict[str, Any]:
-        names = ("startup_s", "reset_s", "step_s", "call_s")
-        return {} if self.timeout is None else dict.fromkeys(names, self.timeout)
+def read_gpu(text: str | None) -> bool | list[int] | None:
+    """``all`` or indices.
+
+    Raises:
+        UsageError: It is neither.
+    """
+    if text is None or text == "all":
+        return None if text is None else True
+    if not all(index.isdecimal() for index in text.split(",")):
+        raise UsageError(f"--gpu is {text}; it takes all, or indices such as 0,1")
+    return [int(index) for index in text.split(",")]
 
 
 def is_typed(context: typer.Context, name: str) -> bool:
     """Whether a parameter stands on the command line, and not in a file or nowhere."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
-
-
-def _given(options: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in options.items() if value is not None}
 
 
 @contextlib.contextmanager
@@ -358,10 +346,10 @@ def read_size(option: str, text: str | None) -> int | None:
     """
     if text is None:
         return None
-    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([kmgt]?)(?:i?b)?", text.strip().lower())
-    if found is None:
-        raise UsageError(f"{option} is {text!r}; it takes a size such as 512M or 4G")
-    return int(float(found[1]) * _UNITS[found[2]])
+    try:
+        return parse_size(text)
+    except ValueError as error:
+        raise UsageError(f"{option} is {text!r}; {error}") from None
 
 
 def read_env_kwargs(texts: Sequence[str]) -> dict[str, Any]:
@@ -407,3 +395,13 @@ def _json_or_text(value: str) -> Any:
         return json.loads(value)
     except ValueError:
         return value
+
+
+_READERS: dict[str, Callable[[Any], Any]] = {
+    "sandbox": lambda name: None if name == "none" else name,
+    "env_kwargs": lambda texts: read_env_kwargs(texts or ()),
+    "dependencies": read_dependencies,
+    "output": output_policy,
+    "gpu": read_gpu,
+}
+"""How values are made of what was typed, where the two are not the same."""

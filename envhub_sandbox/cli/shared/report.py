@@ -6,15 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from envhub_sandbox.cli.shared.console import safe_line
+from envhub_sandbox.cli.shared.console import safe_line, show, show_rows
+from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from envhub_sandbox.rollouts.episodes import Rollout
 
 _SHOWN_DIGITS = 12
 _SHOWN_PACKAGES = ("gymnasium", "numpy")
+_WIDTH = 12
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,22 +90,13 @@ def task_document(result: TaskResult) -> dict[str, Any]:
     }
 
 
-def print_results(out: Console, results: Sequence[TaskResult]) -> None:
+def print_results(results: Sequence[TaskResult]) -> None:
     """A table with a row per task, and per component where rewards are vectors."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
     with_success = any(success_rate(result.rollout) is not None for result in results)
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column("suite / task", overflow="fold")
-    for title in ("episodes", "return", "min", "max", "length", "steps/s"):
-        table.add_column(title, justify="right", no_wrap=True)
-    if with_success:
-        table.add_column("success", justify="right", no_wrap=True)
-    for result in results:
-        for row in _rows(result, with_success):
-            table.add_row(*row)
-    out.print(table)
+    heads = ["suite / task", "episodes", "return", "min", "max", "length", "steps/s"]
+    heads += ["success"] if with_success else []
+    rows = [row for result in results for row in _rows(result, with_success)]
+    show_rows([heads, *rows], right=range(1, len(heads)))
 
 
 def _rows(result: TaskResult, with_success: bool) -> list[list[str]]:
@@ -138,20 +129,15 @@ def _percent(rate: float | None) -> str:
     return "-" if rate is None else f"{rate:.0%}"
 
 
-def print_provenance(out: Console, provenance: dict[str, Any], *, in_process: bool) -> None:
+def print_provenance(provenance: dict[str, Any], *, in_process: bool) -> None:
     """Where the code came from, what ran it, and what confined it."""
-    from rich.table import Table
-
-    grid = Table.grid(padding=(0, 2))
-    grid.add_column(style="bold", no_wrap=True)
-    grid.add_column(overflow="fold")
-    grid.add_row("repository", _repository(provenance))
+    show("repository", _repository(provenance), width=_WIDTH)
     interpreter = provenance.get("interpreter") or {}
     if interpreter:
-        grid.add_row("ran on", _interpreter(interpreter, provenance.get("packages") or {}))
-    for title, text in _confinement(provenance.get("layers") or [], in_process):
-        grid.add_row(title, text)
-    out.print(grid)
+        told = _interpreter(interpreter, provenance.get("packages") or {})
+        show("ran on", told, width=_WIDTH)
+    for title, text in _confinement(provenance, in_process):
+        show(title, text, width=_WIDTH)
 
 
 def _repository(provenance: dict[str, Any]) -> str:
@@ -159,24 +145,23 @@ def _repository(provenance: dict[str, Any]) -> str:
     commit = provenance["commit"]
     if kind == "local":
         commit = commit[: len("local-") + _SHOWN_DIGITS]
-    return safe_line(f"{provenance['repository']} ({kind}) at {commit}, {provenance['path']}", 400)
+    return f"{provenance['repository']} ({kind}) at {commit}, {provenance['path']}"
 
 
 def _interpreter(interpreter: dict[str, str], packages: dict[str, str]) -> str:
     shown = [f"{name} {packages[name]}" for name in _SHOWN_PACKAGES if name in packages]
     version, executable = interpreter.get("version", ""), interpreter.get("executable", "")
-    return safe_line(", ".join([f"{version} ({executable})", *shown]), 400)
+    return ", ".join([f"{version} ({executable})", *shown])
 
 
-def _confinement(layers: list[dict[str, Any]], in_process: bool) -> list[tuple[str, str]]:
+def _confinement(provenance: dict[str, Any], in_process: bool) -> list[tuple[str, str]]:
+    """How many layers held, whose names ``--json`` has; those that did not, one by one."""
     if in_process:
         return [("confined by", "nothing: the code ran in this process")]
-    held = [safe_line(layer.get("layer", "?"), 40) for layer in layers if layer.get("enforced")]
+    layers = provenance.get("layers") or []
     if not layers:
         return [("confined by", "nothing ran")]
-    rows = [("confined by", ", ".join(held) or "nothing")]
-    for layer in layers:
-        if not layer.get("enforced"):
-            text = f"{layer.get('layer', '?')}: {layer.get('detail', '')}"
-            rows.append(("not enforced", safe_line(text, 300)))
-    return rows
+    missing = [layer for layer in layers if not layer.get("enforced")]
+    held = f"{provenance.get('profile')}, {counted(len(layers) - len(missing), 'layer')}"
+    lacks = [f"{layer.get('layer', '?')}: {layer.get('detail', '')}" for layer in missing]
+    return [("confined by", held), *(("not enforced", text) for text in lacks)]

@@ -21,17 +21,15 @@ from envhub_sandbox.errors import HubReferenceError
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.integrations.lerobot.features import features_of
 from envhub_sandbox.integrations.lerobot.waiting import Waiting
+from envhub_sandbox.option_names import OPTION_NAMES, on_lerobots_command_line, use_option_names
 from envhub_sandbox.vector.suites import EnvSuites
 
 ASKS_CONFIGS = hasattr(EnvConfig, "create_envs")
 """Whether this LeRobot asks a configuration for its environments: 0.6 does, 0.4 and 0.5 do not."""
 
 _WAITING = Waiting()
-_OPTIONS = (
-    *("sandbox", "env_kwargs", "policy", "timeouts", "limits", "endpoint", "python"),
-    *("dependencies", "lock", "num_workers", "prewarm", "lane", "copy", "validate", "server_key"),
-    "hub_cache_dir",
-)
+_SAID_OTHERWISE = {"n_envs", "use_async_envs", "trust_remote_code", "token"}
+_OPTIONS = {one.argument for one in OPTION_NAMES.values()} - _SAID_OTHERWISE
 
 
 @EnvConfig.register_subclass("envhub_sandbox")
@@ -126,7 +124,8 @@ class SandboxedEnvConfig(EnvConfig):
             options["dependencies"] = json.loads(self.dependencies)
         for name in ("policy", "timeouts", "limits", "env_kwargs"):
             options[name] = options[name] or None
-        suites = make_env(self.repo, n_envs=n_envs, use_async_envs=use_async_envs, **options)
+        with use_option_names(on_lerobots_command_line()):
+            suites = make_env(self.repo, n_envs=n_envs, use_async_envs=use_async_envs, **options)
         try:
             suites.keep(self.suite, self.task)
         except BaseException:

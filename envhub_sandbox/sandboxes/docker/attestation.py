@@ -15,6 +15,7 @@ from envhub_sandbox.errors import (
     SandboxUnavailableError,
     WorkerStartupError,
 )
+from envhub_sandbox.option_names import option_name
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_worker.protocol.messages.surroundings import Surroundings
 from envhub_worker.protocol.untrusted import UNTRUSTED
@@ -62,7 +63,8 @@ def profile_for(wanted: str, found: Surroundings) -> str:
     raise SandboxUnavailableError(
         "in this container neither namespaces nor Landlock can be had, so that nothing but a "
         "system call filter would stand between the repository and the server that runs it. If the "
-        "container's own walls are enough for you, say so: Policy(profile='container')."
+        "container's own walls are enough for you, say so: "
+        f"{option_name('profile', 'container')}."
     )
 
 

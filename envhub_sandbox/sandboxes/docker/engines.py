@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
+from envhub_sandbox.option_names import option_name
 
 ENGINES = ("docker", "podman")
 _ANSWER_S = 60.0
@@ -118,7 +119,8 @@ def _engine(name: str, path: str | None, host: str | None) -> Engine:
     if is_elsewhere(name):
         raise SandboxUnavailableError(
             f"DOCKER_HOST is {host}: a container over there cannot share memory with this process. "
-            "Run the worker there, and connect to it with sandbox='tcp://...'."
+            "Run the worker there, and connect to it with "
+            f"{option_name('sandbox', 'tcp://HOST:PORT')}."
         )
     try:
         kind = "podman" if "podman" in run(command, "--version") else name
@@ -179,17 +181,18 @@ _EXPLAINED = (
     ),
     (
         "Range of CPUs",
-        "it has fewer processors than were asked for; see DockerSandbox(cpus=...).",
+        "it has fewer processors than were asked for; see DockerSandbox(cpus=...) in Python.",
     ),
     (
         "bind source path does not exist",
         "it does not see this machine's files (an engine in a virtual machine, or one that was "
-        "installed as a snap): run the worker there and connect with sandbox='tcp://...'.",
+        "installed as a snap): run the worker on a server, and name that as the sandbox.",
     ),
     (
         "cgroup",
         "it cannot limit memory, processes and time here. Delegate control groups to it, or go "
-        "without the container's own limits: DockerSandbox(cgroups=False). Each jail's hold.",
+        "without the container's own limits: DockerSandbox(cgroups=False) in Python. Each jail's "
+        "hold.",
     ),
 )
 

@@ -20,6 +20,7 @@ from envhub_sandbox.errors import (
     name_source,
 )
 from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.option_names import option_name
 from envhub_sandbox.sandboxes.docker.engines import Engine, EngineError, own_limits
 from envhub_sandbox.sandboxes.docker.image import INTERPRETER
 
@@ -38,10 +39,6 @@ there = {one.metadata["Name"]: [one.version, one.requires or []] for one in foun
 facts = [sys.implementation.name, platform.python_version(), os.uname().machine]
 print(json.dumps([*facts, platform.libc_ver()[1], there]))
 """
-_REMEDY = (
-    "Build an image with its packages (envhub image build REF, then sandbox='docker:IMAGE'), or "
-    "take those of the image as they are with dependencies='host'"
-)
 
 
 @dataclass(frozen=True)
@@ -153,13 +150,13 @@ def fitting(theirs: Interpreter, choice: Choice, found: Declared | None) -> Inte
     except InterpreterUnavailableError as error:
         raise InterpreterUnavailableError(
             f"packages for the image's Python {minor} are made with one of this machine, which has "
-            f"none. {_REMEDY}"
+            f"none. {_remedy()}"
         ) from error
     alike = (ours.implementation, ours.machine) == (theirs.implementation, theirs.machine)
     if not alike or not ours.libc or not theirs.libc or Version(ours.libc) > Version(theirs.libc):
         raise InterpreterUnavailableError(
             f"packages of this machine ({ours.machine}, glibc {ours.libc or 'unknown'}) cannot be "
-            f"used in the image ({theirs.machine}, glibc {theirs.libc or 'unknown'}). {_REMEDY}"
+            f"used in the image ({theirs.machine}, glibc {theirs.libc or 'unknown'}). {_remedy()}"
         )
     return ours
 
@@ -168,3 +165,11 @@ def _is_asked(theirs: Interpreter, asked: str) -> bool:
     from envhub_sandbox.dependencies import interpreters
 
     return "/" not in asked and theirs.fits(interpreters.versions(asked))
+
+
+def _remedy() -> str:
+    return (
+        "Build an image with its packages (envhub image build REF, then "
+        f"{option_name('sandbox', 'docker:IMAGE')}), or take those of the image as they are with "
+        f"{option_name('dependencies', 'host')}"
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from envhub_sandbox.errors import PolicyError
+from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes.docker.engines import Engine
 
@@ -181,6 +182,6 @@ def check_readable(paths: tuple[str, ...]) -> None:
         parts = [part for part in path.split("/") if part]
         if ".." in parts or not parts or (len(parts) == 1 and parts[0] in _OWN):
             raise PolicyError(
-                f"policy: readable holds {path!r}, which a container has of its own; name what is "
-                "needed below it"
+                f"{option_name('readable')} holds {path!r}, which a container has of its own; name "
+                "what is needed below it"
             )

@@ -25,6 +25,7 @@ from envhub_sandbox import parent
 from envhub_sandbox.dependencies.choice import Choice
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.base import ServerUse
@@ -98,16 +99,22 @@ class DockerSandbox:
         """
         if runtime.python:
             raise PolicyError(
-                f"python={runtime.python!r} is an interpreter of this machine, and a container has "
-                "its own: choose an image instead, with DockerSandbox(image=...)"
+                f"{option_name('python', runtime.python)} is an interpreter of this machine, and "
+                "a container has its own: choose an image instead, with "
+                f"{option_name('sandbox', 'docker:IMAGE')}"
             )
         if self.gpus is not None and not policy.gpu:
             raise PolicyError("DockerSandbox(gpus=...) takes a policy with gpu=True")
+        if not isinstance(policy.gpu, bool):
+            raise PolicyError(
+                f"gpu={list(policy.gpu)} names GPUs of this machine, and a container counts its "
+                "own: use gpu=True, and choose with DockerSandbox(gpus='device=0')"
+            )
         if not sys.platform.startswith("linux"):
             raise SandboxUnavailableError(
-                f"sandbox='docker' needs Linux, and this is {sys.platform}, where containers run "
-                "in a virtual machine: run `docker run envhub-worker` and connect to it with "
-                "sandbox='tcp://...'"
+                f"{option_name('sandbox', 'docker')} needs Linux, and this is {sys.platform}, "
+                "where containers run in a virtual machine: run `docker run envhub-worker` and "
+                f"connect to it with {option_name('sandbox', 'tcp://HOST:PORT')}"
             )
         run_arguments.check_readable(policy.readable)
         engine = find_engine(self.engine)
@@ -259,7 +266,7 @@ class RepositoryContainer:
             raise SandboxUnavailableError(
                 f"{self._engine.kind} started a container that shares no socket with this process: "
                 "an engine in a virtual machine, or a runtime with a kernel of its own. Run the "
-                "worker there, and connect to it with sandbox='tcp://...'"
+                f"worker there, and connect to it with {option_name('sandbox', 'tcp://HOST:PORT')}"
             )
         title = f"{self._engine.kind} {self._engine.version}, image {self._options.image}"
         runtime = self._options.runtime or "default"

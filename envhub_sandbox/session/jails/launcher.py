@@ -12,7 +12,6 @@ from typing import Any
 from envhub_sandbox.errors import (
     EnvHubError,
     LoadError,
-    VersionMismatchError,
     WorkerTimeoutError,
 )
 from envhub_sandbox.log import WORKER
@@ -46,9 +45,6 @@ _DENIED_S = 10.0
 """Who records wants to know it, also of a host that is busy."""
 _UNKNOWN = ("server", "connection", "gone")
 """How a jail died of which its server can say nothing."""
-_FIRST_WITH_LOAD_TASK = 3
-"""The version of the protocol."""
-_FIRST_WITH_PACKAGES = 5
 
 
 class Launcher:
@@ -121,13 +117,7 @@ class Launcher:
             if isinstance(server, FarServer):
                 server.bring(client, deadline)
             # all at once, where they will load what is known: else it is asked for, and then again
-            known = known if client.version >= _FIRST_WITH_LOAD_TASK else None
             order = self._order(server, known.shards if known else 1)
-            if isinstance(order, m.OpenJailWith) and client.version < _FIRST_WITH_PACKAGES:
-                raise VersionMismatchError(
-                    f"the worker speaks protocol {client.version}, and a repository with packages "
-                    f"of its own needs {_FIRST_WITH_PACKAGES}: upgrade the worker"
-                )
             jail = open_jail(client, order, self.repository.wire_limits, deadline)
         except BaseException:
             client.close()
@@ -164,13 +154,8 @@ class Launcher:
         if isinstance(server, EnclosedServer):
             snapshot, runtime = server.snapshot, Runtime(server.python, server.packages)
             confinement = replace(confinement, profile=server.profile)
-        entry, permitted = self.repository.snapshot.path, asdict(confinement)
-        if not confinement.record_denials:
-            del permitted["record_denials"]  # an older server has no such field
-        order = (self.repository.label, runtime.python, snapshot, entry, permitted, runners)
-        if not runtime.packages:
-            return m.OpenJail(*order)
-        return m.OpenJailWith(*order, runtime.packages)
+        label, entry = self.repository.label, self.repository.snapshot.path
+        return m.OpenJail(label, *runtime, snapshot, entry, asdict(confinement), runners)
 
     def _load(self, jail: JailHandle, use: ServerUse, deadline: Deadline) -> LoadedJail:
         runner = jail.runners[0]
@@ -224,14 +209,10 @@ class Launcher:
     ) -> None:
         """Have runners of a jail call ``make_env``, for a task that is known."""
         jail = loaded.jail
-        if jail.client.version < _FIRST_WITH_LOAD_TASK:
-            load = self.repository.arguments.message()
-            jail.exchange("make_env", [(runner, load) for runner in runners], deadline)
-        else:
-            again = self.repository.arguments.message_for(task)
-            replies = jail.exchange("make_env", [(runner, again) for runner in runners], deadline)
-            found = [typed(reply, m.Value).value for reply in replies]
-            loaded.changed |= not all(_is_what(value, task) for value in found)
+        again = self.repository.arguments.message_for(task)
+        replies = jail.exchange("make_env", [(runner, again) for runner in runners], deadline)
+        found = [typed(reply, m.Value).value for reply in replies]
+        loaded.changed |= not all(_is_what(value, task) for value in found)
         loaded.loaded.update(runners)
 
     def connect(self, loaded: LoadedJail, deadline: Deadline) -> LoadedJail:

@@ -131,7 +131,7 @@ def deposit(
     Raises:
         OSError: The server did not take them.
     """
-    [frame] = m.pack(m.Deposit(session, jail, runner), 0)
+    [frame] = m.pack(m.Deposit(session, jail, runner))
     until, tries = monotonic() + wait_s, 1
     while True:
         try:

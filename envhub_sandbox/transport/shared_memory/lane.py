@@ -42,8 +42,6 @@ _BY_SERVER = ""
 """In place of an operation's name, where it is the relay that is owed the answer."""
 _BULKY = frozenset({"render"})
 """What hardly ever fits the slabs."""
-_FIRST_WITH_LISTS = 7
-"""The version of the protocol."""
 _NOTHING: list[Outcome] = []
 
 
@@ -169,8 +167,7 @@ class SharedMemoryLane:
     # --- steps ---------------------------------------------------------------------------------
 
     def _shard(self, layout: slabs.Layout) -> LaneShard:
-        lists = self.jail.client.version >= _FIRST_WITH_LISTS
-        return LaneShard(layout, self.observations.fd, lists=lists)
+        return LaneShard(layout, self.observations.fd)
 
     def send_step(self, actions: Any) -> None:
         """See ``Lane``."""

@@ -41,16 +41,14 @@ class LaneShard:
     Args:
         layout: Where everything lies.
         observations: The descriptor of the slab that all shards share.
-        lists: Whether the runner can make lists of actions; an older one cannot.
 
     Attributes:
         fds: What the runner gets: three slabs, its doorbell, ours.
         bell: Our doorbell, to be watched.
     """
 
-    def __init__(self, layout: slabs.Layout, observations: int, *, lists: bool = True) -> None:
+    def __init__(self, layout: slabs.Layout, observations: int) -> None:
         self.layout = layout
-        self._listed = slabs.LISTED if lists else 0
         self._request, request = slab("request", layout.request_bytes, SEAL_FUTURE_WRITE)
         self._reply, reply = slab("reply", layout.reply_bytes)
         self._runner_bell, self.bell = RunnerBell(), OwnBell()
@@ -86,7 +84,7 @@ class LaneShard:
             found = self._views.get((index, leaf.dtype))
             if found is None:
                 found = self._view(index, leaf.dtype)
-            code = found[0] + self._listed if listed else found[0]
+            code = found[0] + slabs.LISTED if listed else found[0]
             if self._codes[index] != code:
                 self._codes[index] = _UNKNOWN
                 asks[slabs.DTYPES + index] = code
@@ -169,7 +167,7 @@ class LaneShard:
         start = self.layout.infos
         message = m.unpack(
             [self._reply[start : start + length]], tensors=to_tensor, things=Described
-        )[1]
+        )
         if isinstance(message, m.Value) and type(message.value) is dict:
             with UNTRUSTED:
                 self._learn(message.value)
@@ -212,4 +210,4 @@ class LaneShard:
 
 def _unpacked(frames: Sequence[Any]) -> m.Message:
     """A runner's message. Trust: input from the worker."""
-    return m.unpack(frames, tensors=to_tensor, things=Described)[1]
+    return m.unpack(frames, tensors=to_tensor, things=Described)

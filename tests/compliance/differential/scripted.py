@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
+import datetime
+import enum
 import random
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+
+class Unhashable(enum.Enum):
+    """Members can be keys, though their values cannot."""
+
+    MAPPING = {"a": {1: 2}}  # noqa: RUF012
+    LIST = [1, ["b"]]  # noqa: RUF012
+
+
+ANY_KEYS = (
+    *(*Unhashable, (1, (2,)), (Unhashable.MAPPING, 3), frozenset({3}), range(2), 1.5, 2**70, None),
+    *(b"k", True, 2j, np.int8(3), np.str_("k"), np.datetime64("2024-05-06")),
+    datetime.date(2024, 5, 6),
+)
 KEYS = ("a", "b", "speed", "episode", "is_success", "nothing", 7)
 DTYPES = (np.int8, np.uint8, np.int32, np.int64, np.float16, np.float32, np.float64, np.bool_)
 
@@ -66,6 +81,11 @@ class Scripted(gym.Env[Any, Any]):
     def told(self, *args: Any, **kwargs: Any) -> Any:
         """What it was given, and a value of any kind."""
         return said((args, kwargs)), self.value(self.draw.choice(KINDS), 0)
+
+    def keyed(self) -> Any:
+        """A mapping whose keys are of any class, the same each time."""
+        keys = random.Random(self.number).sample(ANY_KEYS, 3)
+        return {key: {"inner": {key: self.number}} for key in keys}
 
     def holds(self) -> str:
         """What was set, in words: it may be what does not come back."""

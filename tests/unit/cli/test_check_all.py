@@ -85,9 +85,12 @@ def test_a_file_says_what_one_may_type_about_a_list(
     for typed in ((), ("--jobs", "2"), ("--memory-budget", "2G"), ("--deadline", "8")):
         done = called(*arguments, *typed)
         assert done.exit_code == Exit.UNJUDGED, done.output
-    assert ([jobs for jobs, _ in started[::2]], seconds) == ([3, 2, 1, 3], [9, 9, 9, 8])
+    assert ([jobs for jobs, _ in started[::2]], seconds) == ([3, 2, 1, 3], [69, 69, 69, 68])
     assert all("--memory=1G" in words for _, words in started)
-    assert not any(word.startswith(("--jobs", "--dead")) for _, words in started for word in words)
+    assert not any(word.startswith("--jobs") for _, words in started for word in words)
+    assert [word for _, words in started[::2] for word in words if word.startswith("--dead")] == [
+        *("--deadline=9.0", "--deadline=9.0", "--deadline=9.0", "--deadline=8.0")
+    ]
     alone = called("./nothing", "--settings", "settings.toml")
     assert "there is no such folder" in alone.output
 
@@ -132,7 +135,7 @@ def test_every_option_is_handed_on_or_about_the_list() -> None:
         ("", "name a repository, or a list"),
         ("org/repo --jobs 2", "are for --all FILE"),
         ("org/repo --output out", "are for --all FILE"),
-        ("org/repo --deadline 9", "are for --all FILE"),
+        ("org/repo --deadline inf", "--deadline is inf"),
     ],
 )
 def test_what_cannot_be_is_told_first(

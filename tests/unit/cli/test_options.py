@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,41 +10,44 @@ import typer
 
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.shared.exits import ForeignError, UsageError
-from envhub_sandbox.cli.shared.options import MakeOptions, read_env_kwargs, read_size
+from envhub_sandbox.cli.shared.options import MakeOptions, read_env_kwargs, read_gpu, read_size
 from envhub_sandbox.cli.shared.select import select
-from envhub_sandbox.errors import RemoteEnvError
+from envhub_sandbox.errors import PolicyError, RemoteEnvError
+from envhub_sandbox.policy import policy_from
 
-NOTHING: dict[str, Any] = dict.fromkeys(
-    (
-        *("env_kwargs", "python", "num_workers", "profile", "network", "readable", "variables"),
-        *("memory", "disk", "processes", "cpu_time", "timeout", "token", "endpoint"),
-        *("hub_cache_dir", "server_key"),
-    )
-)
+_OUTPUT = "worker_output"
+"""The panel of another kind has it."""
 
 
 def options(**given: Any) -> MakeOptions:
-    """Options as typed; the others at their defaults."""
-    defaults = {"ref": "org/repo", "n_envs": 1, "use_async": False, "gpu": False}
-    defaults["dependencies"] = "auto"
-    return MakeOptions(**{**NOTHING, **defaults, "sandbox": "process", "trust": False, **given})
+    """Options of ``envhub run`` as typed; the others at their defaults."""
+    command = typer.main.get_command(app).commands["run"]  # type: ignore[attr-defined]
+    params = {one.name: one.default for one in command.params} | {"ref": "org/repo"}
+    assert set(given) <= set(params)
+    return MakeOptions.of(SimpleNamespace(command=command, params={**params, **given}))
+
+
+def test_gpus_are_all_or_named_by_number() -> None:
+    """Anything else is told in the words of the option."""
+    assert [read_gpu(text) for text in (None, "all", "0", "0,2")] == [None, True, [0], [0, 2]]
+    for text in ("", "true", "-1", "0,", "0 1"):
+        with pytest.raises(UsageError, match="it takes all, or indices"):
+            read_gpu(text)
 
 
 @pytest.mark.parametrize("name", ["run", "inspect", "check"])
 def test_every_option_about_make_env_reaches_it(name: str) -> None:
-    """By its name: a field without a default is an option of every command, and none is lost."""
+    """None is lost, and none of another meaning is taken for one."""
     command = typer.main.get_command(app).commands[name]  # type: ignore[attr-defined]
     panels = ("How it is built", "What it may do", "Where it comes from")
     about = {
         one.name for one in command.params if getattr(one, "rich_help_panel", None) in panels
     } - {"suite", "task", "policy"}  # which make_env is not told, or not in this way
-    names = {one.name for one in fields(MakeOptions)}
     assert len(about) > 15
-    assert about <= names
     params = {one.name: f"<{one.name}>" for one in command.params}
-    made = MakeOptions.of(SimpleNamespace(params=params), timeout=7.0)  # type: ignore[arg-type]
-    assert all(getattr(made, one) == f"<{one}>" for one in about - {"timeout"})
-    assert (made.ref, made.timeout) == ("<ref>", 7.0)
+    made = MakeOptions.of(SimpleNamespace(command=command, params=params))
+    assert set(made.given.values()) == {f"<{one}>" for one in about | set(params) & {_OUTPUT}}
+    assert (made.ref, made.given["step_s"]) == ("<ref>", "<timeout>")
 
 
 @pytest.mark.parametrize(
@@ -103,15 +105,23 @@ def test_only_what_was_given_reaches_the_policy() -> None:
     assert options().arguments()["policy"] == {}
     assert options().arguments()["timeouts"] == {}
     given = options(
-        memory="1G", cpu_time=5, network="loopback", gpu=True, readable=["/data"], variables=["A"]
+        memory="1G", cpu_time=5, network="loopback", gpu="all", readable=["/data"], variables=["A"]
     )
     assert given.arguments()["policy"] == {
         "network": "loopback",
         "gpu": True,
-        "readable": ("/data",),
-        "environment": ("A",),
-        "limits": {"memory_bytes": 2**30, "cpu_s": 5},
+        "readable": ["/data"],
+        "environment": ["A"],
+        "limits": {"memory_bytes": "1G", "cpu_s": 5},
     }
+
+
+@pytest.mark.parametrize("name", ["memory", "disk", "processes", "cpu_time"])
+def test_a_limit_of_nothing_is_refused(name: str) -> None:
+    """And is not taken for the default."""
+    given = options(**{name: "0" if name in ("memory", "disk") else 0}).arguments()
+    with pytest.raises(PolicyError, match="above 0"):
+        policy_from(given["policy"], None)
 
 
 def test_a_timeout_is_for_every_operation_but_close() -> None:

@@ -114,7 +114,7 @@ def test_options_become_arguments_of_make_env(monkeypatch: pytest.MonkeyPatch) -
         "sandbox": "process",
         "server_key": None,
         "env_kwargs": {"size": 8},
-        "policy": {"profile": "strict", "limits": {"memory_bytes": 2**30}},
+        "policy": {"profile": "strict", "limits": {"memory_bytes": "1G"}},
         "timeouts": {"startup_s": 9.0, "reset_s": 9.0, "step_s": 9.0, "call_s": 9.0},
         "token": "hf_x",
         "endpoint": "http://h",

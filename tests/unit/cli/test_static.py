@@ -17,6 +17,7 @@ from envhub_sandbox.cli.app import app
 from envhub_sandbox.hub.hashing import GIT_SHA1, digest_of
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
 from envhub_sandbox.hub.snapshot import local
+from tests.support.ci import obeyed
 from tests.support.repositories import write_repository
 
 _ENTRY = """import gymnasium as gym
@@ -114,11 +115,6 @@ def test_options_that_mean_nothing_are_refused(
     assert (done.exit_code, says in " ".join(done.stderr.split())) == (2, True), done.stderr
 
 
-def obeyed(text: str) -> list[str]:
-    """The lines that GitHub's runner would obey."""
-    return [line for line in text.splitlines() if line.strip().startswith("::") or "##[" in line]
-
-
 def test_a_repository_paints_and_commands_nothing(tmp_path: Path) -> None:
     """Neither a terminal nor GitHub's runner: not by names, not by texts, not by what differs."""
     old = repository(tmp_path / "old")
@@ -197,7 +193,7 @@ def test_a_folder_is_held_against_what_the_hub_has(tmp_path: Path) -> None:
     assert changes(static(there), static(hub)) == []
     (folder / "README.md").write_text("# y")
     assert [one.text for one in changes(static(hub), static(local(folder)))] == [
-        "README.md: 3 bytes, now 3"
+        "README.md: 3 bytes, now 3 bytes"
     ]
 
 

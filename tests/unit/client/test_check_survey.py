@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import pickle
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -16,9 +18,19 @@ from tests.support.repositories import write_repository
 _ENTRY = "def make_env(n_envs=1, use_async_envs=False): pass"
 
 
+def zipped(*names: str) -> bytes:
+    """An archive of empty files."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name in names:
+            archive.writestr(name, b"")
+    return file.getvalue()
+
+
 def repository(folder: Path, name: str, data: bytes | str) -> Path:
     """One with its papers and a further file."""
     write_repository(folder, _ENTRY, README__md="# x", LICENSE="MIT")
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
     (folder / name).write_bytes(data.encode() if isinstance(data, str) else data)
     return folder
 
@@ -58,6 +70,9 @@ def found(folder: Path, data: bytes | str, name: str = "odd.py") -> list[tuple[s
         ("\uff45\uff56\uff41\uff4c('1')", "source-dynamic"),
         ("import importlib; importlib.import_module(x)", "source-dynamic"),
         ("import builtins", "source-dynamic"),
+        ("import zipimport", "source-dynamic"),
+        ("import importlib.machinery as m; m.SourceFileLoader('x', 'x.txt')", "source-dynamic"),
+        ("import codecs; codecs.register(x)", "source-dynamic"),
         ("import torch; torch.load('x')", "source-pickle"),
         ("import numpy as np; np.load('x', allow_pickle=True)", "source-pickle"),
         ("import ctypes", "source-native"),
@@ -103,11 +118,17 @@ def test_honest_code_is_not_named(text: str, tmp_path: Path) -> None:
     [
         ("fast.so", b"", "machine code", "source-native"),
         ("weights.npz", b"\x7fELF\x02", "machine code", "source-native"),
-        ("env.cpython-311.pyc", b"\xa7\r\r\n\0\0", "compiled Python", "source-native"),
+        ("env.cpython-311.pyc", b"\xa7\r\r\n\0\0", "compiled Python", "source-compiled"),
+        ("__pycache__/env.pyc", b"MZ", "compiled Python", "source-compiled"),
         ("policy.pt", b"PK\x03\x04", "pickle", "source-pickle"),
         ("data.bin", pickle.dumps({"a": [1]}), "pickle", "source-pickle"),
         ("more.zip", b"PK\x03\x04", "archive", "source-unread"),
         ("more.dat", b"\x1f\x8b\x08", "archive", "source-unread"),
+        ("icon.png", b"\x89PNG\r\n\x1a\n\0" + zipped("a.py"), "archive", "source-unread"),
+        ("notes.txt", b"a\n" * 9_000 + zipped("a.txt"), "archive", "source-unread"),
+        ("arrays.npz", zipped("a.npy", "b.npy"), "binary", ""),
+        ("arrays.npz", zipped("a.npy", "b.pyc", "c.npy"), "archive", "source-unread"),
+        ("arrays.npz", zipped(*map(str, range(2_000))), "archive", "source-unread"),
         (
             "mesh.stl",
             b"version https://git-lfs.github.com/spec/v1\n",
@@ -121,38 +142,38 @@ def test_honest_code_is_not_named(text: str, tmp_path: Path) -> None:
         ("turned.md", "a\u2066b".encode(), "text", "source-hidden"),
     ],
 )
-def test_files_are_told_by_their_beginnings(
+def test_files_are_told_by_their_beginnings_and_ends(
     name: str, data: bytes, kind: str, check: str, tmp_path: Path
 ) -> None:
-    """Whatever they are called; nothing opens them further."""
+    """Whatever they are called, but what Python runs by its name; nothing opens them further."""
     told = surveyed(from_the_hub(repository(tmp_path / "r", name, data)))
     assert {one.record.path: one.kind for one in told.files}[name] == kind
     assert [one.id for one in told.findings if one.file == name] == ([check] if check else [])
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("text", "check"),
     [
-        "def (",
-        "\0",
-        "(" * 5_000,
-        "x = " + "-" * 100_000 + "1",
-        "\xff\xfe",
-        "#" * (3 << 20),
+        ("def (", "source-unread"),
+        ("\0", "source-unread"),
+        ("(" * 5_000, "source-unread"),
+        ("x = " + "-" * 100_000 + "1", "source-unparsed"),
+        ("\xff\xfe", "source-encoding"),
+        ("#" * (3 << 20), "source-unparsed"),
     ],
     ids=["syntax", "null", "nesting", "deep", "bytes", "large"],
 )
-def test_what_cannot_be_read_is_said(text: str, tmp_path: Path) -> None:
+def test_what_cannot_be_read_is_said(text: str, check: str, tmp_path: Path) -> None:
     """No crash, no recursion without end, no time for what no person wrote, and no silence."""
     checks = {check for check, _ in found(tmp_path / "r", text.encode("latin-1"))}
-    assert "source-unread" in checks
-    assert checks <= {"source-unread", "source-hidden", "source-obscure"}
+    assert check in checks
+    assert checks <= {check, "source-hidden", "source-obscure"}
 
 
 def test_a_long_chain_ends_nothing(tmp_path: Path) -> None:
     """Some versions of Python's parser take it, and others do not."""
     chain = "if x: pass\n" + "elif x: pass\n" * 5_000
-    assert {check for check, _ in found(tmp_path / "r", chain)} <= {"source-unread"}
+    assert {check for check, _ in found(tmp_path / "r", chain)} <= {"source-unparsed"}
 
 
 def test_what_is_found_in_a_file_is_bounded(tmp_path: Path) -> None:
@@ -170,6 +191,41 @@ def test_what_is_read_of_a_repository_is_bounded(tmp_path: Path) -> None:
     assert left_over == sorted(left_over)
     assert left_over[-1] == "part69.py"
     assert 0 < len(left_over) < 10
+
+
+@pytest.mark.parametrize("start", ["MZ = 1", "BZh = 1", "#" + " " * 256 + "ustar"])
+def test_no_beginning_makes_python_anything_else(start: str, tmp_path: Path) -> None:
+    """It runs by its name, and is read by it."""
+    assert ("source-process", 2) in found(tmp_path / "r", f"{start}\nimport subprocess")
+
+
+def test_machine_code_in_place_of_a_source_fails(tmp_path: Path) -> None:
+    """Python takes it first; beside no source of its name it is what it is."""
+    folder = repository(tmp_path / "r", "lib/fast.cpython-311-x86_64-linux-gnu.so", b"\x7fELF")
+    (folder / "lib/fast.py").write_text("x = 1")
+    (folder / "env.abi3.so").write_bytes(b"\x7fELF")
+    (folder / "other.so").write_bytes(b"\x7fELF")
+    told = surveyed(from_the_hub(folder)).findings
+    assert {one.file for one in told if one.id == "source-compiled"} == {
+        "env.abi3.so",
+        "lib/fast.cpython-311-x86_64-linux-gnu.so",
+    }
+
+
+def test_no_flood_hides_what_weighs_more(tmp_path: Path) -> None:
+    """Neither of findings nor of texts to be read."""
+    folder = repository(tmp_path / "r", "z/odd.py", b"# coding: utf-7\n")
+    (folder / "z/turned.py").write_text("x = 'a\u202eb'")
+    for number in range(220):
+        (folder / f"a{number:03}.py").write_text("eval()\n" * 101)
+    for number in range(33):
+        (folder / f"b{number}.txt").write_text("a b\n" * (1 << 18))
+    told = surveyed(from_the_hub(folder)).findings
+    assert len(told) > 20_000
+    assert {one.id for one in told if one.file.startswith("z/")} == {
+        "source-encoding",
+        "source-hidden",
+    }
 
 
 def test_links_are_named(tmp_path: Path) -> None:

@@ -56,7 +56,11 @@ def test_unknown_names_are_refused(make: Any, complaint: str) -> None:
         (lambda: Policy(network="all"), "network is 'all'; it is one of none, loopback, host"),
         (lambda: Policy(restart="always"), "restart is 'always'"),
         (lambda: Policy(restart="sometimes"), "restart is 'sometimes'"),
-        (lambda: Policy(gpu="no"), "gpu is 'no'; it is True or False"),  # type: ignore[arg-type]
+        (lambda: Policy(gpu="no"), "gpu is 'no'; it takes True, False or"),  # type: ignore[arg-type]
+        (lambda: Policy(gpu=[]), r"gpu is \[\]; it takes True, False or a list"),
+        (lambda: Policy(gpu=[True]), "gpu is"),
+        (lambda: Policy(gpu=[-1]), "gpu is"),
+        (lambda: Policy(gpu=1), "gpu is 1; it takes True, False or"),  # type: ignore[arg-type]
         (lambda: Policy(readable="/data"), "readable is '/data'; it takes a tuple"),  # type: ignore[arg-type]
         (lambda: Policy(environment="HOME"), "environment is 'HOME'"),  # type: ignore[arg-type]
         (lambda: Policy(environment=(1,)), "environment is"),  # type: ignore[arg-type]
@@ -66,7 +70,7 @@ def test_unknown_names_are_refused(make: Any, complaint: str) -> None:
         (lambda: Policy(limits=Limits(processes=-1)), "processes is -1"),
         (lambda: Policy(limits=Limits(open_files=True)), "open_files is True"),
         (lambda: Policy(limits=Limits(open_files=1.5)), "open_files is 1.5"),  # type: ignore[arg-type]
-        (lambda: Policy(limits=Limits(disk_bytes="1G")), "disk_bytes is '1G'"),  # type: ignore[arg-type]
+        (lambda: Policy(limits=Limits(disk_bytes="1X")), "disk_bytes is '1X'; it takes a size"),  # type: ignore[arg-type]
         (lambda: Policy(limits=Limits(memory_bytes=None)), "memory_bytes is None"),  # type: ignore[arg-type]
         (lambda: Policy(limits=Limits(memory_bytes=float("inf"))), "memory_bytes is inf"),  # type: ignore[arg-type]
         (lambda: Policy(limits=Limits(memory_bytes=float("nan"))), "memory_bytes is nan"),  # type: ignore[arg-type]
@@ -183,3 +187,11 @@ def test_paths_may_be_path_objects() -> None:
     """They become text, as everything in a policy that crosses to another process."""
     policy = Policy(output=Path("a/b.log"), crash_folder=Path("c"))  # type: ignore[arg-type]
     assert (policy.output, policy.crash_folder) == ("a/b.log", "c")
+
+
+def test_sizes_may_have_a_unit() -> None:
+    """In a file of TOML and in Python as on the command line; what is no size may not."""
+    policy = policy_from({"limits": {"memory_bytes": "4G"}}, {"disk_bytes": "512 MiB"})
+    assert (policy.limits.memory_bytes, policy.limits.disk_bytes) == (4 << 30, 512 << 20)
+    with pytest.raises(PolicyError, match="processes is '4K'"):
+        policy_from(None, {"processes": "4K"})

@@ -73,8 +73,11 @@ def test_the_action_judges_with_its_inputs(checkout: Path, tmp_path: Path) -> No
     assert code == 1
     assert [line.strip("<>") for line in lines] == [
         *("check", "--github", "--profile", "strict", "--fail-on", "error", "--steps", "200"),
+        *("--deadline", "900"),
         *("--allow", "card", "--allow", "licence", "--", "./my env"),
     ]
+    _, lines = judged(checkout, tmp_path, deadline="60")
+    assert lines[lines.index("<--deadline>") + 1] == "<60>"
     _, lines = judged(checkout, tmp_path, ref="--sandbox=none")
     assert lines[-2:] == ["<-->", "<--sandbox=none>"]
     _, lines = judged(checkout, tmp_path, sarif="a b.sarif")
@@ -131,7 +134,7 @@ def test_the_job_for_gitlab_judges_with_its_variables(checkout: Path, tmp_path: 
     done = run(job["script"][-1], **variables)
     assert [line.strip("<>") for line in done.stdout.splitlines()] == [
         *("check", "--profile", "strict", "--fail-on", "error"),
-        *("--junit", job["artifacts"]["reports"]["junit"], "--", "./"),
+        *("--deadline", "900", "--junit", job["artifacts"]["reports"]["junit"], "--", "./"),
     ]
     assert run(job["script"][-1], ENVHUB_CODE="1", **variables).returncode == 1
 

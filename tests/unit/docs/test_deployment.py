@@ -39,7 +39,7 @@ def exported() -> dict[str, set[str]]:
         state="/",
         max_connections=1,
     )
-    share = vars(Client(requests={"step": 1}, protocols={"9": 1}))
+    share = vars(Client(requests={"step": 1}))
     told = {
         **facts.for_clients(),
         **facts.for_operators(),

@@ -51,7 +51,10 @@ DESERIALISERS = {"_pickle", "copyreg", "dill", "joblib", "marshal", "pickle", "s
 
 # Which package may import which; a package is a folder or a module right below one of the two.
 # Every package may import the lowest ones, LOWEST, as far as these stand below it.
-LOWEST = {"envhub_sandbox.errors", "envhub_sandbox.log", "envhub_worker.protocol"}
+LOWEST = {
+    *("envhub_sandbox.errors", "envhub_sandbox.log", "envhub_sandbox.option_names"),
+    "envhub_worker.protocol",
+}
 MAY_IMPORT = {
     "envhub_sandbox": {"api", "gym", "hub", "policy", "sandboxes", "vector"},
     "envhub_sandbox.__main__": {"cli"},
@@ -87,6 +90,7 @@ MAY_IMPORT = {
     "envhub_sandbox.std_streams": set(),
     "envhub_sandbox.parent": set(),
     "envhub_sandbox.errors": set(),
+    "envhub_sandbox.option_names": set(),
     "envhub_worker.__main__": {"cli", "std_streams"},
     "envhub_worker.cli": {"", "access", "lockdown", "server", "spawn"},
     "envhub_worker.server": {"", "access", "lockdown", "loop", "multipart", "spawn", "supervisor"},

@@ -212,6 +212,26 @@ def test_unknown_objects_arrive_as_their_description(value: object) -> None:
     assert remote.type_name.endswith(type(value).__qualname__)
 
 
+def test_keys_that_look_alike_are_numbered() -> None:
+    """Objects with one ``repr`` are different keys in the worker; a number tells them apart."""
+    objects = [Unprintable() for _ in range(100)]
+    mapping = through(dict(zip(objects, range(100), strict=True)))
+    assert list(mapping.values()) == list(range(100))
+    first, second, *_ = mapping
+    assert (second.type_name, second.text) == (first.type_name, f"{first.text} #2")
+    assert len(through(set(objects))) == 100
+    nested = through({(objects[0], 1): "a", (objects[1], 1): "b"})
+    assert list(nested.values()) == ["a", "b"]
+
+
+def test_keys_that_cannot_be_hashed_here_are_described() -> None:
+    """A tensor is a key to the worker, and arrives as an array, which is none."""
+    torch = pytest.importorskip("torch")
+    for key in (torch.zeros(2), (1, torch.zeros(2))):
+        assert [type(one) for one in through({key: 1})] == [RemoteObject]
+    assert [type(one) for one in through({torch.zeros(2)})] == [RemoteObject]
+
+
 def test_description_is_bounded_printable_and_without_addresses() -> None:
     """A description never drives a terminal, never floods a log, and is the same every time."""
     loud = type("Loud", (), {"__repr__": lambda self: "\x1b[2J\n\u202e" + "x" * 10_000})()

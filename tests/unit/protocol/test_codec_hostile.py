@@ -32,6 +32,16 @@ SMALL = WireLimits(
 )
 
 
+def test_times_without_a_unit_are_refused() -> None:
+    """Their ``repr`` raises, wherever a program prints one; the one that is no time has one."""
+    times = np.array([4, 5]).view("M8")
+    for value in (times, times[0]):
+        with pytest.raises(RemoteProtocolError, match="no unit"):
+            decode(encode(value))
+    for value in (np.array(["NaT"], "M8"), np.array([4]).view("m8")):
+        assert_same(value, decode(encode(value)))
+
+
 @pytest.mark.parametrize(
     "frames",
     [

@@ -21,12 +21,12 @@ from tests.support.compare import assert_identical
 
 def frames_of(value: object) -> list[Any]:
     """A call with this for an argument."""
-    return [bytes(one) for one in m.pack(m.Call(1, "told", (value,), {}), 2, pickler=framed)]
+    return [bytes(one) for one in m.pack(m.Call(1, "told", (value,), {}), pickler=framed)]
 
 
 def through(value: object) -> Any:
     """What the other side gets of it."""
-    _, call = m.unpack(frames_of(value), unpickler=cloudpickle.loads)
+    call = m.unpack(frames_of(value), unpickler=cloudpickle.loads)
     assert isinstance(call, m.Call)
     return call.args[0]
 
@@ -68,7 +68,7 @@ def test_what_holds_itself_arrives_so() -> None:
 @pytest.mark.parametrize("name", handed.PLAIN)
 def test_what_the_wire_carries_is_not_pickled(name: str) -> None:
     """Crash bundles repeat it, and who has no unpickler reads it."""
-    assert isinstance(m.unpack(frames_of(handed.PLAIN[name]))[1], m.Call)
+    assert isinstance(m.unpack(frames_of(handed.PLAIN[name])), m.Call)
 
 
 @pytest.mark.parametrize("name", handed.PICKLED)
@@ -89,16 +89,16 @@ def test_every_field_of_the_callers_own_arrives_as_it_is() -> None:
         m.CallOwn(1, "told", (value,), {"b": value}),
         m.SetAttr(1, "note", (value, value)),
     ):
-        frames = m.pack(message, 2, pickler=framed)
-        assert_identical(message, m.unpack(frames, unpickler=cloudpickle.loads)[1], "message")
+        frames = m.pack(message, pickler=framed)
+        assert_identical(message, m.unpack(frames, unpickler=cloudpickle.loads), "message")
 
 
 def test_what_comes_back_is_never_pickled() -> None:
     """An answer has no field that would be; a pickle in it is refused, framed or not."""
     for size in (1, 2 * INLINE_BYTES):
-        frames = m.pack(m.Value(bytearray(size)), 1, pickler=framed)
-        assert isinstance(m.unpack(frames)[1], m.Value)
-        forged = m.pack(m.Value(functools.partial(print, bytes(size))), 1, pickler=framed)
+        frames = m.pack(m.Value(bytearray(size)), pickler=framed)
+        assert isinstance(m.unpack(frames), m.Value)
+        forged = m.pack(m.Value(functools.partial(print, bytes(size))), pickler=framed)
         with pytest.raises(RemoteProtocolError, match="never loaded"):
             m.unpack(forged)
     frames = frames_of(np.zeros(INLINE_BYTES, handed.STRUCTURED))
@@ -138,6 +138,6 @@ def test_a_framed_pickle_is_an_array_of_bytes() -> None:
 def test_what_cannot_be_sent_is_named(message: m.Message, words: str) -> None:
     """Which call, which argument, which key in it, and what to do."""
     with pytest.raises(LocalProtocolError, match=words) as caught:
-        m.pack(message, 1, pickler=framed)
+        m.pack(message, pickler=framed)
     if message.HANDED:
         assert "Hand over plain data" in str(caught.value)

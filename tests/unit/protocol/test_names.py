@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import importlib.util
 import pickle
 from typing import Any
 
@@ -25,6 +26,16 @@ from tests.support.curious import names_asked_for
 from tests.support.protocol_names import names_that_libraries_call
 from tests.unit.protocol.test_manifest import an_env, read, with_env
 
+ASKED = {
+    "pandas": {"toDict", "dtype", "ndim", "read", "write", "keys"},
+    "matplotlib": {"shape", "values", "index", "to_numpy"},
+    "numpy": {"size", "shape", "ndim", "dtype", "imag"},
+    "IPython": {"getdoc", "_repr_html_", "_ipython_display_"},
+    "rich": {"__rich_console__", "_fields"},
+    "torch": {"pin_memory", "__cuda_array_interface__"},
+    "tqdm": {"shape"},
+}
+"""Some of what libraries look for: they are really asked here."""
 HONEST = ("hub_config", "task_description", "task", "language", "_ensure", "_max_episode_steps")
 
 
@@ -45,6 +56,9 @@ def test_no_name_that_is_looked_for_in_any_object_is_served() -> None:
     """Found out by doing it: copying, converting, showing and inspecting an object that listens."""
     asked = names_asked_for()
     assert {"__deepcopy__", "__array_interface__", "__array__"} <= asked
+    for library, names in ASKED.items():
+        if importlib.util.find_spec(library):
+            assert names <= asked, f"{library}: it no longer asks, or cannot be asked like this"
     assert {name for name in asked if is_servable(name)} == set()
 
 

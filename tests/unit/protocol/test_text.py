@@ -6,7 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envhub_worker.protocol.text import printable
+from envhub_worker.protocol.text import (
+    counted,
+    duration_text,
+    parse_size,
+    printable,
+    size_text,
+)
 
 
 @pytest.mark.parametrize(
@@ -55,3 +61,75 @@ def test_beginning_and_end_are_kept() -> None:
     shown = printable("first" + "." * 1000 + "last", 20)
     assert shown.startswith("first")
     assert shown.endswith("last")
+
+
+@pytest.mark.parametrize(
+    ("count", "said"),
+    [
+        (0, "0 bytes"),
+        (1, "1 byte"),
+        (1023, "1,023 bytes"),
+        (1024, "1 KiB"),
+        (1536, "1.5 KiB"),
+        (1000 << 10, "1000 KiB"),
+        (24.1 * 2**20, "24.1 MiB"),
+        (8 << 30, "8 GiB"),
+        (3 << 40, "3 TiB"),
+    ],
+)
+def test_sizes_are_said_in_the_unit_that_people_read(count: float, said: str) -> None:
+    """In three digits or four."""
+    assert size_text(count) == said
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "size"),
+    [
+        ("1048576", "", 2**20),
+        ("16G", "", 16 << 30),
+        ("16gib", "", 16 << 30),
+        ("1.5 MB", "", 3 << 19),
+        ("3 bytes", "m", 3),
+        ("3", "m", 3 << 20),
+        ("3B", "g", 3),
+        ("3K", "g", 3 << 10),
+    ],
+)
+def test_sizes_are_read(text: str, unit: str, size: int) -> None:
+    """With a unit, in it; else in the one that the place has."""
+    assert parse_size(text, unit) == size
+
+
+@pytest.mark.parametrize("text", ["", "G", "16X", "-1", "1e9", "1,5G", "٣"])
+def test_what_is_no_size_is_told(text: str) -> None:
+    """With what is one."""
+    with pytest.raises(ValueError, match=r"512M, 1\.5GiB or 4G"):
+        parse_size(text)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [
+        (2e-6, "2 µs"),
+        (0.0123, "12.3 ms"),
+        (1.5, "1.5 s"),
+        (59.97, "60 s"),
+        (320, "5 min 20 s"),
+        (9_000, "2 h 30 min"),
+        (7.2e5, "200 h"),
+        (float("inf"), "inf h"),
+    ],
+)
+def test_times_are_said_in_the_unit_that_people_read(seconds: float, said: str) -> None:
+    """In few characters, whatever they are."""
+    assert duration_text(seconds) == said
+
+
+def test_one_is_no_plural() -> None:
+    """Of words that are made by an s, and of others."""
+    assert [counted(n, "finding") for n in (0, 1, 2_000)] == [
+        *("0 findings", "1 finding", "2,000 findings")
+    ]
+    assert [counted(n, "check holds", "checks hold") for n in (1, 2)] == [
+        *("1 check holds", "2 checks hold")
+    ]

@@ -88,7 +88,7 @@ class Slab:
         self.outcomes.append(outcome)
         if outcome == slabs.COLUMNS:
             return {c.key: c.view(self.memory, 0).astype(c.dtype) for c in self.columns}
-        _, message = m.unpack([bytes(self.memory[:length])])
+        message = m.unpack([bytes(self.memory[:length])])
         assert isinstance(message, m.Value)
         assert isinstance(message.value, dict)
         self.columns = columns_of(message.value)

@@ -89,6 +89,15 @@ def test_weaker_profile_lists_what_it_goes_without() -> None:
     assert made[-1] == ("scratch", True, "64 MiB, measured by the jail's init")
 
 
+@pytest.mark.parametrize("gpu", [True, (0,)])
+def test_what_a_gpu_keeps_from_being_counted_is_told(gpu: bool | tuple[int, ...]) -> None:
+    """Its driver's memory, whoever counts; what it shares, where init does."""
+    for memory, more in (("cgroup-v2", ""), ("watchdog", ", epoll watches, memfds and shared")):
+        made = layers(replace(STRICT, gpu=gpu), replace(USER, memory=memory))
+        [detail] = [detail for layer, _, detail in made if layer == "memory"]
+        assert f"; not counted: file locks, memory of the GPU's driver{more}" in detail
+
+
 @pytest.mark.parametrize(
     ("network", "layer"),
     [
@@ -200,7 +209,7 @@ def test_rlimits_follow_the_limits() -> None:
             "AppArmor",
             "sudo sysctl kernel.apparmor_restrict_unprivileged_userns=0",
         ),
-        ({"/.dockerenv": ""}, "container's seccomp profile", 'Policy(profile="container")'),
+        ({"/.dockerenv": ""}, "container's seccomp profile", 'profile "container"'),
         ({}, "EPERM", "administrator"),
     ],
 )
@@ -210,4 +219,4 @@ def test_refused_user_namespace_is_explained(files: dict[str, str], reason: str,
     assert error.layer == "user-namespace"
     assert reason in error.reason
     assert fix in error.fix
-    assert 'Policy(profile="no-userns")' in error.fix
+    assert 'by its name: profile "no-userns"' in error.fix

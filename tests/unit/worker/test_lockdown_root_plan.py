@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from envhub_worker.lockdown.root_plan import HostFiles, RootPlan, gpu_devices, outermost, plan_root
+from envhub_worker.lockdown.root_plan import HostFiles, RootPlan, outermost, plan_root
 
 FOLDERS = {
     "/",
@@ -17,20 +17,15 @@ FOLDERS = {
     "/data/store",
     "/home/ann",
     "/home/ann/proj",
-    "/sys/devices",
     "/sys/devices/system/cpu",
 }
 FILES = {"/etc/ld.so.cache", "/etc/resolv.conf", "/etc/hosts"}
 LINKS = {"/bin": "usr/bin", "/lib": "usr/lib", "/python": "/opt/py", "/opt/py/current": "lib"}
-LISTINGS = {
-    "/dev": ["null", "nvidia0", "nvidiactl", "nvidia-caps", "kfd", "sda", "kvm"],
-    "/dev/nvidia-caps": ["nvidia-cap1"],
-    "/dev/dri": ["card0", "renderD128", "by-path"],
-}
 HOST = HostFiles(
     exists=lambda path: path in FOLDERS | FILES,
     readlink=LINKS.get,
-    listdir=lambda path: LISTINGS.get(path, []),
+    listdir=lambda path: [],
+    read=lambda path: "",
 )
 
 
@@ -39,7 +34,7 @@ def root(
     readable: tuple[str, ...] = (),
     roots: tuple[str, ...] = (),
     *,
-    gpu: bool = False,
+    devices: tuple[str, ...] = (),
     network: str = "none",
 ) -> RootPlan:
     """The plan on ``HOST``, for ann."""
@@ -48,7 +43,7 @@ def root(
         readable,
         roots,
         private=["/home/ann", "/run/envhub/zygote"],
-        gpu=gpu,
+        devices=devices,
         network=network,
         host=HOST,
     )
@@ -96,17 +91,11 @@ def test_snapshot_roots_are_kept_apart() -> None:
     assert "/data/store" not in plan.trees
 
 
-def test_gpu_adds_compute_nodes_and_what_drivers_read() -> None:
-    """Render nodes, not display nodes; never disks or kvm."""
-    assert gpu_devices(HOST) == (
-        "/dev/dri/renderD128",
-        "/dev/kfd",
-        "/dev/nvidia0",
-        "/dev/nvidiactl",
-    )
-    plan = root(gpu=True)
-    assert set(gpu_devices(HOST)) <= set(plan.devices)
-    assert [path for path in plan.trees if path.startswith("/sys")] == ["/sys/devices"]
+def test_devices_are_those_that_are_granted() -> None:
+    """With the harmless ones; never the one whose mappings are memory in no account."""
+    plan = root(devices=("/dev/nvidia0",))
+    assert plan.devices == (*root().devices, "/dev/nvidia0")
+    assert "/dev/zero" not in plan.devices
 
 
 def test_host_network_adds_name_resolution() -> None:

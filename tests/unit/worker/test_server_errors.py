@@ -53,10 +53,10 @@ def refused(endpoint: str) -> m.Refused:
     with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
         peer.setsockopt(zmq.LINGER, 0)
         peer.connect(endpoint)
-        for number, request in enumerate((m.Hello(2, m.VERSION, b"me"), m.GetStatus())):
-            peer.send_multipart(m.pack(request, number))
+        for number, request in enumerate((m.Hello(m.VERSION, b"me"), m.GetStatus()), 1):
+            peer.send_multipart(m.pack_header(request, number))
             assert peer.poll(_PATIENCE_MS)
-            _, reply = m.unpack(peer.recv_multipart())
+            _, reply = m.unpack_header(peer.recv_multipart()[0])
     assert isinstance(reply, m.Refused)
     return reply
 

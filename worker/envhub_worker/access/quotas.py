@@ -12,6 +12,7 @@ from envhub_worker.protocol.confinement import GIB, MIB, PROFILES, Confinement
 from envhub_worker.protocol.messages import busy as busy_words
 from envhub_worker.protocol.messages.busy import Busy
 from envhub_worker.protocol.records import dataclass
+from envhub_worker.protocol.text import size_text
 from envhub_worker.supervisor.records import Asker
 
 
@@ -104,12 +105,10 @@ def check_policy(request: m.OpenJail, confinement: Confinement, permitted: Permi
         raise RefusedError("PolicyError", "readable: paths of the remote server cannot be named")
     if confinement.network == "host" and not permitted.network:
         raise RefusedError(
-            "PolicyError", "network='host' needs a server that was started with --allow-network"
+            "PolicyError", "the network 'host' needs a server that was started with --allow-network"
         )
-    if confinement.gpu and not permitted.gpu:
-        raise RefusedError(
-            "PolicyError", "gpu=True needs a server that was started with --allow-gpu"
-        )
+    if confinement.gpu is not False and not permitted.gpu:
+        raise RefusedError("PolicyError", "a GPU needs a server that was started with --allow-gpu")
     asked, weakest = confinement.profile, permitted.weakest_profile
     if asked not in PROFILES or PROFILES.index(asked) > PROFILES.index(weakest):
         raise RefusedError(
@@ -132,11 +131,13 @@ def check_jail(open_jails: Iterable[Use], more: Use, quotas: Quotas) -> None:
     for name, what, number, quota, option in (
         ("jails", "jails", jails, quotas.jails, "--max-jails"),
         ("runners", "runners", runners, quotas.runners, "--max-runners"),
-        ("memory", "bytes of memory limits", memory, quotas.memory_bytes, "--max-memory"),
+        ("memory", "of memory limits", memory, quotas.memory_bytes, "--max-memory"),
     ):
         if number > quota:
+            shown = size_text if name == "memory" else str
             text = (
-                f"this would make {number} {what} of your key, over the server's quota of {quota} "
+                f"this would make {shown(number)} {what} of your key, over the server's quota of "
+                f"{shown(quota)} "
                 f"({option}); close environments, or lower their limits"
             )
             if not uses:
@@ -168,8 +169,9 @@ class InFlight:
             raise RefusedError("LocalProtocolError", "a request with this id is not answered yet")
         if taken + size > quota:
             text = (
-                f"{taken} bytes of your key's requests are not answered yet, and {size} more are "
-                f"over the server's quota of {quota}; wait for replies"
+                f"{size_text(taken)} of your key's requests are not answered yet, and "
+                f"{size_text(size)} more are over the server's quota of {size_text(quota)}; wait "
+                "for replies"
             )
             if not taken:
                 raise RefusedError("WorkerError", text)

@@ -240,10 +240,13 @@ class RemoteGate:
         runtime = self._packages.runtime(asked.asker.key, packages) if packages else OWN
         self._find_place(asked, Use(confinement.limits.memory_bytes, request.runners))
         tree = self._uploads.tree(asked.asker.key, request.snapshot)
-        order = (request.name[:512], runtime.python, tree, request.entry, request.confinement)
-        if not packages:
-            return m.OpenJail(*order, request.runners)
-        return m.OpenJailWith(*order, request.runners, runtime.packages)
+        return m.replace(
+            request,
+            name=request.name[:512],
+            python=runtime.python,
+            packages=runtime.packages,
+            snapshot=tree,
+        )
 
     def _need(self, asked: Asked) -> m.Message:
         request = asked.request
@@ -282,9 +285,7 @@ class RemoteGate:
     def _tell_sessions(self, asked: Asked) -> m.Message:
         asker = asked.asker
         told = self._sessions_of(asker.key, asked.sessions, asked.jails)
-        if asker.version >= m.FIRST_WITH_FIGURES_VERSION:
-            told.append({"server": self.figures(asked.sessions, asked.jails, asker.key)})
-        return m.Sessions(tuple(told))
+        return m.Sessions(tuple(told), self.figures(asked.sessions, asked.jails, asker.key))
 
     def answered(self, asker: Asker) -> None:
         """Its bytes are no longer in flight."""
@@ -339,7 +340,6 @@ class RemoteGate:
                 "client": self._name_of(one.key) or "operator",
                 "key": key_text(one.key),
                 "session": one.name.hex()[:8],
-                "protocol": one.version,
                 "heard_s": sessions.age_s(one),
                 "connections": len(one.connections),
                 "upload_bytes": used[one.key],

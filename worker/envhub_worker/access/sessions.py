@@ -7,8 +7,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
-from envhub_worker.protocol.messages import OLDEST_VERSION
-
 WATCHER = b"status"
 """The session of whoever only looks: the same each time, and not counted."""
 
@@ -42,14 +40,12 @@ class Session:
         heard: When it last said anything.
         since: When it said Hello for the first time.
         held: The jails that it last said it holds, and when; None before it said so.
-        version: The version of the protocol that it last agreed to.
     """
 
     key: bytes
     name: bytes
     heard: float
     held: dict[int, float] | None = None
-    version: int = OLDEST_VERSION
     connections: OrderedDict[tuple[bytes, bytes], Connection] = field(default_factory=OrderedDict)
     since: float = field(default_factory=time.monotonic)
 

@@ -20,6 +20,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +40,9 @@ from envhub_worker.cli.note import Note, Noted
 from envhub_worker.lockdown import probe, surroundings
 from envhub_worker.lockdown.mechanisms import landlock, locked_folder
 from envhub_worker.lockdown.mechanisms.locked_folder import LockedFolder
-from envhub_worker.protocol.confinement import GIB, MIB, PROFILES
+from envhub_worker.protocol.confinement import PROFILES
 from envhub_worker.protocol.keys import key_text
+from envhub_worker.protocol.text import parse_size, size_text
 from envhub_worker.server import Server
 
 DEFAULT_BIND = "tcp://127.0.0.1:5555"
@@ -136,26 +138,43 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_quotas(parser: argparse.ArgumentParser) -> None:
     quotas = Quotas()
-    for names, what, default, unit in (
-        (("--max-jails",), "open jails", quotas.jails, ""),
-        (("--max-runners", "--max-hosts"), "processes of environments", quotas.runners, ""),
-        (("--max-sessions",), "client processes", quotas.sessions, ""),
-        (("--max-upload-files",), "files of a snapshot", quotas.upload_files, ""),
-        (("--max-memory",), "memory limits of jails", quotas.memory_bytes // GIB, " GiB"),
-        (("--max-upload",), "snapshots", quotas.upload_bytes // MIB, " MiB"),
-        (("--max-packages",), "installed packages", quotas.packages_bytes // MIB, " MiB"),
-        (("--max-inflight",), "unanswered requests", quotas.inflight_bytes // MIB, " MiB"),
+    for names, what, default in (
+        (("--max-jails",), "open jails", quotas.jails),
+        (("--max-runners", "--max-hosts"), "processes of environments", quotas.runners),
+        (("--max-sessions",), "client processes", quotas.sessions),
+        (("--max-upload-files",), "files of a snapshot", quotas.upload_files),
     ):
         parser.add_argument(
-            *names,
-            type=_count,
-            default=default,
-            help=f"of one key: {what} (default: {default}{unit})",
+            *names, type=_count, default=default, help=f"of one key: {what} (default: {default})"
+        )
+    for name, what, size, unit in (
+        ("--max-memory", "memory limits of jails", quotas.memory_bytes, "GiB"),
+        ("--max-upload", "snapshots", quotas.upload_bytes, "MiB"),
+        ("--max-packages", "installed packages", quotas.packages_bytes, "MiB"),
+        ("--max-inflight", "unanswered requests", quotas.inflight_bytes, "MiB"),
+    ):
+        parser.add_argument(
+            name,
+            type=partial(_size, unit),
+            default=size,
+            metavar="SIZE",
+            help=f"of one key: {what}, as in 16G; in {unit} without a unit (default: "
+            f"{size_text(size)})",
         )
 
 
 def _count(text: str) -> int:
     return _at_least(1, text)
+
+
+def _size(unit: str, text: str) -> int:
+    try:
+        size = parse_size(text, unit[0].lower())
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{error}, and {text!r} is none") from None
+    if size < 1:
+        raise argparse.ArgumentTypeError(f"takes a size above 0, not {text!r}")
+    return size
 
 
 def _seconds(text: str) -> int:
@@ -447,11 +466,11 @@ def _gate(
     quotas = Quotas(
         jails=arguments.max_jails,
         runners=arguments.max_runners,
-        memory_bytes=arguments.max_memory * GIB,
-        upload_bytes=arguments.max_upload * MIB,
+        memory_bytes=arguments.max_memory,
+        upload_bytes=arguments.max_upload,
         upload_files=arguments.max_upload_files,
-        packages_bytes=arguments.max_packages * MIB,
-        inflight_bytes=arguments.max_inflight * MIB,
+        packages_bytes=arguments.max_packages,
+        inflight_bytes=arguments.max_inflight,
         sessions=arguments.max_sessions,
     )
     rules = Rules(

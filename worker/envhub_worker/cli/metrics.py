@@ -163,9 +163,6 @@ class ServerCollector:
         text = "What clients asked of their environments."
         labels = ("client", "operation")
         yield _nested("envhub_server_requests", text, labels, clients, "requests", counts=True)
-        text = "Sessions by the version of the protocol that they speak."
-        labels = ("client", "protocol")
-        yield _nested("envhub_server_session_protocols", text, labels, clients, "protocols")
 
 
 def _family(

@@ -17,10 +17,9 @@ from envhub_worker.access.sessions import WATCHER
 from envhub_worker.cli import note
 from envhub_worker.cli.listen import reachable, state_dir
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.confinement import MIB
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.keys import parse_key
-from envhub_worker.protocol.text import printable
+from envhub_worker.protocol.text import counted, printable, size_text
 
 _WAIT_MS = 5_000
 
@@ -41,16 +40,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Print who uses the server, what their jails do, and how the server is."""
     try:
-        told = _ask(*_address(arguments))
+        sessions, server = _ask(*_address(arguments))
     except (OSError, ValueError, ProtocolError, UnreachableError) as error:
         sys.stderr.write(f"envhub-worker status: {error}\n")
         return 1
-    server = next((one["server"] for one in told if "server" in one), None)
-    sessions = [one for one in told if "session" in one]
     if arguments.json:
         print(json.dumps({"server": server, "sessions": sessions}, indent=2))
     else:
-        print(table(sessions) if server is None else f"{head(server)}\n{table(sessions)}")
+        print(f"{head(server)}\n{table(sessions)}")
     return 0
 
 
@@ -97,23 +94,26 @@ def is_healthy(chosen: Path | None) -> bool | None:
     return None if noted is None else True
 
 
-def _ask(endpoint: str, server_key: bytes | None, pair: keys.KeyPair) -> list[dict[str, Any]]:
+def _ask(
+    endpoint: str, server_key: bytes | None, pair: keys.KeyPair
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """The sessions, and what the server says about itself."""
     with _greeted(endpoint, server_key, pair) as (socket, _):
         reply = _request(socket, m.GetSessions(), 2, m.Sessions)
         assert isinstance(reply, m.Sessions)
-        return [dict(one) for one in reply.sessions if isinstance(one, dict)]
+        return [dict(one) for one in reply.sessions if isinstance(one, dict)], reply.server
 
 
 def of_server(endpoint: str, server_key: bytes | None, pair: keys.KeyPair) -> dict[str, Any]:
     """What the server says about itself to its operator.
 
     Raises:
-        UnreachableError: Nothing: it is older than that.
+        UnreachableError: It does not know us as its operator.
     """
-    for one in _ask(endpoint, server_key, pair):
-        if "pid_namespace" in one.get("server", {}):
-            return dict(one["server"])
-    raise UnreachableError("the server is older than this command: send it SIGTERM yourself")
+    server = _ask(endpoint, server_key, pair)[1]
+    if "pid_namespace" not in server:
+        raise UnreachableError("the server does not know this key as its operator's")
+    return server
 
 
 @contextmanager
@@ -128,7 +128,7 @@ def _greeted(
             socket.setsockopt(zmq.CURVE_PUBLICKEY, pair.public)
             socket.setsockopt(zmq.CURVE_SECRETKEY, pair.secret)
         socket.connect(endpoint)
-        welcome = _request(socket, m.Hello(2, m.VERSION, WATCHER), 1, m.Welcome)
+        welcome = _request(socket, m.Hello(m.VERSION, WATCHER), 1, m.Welcome)
         assert isinstance(welcome, m.Welcome)
         yield socket, welcome
 
@@ -136,10 +136,10 @@ def _greeted(
 def _request(
     socket: zmq.Socket[bytes], request: m.Message, number: int, kind: type[m.Message]
 ) -> m.Message:
-    socket.send_multipart(m.pack(request, number))
+    socket.send_multipart(m.pack_header(request, number))
     if not socket.poll(_WAIT_MS):
         raise UnreachableError("the server does not answer: is the key one that it knows?")
-    _, reply = m.unpack(socket.recv_multipart())
+    _, reply = m.unpack_header(socket.recv_multipart()[0])
     if isinstance(reply, m.Refused):
         raise UnreachableError(printable(reply.message))
     if not isinstance(reply, kind):
@@ -154,10 +154,12 @@ def head(server: dict[str, Any]) -> str:
         f"{server['profile']} at most"
     ]
     if "disk" in server:
-        free = server["disk"]["free_bytes"] // MIB
-        lines[0] += f", {server['connections']} connections, {free} MiB of disk free"
+        free = size_text(server["disk"]["free_bytes"])
+        connections = counted(server["connections"], "connection")
+        lines[0] += f", {connections}, {free} of disk free"
         refusals, deaths = sum(server["refusals"].values()), sum(server["deaths"].values())
-        lines.append(f"since its start: {refusals} refusals, {deaths} deaths")
+        counts = f"{counted(refusals, 'refusal')}, {counted(deaths, 'death')}"
+        lines.append(f"since its start: {counts}")
     if server["draining_s"] is not None:
         lines.append(f"draining: open jails have {server['draining_s']:.0f} s left")
     return printable("\n".join(lines))
@@ -165,12 +167,12 @@ def head(server: dict[str, Any]) -> str:
 
 def table(sessions: list[dict[str, Any]]) -> str:
     """Sessions and their jails, one line each."""
-    lines = [f"{len(sessions)} sessions"]
+    lines = [counted(len(sessions), "session")]
     for one in sessions:
         lines.append(
             f"{one['client']} {one['session']}: heard {one['heard_s']:.0f} s ago, "
-            f"{one['connections']} connections, {one['upload_bytes']} bytes of snapshots, "
-            f"{len(one['jails'])} jails"
+            f"{counted(one['connections'], 'connection')}, {size_text(one['upload_bytes'])} of "
+            f"snapshots, {counted(len(one['jails']), 'jail')}"
         )
         for jail in one["jails"]:
             doing = f"{jail['operation']} for {jail['busy_s']:.1f} s" if jail["operation"] else "-"

@@ -20,7 +20,7 @@ class ZygoteConfig:
         target: What a runner runs once it is confined, as ``"module:function"``.
         profile: The profile of its jails.
         network: Their network.
-        gpu: Whether they get the GPU.
+        gpu: Whether they get all GPUs, or the indices of those that they get.
         readable: Further paths that they read.
         packages: The folder of packages that their code comes with, or empty. Not trusted: only a
             runner imports from it, once it is confined.
@@ -36,7 +36,7 @@ class ZygoteConfig:
     target: str
     profile: str
     network: str
-    gpu: bool
+    gpu: bool | tuple[int, ...]
     readable: tuple[str, ...]
     packages: str
     roots: tuple[str, ...]
@@ -50,7 +50,8 @@ class ZygoteConfig:
     def from_wire(cls, data: dict[str, Any]) -> ZygoteConfig:
         """From ``dataclasses.asdict`` after a trip through JSON."""
         paths = {name: tuple(data[name]) for name in ("readable", "roots")}
-        return cls(**{**data, **paths})
+        gpu = data["gpu"]
+        return cls(**{**data, **paths, "gpu": gpu if type(gpu) is bool else tuple(gpu)})
 
 
 @dataclass(frozen=True, kw_only=True)

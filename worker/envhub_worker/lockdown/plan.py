@@ -72,7 +72,7 @@ def plan(confinement: Confinement, facts: HostFacts) -> Plan:
         raise LayerUnavailableError(
             "network-namespace",
             f"the profile {confinement.profile} has no network of its own to give",
-            'Use the profile "strict", or network="none".',
+            'Use profile "strict", or the network "none".',
         )
     layers = [
         *_user_layers(facts, namespaced),
@@ -205,8 +205,12 @@ def _quota_layer(facts: HostFacts) -> Layer:
 def _uncounted(confinement: Confinement, facts: HostFacts, namespaced: bool) -> str:
     """What of a jail's memory nothing counts here, named for the report."""
     names = ["file locks"]
+    if confinement.gpu is not False:
+        names.append("memory of the GPU's driver")
     if facts.memory == "watchdog":
         names.append("epoll watches")
+        if confinement.gpu is not False:  # drivers need them, so that the filter permits them
+            names.append("memfds and shared memory that are mapped nowhere, or in part")
         if not namespaced:
             names.append("sockets that wait in sockets")
         if confinement.network == "host":

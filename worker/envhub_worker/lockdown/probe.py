@@ -18,7 +18,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from envhub_worker.lockdown import root_plan
+from envhub_worker.lockdown import gpus, root_plan
 from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.lockdown.mechanisms import (
     capabilities,
@@ -70,7 +70,7 @@ def host_facts() -> dict[str, Any]:
         "python": sys.executable,
         "landlock_abi": landlock.version(),
         "memory": hierarchy.kind if hierarchy else "watchdog",
-        "gpu": list(root_plan.gpu_devices(root_plan.real_host())),
+        "gpu": list(gpus.gpu_devices(root_plan.real_host())),
     }
 
 

@@ -26,9 +26,8 @@ _ETC_FILES = ("/etc/ld.so.cache", "/etc/localtime", "/etc/mime.types", "/etc/os-
 _NETWORK_FILES = ("/etc/resolv.conf", "/etc/hosts", "/etc/services", "/etc/gai.conf")
 _NETWORK_FOLDERS = ("/etc/ssl", "/etc/pki", "/etc/ca-certificates")
 _SYS_FOLDERS = ("/sys/devices/system/cpu", "/sys/devices/system/node")
-# Drivers look devices up here; the rest of /sys is left out.
-_GPU_SYS_FOLDERS = ("/sys/bus/pci", "/sys/class/drm", "/sys/dev/char", "/sys/devices")
-# Not /dev/zero: mapped, it is shared memory that can be kept out of sight (see the filter).
+# Not /dev/zero, under no policy: mapped, it is shared memory that can be kept out of sight (see the
+# filter). No driver is known to need it.
 _DEVICES = ("/dev/null", "/dev/full", "/dev/random", "/dev/urandom")
 
 _TEXTS = {
@@ -77,11 +76,13 @@ class HostFiles:
         exists: Whether a path exists.
         readlink: A symbolic link's target, or None for anything else.
         listdir: Names in a folder; empty where there is none.
+        read: What is in a small file; empty where there is none.
     """
 
     exists: Callable[[str], bool]
     readlink: Callable[[str], str | None]
     listdir: Callable[[str], list[str]]
+    read: Callable[[str], str]
 
 
 def plan_root(
@@ -90,7 +91,7 @@ def plan_root(
     roots: Iterable[str],
     *,
     private: Iterable[str],
-    gpu: bool,
+    devices: Iterable[str],
     network: str,
     host: HostFiles,
 ) -> RootPlan:
@@ -98,11 +99,11 @@ def plan_root(
 
     Args:
         interpreter: Paths that the interpreter needs: prefixes, ``sys.path``, this package.
-        readable: Paths that the caller grants by name.
+        readable: Paths that the caller grants by name, and what its devices need of /sys.
         roots: Folders that snapshots lie in; each jail later sees only its own snapshot.
         private: Folders that must never appear because an interpreter names something above
             them (a ``sys.path`` entry that is somebody's home).
-        gpu: Add the device nodes and what drivers read.
+        devices: Device nodes that are granted.
         network: ``"host"`` adds what name resolution and TLS read.
         host: The host's files.
     """
@@ -111,8 +112,6 @@ def plan_root(
     trees = [*wanted, *readable, *_ETC_FOLDERS, *_SYS_FOLDERS, *_SYSTEM]
     copies = list(_ETC_FILES)
     texts = dict(_TEXTS)
-    if gpu:
-        trees += _GPU_SYS_FOLDERS
     if network == "host":
         copies += _NETWORK_FILES
         trees += _NETWORK_FOLDERS
@@ -126,20 +125,11 @@ def plan_root(
         folders=OWN_FOLDERS,
         trees=real(trees),
         roots=real(roots),
-        devices=(*_DEVICES, *(("/dev/zero", *gpu_devices(host)) if gpu else ())),
+        devices=(*_DEVICES, *devices),
         copies=tuple(path for path in copies if host.exists(path)),
         links={path: target for path, target in links.items() if path not in ("/proc", "/")},
         texts=texts,
     )
-
-
-def gpu_devices(host: HostFiles) -> tuple[str, ...]:
-    """Render nodes (never the display ones), NVIDIA's and AMD's compute nodes."""
-    render = [f"/dev/dri/{name}" for name in host.listdir("/dev/dri") if name.startswith("renderD")]
-    names = host.listdir("/dev")
-    vendor = [f"/dev/{name}" for name in names if name.startswith("nvidia") or name == "kfd"]
-    plain = [path for path in vendor if not host.listdir(path)]
-    return tuple(sorted(render + plain))
 
 
 def outermost(paths: Iterable[str]) -> tuple[str, ...]:
@@ -177,10 +167,24 @@ def _resolve(path: str, links: dict[str, str], host: HostFiles) -> str:
     return current
 
 
+def real_path(path: str, host: HostFiles) -> str:
+    """Where a path leads through the symbolic links of ``host``."""
+    return _resolve(path, {}, host)
+
+
 def real_host() -> HostFiles:
     """This host's files."""
     return HostFiles(
         exists=os.path.exists,
         readlink=lambda path: os.readlink(path) if os.path.islink(path) else None,
         listdir=lambda path: sorted(os.listdir(path)) if os.path.isdir(path) else [],
+        read=_content,
     )
+
+
+def _content(path: str) -> str:
+    try:
+        with open(path, errors="replace") as file:
+            return file.read(4096)
+    except OSError:
+        return ""

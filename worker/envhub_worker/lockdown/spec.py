@@ -16,8 +16,7 @@ _MAX_OUTPUT_BYTES = 64 << 20
 _MAX_ENVIRONMENT_BYTES = 64 << 10
 """All granted variables together: they travel in one packet between our own processes."""
 _MAX_READABLE = 64
-_YOUNGER = frozenset({"record_denials"})
-"""What an older client does not say, and none says that does not want it."""
+_MAX_GPUS = 64
 _LIFTABLE = frozenset({"cpu_s", "file_bytes"})
 
 
@@ -30,14 +29,12 @@ class JailSpec:
         entry: The entry file, relative to it.
         confinement: What the jail is permitted.
         name: For logs.
-        version: Of the protocol, as its client reads it.
     """
 
     snapshot: str
     entry: str
     confinement: Confinement
     name: str
-    version: int = 1
 
     def to_wire(self) -> dict[str, Any]:
         """Plain data for a channel between our own processes."""
@@ -58,12 +55,11 @@ def confinement_from_wire(data: dict[str, Any]) -> Confinement:
         RemoteProtocolError: A name, type or number that there cannot be.
     """
     names = {item.name for item in fields(Confinement)}
-    if not names - _YOUNGER <= set(data) <= names:
+    if set(data) != names:
         raise RemoteProtocolError("a confinement has other fields")
-    made = Confinement(
-        **{**data, "readable": tuple(_texts(data["readable"])), "limits": _limits(data["limits"])}
-    )
-    known = made.profile in PROFILES and made.network in NETWORKS and type(made.gpu) is bool
+    checked = {"limits": _limits(data["limits"]), "gpu": _gpu(data["gpu"])}
+    made = Confinement(**{**data, "readable": tuple(_texts(data["readable"])), **checked})
+    known = made.profile in PROFILES and made.network in NETWORKS
     known = known and type(made.record_denials) is bool
     if not known or len(made.readable) > _MAX_READABLE or not _may_be_granted(made.environment):
         raise RemoteProtocolError("a confinement that there cannot be")
@@ -74,6 +70,15 @@ def _texts(value: Any) -> Any:
     if type(value) not in (list, tuple) or not all(type(item) is str for item in value):
         raise RemoteProtocolError("readable paths are a list of strings")
     return value
+
+
+def _gpu(value: Any) -> bool | tuple[int, ...]:
+    if type(value) is bool:
+        return value
+    whole = type(value) in (list, tuple) and all(type(index) is int for index in value)
+    if not whole or not 0 < len(value) <= _MAX_GPUS or min(value) < 0:
+        raise RemoteProtocolError("gpu is a boolean, or a list of indices")
+    return tuple(value)
 
 
 def _limits(data: Any) -> Limits:

@@ -41,6 +41,8 @@ REASONS: tuple[Reason, ...] = get_args(Reason)
 class Limits:
     """Hard caps of one jail. ``None`` where a cap may be lifted means no cap of ours.
 
+    What is in bytes may also be a text such as ``"4G"``, which ``Policy`` reads.
+
     Attributes:
         memory_bytes: All memory of all processes of the jail, shared memory included.
         processes: Processes and threads alive at once.
@@ -75,7 +77,7 @@ class Confinement:
         profile: Which layers must hold: ``"strict"`` (all), ``"no-userns"``, ``"container"``.
         network: ``"none"``, ``"loopback"`` (its own, empty one) or ``"host"``.
         readable: Further absolute paths that the jail may read.
-        gpu: Grants the render and NVIDIA device nodes and the driver libraries.
+        gpu: Grants the device nodes of all GPUs, or of those with these indices.
         environment: Environment variables that the caller grants by name, with their values.
         limits: Hard caps.
         record_denials: Init itself answers the system calls that are denied, and tells which.
@@ -84,7 +86,7 @@ class Confinement:
     profile: str = "strict"
     network: str = "none"
     readable: tuple[str, ...] = ()
-    gpu: bool = False
+    gpu: bool | tuple[int, ...] = False
     environment: dict[str, str] = field(default_factory=dict)
     limits: Limits = field(default_factory=Limits)
     record_denials: bool = False

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 _KEPT = "\n\t"
 MARGIN = "  | "
 """Before a stranger's lines among ours."""
@@ -21,6 +23,59 @@ def printable(text: str, limit: int = 16_384) -> str:
     if text.isprintable():
         return text
     return "".join(char if char in _KEPT or char.isprintable() else _escaped(char) for char in text)
+
+
+def counted(count: int, noun: str, plural: str = "") -> str:
+    """``"1 finding"`` or ``"2 findings"``."""
+    return f"{count:,} {noun if count == 1 else plural or noun + 's'}"
+
+
+def size_text(count: float) -> str:
+    """Bytes in the unit that people read, such as ``"1.5 GiB"``; units are powers of 1024."""
+    if count < 1024:
+        return counted(round(count), "byte")
+    for unit in ("KiB", "MiB", "GiB"):
+        count /= 1024
+        if count < 1024:
+            return f"{count:.3g} {unit}" if count < 1000 else f"{count:.0f} {unit}"
+    return f"{count / 1024:,.3g} TiB"
+
+
+def duration_text(seconds: float) -> str:
+    """A time as people say it, such as ``"3 ms"``, ``"2.5 s"`` or ``"5 min 20 s"``."""
+    if seconds < 1e-3:
+        return f"{seconds * 1e6:.0f} µs"
+    if seconds < 1:
+        return f"{seconds * 1e3:.3g} ms"
+    if seconds < 60:
+        return f"{seconds:.3g} s"
+    if not seconds < 3.6e5:  # nor a number
+        return f"{seconds / 3600:.3g} h"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s"
+
+
+_SIZE = re.compile(r"(\d+(?:\.\d+)?) *([kmgt]?)(i?b|bytes?)?", re.ASCII)
+SIZES = "a size such as 512M, 1.5GiB or 4G; units are powers of 1024"
+"""What ``parse_size`` takes, for errors and help."""
+
+
+def parse_size(text: str, unit: str = "") -> int:
+    """Bytes of a size.
+
+    Args:
+        text: A number with or without a unit.
+        unit: Of a bare number: ``""`` for bytes, ``"m"``, ``"g"``.
+
+    Raises:
+        ValueError: It is no size; the text says what is one.
+    """
+    found = _SIZE.fullmatch(text.strip().lower())
+    if found is None:
+        raise ValueError(f"it takes {SIZES}")
+    number, prefix, rest = found.groups()
+    return int(float(number) * 1024 ** " kmgt".index(prefix or ("" if rest else unit) or " "))
 
 
 def continued(text: str) -> str:

@@ -10,7 +10,7 @@ from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.shared_memory.columns import Column, columns_of
 from envhub_worker.protocol.spaces import batches
 
-Pack = Callable[[m.Message, int], list[Any]]
+Pack = Callable[[m.Message], list[Any]]
 Pairs = list[tuple[int, dict[Any, Any]]]
 """Infos with the index of their sub-environment, in the order in which they came."""
 
@@ -66,7 +66,7 @@ class InfoWriter:
         if self._keys is not None and self._write_columns(pairs):
             return slabs.COLUMNS, 0
         infos = join(pairs, self._count, sliced=self._sliced)
-        frames = self._pack(m.Value(infos), 0)
+        frames = self._pack(m.Value(infos))
         if len(frames) > 1 or memoryview(frames[0]).nbytes > slabs.INFO_BYTES:
             return slabs.FETCH, 0
         self._learn(pairs, infos)

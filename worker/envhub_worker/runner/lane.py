@@ -55,7 +55,7 @@ class Lane:
         attach: m.Attach,
         fds: list[int],
         answer: Callable[[Packet], list[Any]],
-        pack: Callable[[m.Message, int], list[Any]],
+        pack: Callable[[m.Message], list[Any]],
         raised: Callable[[BaseException, str], m.Raised],
         warned: Sequence[Any] = (),
         watches: Watches | None = None,
@@ -237,7 +237,7 @@ class Lane:
 
 def _raised_frame(message: m.Raised) -> Any:
     """The encoded exception; without its traceback where that does not fit."""
-    [frame] = m.pack(message, 0)
+    [frame] = m.pack(message)
     if len(frame) > slabs.INFO_BYTES:
-        [frame] = m.pack(m.replace(message, traceback=""), 0)
+        [frame] = m.pack(m.replace(message, traceback=""))
     return frame

@@ -156,8 +156,8 @@ def _check_arguments(
     ]
     if missing:
         raise ArgumentsError(
-            f"make_env needs {', '.join(missing)}; pass "
-            "env_kwargs={...}, or a config object where it is cfg"
+            f"make_env needs {', '.join(missing)}; pass env_kwargs, or a config object where it is "
+            "cfg"
         )
 
 

@@ -20,7 +20,6 @@ import numpy as np
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import encode_env, encode_manifest
-from envhub_worker.protocol.messages.warned import FIRST_VERSION
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
 from envhub_worker.runner import loader, manifest
@@ -37,15 +36,12 @@ from envhub_worker.runner.watches import Watches
 
 _ANCILLARY_BYTES = socket.CMSG_SPACE(8 * array("i").itemsize)
 _RECHECK_MS = 2
-_FIRST_WITH_DESCRIPTIONS = 7
-"""The version of the protocol."""
 
 
 def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
     """Serve until the other side closes the stream. Runs confined, as the jail's main program."""
-    runner = Runner(spec.snapshot, spec.entry, spec.version)
-    if spec.version >= FIRST_VERSION:
-        runner.warned.listen()
+    runner = Runner(spec.snapshot, spec.entry)
+    runner.warned.listen()
     reader = PacketReader()
     poller = select.poll()
     poller.register(stream, select.POLLIN)
@@ -92,18 +88,14 @@ class Runner:
     Args:
         snapshot: The folder of the repository.
         entry: The entry file in it.
-        version: Of the protocol, as the client reads it: an older one's answers hold descriptions
-            as texts.
 
     Attributes:
         warned: What the repository has warned of.
         watches: What the client has had watched.
     """
 
-    def __init__(self, snapshot: str, entry: str, version: int = m.VERSION) -> None:
-        reads = version >= _FIRST_WITH_DESCRIPTIONS
-        self._reads = reads
-        self._pack = partial(m.pack, describer=described) if reads else m.pack
+    def __init__(self, snapshot: str, entry: str) -> None:
+        self._pack = partial(m.pack, describer=described)
         self._snapshot = snapshot
         self._entry = entry
         self._tasks: dict[tuple[str, Any], Task] = {}
@@ -122,9 +114,9 @@ class Runner:
         """The reply's frames; whatever the repository raises becomes ``Raised``."""
         try:
             # the caller's own arguments may be pickled: this is the only place that unpickles
-            request_id, request = m.unpack(packet.frames, unpickler=cloudpickle.loads)
+            request = m.unpack(packet.frames, unpickler=cloudpickle.loads)
         except Exception as error:  # of a class that is not to be had here, for instance
-            return m.pack(raised(error, "arguments"), 0)
+            return m.pack(raised(error, "arguments"))
         self._stage = type(request).__name__.lower()
         if self.lane is not None and not by_lane:
             if isinstance(request, m.FetchInfos) and self.lane.unsent:
@@ -135,11 +127,11 @@ class Runner:
             reply = _HANDLERS[type(request)](self, request)
             if by_lane and isinstance(reply, m.ResetDone):
                 reply = m.Value(reply.info)  # the observation lies in the slab already
-            return self._pack(reply, request_id)
+            return self._pack(reply)
         except ResultError as error:
-            return m.pack(raised(error, "return", self._snapshot), request_id)
+            return m.pack(raised(error, "return", self._snapshot))
         except BaseException as error:
-            return m.pack(raised(error, self._stage, self._snapshot), request_id)
+            return m.pack(raised(error, self._stage, self._snapshot))
         finally:
             if self.watches.readings:
                 self.watches.look()
@@ -147,7 +139,7 @@ class Runner:
     def load(self, request: m.Load) -> m.Message:
         """Import the repository, call ``make_env``, describe what came back."""
         made = manifest.describe(self._load(request))
-        return m.Loaded(encode_manifest(made, seeded=self._reads))
+        return m.Loaded(encode_manifest(made, seeded=True))
 
     def load_task(self, request: m.LoadTask) -> m.Message:
         """Import the repository, call ``make_env``, and describe nothing: it is known."""

@@ -55,7 +55,7 @@ class Deposits:
     def _serve(self, connection: socket.socket) -> None:
         data, fds, _, _ = socket.recv_fds(connection, _REQUEST_BYTES, FDS)
         try:
-            _, request = m.unpack([data])
+            request = m.unpack([data])
             pidfd = self._pidfd_for(request) if isinstance(request, m.Deposit) else None
             if pidfd is None or len(fds) != FDS:
                 return

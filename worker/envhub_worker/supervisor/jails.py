@@ -106,7 +106,6 @@ class Jails:
             entry=request.entry,
             confinement=confinement,
             name=request.name,
-            version=asker.version,
         )
         zygote, jail = self._zygotes.fork(request.runtime, confinement, spec)
         entry = JailEntry(

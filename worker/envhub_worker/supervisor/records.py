@@ -20,16 +20,13 @@ from envhub_worker.supervisor.runner_stream import RunnerLink
 class Asker(NamedTuple):
     """Who asked: the reply goes to this identity under this id. Jails belong to its session.
 
-    ``key`` was proved in the handshake; empty where none is needed. ``version`` is what its client
-    can read; ``numbered`` is how it asks and is answered (see ``messages.packing``).
+    ``key`` was proved in the handshake; empty where none is needed.
     """
 
     identity: bytes
     request_id: int
     session: bytes = b""
     key: bytes = b""
-    version: int = m.OLDEST_VERSION
-    numbered: bool = False
 
 
 @dataclass
@@ -55,7 +52,7 @@ class Pending:
     def lost(self, index: int, death: m.Died) -> None:
         """In the place of a runner's answer: how it died."""
         self.dead.add(index)
-        self.replies[index] = m.pack(for_operation(death, self.operation), 0)
+        self.replies[index] = m.pack(for_operation(death, self.operation))
 
 
 @dataclass

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from html import unescape
 from xml.etree import ElementTree
 
 import pytest
 
 from envhub_sandbox.check import reports
 from envhub_sandbox.check.findings import Finding, Report
+from envhub_sandbox.check.page import page
 from envhub_sandbox.check.table import CHECKS, Severity
 from envhub_sandbox.check.walls import walls
 from envhub_worker.protocol.text import printable
@@ -150,3 +152,108 @@ def test_severities_are_ordered() -> None:
     assert Severity.ERROR.reaches(Severity.WARNING)
     assert not Severity.NOTE.reaches(Severity.WARNING)
     assert Severity.NOTE.reaches(Severity.NOTE)
+
+
+def mixed() -> Report:
+    """What was found in the order in which it is found: notes first, an error last."""
+    made = Report("./walk:env.py")
+    for check in ("card", "rewards", "licence", "leaks-threads", "runs", "seeding"):
+        made.judged(check, [f"about {check}"], "a / 0")
+    made.judged("loads", [])
+    return made
+
+
+def test_the_most_severe_stands_first_in_every_form() -> None:
+    """Those of one severity stay in the order in which they were found."""
+    made = mixed()
+    failures = made.failures(Severity.WARNING, ["runs"])
+    order = ["runs", "seeding", "rewards", "leaks-threads", "card", "licence"]
+    told = reports.document(made, failures)
+    assert [one["check"] for one in told["findings"]] == order
+    assert [one.id for one in reports.read(told)[0].findings] == order
+    cases = [one.attrib["name"] for one in ElementTree.fromstring(reports.junit(made, failures))]
+    assert cases == [*order, "loads"]
+    [run] = json.loads(reports.sarif(made, failures))["runs"]
+    assert [one["ruleId"] for one in run["results"]] == order
+    commands = [line.partition("title=envhub check%3A ")[2] for line in workflow(made)]
+    assert [line.partition(" ")[0] for line in commands] == order
+    rows = reports.summary(made, failures).splitlines()[-6:]
+    assert [row.split("|")[2].strip() for row in rows] == order
+    words = page(made, failures)
+    assert sorted(order, key=lambda check: words.index(f"about {check}")) == order
+
+
+def workflow(made: Report) -> list[str]:
+    """GitHub's annotations."""
+    return list(reports.workflow_commands(made))
+
+
+@pytest.mark.parametrize(
+    ("found", "allowed", "says"),
+    [
+        ([], [], "2 checks hold, 0 findings: passed"),
+        (["card"], [], "2 checks hold, 1 finding, of which 1 fails it"),
+        (["card", "runs"], [], "2 checks hold, 2 findings, of which 2 fail it"),
+        (["card", "runs"], ["runs"], "2 checks hold, 2 findings, of which 1 fails it"),
+        (["deadline"], [], "2 checks hold, 1 finding; not judged to its end"),
+        (["deadline", "runs"], [], "2 checks hold, 2 findings, of which 2 fail it"),
+    ],
+)
+def test_a_verdict_is_a_sentence(found: list[str], allowed: list[str], says: str) -> None:
+    """The same for people on a terminal, on a page and in GitHub's summary."""
+    made = Report("./walk:env.py")
+    for check in ("loads", "imports"):
+        made.judged(check, [])
+    for check in found:
+        made.judged(check, ["it broke"])
+    failures = made.failures(Severity.NOTE, allowed)
+    assert made.verdict(failures) == says
+    assert says in reports.summary(made, failures)
+    assert says in page(made, failures)
+
+
+@pytest.mark.parametrize(
+    ("cause", "says"),
+    [
+        ("DependencyNotInstalled", "requirements.txt"),
+        ("ModuleNotFoundError", "requirements.txt"),
+        ("NamespaceNotFound", "Import the package that registers"),
+        ("FileNotFoundError", "Bring the file along"),
+        ("out-of-memory", "--memory"),
+        ("timeout", "--timeout"),
+        ("ZeroDivisionError", CHECKS["runs"].cure),
+        ("", CHECKS["runs"].cure),
+    ],
+)
+def test_advice_follows_from_the_error(cause: str, says: str) -> None:
+    """In every form that has advice; else it is that of the check."""
+    made = Report("./walk:env.py")
+    made.judged("runs", ["it broke"], cause=cause)
+    [told] = reports.document(made, [])["findings"]
+    assert says in told["cure"]
+    assert says in workflow(made)[0]
+    assert told["cure"] in unescape(page(made, []))
+
+
+def test_what_was_not_judged_is_told_in_every_form() -> None:
+    """Checks that were made of nothing, and tasks that were not played to their end."""
+    made = mixed()
+    made.waiting = ["a / 0", "b / 1"]
+    made.stopped(900, "a / 0")
+    first = made.findings[0]
+    assert (first.id, made.failures(Severity.ERROR)[0].id) == ("runs", "runs")
+    [ended] = [one for one in made.findings if one.id == "deadline"]
+    assert "ended after 15 min 0 s, at: a / 0. Not judged: requirements, " in ended.message
+    assert ended.message.endswith("and 1 more") or "all of b / 1" in ended.message
+    told = reports.document(made, [])
+    assert told["unjudged"]["tasks"] == ["a / 0", "b / 1"]
+    assert not set(told["unjudged"]["checks"]) & {"runs", "card", "loads", "deadline"}
+    again, _ = reports.read({**told, "passed": True})
+    assert (again.unmade, again.waiting) == (made.unmade, made.waiting)
+    root = ElementTree.fromstring(reports.junit(made, []))
+    skipped = [one.attrib for one in root if one.find("skipped") is not None]
+    assert {"classname": "b / 1", "name": "*"} in skipped
+    assert int(root.attrib["skipped"]) == len(skipped) == len(made.unmade) + 2
+    assert int(root.attrib["tests"]) == len(list(root))
+    [run] = json.loads(reports.sarif(made, []))["runs"]
+    assert run["invocations"] == [{"executionSuccessful": False}]

@@ -81,7 +81,7 @@ def test_what_was_judged_is_known_again(folder: Path) -> None:
         made = keep(Results(folder, "as ever"), running)
     assert (made.verdict, made.fails, made.found) == (
         Verdict.FAILED,
-        ("runs",),
+        (("runs", "it broke:3: it broke"),),
         {"error": 1, "note": 1},
     )
     assert Results(folder, "as ever").kept(_ONE) == made
@@ -222,14 +222,16 @@ def test_an_index_runs_nothing() -> None:
 
 
 def test_an_index_shows_first_what_fails() -> None:
-    """And in the document they stand as in the list."""
+    """In the document, JUnit's file and the annotations too."""
     made = list(reversed(results_of("walk")))
     text = Page(index.page(made)).text
     words = ["failed", "not judged", "waiting", "passed"]
     body = text[text.rindex("judged\n") :] if "judged\n" in text else text
     assert sorted(words, key=body.rindex) == words
     document = index.document(made)
-    assert [row["verdict"] for row in document["results"]] == list(reversed(words))
+    assert [row["verdict"] for row in document["results"]] == words
+    titles = [line.partition("::")[2].partition("%0A")[0] for line in index.workflow_commands(made)]
+    assert [title.rpartition("::")[2] for title in titles] == words[:3]
     assert document["counts"] == dict.fromkeys(words, 1)
 
 

@@ -9,6 +9,7 @@ from html.parser import HTMLParser
 
 import pytest
 
+from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.page import page
 from envhub_sandbox.check.plays import Film, Play
 from envhub_sandbox.rollouts.pictures import png
@@ -89,6 +90,7 @@ def test_a_page_needs_and_runs_nothing() -> None:
     attributes = {name for tag, attrs in found.tags for name, _ in attrs if tag not in _DRAWN}
     assert attributes == {
         *("lang", "charset", "http-equiv", "content", "name", "class", "alt", "src"),
+        "data-head",
         *("controls", "loop", "muted", "playsinline"),
     }
     for _, attrs in found.tags:
@@ -148,3 +150,38 @@ def test_a_page_is_bounded() -> None:
         made.judged("loads", [], "t" * 1_000)
     made.provenance = {"packages": {str(number): "x" * 1_000 for number in range(10_000)}}
     assert len(page(made, made.findings)) < 2_000_000
+
+
+@pytest.mark.parametrize(
+    ("film", "says", "says_not"),
+    [
+        (Film((png(FRAME),), b"a video", 9, 3.0, "it stopped"), "The film ends early", "No film"),
+        (Film((png(FRAME),), frames=9, lacks="it stopped"), "No film", "ends early"),
+        (Film(lacks="it stopped"), "No picture", "No film"),
+        (Film((png(FRAME),), b"a video", 1, 3.0), "1 frame, 3 a second", "No film"),
+    ],
+)
+def test_a_page_says_no_film_only_where_there_is_none(film: Film, says: str, says_not: str) -> None:
+    """And why, below what there is."""
+    made = Report("./walk:env.py")
+    made.plays["a / 0"] = Play(film=film)
+    text = page(made, [])
+    assert says in text
+    assert says_not not in text
+
+
+def test_a_lone_plot_is_as_large_as_one_of_several() -> None:
+    """Its columns are there whether they are filled or not; so a browser draws it."""
+    [style] = re.findall("<style>(.*)</style>", page(Report("x"), []), re.DOTALL)
+    [plots] = re.findall(r"\.plots \{([^}]*)\}", style)
+    assert "auto-fill" in plots
+    assert "auto-fit" not in plots
+
+
+def test_figures_have_units_for_people() -> None:
+    """Sizes and times, in as few characters as say it."""
+    made = Report("./walk:env.py")
+    made.figures["a / 0"] = {"steps": 200.0, "step_mean_s": 0.0123, "memory_bytes": 3.0 * 2**30}
+    words = "".join(_Read(page(made, [])).words)
+    assert "12.3 ms" in words
+    assert "3 GiB" in words

@@ -196,7 +196,7 @@ def test_nothing_in_a_bundle_is_executed(tmp_path: Path) -> None:
     canary.unlink()
     folder = bundle(tmp_path)
     load = m.Load(1, False, None, {"a": Bomb(canary)})
-    frames = m.pack(load, 0, pickler=pickle.dumps)
+    frames = m.pack(load, pickler=pickle.dumps)
     (folder / "arguments.bin").write_bytes(inside.packet(frames))
     with pytest.raises(BundleError, match="no crash bundle"):
         load_bundle(folder)
@@ -320,7 +320,7 @@ def test_a_bundle_cannot_call_the_proxy_itself(tmp_path: Path) -> None:
     """Only names that the repository's environment has beyond ours."""
     folder = bundle(tmp_path)
     calls: list[m.Message] = [m.CallOwn(0, "close", (), {}), m.GetOwn(0, "__dict__")]
-    packets = b"".join(inside.packet(m.pack(call, 0)) for call in calls)
+    packets = b"".join(inside.packet(m.pack(call)) for call in calls)
     (folder / "requests.bin").write_bytes(packets)
     edit(folder, "history", "requests", value=[{"operation": "callown"}] * 2)
     env = Recorder()
@@ -340,7 +340,7 @@ def test_a_request_that_does_not_fit_is_said(tmp_path: Path) -> None:
 def test_what_was_set_before_and_does_not_fit_is_said(tmp_path: Path) -> None:
     """It is an answer, not a traceback."""
     folder = bundle(tmp_path)
-    setting = inside.packet(m.pack(m.SetAttr(0, "size", (1,)), 0))
+    setting = inside.packet(m.pack(m.SetAttr(0, "size", (1,))))
     (folder / "requests.bin").write_bytes(setting + (folder / "requests.bin").read_bytes())
     edit(folder, "history", "before", value=[{"operation": "set_attr"}])
     env: Any = Recorder()

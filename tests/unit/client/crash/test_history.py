@@ -53,7 +53,7 @@ def test_what_shards_were_sent_is_kept_as_it_was_asked() -> None:
     values[0][:] = 9.0
     recording = kept.recording()
     assert recording.exact
-    found = [m.unpack(one.frames)[1] for one in recording.requests if isinstance(one, Requested)]
+    found = [m.unpack(one.frames) for one in recording.requests if isinstance(one, Requested)]
     assert [one.operation for one in recording.requests if isinstance(one, Requested)] == [
         *("reset", "setattr", "call", "callone"),
     ]
@@ -88,7 +88,7 @@ def test_requests_come_back_in_order() -> None:
     kept.step(np.array([4, 4]))
     first, steps, render, last = kept.recording().requests
     assert isinstance(first, Requested)
-    assert_same(m.unpack(first.frames)[1], m.Reset(0, [1, 2], None, None))
+    assert_same(m.unpack(first.frames), m.Reset(0, [1, 2], None, None))
     assert isinstance(steps, Steps)
     assert_same(steps.actions, np.array([[0, 1], [2, 3]]))
     assert isinstance(render, Requested)
@@ -121,14 +121,14 @@ def test_the_caller_may_change_his_actions() -> None:
     parts["a"][:] = 0
     [request] = nested.recording().requests
     assert isinstance(request, Requested)
-    step: Any = m.unpack(request.frames)[1]
+    step: Any = m.unpack(request.frames)
     assert_same(step.actions, {"a": np.array([1, 2])})
     options = {"level": [1]}
     ask(flat, m.Reset(0, None, options, np.array([True, False])))
     options["level"].append(2)
     last = flat.recording().requests[-1]
     assert isinstance(last, Requested)
-    kept: Any = m.unpack(last.frames)[1]
+    kept: Any = m.unpack(last.frames)
     assert kept.options == {"level": [1]}
 
 
@@ -167,7 +167,7 @@ def test_attributes_and_calls_outlast_a_reset() -> None:
     ask(kept, m.Call(0, "task", (), {}))
     ask(kept, m.SetAttr(0, "a", (2, 2)))
     reset(kept, [1, 2])
-    before: list[Any] = [m.unpack(one.frames)[1] for one in kept.recording().before]
+    before: list[Any] = [m.unpack(one.frames) for one in kept.recording().before]
     assert [(type(one).__name__, one.name) for one in before] == [
         ("Call", "add"),
         ("Call", "add"),
@@ -217,7 +217,7 @@ def test_what_only_pickle_could_carry_is_described() -> None:
     [request] = kept.recording().requests
     assert isinstance(request, Requested)
     assert not kept.recording().exact
-    assert "remote object" in repr(m.unpack(request.frames)[1])
+    assert "remote object" in repr(m.unpack(request.frames))
 
 
 def test_nothing_is_kept_where_nothing_is_wanted() -> None:

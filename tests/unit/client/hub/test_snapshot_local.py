@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import sys
 from pathlib import Path
 
 import pytest
@@ -118,17 +119,27 @@ def test_missing_entry_lists_the_python_files(folder: Path, path: str) -> None:
         local(folder, path)
 
 
-def test_what_git_and_the_hub_would_leave_out_is_left_out(folder: Path) -> None:
-    """History, caches, virtual environments, sockets and pipes stay at home."""
-    for name in (".git/config", "__pycache__/env.pyc", ".venv/x", "sub/.pytest_cache/x", "a.pyc"):
+def test_every_file_counts_but_those_of_git(folder: Path) -> None:
+    """Without git nothing says which files are caches. Sockets and pipes are no files."""
+    hidden = {"__pycache__/env.pyc", ".venv/x", "lib/pyvenv.cfg", "sub/.pytest_cache/x", "a.pyc"}
+    (folder / ".gitignore").write_text("*")
+    for name in (*hidden, "sub/.git/config"):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text("")
-    (folder / "myvenv").mkdir()
-    (folder / "myvenv" / "pyvenv.cfg").write_text("")
+    (folder / ".git").write_text("gitdir: sub")
     os.mkfifo(folder / "pipe")
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(os.path.relpath(folder / "socket"))
-        assert names(local(folder)) == ["env.py", "sub/other.py"]
+        assert set(names(local(folder))) == hidden | {".gitignore", "env.py", "sub/other.py"}
+
+
+def test_a_virtual_environment_is_named(folder: Path) -> None:
+    """It cannot be copied, and the error says what to do."""
+    (folder / ".venv/bin").mkdir(parents=True)
+    (folder / ".venv/pyvenv.cfg").write_text("")
+    (folder / ".venv/bin/python").symlink_to(sys.executable)
+    with pytest.raises(SnapshotError, match=r"Move .*/my-env/\.venv elsewhere.*'\.venv/' in .gi"):
+        local(folder)
 
 
 def test_link_inside_becomes_a_real_file(folder: Path) -> None:
@@ -141,10 +152,12 @@ def test_link_inside_becomes_a_real_file(folder: Path) -> None:
     assert (snapshot.root / "link.py").read_text() == "2"
 
 
-@pytest.mark.parametrize("target", ["/etc/passwd", "../secret", "/etc", ".."])
+@pytest.mark.parametrize("target", ["/etc/passwd", "../secret", "/etc", "..", ".git/config"])
 def test_link_that_leaves_the_folder_is_refused(folder: Path, target: str) -> None:
-    """Nothing outside the folder is copied in through a link."""
+    """Nothing outside the folder is copied in through a link, nor what may hold a login."""
     (folder.parent / "secret").write_text("s")
+    (folder / ".git").mkdir()
+    (folder / ".git/config").write_text("s")
     (folder / "link").symlink_to(target)
     with pytest.raises(SnapshotError, match="'link' leaves the folder"):
         local(folder)
@@ -180,9 +193,9 @@ def test_folder_reached_through_a_link_works(folder: Path) -> None:
 
 @pytest.mark.parametrize("name", ["max_files", "max_bytes", "max_file_bytes"])
 def test_folder_over_a_limit_is_refused(folder: Path, name: str) -> None:
-    """A home folder that was given by mistake is not copied."""
+    """A home folder that was given by mistake is not copied; the error says what counts."""
     (folder / "env.py").write_text("22")
-    with pytest.raises(SnapshotTooLargeError, match=name):
+    with pytest.raises(SnapshotTooLargeError, match=rf"{name}(.|\n)*every file in it counts"):
         local(folder, limits=SnapshotLimits(**{name: 1}))
 
 

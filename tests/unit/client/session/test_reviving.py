@@ -33,7 +33,7 @@ class Told:
     def __init__(self, reply: m.Message, *parts: m.Message) -> None:
         self.reply = reply
         self.version = m.VERSION
-        self.payload: list[Buffer] = [frame for part in parts for frame in m.pack(part, 0)]
+        self.payload: list[Buffer] = [frame for part in parts for frame in m.pack(part)]
 
     def send(self, message: m.Message, payload: Any = ()) -> int:
         """Whatever it is."""
@@ -159,7 +159,7 @@ def test_a_shape_that_is_only_told_is_not_taken_for_rewards(shape: tuple[int, ..
     no = np.zeros(2, np.bool_)
     told = m.StepDone(np.zeros((2, 1)), OpaqueSpace("a.Space", "Space()", shape), no, no, {})
     frames = m.pack(told, describer=described)
-    said = m.unpack(frames, things=Described)[1]
+    said = m.unpack(frames, things=Described)
     assert isinstance(said, m.StepDone)
     assert getattr(said.rewards, "shape", None) == shape
     assert truncated(said, 2).rewards.shape == (2,)  # type: ignore[attr-defined]

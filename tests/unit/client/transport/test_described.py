@@ -38,8 +38,8 @@ BITS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
 
 def arrived(value: object) -> Any:
     """What a client makes of a worker's answer."""
-    frames = m.pack(m.Value(value), 1, describer=described)
-    message = m.unpack(frames, things=Described)[1]
+    frames = m.pack(m.Value(value), describer=described)
+    message = m.unpack(frames, things=Described)
     assert isinstance(message, m.Value)
     return message.value
 
@@ -103,9 +103,9 @@ def test_a_message_has_one_budget() -> None:
     limits = WireLimits(message_bytes=48 << 10)
     space = spaces.Box(0, 1, (3000,))
     for values, fits in (((space,), True), ((space, spaces.Box(0, 2, (3000,)), space), False)):
-        frames = m.pack(m.Value(values), 1, describer=described)
+        frames = m.pack(m.Value(values), describer=described)
         if fits:
-            assert m.unpack(frames, limits=limits, things=Described)[1] == m.Value(values)
+            assert m.unpack(frames, limits=limits, things=Described) == m.Value(values)
             continue
         with pytest.raises(RemoteProtocolError, match="cost more"):
             m.unpack(frames, limits=limits, things=Described)
@@ -114,7 +114,7 @@ def test_a_message_has_one_budget() -> None:
 def test_nobody_else_makes_anything_of_descriptions() -> None:
     """Whoever was not given what makes them refuses them: a server, a runner, an older client."""
     with pytest.raises(RemoteProtocolError, match="not made here"):
-        m.unpack(m.pack(m.Value(spaces.Discrete(2)), 1, describer=described))
-    plain = m.unpack(m.pack(m.Value(spaces.Discrete(2)), 1), things=Described)[1]
+        m.unpack(m.pack(m.Value(spaces.Discrete(2)), describer=described))
+    plain = m.unpack(m.pack(m.Value(spaces.Discrete(2))), things=Described)
     assert isinstance(plain, m.Value)
     assert isinstance(plain.value, RemoteObject)

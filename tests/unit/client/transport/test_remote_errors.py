@@ -202,7 +202,7 @@ def test_a_runner_cannot_speak_in_the_servers_name(message: m.Message) -> None:
 
 def test_the_kinds_of_both_conversations_are_apart() -> None:
     """What runners may send begins at one number."""
-    runners = {cls.__name__ for kind, cls in m.KINDS.items() if m.is_of_runner(kind)}
+    runners = {cls.__name__ for kind, cls in m.KINDS.items() if kind >= m.FIRST_RUNNER_KIND}
     assert {"Loaded", "Built", "ResetDone", "StepDone", "Value", "Method", "Raised"} <= runners
     assert not runners & {type(message).__name__ for message in SERVERS}
 

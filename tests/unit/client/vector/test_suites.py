@@ -64,3 +64,12 @@ def test_keeping_nothing_is_refused() -> None:
 def test_code_of_this_process_has_no_reference() -> None:
     """Nothing could make it again elsewhere."""
     assert suites([]).reference is None
+
+
+def test_a_suite_that_there_is_not_names_those_there_are() -> None:
+    """As a ``KeyError``, and only where one asks for it by its name."""
+    found = suites([])
+    with pytest.raises(KeyError, match="no suite 'c'; there are: 'a', 'b'"):
+        found["c"]
+    assert found.get("c") is None
+    assert "c" not in found

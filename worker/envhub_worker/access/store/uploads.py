@@ -29,6 +29,7 @@ from envhub_worker.access.store.blob_store import (
 )
 from envhub_worker.lockdown.mechanisms.scratch import remove_tree
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.text import size_text
 
 MAX_PIECE_BYTES = 8 << 20
 """One ``PutBlob``: the server writes and hashes it while everybody else waits."""
@@ -243,9 +244,10 @@ class Uploads:
         if not self._fits(store):
             raise RefusedError(
                 "WorkerError",
-                f"your key's snapshots would take more than the server's quota of "
-                f"{self._quotas.upload_bytes} bytes (--max-upload), or be more than {MAX_TREES}; "
-                "open environments use the others, or other processes of yours bring them",
+                "your key's snapshots would take more than the server's quota of "
+                f"{size_text(self._quotas.upload_bytes)} (--max-upload), or be more than "
+                f"{MAX_TREES}; open environments use the others, or other processes of yours bring "
+                "them",
             )
 
     def _fits(self, store: Store) -> bool:
@@ -272,7 +274,8 @@ def checked_listing(files: tuple[object, ...], quotas: Quotas) -> list[Listed]:
     if total > quotas.upload_bytes:
         raise RefusedError(
             "WorkerError",
-            f"a snapshot of {total} bytes is over the server's quota of {quotas.upload_bytes} "
+            f"a snapshot of {size_text(total)} is over the server's quota of "
+            f"{size_text(quotas.upload_bytes)} "
             "(--max-upload)",
         )
     steps = sum(file.path.count("/") + 1 for file in listed)

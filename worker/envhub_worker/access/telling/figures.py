@@ -137,7 +137,6 @@ class Client:
     inflight_bytes: int = 0
     opened: int = 0
     requests: dict[str, int] = field(default_factory=dict)
-    protocols: dict[str, int] = field(default_factory=dict)
 
     def add_jail(self, entry: JailEntry) -> None:
         """Count an open jail."""
@@ -148,8 +147,6 @@ class Client:
     def add_session(self, session: Session) -> None:
         """Count a session."""
         self.sessions += 1
-        version = str(session.version)
-        self.protocols[version] = self.protocols.get(version, 0) + 1
 
 
 class Clients:

@@ -1,10 +1,9 @@
 """Measuring a jail's memory and scratch where no cgroup and no quota count them.
 
-A resource limit counts one process, and misses files in memory (memfd), System V segments,
-shared anonymous memory and what waits in sockets and pipes. So init looks at all processes of the
-jail, the sooner the nearer they are to the limit, and ends them over it. What it cannot see the
-filter denies (``seccomp_policy.table``, "measured") or the kernel bounds; ``plan`` names what
-remains.
+A resource limit counts one process, and misses files in memory (memfd), shared anonymous memory
+and what waits in sockets and pipes. So init looks at all processes of the jail, the sooner the
+nearer they are to the limit, and ends them over it. What it cannot see the filter denies
+(``seccomp.policy.table``, "measured") or the kernel bounds; ``plan`` names what remains.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ class Usage:
         files: memfds that some process has open, by (device, inode).
         sockets: Names of open sockets.
         pipes: Names of open pipes.
-        other: System V segments, and files in the jail's tmpfs.
+        other: Files in the jail's tmpfs.
     """
 
     private: int = 0
@@ -117,7 +116,7 @@ class MemoryWatch:
         return exact + min(usage.shared, shared_of_the_machine()) + usage.certain, hidden
 
     def _bound(self, pids: Collection[int]) -> tuple[Usage, list[int]]:
-        usage, hidden = Usage(other=self._tmpfs_bytes() + _system_v_bytes()), []
+        usage, hidden = Usage(other=self._tmpfs_bytes()), []
         for pid in pids:
             try:
                 _add_process(usage, pid)
@@ -232,16 +231,6 @@ def _content(path: str) -> bytes:
             return file.read()
     except (FileNotFoundError, ProcessLookupError):
         return b""
-
-
-def _system_v_bytes() -> int:
-    lines = _content("/proc/sysvipc/shm").splitlines()
-    if not lines:
-        return 0
-    columns = lines[0].split()
-    rss, swap = columns.index(b"rss"), columns.index(b"swap")
-    rows = [line.split() for line in lines[1:]]
-    return sum(int(row[rss]) + int(row[swap]) for row in rows)
 
 
 def _proportional(pid: int) -> int:

@@ -33,9 +33,7 @@ _SIOCGIFFLAGS = 0x8913
 _SIOCSIFFLAGS = 0x8914
 _IFF_UP = 1
 
-_WEAKER = (
-    'Or choose the weaker profile by name: Policy(profile="no-userns"), or --profile no-userns.'
-)
+_WEAKER = 'Or choose a weaker one by its name: profile "no-userns".'
 
 
 def enter_user_namespace(uid: int, gid: int) -> None:
@@ -158,7 +156,7 @@ def _diagnosis(error: OSError, read: Callable[[str], str | None]) -> tuple[str, 
             f"the container's seccomp profile forbids it ({answer})",
             "Lock the container itself down (--network none --read-only --cap-drop ALL "
             "--security-opt no-new-privileges --pids-limit 512 --memory 8g) and choose "
-            'Policy(profile="container").',
+            'profile "container".',
         )
     return f"the kernel answers {answer}", "Ask the administrator of this host to allow it."
 

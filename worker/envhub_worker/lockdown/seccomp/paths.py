@@ -11,7 +11,6 @@ import contextlib
 import os
 import re
 import struct
-import sys
 from collections.abc import Callable, Collection, Sequence
 from typing import BinaryIO
 
@@ -35,8 +34,8 @@ _PLAIN: _Where = ((None, 0),)
 _TWO_AT: _Where = ((0, 1), (2, 3))
 _TWO: _Where = ((None, 0), (None, 1))
 _CALLS: tuple[tuple[str, _Where], ...] = (
-    ("openat openat2 mkdirat unlinkat fchmodat fchmodat2 fchownat utimensat futimesat", _AT),
-    ("open creat mkdir rmdir unlink truncate chmod chown lchown utime utimes", _PLAIN),
+    ("openat mkdirat unlinkat fchmodat fchmodat2 fchownat utimensat", _AT),
+    ("open creat mkdir rmdir unlink truncate chmod chown lchown", _PLAIN),
     ("setxattr lsetxattr removexattr lremovexattr", _PLAIN),
     ("renameat renameat2 linkat", _TWO_AT),
     ("rename link", _TWO),
@@ -64,7 +63,7 @@ _DEEPEST = 16
 """Links are looked at so far below a folder of the jail's own."""
 _NO_FOLLOW = 0x100
 _FLAGS_OF_AT = {"fchmodat2": 3, "utimensat": 3, "fchownat": 4}
-_FOLLOWING = "creat truncate chmod fchmodat chown utime utimes futimesat setxattr removexattr"
+_FOLLOWING = "creat truncate chmod fchmodat chown setxattr removexattr"
 _HARMLESS = ("/var/run/nscd/socket", "/run/nscd/socket")
 """The C library asks there who a user is."""
 
@@ -108,17 +107,15 @@ def asked(
                 path = _addressed(memory, place, size, thread, own)
                 known = not path or path in _HARMLESS or _is_within(path, own.changed)
                 return [] if known else [(call, _shown(path))]
-            deed, last = _deed(call, memory, words)
+            deed, last = _deed(call, words)
             paths = [_named(memory, thread, words, own, last, *where) for where in NAMED[call]]
         return [(deed, _shown(path)) for path in paths if path and not _may(deed, path, own)]
     return []
 
 
-def _deed(call: str, memory: BinaryIO, words: Sequence[int]) -> tuple[str, bool]:
+def _deed(call: str, words: Sequence[int]) -> tuple[str, bool]:
     """What it does, and whether it follows a link that stands at the end of a path."""
-    if call == "openat2":
-        flags = int.from_bytes(os.pread(memory.fileno(), 8, words[2]), sys.byteorder)
-    elif call in _FLAGS:
+    if call in _FLAGS:
         flags = words[_FLAGS[call]]
     elif call in _FLAGS_OF_AT:
         return call, not words[_FLAGS_OF_AT[call]] & _NO_FOLLOW

@@ -1,7 +1,9 @@
 """Which system calls a jail may make: a table per profile. Pure.
 
 An allow-list: a call that the kernel headers of ``syscalls`` name and that is not here answers
-EPERM; one that they do not name answers ENOSYS, so that programs fall back.
+EPERM; one that they do not name answers ENOSYS, so that programs fall back. What is here some
+library asks for: ``python -m tests.field`` runs the packages of the field, and says which calls
+they make.
 """
 
 from __future__ import annotations
@@ -46,35 +48,32 @@ class ByArguments:
 Verdict = int | ByArguments
 
 _MEMORY = """
-    brk munmap mremap mprotect madvise mincore msync mlock mlock2 munlock mlockall munlockall
-    membarrier pkey_alloc pkey_free pkey_mprotect memfd_create mseal get_mempolicy
+    brk munmap mremap mprotect madvise mincore msync mlock munlock membarrier memfd_create
+    get_mempolicy
 """
 _FILES = """
     read write pread64 pwrite64 readv writev preadv pwritev preadv2 pwritev2 open openat creat
     close close_range lseek stat lstat fstat newfstatat statx access faccessat faccessat2 getdents
     getdents64 getcwd chdir fchdir mkdir mkdirat rmdir unlink unlinkat rename renameat renameat2
     link linkat symlink symlinkat readlink readlinkat truncate ftruncate fallocate fadvise64
-    readahead copy_file_range sendfile splice tee dup dup2 dup3 flock fsync fdatasync
-    sync_file_range statfs fstatfs umask getxattr lgetxattr fgetxattr listxattr llistxattr
-    flistxattr pipe pipe2 eventfd eventfd2 signalfd signalfd4 timerfd_create timerfd_settime
-    timerfd_gettime epoll_create epoll_create1 epoll_ctl epoll_wait epoll_pwait epoll_pwait2 poll
-    ppoll select pselect6
+    copy_file_range sendfile dup dup2 dup3 flock fsync fdatasync statfs fstatfs umask getxattr
+    lgetxattr fgetxattr listxattr llistxattr flistxattr pipe pipe2 eventfd2 timerfd_create
+    timerfd_settime timerfd_gettime epoll_create epoll_create1 epoll_ctl epoll_wait epoll_pwait
+    poll ppoll select pselect6
 """
 _PROCESSES = """
-    fork vfork execve execveat exit exit_group wait4 waitid getpid getppid gettid getpgid getpgrp
-    getsid setsid setpgid getuid geteuid getgid getegid getresuid getresgid getgroups setuid
-    setgid setreuid setregid setresuid setresgid setfsuid setfsgid setgroups capget capset
-    arch_prctl set_tid_address set_robust_list get_robust_list rseq restart_syscall futex
-    futex_waitv futex_wake futex_wait futex_requeue sched_yield sched_getaffinity sched_getparam
-    sched_getscheduler sched_getattr sched_get_priority_max sched_get_priority_min
-    sched_rr_get_interval getcpu getpriority ioprio_get getrlimit setrlimit getrusage times
-    sysinfo uname alarm pause nanosleep clock_nanosleep clock_gettime clock_getres gettimeofday
-    time getitimer setitimer timer_create timer_settime timer_gettime timer_getoverrun
-    timer_delete pidfd_open getrandom set_thread_area get_thread_area
+    fork vfork execve exit exit_group wait4 waitid getpid getppid gettid getpgid getpgrp getsid
+    setsid setpgid getuid geteuid getgid getegid getresuid getresgid getgroups capget
+    set_tid_address set_robust_list rseq restart_syscall futex sched_yield sched_getaffinity
+    sched_getparam sched_getscheduler sched_getattr sched_get_priority_max
+    sched_get_priority_min sched_rr_get_interval getcpu getpriority ioprio_get getrlimit
+    setrlimit getrusage times sysinfo uname alarm pause nanosleep clock_nanosleep clock_gettime
+    clock_getres gettimeofday time getitimer setitimer timer_create timer_settime timer_gettime
+    timer_getoverrun timer_delete pidfd_open getrandom
 """
 _SIGNALS = """
     kill tkill tgkill rt_sigaction rt_sigprocmask rt_sigreturn rt_sigpending rt_sigsuspend
-    rt_sigtimedwait rt_sigqueueinfo rt_tgsigqueueinfo sigaltstack pidfd_send_signal
+    rt_sigtimedwait sigaltstack pidfd_send_signal
 """
 _CONNECTED_SOCKETS = """
     getsockname getpeername sendmsg sendmmsg recvfrom recvmsg recvmmsg getsockopt shutdown
@@ -82,19 +81,32 @@ _CONNECTED_SOCKETS = """
 _OTHER_SOCKETS = "bind listen accept accept4 connect"
 # These reach beyond what Landlock guards, so they need a mount and an IPC namespace.
 _NAMESPACED = """
-    chmod fchmod fchmodat fchmodat2 chown fchown lchown fchownat utime utimes utimensat futimesat
-    setxattr lsetxattr fsetxattr removexattr lremovexattr fremovexattr openat2 shmget shmat shmctl
-    shmdt sched_setaffinity
+    chmod fchmod fchmodat fchmodat2 chown fchown lchown fchownat utimensat setxattr lsetxattr
+    fsetxattr removexattr lremovexattr fremovexattr sched_setaffinity
 """
-_MODES_AND_TIMES = """
-    chmod fchmod fchmodat fchmodat2 chown fchown lchown fchownat utime utimes utimensat futimesat
+_MODES_AND_TIMES = "chmod fchmod fchmodat fchmodat2 chown fchown lchown fchownat utimensat"
+# These succeed and do nothing: a jail has one user, libzmq aborts if it cannot set the scheduler,
+# and syncing stalls the host's disks. The last three are what there was before utimensat.
+_WITHOUT_EFFECT = """
+    setuid setgid setreuid setregid setresuid setresgid sched_setscheduler sched_setparam
+    sched_setattr sync syncfs sync_file_range readahead utime utimes futimesat
+"""
+# Programs fall back from these, for other kernels do not have them. The first three lines are
+# memory of the kernel's own, counted per user if at all (watches of files also tell what others
+# open). Memory policies, mbind, are not in the table either.
+_ABSENT = """
+    inotify_init inotify_init1 inotify_add_watch inotify_rm_watch
+    semget semop semtimedop semctl msgget msgsnd msgrcv msgctl shmget shmat shmctl shmdt
+    mq_open mq_unlink mq_timedsend mq_timedreceive mq_notify mq_getsetattr
+    openat2 execveat splice tee signalfd signalfd4 eventfd epoll_pwait2 mlock2 mseal
+    pkey_alloc pkey_free pkey_mprotect futex_waitv futex_wake futex_wait futex_requeue
 """
 
 #: Below it shared memory without a name may be made where init measures memory.
 SHARED_BYTES = 1 << 20
 
 _NAMESPACES = 0x7E020000  # every CLONE_NEW* that clone takes
-_S_IFMT, _S_IFIFO, _S_IFREG = 0o170000, 0o010000, 0o100000
+_S_IFMT, _S_IFIFO = 0o170000, 0o010000
 _AF_UNIX, _AF_INET, _AF_INET6 = 1, 2, 10
 _SOCK_STREAM, _SOCK_DGRAM, _SOCK_SEQPACKET, _SOCK_TYPE = 1, 2, 5, 0xF
 _EAFNOSUPPORT = _ERRNO | errno.EAFNOSUPPORT
@@ -112,8 +124,14 @@ _HUGE = (((Check(3, _MAP_HUGETLB, _MAP_HUGETLB),), _ENOMEM),)
 _SOL_SOCKET = 1
 _SO_SNDBUF, _SO_RCVBUF, _SO_SNDBUFFORCE, _SO_RCVBUFFORCE = 7, 8, 32, 33
 _SO_ATTACH_FILTER, _SO_ATTACH_BPF, _SO_ATTACH_CBPF, _SO_ATTACH_EBPF = 26, 50, 51, 52
-_PR_SET_DUMPABLE = 4
-_PERSONALITY_QUERY = 0xFFFFFFFF
+# PR_SET_PDEATHSIG, _NAME, _TIMERSLACK, _CHILD_SUBREAPER and _NO_NEW_PRIVS, and what only reads.
+_PRCTLS = (1, 2, 3, 15, 16, 21, 23, 27, 29, 30, 36, 37, 38, 39, 42, 51, 52, 56, 64)
+# PR_SET_DUMPABLE (init must be able to measure), _SECCOMP (filters are memory in no account), _MM,
+# _SYSCALL_USER_DISPATCH, and capabilities. An option of neither list answers EINVAL, as an unknown
+# one does.
+_PR_DENIED = (4, 8, 22, 24, 28, 35, 47, 59)
+# Segment bases, with which threads are made, and the registers for matrices: torch asks for them.
+_ARCH_PRCTLS = (0x1001, 0x1002, 0x1003, 0x1004, 0x1021, 0x1022, 0x1023)
 
 
 def table(
@@ -137,14 +155,15 @@ def table(
     verdicts: dict[str, Verdict] = {}
     for group in (_MEMORY, _FILES, _PROCESSES, _SIGNALS, _CONNECTED_SOCKETS):
         verdicts |= dict.fromkeys(group.split(), ALLOW)
-    verdicts |= _filtered() | _pretended() | _of_the_user()
+    verdicts |= dict.fromkeys(_WITHOUT_EFFECT.split(), PRETEND)
+    verdicts |= dict.fromkeys(_ABSENT.split(), ENOSYS)
+    verdicts |= _filtered()
     if measured:
         verdicts |= _unmeasurable()
     verdicts |= _sockets(namespaced and (scoped or network != "host"), network)
     verdicts |= dict.fromkeys(_NAMESPACED.split(), ALLOW) if namespaced else _without_namespaces()
     if brokered:
         verdicts |= dict.fromkeys(("kill", "tkill", "tgkill"), ASK)
-        verdicts |= dict.fromkeys(("rt_sigqueueinfo", "rt_tgsigqueueinfo"), EPERM)
         verdicts["pidfd_send_signal"] = ENOSYS
     return verdicts
 
@@ -197,15 +216,14 @@ def _filtered() -> dict[str, Verdict]:
         "clone": ByArguments((((Check(0, 0, _NAMESPACES),), ALLOW),), EPERM),
         # Its flags lie in memory, where a filter cannot look; the C library falls back.
         "clone3": ENOSYS,
-        "prctl": ByArguments((((Check(0, _PR_SET_DUMPABLE),), EPERM),), ALLOW),
+        "prctl": _by_option(0, _PRCTLS, _PR_DENIED),
+        "arch_prctl": _by_option(0, _ARCH_PRCTLS),
         "prlimit64": ByArguments((((Check(0, 0),), ALLOW),), EPERM),
         "setpriority": ByArguments((own,), EPERM),
         "ioprio_set": EPERM,
-        "personality": ByArguments(
-            (((Check(0, 0),), ALLOW), ((Check(0, _PERSONALITY_QUERY),), ALLOW)), EPERM
-        ),
-        "mknod": _mknod(1),
-        "mknodat": _mknod(2),
+        # A fifo; in this way libraries make no other file.
+        "mknod": ByArguments((((Check(1, _S_IFIFO, _S_IFMT),), ALLOW),), EPERM),
+        "mknodat": ByArguments((((Check(2, _S_IFIFO, _S_IFMT),), ALLOW),), EPERM),
         "ioctl": ByArguments(_ioctls(), ALLOW),
         "fcntl": _fcntls(),
         "setsockopt": _socket_options(),
@@ -223,8 +241,13 @@ def _fcntls() -> ByArguments:
     owners = (_F_SETOWN, _F_SETSIG, _F_SETOWN_EX)
     others = (_F_SETPIPE_SZ, _F_SET_RW_HINT, _F_SET_FILE_RW_HINT)
     denied = (*owners, _F_SETLEASE, _F_NOTIFY, _F_SETDELEG, *others)
-    rules = tuple(((Check(1, one),), ALLOW) for one in _FCNTLS)
-    return ByArguments((*rules, *(((Check(1, one),), EPERM) for one in denied)), EINVAL)
+    return _by_option(1, _FCNTLS, denied)
+
+
+def _by_option(arg: int, allowed: Iterable[int], denied: Iterable[int] = ()) -> ByArguments:
+    """A call whose argument ``arg`` says what it does; an option of neither list is invalid."""
+    rules = [((Check(arg, one),), ALLOW) for one in allowed]
+    return ByArguments((*rules, *(((Check(arg, one),), EPERM) for one in denied)), EINVAL)
 
 
 def _socket_options() -> ByArguments:
@@ -236,18 +259,6 @@ def _socket_options() -> ByArguments:
     sizes = rules(PRETEND, _SO_SNDBUF, _SO_RCVBUF, _SO_SNDBUFFORCE, _SO_RCVBUFFORCE)
     filters = (_SO_ATTACH_FILTER, _SO_ATTACH_BPF, _SO_ATTACH_CBPF, _SO_ATTACH_EBPF)
     return ByArguments(sizes + rules(EPERM, *filters), ALLOW)
-
-
-def _of_the_user() -> dict[str, Verdict]:
-    """What lies in the kernel's memory, counted per user if at all: programs fall back.
-
-    Watches of files also tell what others open. (Memory policies of shared files, ``mbind``, are
-    not in the table either.)
-    """
-    names = "inotify_init inotify_init1 inotify_add_watch inotify_rm_watch"
-    names += " semget semop semtimedop semctl msgget msgsnd msgrcv msgctl"
-    names += " mq_open mq_unlink mq_timedsend mq_timedreceive mq_notify mq_getsetattr"
-    return dict.fromkeys(names.split(), ENOSYS)
 
 
 def _unmeasurable() -> dict[str, Verdict]:
@@ -262,14 +273,6 @@ def _unmeasurable() -> dict[str, Verdict]:
     return {"memfd_create": ENOSYS, "mmap": ByArguments(rules, ALLOW)}
 
 
-def _mknod(mode: int) -> ByArguments:
-    kinds = (_S_IFIFO, _S_IFREG, 0)
-    return ByArguments(
-        tuple(((Check(mode, kind, _S_IFMT),), ALLOW) for kind in kinds),
-        EPERM,
-    )
-
-
 def _ioctls() -> tuple[tuple[tuple[Check, ...], int], ...]:
     # File systems' own calls, which Landlock does not see: 'f', 'v' and 'X' change flags,
     # versions, encryption and verity of a file that is open for reading, 0x94 (btrfs) and 0xf5
@@ -278,12 +281,6 @@ def _ioctls() -> tuple[tuple[tuple[Check, ...], int], ...]:
     families = tuple(((Check(1, kind << 8, 0xFF00),), _ENOTTY) for kind in kinds)
     denied = (_TIOCSTI, _TIOCLINUX, _TIOCCONS, _TIOCSETD, _FIOSETOWN, _SIOCSPGRP)
     return families + tuple(((Check(1, request),), EPERM) for request in denied)
-
-
-def _pretended() -> dict[str, Verdict]:
-    # libzmq aborts on a failing sched_setscheduler; sync would stall the host's disks.
-    names = "sched_setscheduler sched_setparam sched_setattr sync syncfs"
-    return dict.fromkeys(names.split(), PRETEND)
 
 
 def _sockets(local: bool, network: str) -> dict[str, Verdict]:
@@ -329,6 +326,5 @@ def _without_namespaces() -> dict[str, Verdict]:
     return {
         **dict.fromkeys(_MODES_AND_TIMES.split(), PRETEND),
         "utimensat": _utimensat(),
-        "openat2": ENOSYS,
         "sched_setaffinity": ByArguments((((Check(0, 0),), ALLOW),), PRETEND),
     }

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Iterable
 
 import envhub_worker
-from envhub_worker.lockdown import root_plan
+from envhub_worker.lockdown import gpus, root_plan
 from envhub_worker.lockdown.context import Common, ZygoteConfig
 from envhub_worker.lockdown.mechanisms import landlock, mounts, namespaces, process, user
 from envhub_worker.lockdown.mechanisms.kernel import CLONE_NEWNS, unshare
@@ -36,8 +36,6 @@ def enter(config: ZygoteConfig) -> Common:
     """
     if config.refusal is not None:
         raise LayerUnavailableError(**config.refusal)
-    if config.gpu:
-        _check_gpu()
     namespaced = config.profile == "strict"
     plan = _plan_root(config)
     if namespaced:
@@ -87,27 +85,17 @@ def _watched(config: ZygoteConfig, *, brokered: bool) -> frozenset[str]:
     return watched(table(namespaced=namespaced, network=config.network, brokered=brokered))
 
 
-def _check_gpu() -> None:
-    """What is granted and is not there would be missed later, and only by some."""
-    if not root_plan.gpu_devices(root_plan.real_host()):
-        raise LayerUnavailableError(
-            "gpu",
-            "the policy grants the GPU, and there is none here: no /dev/dri/renderD*, /dev/nvidia* "
-            "or /dev/kfd",
-            "Install its driver, or in a container hand it in (docker run --gpus all); or leave "
-            "gpu=True out.",
-        )
-
-
 def _plan_root(config: ZygoteConfig) -> root_plan.RootPlan:
+    host = root_plan.real_host()
+    gpu = gpus.granted(config.gpu, host)
     return root_plan.plan_root(
         interpreter_paths(),
-        (*config.readable, *([config.packages] if config.packages else [])),
+        (*config.readable, *gpu.folders, *([config.packages] if config.packages else [])),
         config.roots,
         private=[*_homes(), config.place],
-        gpu=config.gpu,
+        devices=gpu.devices,
         network=config.network,
-        host=root_plan.real_host(),
+        host=host,
     )
 
 

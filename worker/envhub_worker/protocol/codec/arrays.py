@@ -132,7 +132,7 @@ class ArrayReader:
             array = np.ndarray(shape, dtype, self._frame(nbytes)).copy()
         else:
             array = _read_only(np.ndarray(shape, dtype, self._frame(nbytes)))
-        if dtype.kind in "bU":
+        if dtype.kind in "bUM":
             check_content(array)
         return array
 
@@ -254,7 +254,7 @@ def read_scalar(data: bytes) -> np.generic:
     if len(data) != offset + dtype.itemsize:
         raise RemoteProtocolError("A numpy scalar has a wrong number of bytes.")
     flat = np.frombuffer(data, dtype, 1, offset)
-    if dtype.kind in "bU":
+    if dtype.kind in "bUM":
         check_content(flat)
     scalar: np.generic = flat[0]
     return scalar
@@ -346,12 +346,16 @@ def check_content(array: Array) -> None:
     """Refuses bytes that are not values of their dtype.
 
     numpy counts a mask's True values by adding its bytes and writes that many elements, so
-    that a boolean of 2 reaches outside of an array; a character beyond Unicode makes str fail.
+    that a boolean of 2 reaches outside of an array; a character beyond Unicode makes str fail,
+    and so does a time without a unit.
     """
     if array.dtype.kind == "U":
         points = array.reshape(-1).view(np.uint32)
         if points.max() > 0x10FFFF or ((points >= 0xD800) & (points <= 0xDFFF)).any():
             raise RemoteProtocolError("A string array holds something that is no character.")
+    elif array.dtype.kind == "M":
+        if np.datetime_data(array.dtype)[0] == "generic" and not np.isnat(array).all():
+            raise RemoteProtocolError("A time has no unit.")
     elif array.size <= 1024:
         if array.tobytes().strip(b"\0\1"):
             raise RemoteProtocolError("A boolean is neither 0 nor 1.")

@@ -21,6 +21,7 @@ from envhub_worker.protocol.codec.inert import (
     MAX_REPR_CHARS,
     RemoteEnum,
     RemoteObject,
+    describe,
     one_line,
 )
 from envhub_worker.protocol.codec.kinds import (
@@ -58,6 +59,9 @@ ThingReader = Callable[[WireLimits], Callable[[int, object], object]]
 # Maps and sets up to this size are too small for colliding keys to cost anything.
 _FEW_KEYS = 64
 _MAX_SAME_HASH = 16
+_DESCRIBED = frozenset({RemoteObject, RemoteEnum})
+_LOSSY = _DESCRIBED | {tuple, frozenset, slice, np.ndarray}
+"""Classes that keys of different objects arrive as, or that Python cannot hash."""
 
 
 class _Head:
@@ -137,7 +141,13 @@ class Decoder:
     def _map(self, pairs: list[tuple[Any, Any]]) -> object:
         if len(pairs) > _FEW_KEYS:
             self.check_keys([key for key, _ in pairs])
-        result = dict(pairs)
+        try:
+            result = dict(pairs)
+        except TypeError:
+            result = {}
+        if len(result) != len(pairs):
+            keys = _distinct([key for key, _ in pairs])
+            result = dict(zip(keys, [value for _, value in pairs], strict=True))
         if len(result) != len(pairs):
             raise RemoteProtocolError("A map has a key twice.")
         return result
@@ -158,9 +168,37 @@ class Decoder:
             raise MessageTooLargeError(
                 f"More than {self.limits.hashed_keys} keys that are no text (hashed_keys)."
             )
-        same = Counter(map(hash, hashed)).most_common(1)
+        # a description's hash is that of its texts, and equal ones cost nothing
+        chosen = [hash(key) for key in hashed if key.__class__ not in _DESCRIBED]
+        same = Counter(chosen).most_common(1)
         if same and same[0][1] > _MAX_SAME_HASH:
             raise RemoteProtocolError("Keys were chosen so that their hashes collide.")
+
+
+def _distinct(keys: list[Any]) -> list[Any]:
+    """The same keys, but those that cannot be told apart or hashed here are described.
+
+    In the worker they were different objects: two with the same ``repr``, or a tensor.
+    """
+    seen: Counter[object] = Counter()
+    made = []
+    for key in keys:
+        if key.__class__ in _LOSSY:
+            key = key if _is_hashable(key) else describe(key)
+            seen[key] += 1
+            if seen[key] > 1:
+                same = key if isinstance(key, RemoteObject) else describe(key)
+                key = RemoteObject(same.type_name, f"{same.text} #{seen[key]}")
+        made.append(key)
+    return made
+
+
+def _is_hashable(key: object) -> bool:
+    try:
+        hash(key)
+    except TypeError:
+        return False
+    return True
 
 
 def _read_array(decoder: Decoder, payload: bytes) -> object:
@@ -216,7 +254,12 @@ def _build_tuple(decoder: Decoder, items: list[Any], payload: bytes) -> object:
 def _build_set(decoder: Decoder, items: list[Any], payload: bytes) -> set[object]:
     if len(items) > _FEW_KEYS:
         decoder.check_keys(items)
-    result = set(items)
+    try:
+        result = set(items)
+    except TypeError:
+        result = set()
+    if len(result) != len(items):
+        result = set(_distinct(items))
     if len(result) != len(items):
         raise RemoteProtocolError("A set has an element twice.")
     return result

@@ -54,17 +54,25 @@ class Forms(Generic[K, F]):
         self.get = self._forms.get
 
     def met(self, key: K, make: Callable[[], F]) -> None:
-        """Take note of a key that has no form, or none that holds."""
+        """Take note of a key that has no form, or none that holds.
+
+        The codec has already made the message. So if ``make`` fails, for whatever reason, there is
+        no form, and the codec makes the next message of this key too.
+        """
         hashed = hash(key)
         if hashed not in self._once and key not in self._forms:
             if len(self._once) >= _MAX_FORMS:
                 self._once.clear()
             self._once.add(hashed)
             return
+        self._once.discard(hashed)
+        try:
+            form = make()
+        except Exception:
+            return
         if len(self._forms) >= _MAX_FORMS:
             self._forms.clear()
-        self._forms[key] = make()
-        self._once.discard(hashed)
+        self._forms[key] = form
 
 
 class Outgoing:
@@ -113,10 +121,11 @@ class Incoming(Generic[T]):
     Args:
         document: All of it.
         make: Makes the message of its fields.
-        limits: For which it was decoded.
+        limits: For which it was decoded, and holds.
 
-    Attributes:
-        limits: For which it holds; None if it does not hold at all.
+    Raises:
+        Exception: There is no form for it: a key cannot be hashed, say, in the plain form that is
+            read here, though what the codec makes of it can.
     """
 
     __slots__ = (
@@ -131,17 +140,13 @@ class Incoming(Generic[T]):
         self._descriptors: list[bytes] = []
         self._views: list[tuple[np.dtype[Any], tuple[int, ...], slice]] = []
         self._tail_bytes: int | None = 0
-        self.limits: WireLimits | None = limits
-        try:
-            # as tuples: what is a key has to be hashed, and was before in another form
-            fields = msgpack.unpackb(document, strict_map_key=False, use_list=False)
-            _, _, *self._shape = _shaped(fields, self._descriptors)
-        except _IrregularError:
-            self.limits = None
-        else:
-            self._lay_out()
-            if all(map(_is_constant, self._shape)):
-                self._message = make(*self._shape)
+        self.limits = limits
+        # as tuples: what is a key has to be hashed, and was before in another form
+        fields = msgpack.unpackb(document, strict_map_key=False, use_list=False)
+        _, *self._shape = _shaped(fields, self._descriptors)
+        self._lay_out()
+        if all(map(_is_constant, self._shape)):
+            self._message = make(*self._shape)
 
     def _lay_out(self) -> None:
         """Where each array lies, if all lie in the tail of the header and hold numbers."""
@@ -166,7 +171,6 @@ class Incoming(Generic[T]):
         Raises:
             RemoteProtocolError: Their bytes are not what the document says.
         """
-        assert self.limits is not None
         if len(tail) == self._tail_bytes and not buffers:
             arrays = [self._own(tail[where], dtype, shape) for dtype, shape, where in self._views]
         else:

@@ -25,15 +25,22 @@ SERVED_PRIVATE = frozenset({"_ensure", "_max_episode_steps"})
 
 PROBED = frozenset(
     {
-        # of files, mappings, classes and numbers; by the interpreter and the standard library
-        *("fileno", "keys", "mro", "as_integer_ratio", "getvalue", "conjugate"),
-        # of arrays and tensors; by numpy, pandas, torch and who wants to be polite to them
-        *("toarray", "to_numpy", "tolist", "numpy", "detach", "pin_memory", "dtype", "flat"),
-        # by notebooks: IPython's help and completion
-        *("getdoc", "trait_names"),
+        # of files, mappings, classes, numbers and dates; by the standard library, pandas, tabulate
+        *("fileno", "read", "write", "getvalue", "keys", "items", "mro"),
+        *("as_integer_ratio", "is_integer", "conjugate", "real", "imag", "isoformat"),
+        # of arrays, tensors and tables; by numpy, pandas, matplotlib, torch, jax, tqdm, wandb
+        *("dtype", "shape", "ndim", "size", "flat", "item", "tolist", "toarray", "tocoo"),
+        *("to", "cpu", "detach", "numpy", "pin_memory", "block_until_ready", "is_tensor_like"),
+        *("to_numpy", "values", "index", "input_objs", "aval", "weak_type"),
+        # by encoders to JSON, which call them: pandas, simplejson, wandb
+        *("toDict", "for_json", "json_encode"),
+        # by notebooks: IPython's help and completion; by rich, which looks whether all is there
+        *("getdoc", "trait_names", "awehoi234_wdfjwljet234_234wdfoijsdfmmnxpi492"),
     }
 )
-"""Names without an underscore that libraries look for in any object."""
+"""Names without an underscore that libraries look for in any object, found by having some forty
+convert, print, plot, log, copy and compare one that listens (``tests/support/curious.py``). Whoever
+means such an attribute asks for it by name: ``get_attr`` and ``get_wrapper_attr``."""
 
 GYMNASIUMS = frozenset(dir(VectorEnv)) | {
     *getattr(VectorEnv, "__annotations__", ()),
@@ -55,6 +62,17 @@ def is_servable(name: str) -> bool:
     if name.startswith("_") or not name.isidentifier() or len(name) > MAX_NAME:
         return False
     return name not in GYMNASIUMS and name not in PROBED
+
+
+def absent(owner: object, name: str, ask: str) -> AttributeError:
+    """The error of ``owner``, which does not serve ``name``; ``ask`` is its method that does."""
+    kind = type(owner).__name__
+    if name not in PROBED:
+        return AttributeError(f"{kind!r} object has no attribute {name!r}")
+    return AttributeError(
+        f"a {kind} does not serve the attribute {name!r}, which libraries look for in any object; "
+        f"if it is meant, call {ask}({name!r})"
+    )
 
 
 def checked_name(value: object, what: str) -> str:

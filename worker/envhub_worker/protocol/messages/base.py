@@ -20,29 +20,10 @@ else:
         return lambda cls: cls
 
 
-VERSION = 12
-"""The newest version of the protocol: ``Hello`` offers a range, ``Welcome`` agrees to one.
-
-Version 2 added kinds 17 to 30, version 3 kind 53, version 4 kind 54, version 5 kind 31, version 6
-pickles in frames of their own, version 7 kinds 55 and 56, the extensions 26 to 28 and lists of
-actions in slabs; nothing that there was changed. From version 8 on the id stands in front of what
-client and server say to one another, and from version 9 on the last mapping of ``Sessions`` is
-about the server. Version 10 added kind 57, version 11 kinds 58 and 59, version 12 kinds 60 to 62.
-"""
-FIRST_WITH_FIGURES_VERSION = 9
-OLDEST_VERSION = 1
-"""The oldest version that this code still speaks."""
-FIRST_RUNNER_KIND = 32
+VERSION = 1
+"""The version of the protocol. Both sides must speak the same one (``Hello``)."""
+FIRST_RUNNER_KIND = 64
 """Kinds from here on are between client and runner; a runner may send no other."""
-FIRST_WITH_MADE_PACKAGES_VERSION = 11
-FIRST_WITH_WATCHES_VERSION = 12
-_SERVERS_LATER = frozenset({58, 59})
-"""Between client and server all the same: the numbers below ``FIRST_RUNNER_KIND`` are used up."""
-
-
-def is_of_runner(kind: int) -> bool:
-    """Whether messages of this kind are between client and runner."""
-    return kind >= FIRST_RUNNER_KIND and kind not in _SERVERS_LATER
 
 
 # a field's annotation, and the types that a decoded value of it may have

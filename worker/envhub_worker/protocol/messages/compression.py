@@ -35,7 +35,7 @@ def pack_frames(frames: Sequence[Buffer], compression: str) -> list[Buffer]:
         return list(frames)
     sizes = [-1 if n is None else _size(f) for n, f in zip(packed, frames, strict=True)]
     bodies = [f if n is None else n for n, f in zip(packed, frames, strict=True)]
-    return [*m.pack(m.Packed(compression, tuple(sizes)), 0), *bodies]
+    return [*m.pack_header(m.Packed(compression, tuple(sizes)), 0), *bodies]
 
 
 def _packed(frame: Buffer, block: Any) -> bytes | None:
@@ -60,10 +60,11 @@ def unpack_frames(frames: Sequence[Buffer], limits: WireLimits) -> list[Buffer]:
         MessageTooLargeError: Over ``limits`` once unpacked.
         RemoteProtocolError: What is there is not what ``Packed`` says.
     """
-    if not frames or not _starts_packed(frames[0], limits):
+    if not frames or m.number_of(frames[0]) != 0:
         return list(frames)
-    _, header = m.unpack(frames[:1], limits=limits)
-    assert isinstance(header, m.Packed)
+    header = m.unpack([m.without_id(frames[0])], limits=limits)
+    if not isinstance(header, m.Packed):
+        raise RemoteProtocolError("the id 0 stands before Packed alone")
     bodies = list(frames[1:])
     _check(header, bodies, limits)
     unpack = _unpacker(header.compression)
@@ -71,15 +72,6 @@ def unpack_frames(frames: Sequence[Buffer], limits: WireLimits) -> list[Buffer]:
         body if size == -1 else unpack(body, size)
         for body, size in zip(bodies, header.sizes, strict=True)
     ]
-
-
-_HEAD_BYTES = 256
-
-
-def _starts_packed(frame: Buffer, limits: WireLimits) -> bool:
-    # every message is a list whose first item is its kind: after the length of the document
-    head = bytes(memoryview(frame).cast("B")[:_HEAD_BYTES])
-    return head[4:5] == b"\x94" and head[5:6] == bytes([m.Packed.kind])
 
 
 def _check(header: m.Packed, bodies: Sequence[Buffer], limits: WireLimits) -> None:

@@ -16,14 +16,14 @@ from envhub_worker.protocol.messages.packing import unpack
 _LENGTH_BYTES = 4
 """The length of the document."""
 _LIST = 0x90
-"""The head of a short list of msgpack; a message is one of its kind, its id and its fields."""
+"""The head of a short list of msgpack; a message is one of its kind and its fields."""
 
 
 def stands_in_front(kind: type[Message], frames: Sequence[Buffer]) -> bool:
     """Whether a message of this kind is in front of a reply. Trust: two bytes are looked at."""
     if len(frames) < 2:
         return False
-    head = bytes([_LIST + 2 + len(kind.FIELDS), kind.kind])
+    head = bytes([_LIST + 1 + len(kind.FIELDS), kind.kind])
     return memoryview(frames[0]).cast("B")[_LENGTH_BYTES : _LENGTH_BYTES + len(head)] == head
 
 
@@ -40,7 +40,7 @@ def things_said(
     size, name = memoryview(frame).nbytes, kind.__name__
     if size > max_bytes:
         raise MessageTooLargeError(f"{size} bytes of {name} are over the limit of {max_bytes}.")
-    message = unpack([frame])[1]
+    message = unpack([frame])
     said = values_of(message)[0] if type(message) is kind else None
     if type(said) is not tuple or len(said) > most:
         raise RemoteProtocolError(f"the worker says {name} in another way than was agreed on")

@@ -1,12 +1,11 @@
 """Messages to frames and back.
 
-A message is the value ``[kind, id, field, ...]`` in the codec's encoding: one msgpack header and
-raw buffers. ``unpack`` checks the kind, the number of fields and each field's type, so that a
-decoded message is what its class says. Trust: what comes from a jail is hostile.
+A message is the value ``[kind, field, ...]`` in the codec's encoding: one msgpack header and raw
+buffers. ``unpack`` checks the kind, the number of fields and each field's type, so that a decoded
+message is what its class says. Trust: what comes from a jail is hostile.
 
-The id ties a reply to its request. Between client and runner it is 0: packets have their own ids.
-Between client and server it was the second item up to version 7. From version 8 on that is 0 too,
-and the id stands in front of the header, so that a message that recurs is the same bytes again.
+Between client and server an id ties a reply to its request. It stands in front of the header, so
+that a message that recurs is the same bytes again. Packets to a runner have ids of their own.
 """
 
 from __future__ import annotations
@@ -14,13 +13,11 @@ from __future__ import annotations
 import struct
 import sys
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
-
-import msgpack  # type: ignore[import-untyped]
+from typing import TYPE_CHECKING, Any
 
 from envhub_worker.protocol.codec import plain, templates
 from envhub_worker.protocol.codec.frames import split
-from envhub_worker.protocol.codec.kinds import DOCUMENT_BYTES, Buffer
+from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.messages.base import KINDS, Message, check_fields, values_of
@@ -31,14 +28,8 @@ if TYPE_CHECKING:
     from envhub_worker.protocol.codec.encoder import Describer
     from envhub_worker.protocol.codec.exact import Pickler
 
-FIRST_NUMBERED_VERSION = 8
-_HEAD_BYTES = 64
-"""Enough for the length of a document, its kind and its id."""
-_NUMBER = struct.Struct(">IQ")
-"""What stands in front of a numbered header: the mark, and the id, whose first byte is below 0x80.
-In other headers there is the head of a msgpack array, which is not: ``compression`` looks there."""
-_MARK = 0xFFFFFFFF
-"""No document is so long: a header without a number begins with its document's length."""
+_NUMBER = struct.Struct(">Q")
+"""The id in front of a header between client and server. 0 stands before ``Packed`` alone."""
 _MOST = (1 << 63) - 1
 _OUTGOING: templates.Forms[Any, templates.Outgoing] = templates.Forms()
 _INCOMING: templates.Forms[bytes, templates.Incoming[Message]] = templates.Forms()
@@ -46,7 +37,6 @@ _INCOMING: templates.Forms[bytes, templates.Incoming[Message]] = templates.Forms
 
 def pack(
     message: Message,
-    request_id: int = 0,
     *,
     pickler: Pickler | None = None,
     limits: WireLimits = DEFAULT_LIMITS,
@@ -63,14 +53,14 @@ def pack(
     values = values_of(message)
     if pickler is not None and cls.HANDED:
         values = _handed(message, values, pickler, limits)
-    found = None if request_id else templates.outline(values)
+    found = templates.outline(values)
     if found is None:
-        return _encoded(message, request_id, values, pickler, limits, describer)
+        return _encoded(message, values, pickler, limits, describer)
     outline, arrays = found
     form = _OUTGOING.get((cls, outline))
     if form is not None and form.limits is limits:
         return form.frames(arrays)
-    frames = _encoded(message, request_id, values, pickler, limits)
+    frames = _encoded(message, values, pickler, limits)
     _OUTGOING.met((cls, outline), lambda: templates.Outgoing(frames, arrays, limits))
     return frames
 
@@ -96,13 +86,12 @@ def _handed(
 
 def _encoded(
     message: Message,
-    request_id: int,
     values: list[Any],
     pickler: Pickler | None,
     limits: WireLimits,
     describer: Describer | None = None,
 ) -> list[Buffer]:
-    value, names = [message.kind, request_id, *values], ("kind", "id", *message.FIELDS)
+    value, names = [message.kind, *values], ("kind", *message.FIELDS)
     if _without_numpy():
         frame = plain.encode(value, limits)
         if frame is not None:
@@ -136,8 +125,8 @@ def unpack(
     unpickler: Unpickler | None = None,
     tensors: Callable[[Any, str], object] | None = None,
     things: ThingReader | None = None,
-) -> tuple[int, Message]:
-    """The request id and the message of some frames.
+) -> Message:
+    """The message of some frames.
 
     Raises:
         RemoteProtocolError: The peer broke the rules.
@@ -146,81 +135,45 @@ def unpack(
         document, tail, buffers = split(frames, limits)
         form = _INCOMING.get(document)
         if form is not None and form.limits is limits:
-            return 0, form.message(tail, buffers)
-        how = (limits, unpickler, tensors, things)
-        request_id, message = _decode(document, tail, buffers, *how)
-        if not request_id and len(document) <= templates.MAX_DOCUMENT_BYTES:
+            return form.message(tail, buffers)
+        message = _decode(document, tail, buffers, limits, unpickler, tensors, things)
+        if len(document) <= templates.MAX_DOCUMENT_BYTES:
             _INCOMING.met(document, lambda: templates.Incoming(document, type(message), limits))
-        return request_id, message
+        return message
 
 
-class Header(NamedTuple):
-    """What stands in the first frame of client or server.
-
-    Attributes:
-        number: The id.
-        message: The message.
-        numbered: Whether the id stands in front, as it does from version 8 on.
-    """
-
-    number: int
-    message: Message
-    numbered: bool
-
-
-def pack_header(message: Message, number: int, *, numbered: bool) -> list[Buffer]:
-    """The frames of a message between client and server."""
-    if not numbered:
-        return pack(message, number)
+def pack_header(message: Message, number: int) -> list[Buffer]:
+    """The frames of a message between client and server, with its id in front."""
     header, *buffers = pack(message)
-    return [_NUMBER.pack(_MARK, number) + header, *buffers]
+    return [_NUMBER.pack(number) + header, *buffers]
 
 
-def unpack_header(frame: Buffer, *, limits: WireLimits = DEFAULT_LIMITS) -> Header:
-    """The opposite of ``pack_header``. Trust: input from the other side.
+def unpack_header(frame: Buffer, *, limits: WireLimits = DEFAULT_LIMITS) -> tuple[int, Message]:
+    """The id and the message of a header. Trust: input from the other side.
 
     Raises:
         RemoteProtocolError: The peer broke the rules.
     """
-    number = _number(frame)
+    number = id_of(frame)
     if number is None:
-        return Header(*unpack([frame], limits=limits), numbered=False)
-    rest = frame if type(frame) is bytes else memoryview(frame).cast("B")
-    inner, message = unpack([rest[_NUMBER.size :]], limits=limits)
-    if inner or not 0 < number <= _MOST:
-        raise RemoteProtocolError(f"nobody can answer under the id {number}")
-    return Header(number, message, numbered=True)
+        raise RemoteProtocolError("a header starts with the id of its request")
+    return number, unpack([without_id(frame)], limits=limits)
 
 
-def id_of(frame: Buffer) -> tuple[int, bool] | None:
-    """The id of a header that cannot be read otherwise, and whether it is numbered.
-
-    None if it has none. Trust: input from the other side. Only the first bytes are looked at.
-    """
-    in_front = _number(frame)
-    number = _number_in_document(frame) if in_front is None else in_front
-    if type(number) is not int or not 0 < number <= _MOST:
-        return None
-    return number, in_front is not None
+def without_id(frame: Buffer) -> Buffer:
+    """What comes after the id of a header."""
+    return frame[_NUMBER.size :] if type(frame) is bytes else memoryview(frame)[_NUMBER.size :]
 
 
-def _number(frame: Buffer) -> int | None:
-    """What stands in front of a header, if it is numbered."""
-    plain = frame if type(frame) is bytes else memoryview(frame).cast("B")
-    if len(plain) < _NUMBER.size:
-        return None
-    mark, number = _NUMBER.unpack_from(plain)
-    return number if mark == _MARK else None
+def id_of(frame: Buffer) -> int | None:
+    """The id in front of a header; None if there is none. Trust: input from the other side."""
+    number = number_of(frame)
+    return number if number is not None and 0 < number <= _MOST else None
 
 
-def _number_in_document(frame: Buffer) -> object:
-    head = msgpack.Unpacker(max_buffer_size=_HEAD_BYTES)
-    head.feed(bytes(memoryview(frame).cast("B")[DOCUMENT_BYTES.size : _HEAD_BYTES]))
-    try:
-        items, kind, number = head.read_array_header(), head.unpack(), head.unpack()
-    except Exception:  # whatever a decoder makes of noise
-        return None
-    return number if items >= 2 and type(kind) is int else None
+def number_of(frame: Buffer) -> int | None:
+    """The first bytes of a header as a number, 0 included; None if there are too few."""
+    return _NUMBER.unpack_from(frame)[0] if len(frame) >= _NUMBER.size else None
 
 
 def _decode(
@@ -231,7 +184,7 @@ def _decode(
     unpickler: Unpickler | None,
     tensors: Callable[[Any, str], object] | None,
     things: ThingReader | None,
-) -> tuple[int, Message]:
+) -> Message:
     value = plain.NOT_PLAIN
     if _without_numpy() and not tail and not buffers:
         value = plain.decode(document, limits)
@@ -239,11 +192,11 @@ def _decode(
         from envhub_worker.protocol.codec.codec import decode_parts
 
         value = decode_parts(document, tail, buffers, limits, unpickler, tensors, things)
-    if type(value) is not list or len(value) < 2:
-        raise RemoteProtocolError("a message is a list that starts with its kind and its id")
-    kind, request_id, *rest = value
+    if type(value) is not list or not value:
+        raise RemoteProtocolError("a message is a list that starts with its kind")
+    kind, *fields = value
     cls = KINDS.get(kind) if type(kind) is int else None
-    if cls is None or type(request_id) is not int or request_id.bit_length() > 63:
+    if cls is None:
         raise RemoteProtocolError(f"unknown message kind {str(kind)[:40]!r}")
-    check_fields(cls, rest)
-    return request_id, cls(*rest)
+    check_fields(cls, fields)
+    return cls(*fields)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from envhub_worker.protocol.messages.base import Message
 
 
-class Load(Message, kind=32, asks="make_env", handed=("cfg", "env_kwargs")):
+class Load(Message, kind=64, asks="make_env", handed=("cfg", "env_kwargs")):
     """Import the entry file and call its ``make_env``. Reply: ``Loaded`` or ``Raised``.
 
     ``cfg`` holds the ``vars()`` of the caller's config object, or None.
@@ -17,13 +17,13 @@ class Load(Message, kind=32, asks="make_env", handed=("cfg", "env_kwargs")):
     env_kwargs: dict[str, object]
 
 
-class Loaded(Message, kind=33):
+class Loaded(Message, kind=65):
     """What the repository's ``make_env`` returned: see ``manifest.decode_manifest``."""
 
     manifest: dict[str, object]
 
 
-class Build(Message, kind=34):
+class Build(Message, kind=66):
     """Build sub-environments ``start`` to ``stop`` of a task as ``env``. Reply: ``Built``.
 
     The reply's manifest is that of the built slice.
@@ -36,13 +36,13 @@ class Build(Message, kind=34):
     stop: int
 
 
-class Built(Message, kind=35):
+class Built(Message, kind=67):
     """The slice is ready: see ``manifest.decode_env``."""
 
     manifest: dict[str, object]
 
 
-class Reset(Message, kind=36, asks="reset", handed=("options",)):
+class Reset(Message, kind=68, asks="reset", handed=("options",)):
     """``seeds`` is None or one seed or None per sub-environment of the slice; so is ``mask``."""
 
     env: int
@@ -51,21 +51,21 @@ class Reset(Message, kind=36, asks="reset", handed=("options",)):
     mask: object
 
 
-class ResetDone(Message, kind=37):
+class ResetDone(Message, kind=69):
     """Batched observation and infos of the slice."""
 
     observation: object
     info: dict[object, object]
 
 
-class Step(Message, kind=38, asks="step"):
+class Step(Message, kind=70, asks="step"):
     """The slice's batch of actions."""
 
     env: int
     actions: object
 
 
-class StepDone(Message, kind=39):
+class StepDone(Message, kind=71):
     """Batched results of the slice."""
 
     observation: object
@@ -75,7 +75,7 @@ class StepDone(Message, kind=39):
     info: dict[object, object]
 
 
-class Call(Message, kind=40, asks="call", handed=("args", "kwargs")):
+class Call(Message, kind=72, asks="call", handed=("args", "kwargs")):
     """``VectorEnv.call``: a method or attribute of every sub-environment. Reply: ``Value``."""
 
     env: int
@@ -84,7 +84,7 @@ class Call(Message, kind=40, asks="call", handed=("args", "kwargs")):
     kwargs: dict[str, object]
 
 
-class SetAttr(Message, kind=41, asks="set_attr", handed=("values",)):
+class SetAttr(Message, kind=73, asks="set_attr", handed=("values",)):
     """One value per sub-environment of the slice. Reply: ``Value``."""
 
     env: int
@@ -92,24 +92,24 @@ class SetAttr(Message, kind=41, asks="set_attr", handed=("values",)):
     values: tuple[object, ...]
 
 
-class Render(Message, kind=42):
+class Render(Message, kind=74):
     """``VectorEnv.render``. Reply: ``Value`` with a tuple of frames or None."""
 
     env: int
 
 
-class GetOwn(Message, kind=43):
+class GetOwn(Message, kind=75):
     """An attribute of the vector environment itself. Reply: ``Value``, or ``Method``."""
 
     env: int
     name: str
 
 
-class Method(Message, kind=44):
+class Method(Message, kind=76):
     """The attribute is callable; ``CallOwn`` calls it."""
 
 
-class CallOwn(Message, kind=45, asks="method", handed=("args", "kwargs")):
+class CallOwn(Message, kind=77, asks="method", handed=("args", "kwargs")):
     """Call a method of the vector environment itself. Reply: ``Value``."""
 
     env: int
@@ -118,7 +118,7 @@ class CallOwn(Message, kind=45, asks="method", handed=("args", "kwargs")):
     kwargs: dict[str, object]
 
 
-class GetOne(Message, kind=55):
+class GetOne(Message, kind=78):
     """An attribute of one sub-environment. Reply: ``Value``, or ``Method`` if it can be called.
 
     ``index`` is its place in the slice; None where the slice does not hold it, whose reply is a
@@ -132,7 +132,7 @@ class GetOne(Message, kind=55):
     name: str
 
 
-class CallOne(Message, kind=56, asks="envs", handed=("args", "kwargs")):
+class CallOne(Message, kind=79, asks="envs", handed=("args", "kwargs")):
     """Call a method of one sub-environment, which ``GetOne`` describes. Reply: ``Value``."""
 
     env: int
@@ -143,19 +143,19 @@ class CallOne(Message, kind=56, asks="envs", handed=("args", "kwargs")):
     kwargs: dict[str, object]
 
 
-class GetRandom(Message, kind=46):
+class GetRandom(Message, kind=80):
     """Ask for the generators. Reply: ``Value``, one state each, or the one state there is."""
 
     env: int
 
 
-class Close(Message, kind=47):
+class Close(Message, kind=81):
     """Close an environment. Reply: ``Value`` with None."""
 
     env: int
 
 
-class Attach(Message, kind=50):
+class Attach(Message, kind=82):
     """Serve an environment's steps over the slabs and doorbells that come along.
 
     The descriptors: request slab, reply slab, observation slab, the runner's doorbell, the
@@ -169,13 +169,13 @@ class Attach(Message, kind=50):
     slots: int
 
 
-class FetchInfos(Message, kind=51):
+class FetchInfos(Message, kind=83):
     """Ask for the last step's infos, which did not fit the slab. Reply: ``Value``."""
 
     env: int
 
 
-class Revive(Message, kind=52):
+class Revive(Message, kind=84):
     """Reset all sub-environments in the place of others, which died in the middle of an episode.
 
     Reply: ``StepDone``: the fresh observations, rewards of zero, every episode truncated. What
@@ -186,7 +186,7 @@ class Revive(Message, kind=52):
     seeds: object
 
 
-class FetchInfosApart(Message, kind=54):
+class FetchInfosApart(Message, kind=85):
     """Ask for the last reset's or step's infos as each sub-environment gave them.
 
     For shards that do not agree about a key: the first sub-environment of all decides.
@@ -196,7 +196,7 @@ class FetchInfosApart(Message, kind=54):
     env: int
 
 
-class LoadTask(Message, kind=53, asks="make_env", handed=("cfg", "env_kwargs")):
+class LoadTask(Message, kind=86, asks="make_env", handed=("cfg", "env_kwargs")):
     """As ``Load``, where the client knows what comes back: nothing is described, nor built for it.
 
     Reply: ``Value`` of the task's ``(num_envs, shardable)``, None if there is none, or ``Raised``.
@@ -210,39 +210,39 @@ class LoadTask(Message, kind=53, asks="make_env", handed=("cfg", "env_kwargs")):
     task: object
 
 
-class Value(Message, kind=48):
+class Value(Message, kind=87):
     """A result."""
 
     value: object
 
 
-class Warned(Message, kind=57):
+class Warned(Message, kind=88):
     """In front of the frames of a reply: what the repository has warned of. See ``warnings``.
 
-    ``((category, text), ...)``. Since version 10 of the protocol.
+    ``((category, text), ...)``.
     """
 
     warnings: tuple[object, ...]
 
 
-class Watch(Message, kind=60, asks="call"):
+class Watch(Message, kind=89, asks="call"):
     """As ``Call`` without arguments; from now on the runner says when that is not true any more.
 
-    Since version 12 of the protocol. Reply: ``Watched``.
+    Reply: ``Watched``.
     """
 
     env: int
     name: str
 
 
-class Watched(Message, kind=61):
+class Watched(Message, kind=90):
     """What ``Call`` would have answered, and whether it stays so until a ``Changed`` says other."""
 
     value: object
     watched: bool
 
 
-class Changed(Message, kind=62):
+class Changed(Message, kind=91):
     """In front of the frames of a reply: what is another now, and watched no more. See ``changed``.
 
     ``((env, name), ...)``.
@@ -251,7 +251,7 @@ class Changed(Message, kind=62):
     attributes: tuple[object, ...]
 
 
-class Raised(Message, kind=49):
+class Raised(Message, kind=92):
     """The repository's code raised. ``builtin`` is its nearest builtin ancestor."""
 
     builtin: str

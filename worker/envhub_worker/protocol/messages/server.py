@@ -10,14 +10,13 @@ from envhub_worker.protocol.runtime import Runtime
 class Hello(Message, kind=1):
     """The first request on every connection. Reply: ``Welcome`` or ``Refused``."""
 
-    oldest: int
-    newest: int
+    version: int
     session: bytes
     """Random bytes that join the connections of one client; jails belong to a session."""
 
 
 class Welcome(Message, kind=2):
-    """The agreed version, and what the worker server runs on."""
+    """The server's version of the protocol, its release, and its pid."""
 
     version: int
     worker: str
@@ -43,10 +42,13 @@ class OpenJail(Message, kind=4):
 
     ``confinement`` holds the fields of ``Confinement``, with ``limits`` as a nested mapping.
     ``python`` is the interpreter that runs the repository; empty for the server's own.
+    ``packages`` is a folder of packages for it, which are used instead of that interpreter's own;
+    empty for these. Nothing of the folder runs outside of the jail.
     """
 
     name: str
     python: str
+    packages: str
     snapshot: str
     entry: str
     confinement: dict[str, object]
@@ -55,7 +57,7 @@ class OpenJail(Message, kind=4):
     @property
     def runtime(self) -> Runtime:
         """What runs the repository."""
-        return Runtime(self.python)
+        return Runtime(self.python, self.packages)
 
 
 class JailOpened(Message, kind=5):
@@ -139,8 +141,8 @@ class GetStatus(Message, kind=14):
 class Status(Message, kind=15):
     """One mapping per jail: ``jail``, ``name``, ``pids``, ``states``, ``busy_s``, ``operation``.
 
-    Of one that lives also ``processes``, ``threads`` and ``memory_bytes``, counted from outside;
-    an older server does not say. Where denials are recorded: ``denied``, a tuple of texts.
+    Of one that lives also ``processes``, ``threads`` and ``memory_bytes``, counted from outside.
+    Where denials are recorded: ``denied``, a tuple of texts.
     """
 
     jails: tuple[object, ...]
@@ -246,10 +248,11 @@ class GetSessions(Message, kind=26):
 class Sessions(Message, kind=27):
     """One mapping a session: ``client``, ``session``, ``heard_s``, ``connections``, ``jails``.
 
-    To whoever speaks version 9, one more with the key ``server``: figures of the server itself.
+    ``server`` has figures of the server itself.
     """
 
     sessions: tuple[object, ...]
+    server: dict[str, object]
 
 
 class FollowOutput(Message, kind=28):
@@ -279,22 +282,7 @@ class ExpireIdle(Message, kind=30):
     idle_ms: int
 
 
-class OpenJailWith(OpenJail, kind=31):
-    """``OpenJail`` for a repository with packages of its own. The same replies.
-
-    ``packages`` is a folder of them, for ``python``; that interpreter's own are not used. Nothing
-    of it runs outside of the jail.
-    """
-
-    packages: str
-
-    @property
-    def runtime(self) -> Runtime:
-        """What runs the repository."""
-        return Runtime(self.python, self.packages)
-
-
-class NeedPackages(Message, kind=58):
+class NeedPackages(Message, kind=31):
     """Ask a server on another host for a repository's packages. Reply: ``Packages`` or ``Refused``.
 
     It makes them in its own time, and says at once how far it is: whoever wants them asks again.
@@ -310,10 +298,10 @@ class NeedPackages(Message, kind=58):
     always: bool
 
 
-class Packages(Message, kind=59):
+class Packages(Message, kind=32):
     """How far they are. ``state`` is ``"making"``, ``"made"``, or ``"own"`` for the server's own.
 
-    ``name`` is what ``OpenJailWith`` may call them, ``told`` a line for people. ``facts`` are the
+    ``name`` is what ``OpenJail`` may call them, ``told`` a line for people. ``facts`` are the
     lock's hash and the pins.
     """
 

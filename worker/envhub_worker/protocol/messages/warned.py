@@ -13,8 +13,6 @@ from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.messages.front import stands_in_front, things_said
 
-FIRST_VERSION = 10
-"""Of the protocol: an older client reads no ``Warned``."""
 MOST_AT_ONCE = 16
 """Warnings of one reply."""
 MAX_CATEGORY = 256

@@ -78,8 +78,7 @@ ACTION_DTYPES = tuple(
 )
 """An action keeps the dtype that the caller gave it; the code is the place in this table."""
 LISTED = 32
-"""Added to the code, it asks for numbers of Python in lists: the caller gave such. Since version 7
-of the protocol."""
+"""Added to the code, it asks for numbers of Python in lists: the caller gave such."""
 DTYPE_CODES = {dtype: code for code, dtype in enumerate(ACTION_DTYPES)}
 _ACTION_ITEM_BYTES = 8
 

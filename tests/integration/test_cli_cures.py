@@ -1,0 +1,84 @@
+"""What an error advises is an option of the place that one is at."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import typer
+
+from envhub_sandbox import make_env
+from envhub_sandbox.cli.app import app
+from envhub_sandbox.errors import EnvHubError
+from tests.integration.test_cli_run import envhub
+from tests.support.repositories import write_repository
+
+_WANTS = "import nothing_of_this_name\n\ndef make_env(n_envs=1, use_async_envs=False): pass\n"
+_SLOW = "import time\n\ndef make_env(n_envs=1, use_async_envs=False): time.sleep(3600)\n"
+_IN_PYTHON = re.compile(r"\b(?:dependencies|policy|timeouts|limits|python|sandbox)=|Policy\(")
+EXTRA = """--dependencies '{"extra": ["NAME-OF-THE-PACKAGE"]}'"""
+
+
+def options_of(command: str) -> set[str]:
+    """Those that a command has."""
+    made = typer.main.get_command(app).commands[command]  # type: ignore[attr-defined]
+    return {option for one in made.params for option in one.opts}
+
+
+def said(command: str, *arguments: str | Path) -> str:
+    """The error of a command, on one line; it names no option that the command does not have."""
+    done = envhub(command, *arguments)
+    assert done.returncode != 0
+    text = " ".join(done.stderr.split())
+    assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)) <= options_of(command) | {"--debug"}
+    return text
+
+
+@pytest.mark.parametrize("command", ["run", "inspect", "lock"])
+def test_a_missing_module(command: str, tmp_path: Path) -> None:
+    """The package joins it by an option; in Python by an argument."""
+    folder = write_repository(tmp_path / "wants", _WANTS)
+    own = tmp_path / "pylock.toml"
+    further = ["--output", own] if command == "lock" else []
+    text = said(command, folder, *further)
+    assert "nothing_of_this_name" in text
+    assert EXTRA in text
+    assert not _IN_PYTHON.search(text)
+    with pytest.raises(EnvHubError, match=r"dependencies=\{'extra': \['NAME-OF-THE-PACKAGE'\]\}"):
+        make_env(folder)
+
+
+def test_a_make_env_that_takes_too_long(tmp_path: Path) -> None:
+    """Where a command has no such option, Python's is named as such."""
+    folder = write_repository(tmp_path / "slow", _SLOW)
+    text = said("run", folder, "--timeout", "1")
+    assert "give it longer with --timeout 2.0" in text
+    assert not _IN_PYTHON.search(text)
+    with pytest.raises(EnvHubError, match=r"longer with timeouts=\{'startup_s': 2"):
+        make_env(folder, timeouts={"startup_s": 1})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--profile", "lax"], "--profile is 'lax'; it is one of strict"),
+        (["--memory", "0"], "--memory is 0; it takes a whole number above 0"),
+        (["--memory", "much"], "--memory is 'much'; it takes a size such as 512M"),
+        (["--python", "/nowhere"], "--python is '/nowhere', which is no program"),
+        (["--readable", "/nowhere"], "--readable holds '/nowhere'"),
+        (["--server-key", "k"], "--server-key is for --sandbox tcp://HOST:PORT"),
+        (
+            ["--python", "/usr/bin/python3", "--dependencies", '{"extra": []}'],
+            """or --dependencies '{"python": "3.12"}' for the repository's own""",
+        ),
+    ],
+)
+def test_what_is_wrong_with_an_option_is_told_by_its_name(
+    arguments: list[str], says: str, tmp_path: Path
+) -> None:
+    """And nothing of it in Python's words."""
+    folder = write_repository(tmp_path / "wants", _WANTS)
+    text = said("run", folder, *arguments)
+    assert says in text
+    assert not _IN_PYTHON.search(text)

@@ -1,0 +1,190 @@
+"""What all commands have in common: their help, what a shell completes, and safe output."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+import envhub_sandbox.cli
+from envhub_sandbox.cli.app import app
+from envhub_sandbox.cli.shared.console import neutralised, out, say, show_rows
+from tests.support.ci import obeyed
+
+_WIDTH = 80
+
+
+def commands() -> Iterator[tuple[str, Any]]:
+    """Every command, and those below others, by the words that call it."""
+    waiting = [("", typer.main.get_command(app))]
+    while waiting:
+        name, command = waiting.pop()
+        below = getattr(command, "commands", {})
+        waiting += [(f"{name} {one}".strip(), found) for one, found in below.items()]
+        if not below:
+            yield name, command
+
+
+_COMMANDS = dict(commands())
+
+
+def help_of(name: str, width: int = _WIDTH) -> str:
+    """What ``--help`` prints."""
+    done = CliRunner().invoke(
+        app, [*name.split(), "--help"], env={"COLUMNS": str(width), "TERM": "dumb"}
+    )
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+def plain(text: str) -> str:
+    """Text without the boxes around it, and with single spaces."""
+    return " ".join(re.sub("[│╭╮╰╯─]", " ", text).split())
+
+
+@pytest.mark.parametrize("name", _COMMANDS)
+def test_no_line_of_a_help_ends_before_it_is_full(name: str) -> None:
+    """A sentence goes on where the terminal ends, and not where the source does."""
+    lines = [line.strip() for line in help_of(name).splitlines()]
+    documented = inspect.cleandoc(_COMMANDS[name].callback.__doc__).split("\n\n")
+    for paragraph in documented:
+        words = re.sub(r"\[/?bold\]", "", paragraph).split()
+        first = next(at for at, line in enumerate(lines) if line.split()[:3] == words[:3])
+        left = words
+        for line in lines[first:]:
+            shown = line.split()
+            assert left[: len(shown)] == shown
+            left = left[len(shown) :]
+            if not left:
+                break
+            assert len(line) + 1 + len(left[0]) > _WIDTH - 2, f"{line!r} has room for {left[0]!r}"
+
+
+@pytest.mark.parametrize("name", _COMMANDS)
+def test_a_help_has_all_words_of_an_option(name: str) -> None:
+    """Brackets as well: they are no markup."""
+    shown = plain(help_of(name, 1_000))
+    texts = [one.help for one in _COMMANDS[name].params if getattr(one, "help", None)]
+    for text in texts:
+        assert " ".join(text.split()) in shown
+
+
+def test_brackets_are_in_some_help() -> None:
+    """The control of the one above."""
+    assert any("[limits]" in (one.help or "") for one in _COMMANDS["check"].params[1:])
+
+
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [
+        ("run x --network ", {"none", "loopback", "host"}),
+        ("run x --profile ", {"strict", "no-userns", "container"}),
+        ("check x --profile c", {"container"}),
+        ("doctor --profile ", {"strict", "no-userns", "container"}),
+        ("check x --fail-on ", {"error", "warning", "note"}),
+        ("inspect x --fail-on w", {"warning"}),
+        ("run x --dependencies ", {"auto", "host"}),
+        ("run x --sandbox ", {"process", "docker", "tcp://", "none"}),
+        ("check x --sandbox ", {"process", "docker", "tcp://"}),
+    ],
+)
+def test_values_are_completed(words: str, completed: set[str]) -> None:
+    """As bash asks for them."""
+    typed = f"envhub {words}"
+    variables = {
+        "_ENVHUB_COMPLETE": "complete_bash",
+        "COMP_WORDS": typed,
+        "COMP_CWORD": str(len(typed.split(" ")) - 1),
+    }
+    done = CliRunner().invoke(app, prog_name="envhub", env=variables)
+    assert set(done.output.split()) == completed
+
+
+@pytest.mark.parametrize("words", ["check ./x --sandbox none", "replay ./x --sandbox none"])
+def test_what_needs_a_sandbox_offers_no_way_without(words: str) -> None:
+    """Neither in its help nor in the error, which names no option that it does not have."""
+    name = words.split()[0]
+    assert "none" not in re.findall(r"--sandbox.*", help_of(name, 1_000))[0]
+    done = CliRunner().invoke(app, words.split())
+    assert done.exit_code == 2
+    assert "leave out --sandbox none" in done.output
+    there = {option for one in _COMMANDS[name].params for option in one.opts}
+    assert set(re.findall(r"--[a-z-]+", done.output)) <= there
+
+
+_TEXTS = ("::error::x", "##[error]x", "##vso[task.a]x", "section_start:1:x", "section_end:1:x")
+
+
+@pytest.mark.parametrize("command", _TEXTS)
+@pytest.mark.parametrize("before", ["", "\n", "  ", "\n\t\x1b[31m ", "x\r", "x\u2028", "x\r\n\n "])
+def test_no_command_is_left(command: str, before: str) -> None:
+    """Whatever skips what stands before it; the control is the text itself."""
+    assert obeyed(before + command)
+    assert obeyed(neutralised(before + command)) == []
+
+
+@given(st.lists(st.sampled_from([*"::##[ \n\rvso", "section_start", "x", "\x1b[1m"])))
+def test_a_command_in_pieces_is_none(pieces: list[str]) -> None:
+    """However many writes it comes in, and what is no command stays as it is."""
+    whole = neutralised("".join(pieces))
+    assert obeyed(whole) == []
+    if not obeyed("".join(pieces)):
+        assert whole == "".join(pieces)
+    runner = typer.Typer(cls=type(typer.main.get_command(app)))
+
+    @runner.command("a")
+    def one() -> None:
+        import sys
+
+        for piece in pieces:
+            sys.stdout.write(piece)
+
+    runner.command("b")(one)
+    shown = CliRunner().invoke(runner, ["a"]).stdout
+    assert obeyed(shown) == []
+
+
+def test_text_in_the_middle_of_a_line_stays() -> None:
+    """``a::b`` is a name, and ``::`` in a path is no command."""
+    for text in ("a::b", "see x::y\n  a ::b", "# [x]", "[x]", "#", "section_start"):
+        assert neutralised(text) == text
+
+
+def test_nothing_is_folded(capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
+    """Whatever the number of columns is said to be: what is folded begins lines."""
+    monkeypatch.setenv("COLUMNS", "20")
+    words = "word " * 100 + "end"
+    out(words)
+    say(words)
+    show_rows([("name", "n"), (words[:150], "1"), ("short", "10")], right=(1,))
+    shown = capsys.readouterr()
+    assert shown.err == f"{words}\n"
+    first, head, long, short = shown.out.splitlines()
+    assert first == words
+    assert head.split() == ["name", "n"]
+    assert long == f"{words[:150]}   1"
+    assert short == f"{'short':150}  10"
+
+
+def test_one_place_writes() -> None:
+    """No command prints by itself, and none makes a console of its own."""
+    found = []
+    for path in Path(next(iter(envhub_sandbox.cli.__path__))).rglob("*.py"):
+        if path.name in ("console.py", "progress.py"):
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            called = ast.unparse(node.func) if isinstance(node, ast.Call) else ""
+            if called in ("print", "typer.echo", "sys.stdout.write", "sys.stderr.write", "console"):
+                found.append(f"{path.name}:{getattr(node, 'lineno', 0)}: {called}")
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rich"):
+                found.append(f"{path.name}:{node.lineno}: {node.module}")
+    assert found == []

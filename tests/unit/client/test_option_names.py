@@ -1,0 +1,142 @@
+"""Each option once, and each place's own spelling of it."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+import envhub_sandbox
+from envhub_sandbox import Limits, Policy, Timeouts, make_env
+from envhub_sandbox.cli.app import app
+from envhub_sandbox.errors import PolicyError
+from envhub_sandbox.option_names import (
+    OPTION_NAMES,
+    in_python,
+    on_command_line,
+    on_lerobots_command_line,
+    option_name,
+    use_option_names,
+)
+
+_ALL = on_command_line({one.command for one in OPTION_NAMES.values()})
+_GROUPS: dict[str, Any] = {"policy": Policy, "limits": Limits, "timeouts": Timeouts}
+_ROOT = Path(next(iter(envhub_sandbox.__path__)))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "python", "command", "lerobot"),
+    [
+        (
+            "dependencies",
+            {"extra": ["a b"]},
+            "dependencies={'extra': ['a b']}",
+            """--dependencies '{"extra": ["a b"]}'""",
+            """--env.dependencies='{"extra": ["a b"]}'""",
+        ),
+        ("python", "PATH", "python='PATH'", "--python PATH", "--env.python=PATH"),
+        (
+            "profile",
+            "container",
+            "policy={'profile': 'container'}",
+            "--profile container",
+            """--env.policy='{"profile": "container"}'""",
+        ),
+        ("gpu", True, "policy={'gpu': True}", "--gpu", """--env.policy='{"gpu": true}'"""),
+        (
+            "startup_s",
+            600,
+            "timeouts={'startup_s': 600}",
+            "--timeout 600",
+            """--env.timeouts='{"startup_s": 600}'""",
+        ),
+        (
+            "restart",
+            "on_reset",
+            "policy={'restart': 'on_reset'}",
+            "policy={'restart': 'on_reset'} in Python",
+            """--env.policy='{"restart": "on_reset"}'""",
+        ),
+    ],
+)
+def test_each_place_has_its_spelling(
+    key: str, value: Any, python: str, command: str, lerobot: str
+) -> None:
+    """Python's is the one that no command line was read for."""
+    assert option_name(key, value) == python
+    with use_option_names(_ALL):
+        assert option_name(key, value) == command
+        with use_option_names(on_lerobots_command_line()):
+            assert option_name(key, value) == lerobot
+        assert option_name(key, value) == command
+    with use_option_names(on_command_line({"--seed"})):
+        assert option_name(key, value) == f"{python} in Python"
+    with use_option_names(on_lerobots_command_line("--sandbox.")):
+        assert option_name(key, value) == lerobot.replace("--env.", "--sandbox.")
+
+
+def test_what_is_wrong_with_an_option_names_it_as_it_was_given() -> None:
+    """In the same error."""
+    for spelling, said in (
+        (in_python, "limits: memory_bytes is 0;"),
+        (_ALL, "--memory is 0;"),
+        (on_lerobots_command_line(), "--env.limits: memory_bytes is 0;"),
+    ):
+        with use_option_names(spelling), pytest.raises(PolicyError, match=f"^{re.escape(said)}"):
+            Policy(limits=Limits(memory_bytes=0))
+
+
+def test_every_option_of_make_env_is_in_the_table() -> None:
+    """Each argument, and each key of one that is a mapping; and no other."""
+    arguments = set(inspect.signature(make_env).parameters) - {"cfg"} - set(_GROUPS)
+    assert {key for key, one in OPTION_NAMES.items() if not one.field} == arguments
+    for argument, kind in _GROUPS.items():
+        known = {one.name for one in dataclasses.fields(kind)} - {"limits"}
+        assert {key for key, one in OPTION_NAMES.items() if one.argument == argument} == known, (
+            argument
+        )
+
+
+def test_every_option_of_a_command_exists() -> None:
+    """``envhub run`` has all of them."""
+    commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    there = {name for one in commands["run"].params for name in one.opts}
+    assert {one.command for one in OPTION_NAMES.values()} - {""} <= there
+
+
+def test_lerobots_configuration_has_every_argument() -> None:
+    """But for what LeRobot says itself, and a token, which it would print and save."""
+    module = ast.parse((_ROOT / "integrations" / "lerobot" / "config.py").read_text())
+    [config] = [node for node in module.body if isinstance(node, ast.ClassDef)]
+    fields = {
+        node.target.id
+        for node in config.body
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
+    }
+    own = {"n_envs", "use_async_envs", "trust_remote_code", "token"}
+    assert {one.argument for one in OPTION_NAMES.values()} - own <= fields
+
+
+def test_no_error_has_a_spelling_of_its_own() -> None:
+    """No text but the documentation of Python writes an option with a value in the source."""
+    names = "|".join({one.argument for one in OPTION_NAMES.values()} - {"copy", "token", "n_envs"})
+    written = re.compile(rf"(?<![-\w.])(?:{names})=(?:['\"{{.]|[A-Z]{{2}})|Policy\(|Timeouts\(")
+    found = []
+    for path in _ROOT.rglob("*.py"):
+        if path.name in ("starter.py", "option_names.py", "inprocess.py", "api.py"):
+            continue
+        module = ast.parse(path.read_text())
+        docs = {id(one.value) for one in ast.walk(module) if isinstance(one, ast.Expr)}
+        found += [
+            f"{path.name}:{one.lineno}: {one.value}"
+            for one in ast.walk(module)
+            if isinstance(one, ast.Constant) and isinstance(one.value, str)
+            if id(one) not in docs and written.search(one.value)
+        ]
+    assert found == []

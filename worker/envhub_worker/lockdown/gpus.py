@@ -1,0 +1,129 @@
+"""Which GPUs a host has, and what of them a jail is given: device nodes and folders of /sys. Pure.
+
+The nodes are those that compute and render: ``nvidiaN``, ``renderD*``, and ``nvidiactl``,
+``nvidia-uvm`` and ``kfd``, through which a driver reaches every GPU whose own node can be opened.
+No display (``card*``, ``nvidia-modeset``), no profiler (``nvidia-uvm-tools``).
+"""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from collections.abc import Collection
+
+from envhub_worker.lockdown.report import LayerUnavailableError
+from envhub_worker.lockdown.root_plan import HostFiles, real_path
+from envhub_worker.protocol.records import dataclass
+
+_ADDRESS = re.compile(r"[0-9a-f]{4,8}:[0-9a-f]{2}:[0-9a-f]{2}\.[0-7]")
+_NVIDIA = re.compile(r"nvidia\d+")
+_RENDER = re.compile(r"renderD\d+")
+_MINOR = re.compile(r"Device Minor:\s*(\d+)")
+_NVIDIAS = "/proc/driver/nvidia/gpus"
+_NVIDIAS_SHARED = ("/dev/nvidiactl", "/dev/nvidia-uvm")
+_KFD, _KFD_FOLDER = "/dev/kfd", "/sys/class/kfd/kfd"
+
+
+@dataclass(frozen=True)
+class Granted:
+    """What a jail gets.
+
+    Attributes:
+        devices: Device nodes.
+        folders: Paths of /sys; links among them are followed.
+    """
+
+    devices: tuple[str, ...] = ()
+    folders: tuple[str, ...] = ()
+
+
+def gpu_devices(host: HostFiles) -> tuple[str, ...]:
+    """The device nodes of all GPUs."""
+    return _granted(gpus(host), host).devices
+
+
+def granted(gpu: bool | tuple[int, ...], host: HostFiles) -> Granted:
+    """What ``gpu`` grants on this host: nothing, all GPUs, or those of some indices.
+
+    Raises:
+        LayerUnavailableError: There is no such GPU. It would be missed later, and only by some.
+    """
+    if gpu is False:
+        return Granted()
+    found = gpus(host)
+    wanted = range(len(found)) if gpu is True else gpu
+    if not found:
+        raise LayerUnavailableError(
+            "gpu",
+            "the policy grants the GPU, and there is none here: no /dev/dri/renderD* and no "
+            "/dev/nvidia0",
+            "Install its driver, or in a container hand it in (docker run --gpus all); or grant "
+            "no GPU.",
+        )
+    missing = [index for index in wanted if index >= len(found)]
+    if missing:
+        there = "; ".join(f"{index}: {' '.join(nodes)}" for index, nodes in enumerate(found))
+        raise LayerUnavailableError(
+            "gpu", f"the policy grants GPU {missing[0]}, and these are here: {there}", "Name those."
+        )
+    return _granted([found[index] for index in wanted], host)
+
+
+def gpus(host: HostFiles) -> list[tuple[str, ...]]:
+    """The nodes of each GPU: NVIDIA's first, by PCI address, which is how ``nvidia-smi`` counts."""
+    by_device: dict[str, list[str]] = {}
+    for node in _own_nodes(host):
+        by_device.setdefault(_address(node, host) or node, []).append(node)
+
+    def place(device: str) -> tuple[bool, bool, list[str | int]]:
+        is_nvidias = any(_is_nvidias(node) for node in by_device[device])
+        number = [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", device)]
+        return not is_nvidias, device.startswith("/"), [device] if ":" in device else number
+
+    return [tuple(by_device[device]) for device in sorted(by_device, key=place)]
+
+
+def _own_nodes(host: HostFiles) -> list[str]:
+    nvidias = [f"/dev/{name}" for name in host.listdir("/dev") if _NVIDIA.fullmatch(name)]
+    renders = [name for name in host.listdir("/dev/dri") if _RENDER.fullmatch(name)]
+    return sorted(nvidias) + sorted(f"/dev/dri/{name}" for name in renders)
+
+
+def _is_nvidias(node: str) -> bool:
+    return node.startswith("/dev/nvidia")
+
+
+def _address(node: str, host: HostFiles) -> str:
+    """The PCI address of what a node belongs to; empty if it has none, or it is not told."""
+    name = posixpath.basename(node)
+    if not _is_nvidias(node):
+        folder = real_path(f"/sys/class/drm/{name}", host)
+        found: list[str] = _ADDRESS.findall(folder)
+        return found[-1] if found else ""
+    for address in host.listdir(_NVIDIAS):
+        minor = _MINOR.search(host.read(f"{_NVIDIAS}/{address}/information"))
+        if minor is not None and name == f"nvidia{minor[1]}" and _ADDRESS.fullmatch(address):
+            return address
+    return ""
+
+
+def _granted(chosen: Collection[tuple[str, ...]], host: HostFiles) -> Granted:
+    own = [node for nodes in chosen for node in nodes]
+    shared = [*_NVIDIAS_SHARED] if any(map(_is_nvidias, own)) else []
+    is_amds = any(not any(map(_is_nvidias, nodes)) for nodes in chosen)
+    shared += [_KFD] if is_amds else []
+    folders = [folder for node in own for folder in _folders(node, host)]
+    folders += [_KFD_FOLDER] if is_amds else []
+    devices = [*own, *(node for node in shared if host.exists(node))]
+    return Granted(tuple(sorted(devices)), tuple(sorted(set(folders))))
+
+
+def _folders(node: str, host: HostFiles) -> list[str]:
+    """Where drivers look up this one device: its folder, by the names that lead to it."""
+    address = _address(node, host)
+    found = [f"/sys/bus/pci/devices/{address}"] if address else []
+    if not _is_nvidias(node):
+        name = posixpath.basename(node)
+        number = host.read(f"/sys/class/drm/{name}/dev").strip()
+        found += [f"/sys/class/drm/{name}", f"/sys/dev/char/{number}"] if number else []
+    return found
