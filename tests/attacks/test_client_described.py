@@ -28,7 +28,7 @@ from tests.attacks.lying_server import Frames, LyingServer, lying
 from tests.attacks.test_client_lies import opened, refuses, relayed
 from tests.attacks.test_client_values import spec_of
 from tests.support.repositories import write_repository
-from tests.support.wire import ext, message, packed
+from tests.support.wire import ext, packed, value
 
 HUGE = 1 << 30
 
@@ -60,7 +60,7 @@ def frames_of(value: object, **limits: int) -> Frames:
     def write(thing: object) -> tuple[int, object] | None:
         return (thing.code, thing.value) if isinstance(thing, Lie) else None
 
-    fields = [m.Value.kind, 1, (value, None)]
+    fields = [m.Value.kind, (value, None)]
     found = encode(fields, describer=write, limits=WireLimits(**{"depth": 1000, **limits}))
     return [bytes(frame) for frame in found]
 
@@ -88,8 +88,8 @@ def generator_state(kind: str = "MT19937", **changes: Any) -> dict[str, Any]:
 
 def deep(levels: int) -> Frames:
     """Descriptions in descriptions, as no encoder of ours makes them."""
-    document = b"\x93\x30\x01" + (b"\x92" + msgpack.packb(ext(SPACE))) * levels + b"\xc0"
-    return [bytes(frame) for frame in message(document)]
+    document = (b"\x92" + msgpack.packb(ext(SPACE))) * levels + b"\xc0"
+    return [bytes(frame) for frame in value(document)]
 
 
 LIES: dict[str, Frames] = {
@@ -121,10 +121,10 @@ LIES: dict[str, Frames] = {
     "a generator that stands still": frames_of(Lie(GENERATOR, generator_state("PCG64", inc=0))),
     "a generator of its own": frames_of(Lie(GENERATOR, {"bit_generator": "Trap", "state": {}})),
     "a generator that is none": frames_of(Lie(GENERATOR, None)),
-    "two descriptions at once": packed([m.Value.kind, 1, [ext(SPACE), {}, {}]]),
-    "a description without one": packed([m.Value.kind, 1, [ext(SPACE)]]),
-    "a code that there is not": packed([m.Value.kind, 1, [ext(29), {}]]),
-    "as a key": packed([m.Value.kind, 1, {(ext(SPEC), 5): 1}]),
+    "two descriptions at once": packed([m.Value.kind, [ext(SPACE), {}, {}]]),
+    "a description without one": packed([m.Value.kind, [ext(SPACE)]]),
+    "a code that there is not": packed([m.Value.kind, [ext(29), {}]]),
+    "as a key": packed([m.Value.kind, {(ext(SPEC), 5): 1}]),
 }
 
 

@@ -30,7 +30,7 @@ from tests.attacks.lying_server import step_done
 from tests.attacks.test_client_lies import Canary, peak_growth
 from tests.support.processes import most_grown, resident
 from tests.support.repositories import write_repository
-from tests.support.wire import message
+from tests.support.wire import value
 
 FAMILY = "The client, from inside a jail"
 
@@ -144,11 +144,11 @@ def test_pickles_from_a_jail_are_never_loaded(
 
 BOMBS: dict[str, list[Buffer]] = {
     "a header of noise": [os.urandom(1000)],
-    "four million empty maps": message(
-        b"\x93\x30\x01\xdd" + (4_000_000).to_bytes(4, "big") + b"\x80" * 4_000_000
+    "four million empty maps": value(
+        b"\xdd" + (4_000_000).to_bytes(4, "big") + b"\x80" * 4_000_000
     ),
-    "lists a million deep": message(b"\x93\x30\x01" + b"\x91" * 1_000_000 + b"\xc0"),
-    "an array that claims four billion": message(b"\x93\x30\x01\xdd\xff\xff\xff\xff"),
+    "lists a million deep": value(b"\x91" * 1_000_000 + b"\xc0"),
+    "an array that claims four billion": value(b"\xdd\xff\xff\xff\xff"),
     "four thousand frames": [*m.pack(m.Value(None)), *[b"x"] * 4000],
     "a frame too many": [*m.pack(step_done()), b"x" * MIB],
     "a wrong shape": m.pack(step_done(observation=np.zeros((2, 99), np.float32))),

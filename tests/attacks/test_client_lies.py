@@ -41,7 +41,7 @@ from tests.attacks.lying_server import (
 )
 from tests.support import inside
 from tests.support.repositories import CARTPOLES, write_repository
-from tests.support.wire import deep, ext, message, packed
+from tests.support.wire import deep, ext, packed, value
 
 MIB = 1 << 20
 GROWTH = 192 * MIB
@@ -414,27 +414,27 @@ DOCUMENTS: dict[str, Callable[[], Frames]] = {
     "no message": lambda: packed("hello"),
     "an unknown kind": lambda: packed([9999, 1]),
     "a kind that is a list": lambda: packed([[], 1]),
-    "too few fields": lambda: packed([m.StepDone.kind, 1]),
-    "too many fields": lambda: packed([m.StepDone.kind, 1, *range(50)]),
-    "nested a thousand deep": lambda: packed([m.Value.kind, 1, deep(400)]),
-    "nested a million deep": lambda: message(b"\x93\x30\x01" + b"\x91" * 1_000_000 + b"\xc0"),
-    "a million empty maps": lambda: message(
-        b"\x93\x30\x01\xdd" + struct.pack(">I", 4_000_000) + b"\x80" * 4_000_000
+    "too few fields": lambda: packed([m.StepDone.kind]),
+    "too many fields": lambda: packed([m.StepDone.kind, *range(50)]),
+    "nested a thousand deep": lambda: packed([m.Value.kind, deep(400)]),
+    "nested a million deep": lambda: value(b"\x91" * 1_000_000 + b"\xc0"),
+    "a million empty maps": lambda: value(
+        b"\xdd" + struct.pack(">I", 4_000_000) + b"\x80" * 4_000_000
     ),
-    "an array that claims four billion": lambda: message(b"\x93\x30\x01\xdd\xff\xff\xff\xff"),
-    "a map that claims four billion": lambda: message(b"\x93\x30\x01\xdf\xff\xff\xff\xff"),
-    "a text that claims four billion": lambda: message(b"\x93\x30\x01\xdb\xff\xff\xff\xff"),
-    "an unknown extension": lambda: packed([m.Value.kind, 1, ext(99, b"x")]),
-    "a timestamp": lambda: message(b"\x93\x30\x01\xd7\xff" + b"\0" * 8),
-    "a key twice": lambda: message(b"\x93\x30\x01\x82\xa1a\x01\xa1a\x02"),
-    "a map for a key": lambda: message(b"\x93\x30\x01\x81\x80\x01"),
-    "an array of objects by hand": lambda: packed([m.Value.kind, 1, ext(1, b"|O8")]),
-    "an array of void by hand": lambda: packed([m.Value.kind, 1, ext(1, b"V2000000000")]),
-    "an array that is not there": lambda: packed([m.Value.kind, 1, ext(1, b"\x0b\x01" + b"\xff")]),
+    "an array that claims four billion": lambda: value(b"\xdd\xff\xff\xff\xff"),
+    "a map that claims four billion": lambda: value(b"\xdf\xff\xff\xff\xff"),
+    "a text that claims four billion": lambda: value(b"\xdb\xff\xff\xff\xff"),
+    "an unknown extension": lambda: packed([m.Value.kind, ext(99, b"x")]),
+    "a timestamp": lambda: value(b"\xd7\xff" + b"\0" * 8),
+    "a key twice": lambda: value(b"\x82\xa1a\x01\xa1a\x02"),
+    "a map for a key": lambda: value(b"\x81\x80\x01"),
+    "an array of objects by hand": lambda: packed([m.Value.kind, ext(1, b"|O8")]),
+    "an array of void by hand": lambda: packed([m.Value.kind, ext(1, b"V2000000000")]),
+    "an array that is not there": lambda: packed([m.Value.kind, ext(1, b"\x0b\x01" + b"\xff")]),
     "frames that nobody mentioned": lambda: [*m.pack(m.Value(None)), b"x" * 4096],
     "a thousand frames": lambda: [*m.pack(m.Value(None)), *[b"x"] * 5000],
-    "a number of a megabyte": lambda: packed([m.Value.kind, 1, ext(3, b"\x7f" * MIB)]),
-    "a text of ten megabytes": lambda: packed([m.Value.kind, 1, "x" * (10 * MIB)]),
+    "a number of a megabyte": lambda: packed([m.Value.kind, ext(3, b"\x7f" * MIB)]),
+    "a text of ten megabytes": lambda: packed([m.Value.kind, "x" * (10 * MIB)]),
 }
 
 

@@ -21,6 +21,11 @@ def message(document: bytes, tail: bytes = b"", *frames: bytes) -> list[Buffer]:
     return [struct.pack("<I", len(document)) + document + tail, *frames]
 
 
+def value(document: bytes) -> list[Buffer]:
+    """A ``Value``, the answer to a call, around a hand-made msgpack document."""
+    return message(b"\x92" + msgpack.packb(m.Value.kind) + document)
+
+
 def ext(code: int, payload: bytes = b"") -> msgpack.ExtType:
     """An extension, for hand-made documents."""
     return msgpack.ExtType(code, payload)
