@@ -1,0 +1,137 @@
+"""Locks on files. The kernel gives a lock back when its holder ends, whatever ended it.
+
+All are ``flock``. Such a lock belongs to the open file description, and not to a process: a child
+that is given the descriptor holds the lock on, and so would a fork, which therefore closes its
+copies. A pid, or a start time, would say nothing in another namespace; a lock does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+_POLL_S = 0.1
+_READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC
+_WRITE = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+
+
+@contextlib.contextmanager
+def held(
+    path: Path,
+    *,
+    wait_s: float = 0.0,
+    shared: bool = False,
+    on_wait: Callable[[], object] = lambda: None,
+    mode: int = 0o600,
+) -> Iterator[int]:
+    """Hold the lock of a file, which is made if it is missing. Gives its descriptor.
+
+    A child that inherits the descriptor keeps the lock only until this context ends. The holder
+    may remove the file: the next one makes another.
+
+    Args:
+        path: The file.
+        wait_s: For how long to wait while another holds it.
+        shared: Whether others may hold it as well, if theirs is shared, too.
+        on_wait: Called once before the first wait.
+        mode: That of a new file.
+
+    Raises:
+        TimeoutError: Another holds it.
+        OSError: It cannot be opened, or its file system has no locks.
+    """
+    until = time.monotonic() + wait_s
+    waits = False
+    while (descriptor := _take(path, mode, shared=shared)) is None:
+        if time.monotonic() >= until:
+            raise TimeoutError(f"another process holds the lock {path}")
+        if not waits:
+            waits = True
+            on_wait()
+        time.sleep(_POLL_S)
+    try:
+        yield descriptor
+    finally:
+        fcntl.flock(descriptor, fcntl.LOCK_UN)  # a fork may have a copy, which would hold it on
+        os.close(descriptor)
+
+
+def _take(path: Path, mode: int, *, shared: bool) -> int | None:
+    """Take it now; None if another has it, or has just removed the file."""
+    descriptor = os.open(path, _WRITE, mode)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_NB | (fcntl.LOCK_SH if shared else fcntl.LOCK_EX))
+        if os.path.samestat(os.fstat(descriptor), os.stat(path)):
+            return descriptor
+    except (BlockingIOError, FileNotFoundError):
+        pass
+    except BaseException:
+        os.close(descriptor)
+        raise
+    os.close(descriptor)
+    return None
+
+
+def is_held(path: Path) -> bool:
+    """Whether another, in whatever namespace, holds a lock that is not shared.
+
+    Args:
+        path: A file or a folder.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        OSError: That cannot be told.
+    """
+    descriptor = os.open(path, _READ)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
+class LifeLock:
+    """A new file whose lock this process holds for as long as it lives, or until ``release``.
+
+    Under its name nobody sees the file without its lock. Where the file system has no locks,
+    ``is_held`` cannot tell, and says so. A fork does not hold it.
+
+    Args:
+        path: The file.
+        content: What stands in it.
+    """
+
+    def __init__(self, path: Path, content: str = "") -> None:
+        new = path.with_name(f".{path.name}")
+        self._descriptor = os.open(new, _WRITE | os.O_EXCL, 0o600)
+        _held_for_life.add(self._descriptor)
+        with contextlib.suppress(OSError):
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX)
+        os.write(self._descriptor, content.encode())
+        os.rename(new, path)
+
+    def release(self) -> None:
+        """Give it back. Idempotent, and nothing in a fork."""
+        if self._descriptor in _held_for_life:
+            _held_for_life.discard(self._descriptor)
+            os.close(self._descriptor)
+        self._descriptor = -1
+
+
+_held_for_life: set[int] = set()
+
+
+def _forked() -> None:
+    for descriptor in _held_for_life:
+        with contextlib.suppress(OSError):
+            os.close(descriptor)
+    _held_for_life.clear()
+
+
+os.register_at_fork(after_in_child=_forked)
