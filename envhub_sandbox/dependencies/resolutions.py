@@ -9,8 +9,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -21,6 +19,7 @@ from envhub_sandbox.dependencies.declared import Wanted
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.resolve import WORKERS, Lock
 from envhub_sandbox.hub.store import cache_root
+from envhub_sandbox.system.files import write_whole
 
 _FORMAT = 1
 _MAX_BYTES = 16 * 1024 * 1024
@@ -54,7 +53,4 @@ def remember(key: str, lock: Lock) -> None:
     """Keep a choice. A cache that cannot be written is no error."""
     with contextlib.suppress(OSError):
         folders.make_private(root())
-        fd, temporary = tempfile.mkstemp(dir=root())
-        with os.fdopen(fd, "w", encoding="utf-8") as file:
-            file.write(lock.text)
-        os.replace(temporary, root() / key)
+        write_whole(root() / key, lock.text.encode())

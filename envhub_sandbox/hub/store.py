@@ -33,6 +33,7 @@ from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
 from envhub_sandbox.hub.hashing import Mismatch, digest_of
 from envhub_sandbox.hub.listing import FileRecord
 from envhub_sandbox.log import SNAPSHOT
+from envhub_sandbox.system.files import write_whole
 
 CACHE_VARIABLE = "ENVHUB_CACHE"
 _FORMAT = 1
@@ -360,10 +361,7 @@ def _write_record(
         status = (tree / file.path).lstat()
         times = (status.st_mtime_ns, status.st_ctime_ns, status.st_ino)
         rows.append(_Entry(file.path, file.size, file.digest, *times))
-    handle, name = tempfile.mkstemp(prefix=".record-", dir=home)
-    with os.fdopen(handle, "w", encoding="utf-8") as stream:
-        json.dump({**document, "files": rows}, stream)
-    os.replace(name, home / "record.json")
+    write_whole(home / "record.json", json.dumps({**document, "files": rows}).encode())
 
 
 @contextlib.contextmanager

@@ -6,11 +6,9 @@ bounds, and decides nothing but what it is about. See ``docs/dependencies.md``.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import re
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +23,7 @@ from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.locks import pylock, toml
 from envhub_sandbox.locks.fingerprint import Task
 from envhub_sandbox.locks.pylock import Package, quoted
+from envhub_sandbox.system.files import write_whole
 
 FORMAT = 1
 MAX_FILES = 20_000
@@ -271,27 +270,10 @@ def write(lock: LockFile, path: Path) -> None:
     Raises:
         LockError: It cannot be written.
     """
-    temporary = None
     try:
-        data = written(lock).encode()
-        fd, temporary = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
-        with os.fdopen(fd, "wb") as file:
-            file.write(data)
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
+        write_whole(path, written(lock).encode(), mode=0o666)
     except (OSError, UnicodeEncodeError) as error:
-        if temporary is not None:
-            with contextlib.suppress(OSError):
-                os.unlink(temporary)
         raise LockError(f"the lock {path} cannot be written: {error}") from error
-
-
-def _umask() -> int:
-    """What a new file of this process may not have; the process's own stays as it is."""
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("Umask:"):
-            return int(line.split()[1], 8)
-    return 0o077
 
 
 def runner_here(lock: LockFile) -> Interpreter:

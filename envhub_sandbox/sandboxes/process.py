@@ -24,6 +24,7 @@ from envhub_sandbox.option_names import option_name
 from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.lingering import Lingering
 from envhub_sandbox.sandboxes.refcount import Sharing, Use, Uses
+from envhub_sandbox.system import procfs
 from envhub_sandbox.transport.forks import Owner
 from envhub_worker.protocol.runtime import OWN, Runtime
 
@@ -57,7 +58,7 @@ class ProcessServer:
         One that was killed is a zombie before its threads are gone, and only then can it be waited
         for: it takes no requests any more.
         """
-        return self.process.poll() is None and not _is_zombie(self.process.pid)
+        return self.process.poll() is None and not procfs.has_ended(self.process.pid)
 
     def stop(self) -> None:
         """End it and everything below it, in bounded time. A fork of its owner does nothing.
@@ -171,11 +172,3 @@ def _wait_until_ready(ready: int, server: ProcessServer) -> None:
 
 
 PROCESS = ProcessSandbox()
-
-
-def _is_zombie(pid: int) -> bool:
-    try:
-        stat = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace")
-    except OSError:
-        return True
-    return stat.rpartition(")")[2].split()[0] in "ZX"

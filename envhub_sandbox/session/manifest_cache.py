@@ -10,13 +10,13 @@ import contextlib
 import hashlib
 import os
 import sys
-import tempfile
 from pathlib import Path
 
 from envhub_sandbox import folders
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.policy import Policy
+from envhub_sandbox.system.files import write_whole
 from envhub_sandbox.transport.shared_memory.sharding import PaceBook
 from envhub_sandbox.transport.values import pickles
 from envhub_sandbox.transport.values.generators import generator
@@ -72,10 +72,7 @@ class ManifestCache:
         data = b"".join(map(bytes, pack_packet(1, m.pack(m.Loaded(value)))))
         with contextlib.suppress(OSError):
             folders.make_private(self._path.parent)
-            fd, temporary = tempfile.mkstemp(dir=self._path.parent)
-            with os.fdopen(fd, "wb") as file:
-                file.write(data)
-            os.replace(temporary, self._path)
+            write_whole(self._path, data)
 
     def forget(self) -> None:
         """Drop the entry."""

@@ -7,7 +7,6 @@ to it: one that is there is whole. It counts again for the same commit, judged i
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import json
 import math
@@ -17,6 +16,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,8 @@ from envhub_sandbox.check import reports
 from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.check.many.lines import Listed
 from envhub_sandbox.check.parsing import content
+from envhub_sandbox.system.files import write_whole
+from envhub_sandbox.system.locks import held
 from envhub_worker.protocol.text import printable
 
 MOST_BYTES = 32 << 20
@@ -135,17 +137,13 @@ class Results:
             raise FolderError(
                 f"{self._folder} has other things in it, and no results: name a new folder"
             )
-        flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-        descriptor = os.open(mark, flags, 0o666)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(descriptor)
-            raise FolderError(f"another run writes to {self._folder}; wait for its end") from None
-        try:
+        with contextlib.ExitStack() as lock:
+            try:
+                lock.enter_context(held(mark, mode=0o666))
+            except TimeoutError:
+                why = f"another run writes to {self._folder}; wait for its end"
+                raise FolderError(why) from None
             yield
-        finally:
-            os.close(descriptor)
 
     def kept(self, listed: Listed) -> Result | None:
         """What came of a reference when it was judged before, in this way; None if it was not.
@@ -200,7 +198,7 @@ class Results:
         data = content(page, MOST_BYTES)
         if data is None:
             raise ForeignResultError("there is no page")
-        write(self._path(listed, "html"), data)
+        _write(self._path(listed, "html"), data)
         how = {
             "settings": self._settings,
             "reference": listed.meaning,
@@ -209,7 +207,7 @@ class Results:
             "ended": ended,
         }
         text = json.dumps({**told, "judgement": how}, indent=2, allow_nan=False)
-        write(self._path(listed, "json"), text.encode())
+        _write(self._path(listed, "json"), text.encode())
         return _result(listed, report, failures, seconds=seconds, ended=ended)
 
     def forget(self, listed: Listed) -> None:
@@ -218,7 +216,7 @@ class Results:
 
     def write(self, name: str, text: str) -> None:
         """Write a file about all of them."""
-        write(self._folder / name, text.encode("utf-8", "backslashreplace"))
+        _write(self._folder / name, text.encode("utf-8", "backslashreplace"))
 
     def _digest(self, listed: Listed) -> str | None:
         data = content(self._path(listed, "html"), MOST_BYTES)
@@ -233,24 +231,7 @@ def link(listed: Listed, kind: str) -> str:
     return f"{_REPORTS}/{listed.name}.{kind}"
 
 
-def write(path: Path, data: bytes) -> None:
-    """Write a file; whoever reads it meanwhile, or after the power failed, reads the old one.
-
-    Raises:
-        OSError: It cannot be written.
-    """
-    part = path.with_name(f".{path.name}.part")
-    part.unlink(missing_ok=True)
-    fd = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
-    try:
-        with open(fd, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(fd)
-        os.replace(part, path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+_write = partial(write_whole, mode=0o666, durable=True)
 
 
 def _result(

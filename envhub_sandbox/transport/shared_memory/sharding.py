@@ -13,12 +13,12 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
+from envhub_sandbox.system.files import write_whole
 from envhub_sandbox.transport.shared_memory.affinity import CPUS
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces.batches import even_bounds
@@ -180,14 +180,7 @@ class PaceBook:
     def _write(self, entries: dict[str, object]) -> None:
         assert self._path is not None
         with contextlib.suppress(OSError):
-            fd, temporary = tempfile.mkstemp(dir=self._path.parent)
-            try:
-                with os.fdopen(fd, "w") as file:
-                    json.dump(entries, file)
-                os.replace(temporary, self._path)
-            except BaseException:
-                os.unlink(temporary)
-                raise
+            write_whole(self._path, json.dumps(entries).encode())
 
 
 def _forgotten(known: Pace | None, awake: Cost) -> Cost:
