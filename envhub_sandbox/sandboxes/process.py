@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import select
-import shutil
 import subprocess
 import sys
 from dataclasses import dataclass, field
@@ -24,6 +23,7 @@ from envhub_sandbox.option_names import option_name
 from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.lingering import Lingering
 from envhub_sandbox.sandboxes.refcount import Sharing, Use, Uses
+from envhub_sandbox.sandboxes.runtime_folder import RuntimeFolder
 from envhub_sandbox.system import procfs
 from envhub_sandbox.transport.forks import Owner
 from envhub_worker.protocol.runtime import OWN, Runtime
@@ -41,10 +41,15 @@ class ProcessServer:
     endpoint: str
     process_fd: int
     process: subprocess.Popen[bytes]
-    folder: Path
+    runtime: RuntimeFolder
     owner: Owner = field(default_factory=Owner)
     uses: Uses = field(default_factory=Uses)
     stopped: bool = False
+
+    @property
+    def folder(self) -> Path:
+        """Where its sockets and its log lie."""
+        return self.runtime.path
 
     @property
     def fd_path(self) -> str:
@@ -73,7 +78,7 @@ class ProcessServer:
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
-        shutil.rmtree(self.folder, ignore_errors=True)
+        self.runtime.remove()
         try:
             self.stopped = True  # once: the number may be somebody else's a moment later
             os.close(self.process_fd)
@@ -106,19 +111,19 @@ class ProcessSandbox:
 
 
 def _start(store: Path, runtime: Runtime) -> ProcessServer:
-    folder = runtime_folder.make(runtime_folder.SERVER)  # of mode 0700: the endpoint is ours alone
-    endpoint = f"ipc://{folder}/server"
+    folder = RuntimeFolder(runtime_folder.SERVER)  # of mode 0700: the endpoint is ours alone
+    endpoint = f"ipc://{folder.path}/server"
     ready, ready_end = os.pipe()
     process = None
     try:
-        process = _execute(folder, store, runtime, endpoint, ready_end)
+        process = _execute(folder.path, store, runtime, endpoint, ready_end)
         server = ProcessServer(endpoint, os.pidfd_open(process.pid), process, folder)
     except BaseException:
         if process is not None:
             process.kill()
             process.wait()
         os.close(ready)
-        shutil.rmtree(folder, ignore_errors=True)
+        folder.remove()
         raise
     finally:
         os.close(ready_end)

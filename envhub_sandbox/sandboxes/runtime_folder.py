@@ -1,14 +1,14 @@
-"""Private folders of servers: where they lie, whose they are, and which are nobody's any more.
+"""Private folders of servers: where they lie, and which of them no process uses any more.
 
-Each has sockets, and a socket's path has 107 bytes at most. Its client writes down who it is
-before anything else, so that whoever comes later can tell that it has gone: it may be killed at
-any moment, also before there is a server that would clean up.
+Each has sockets, and a socket's path has 107 bytes at most. Its client holds the lock of a file in
+it for as long as it lives, so that whoever comes later can tell that it has gone: it may be killed
+at any moment, also before there is a server that would clean up. Containers name such a folder.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
+import errno
 import os
 import re
 import shutil
@@ -19,39 +19,61 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from envhub_sandbox.errors import SandboxUnavailableError
-from envhub_sandbox.sandboxes.owner import has_ended, identity_of, is_of_this_boot
+from envhub_sandbox.system.locks import LifeLock, is_held
 
 SERVER = "envhub-"
 CONTAINER = "envhub-docker-"
 _NAME = re.compile(rf"{SERVER}(docker-|scratch-|state-)?[a-z0-9_]{{8}}")
-_CLIENT_FILE = "client"
+_CLIENT_FILE = "alive"
 _LOCK_FILE = "lock"
+_BEGUN = {f".{_CLIENT_FILE}", f".{_LOCK_FILE}"}
 _SOCKET_BYTES = 107
 _LONGEST = f"/{CONTAINER}12345678/sockets/server"
 _EMPTY_S = 60.0
 """Nobody needs so long from a folder to the first file in it."""
 
 
-def make(prefix: str) -> Path:
-    """A new private folder, marked as this process's.
+class RuntimeFolder:
+    """A new private folder, which is in use as long as this process lives.
+
+    Args:
+        prefix: What its name begins with.
+
+    Attributes:
+        path: Its path.
 
     Raises:
         SandboxUnavailableError: There is no place for one.
     """
-    place = next((place for place in places() if _is_usable(place)), None)
-    if place is None:
-        raise SandboxUnavailableError(
-            f"there is no folder for sockets: their paths have {_SOCKET_BYTES} bytes at most, and "
-            f"{', '.join(map(str, places()))} are too long or cannot be written; set TMPDIR to a "
-            "shorter one"
-        )
-    folder = Path(tempfile.mkdtemp(prefix=prefix, dir=place))
-    try:
-        (folder / _CLIENT_FILE).write_text(identity_of(os.getpid()))
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
-    return folder
+
+    def __init__(self, prefix: str) -> None:
+        self.path = _made(prefix)
+        try:
+            self._lock = LifeLock(self.path / _CLIENT_FILE, f"{_boot()} {os.getpid()}\n")
+        except BaseException:
+            shutil.rmtree(self.path, ignore_errors=True)
+            raise
+
+    def remove(self) -> None:
+        """Remove it, with all that is in it. Idempotent."""
+        shutil.rmtree(self.path, ignore_errors=True)
+        self._lock.release()
+
+
+def _made(prefix: str) -> Path:
+    """A new folder in the first place that takes one: whether it does only an attempt can tell."""
+    why = ""
+    for place in places():
+        if _is_short(place):
+            try:
+                return Path(tempfile.mkdtemp(prefix=prefix, dir=place))
+            except OSError as error:
+                why = why or f" ({error.strerror}: {place})"
+    raise SandboxUnavailableError(
+        f"there is no folder for sockets: their paths have {_SOCKET_BYTES} bytes at most, and "
+        f"{', '.join(map(str, places()))} are too long or cannot be written{why}; set TMPDIR to a "
+        "shorter one, or to one that can be written"
+    )
 
 
 def places() -> list[Path]:
@@ -63,13 +85,12 @@ def places() -> list[Path]:
     return list(dict.fromkeys([*found, Path("/tmp")]))
 
 
-def _is_usable(place: Path) -> bool:
-    path = os.fsencode(place) + os.fsencode(_LONGEST)
-    return len(path) <= _SOCKET_BYTES and os.access(place, os.W_OK | os.X_OK)
+def _is_short(place: Path) -> bool:
+    return len(os.fsencode(place) + os.fsencode(_LONGEST)) <= _SOCKET_BYTES
 
 
 def stale_folders(place: Path) -> Iterator[Path]:
-    """Ours below one of the places that nobody uses any more."""
+    """Ours below one of the places whose client has ended, or the server without a client."""
     for path in sorted(place.glob(f"{SERVER}*")):
         with contextlib.suppress(OSError):
             if _NAME.fullmatch(path.name) and _belongs_to_us(path) and _is_deserted(path):
@@ -79,7 +100,7 @@ def stale_folders(place: Path) -> Iterator[Path]:
 def remove_stale() -> list[Path]:
     """Remove those that were not another machine's, or this one's before it started anew.
 
-    These are for people to judge: a file system may be shared, and its users all live.
+    These are for people to judge: a file system may be shared, and not pass locks on.
 
     Returns:
         What was removed.
@@ -91,11 +112,26 @@ def remove_stale() -> list[Path]:
     return ours
 
 
+def is_in_use(path: Path) -> bool:
+    """Whether the client of a folder lives.
+
+    Raises:
+        FileNotFoundError: It is no folder of a client, or not one of this machine.
+        OSError: That cannot be told.
+    """
+    if not (path.is_absolute() and _NAME.fullmatch(path.name)):
+        raise FileNotFoundError(errno.ENOENT, "it is no runtime folder", str(path))
+    return is_held(path / _CLIENT_FILE)
+
+
 def _is_elsewhere(path: Path) -> bool:
     with contextlib.suppress(FileNotFoundError):
-        client = (path / _CLIENT_FILE).read_text()
-        return bool(client) and not is_of_this_boot(client)
+        return _boot() not in (path / _CLIENT_FILE).read_text()
     return False
+
+
+def _boot() -> str:
+    return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
 def _belongs_to_us(path: Path) -> bool:
@@ -108,25 +144,9 @@ def _belongs_to_us(path: Path) -> bool:
 
 
 def _is_deserted(path: Path) -> bool:
-    """Whether its client has ended, or the server that had no client of its own."""
     names = set(os.listdir(path))
-    if _CLIENT_FILE in names:
-        client = (path / _CLIENT_FILE).read_text()
-        return has_ended(client) is True if client else _is_forgotten(path)
-    if _LOCK_FILE in names:
-        return _is_unlocked(path / _LOCK_FILE)
-    return not names and _is_forgotten(path)
-
-
-def _is_forgotten(path: Path) -> bool:
-    return time.time() - path.stat().st_mtime > _EMPTY_S
-
-
-def _is_unlocked(path: Path) -> bool:
-    """Whether nobody holds the lock that ``envhub-worker listen`` holds as long as it lives."""
-    with path.open("rb") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-    return True
+    for name in (_CLIENT_FILE, _LOCK_FILE):
+        if name in names:
+            return not is_held(path / name)
+    # its client was killed before its first file had that name
+    return names <= _BEGUN and time.time() - path.stat().st_mtime > _EMPTY_S

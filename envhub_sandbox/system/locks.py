@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 _POLL_S = 0.1
-_READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC
+_READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
 _WRITE = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
@@ -86,14 +86,26 @@ def is_held(path: Path) -> bool:
         FileNotFoundError: There is no such file.
         OSError: That cannot be told.
     """
+    with unheld(path) as free:
+        return not free
+
+
+@contextlib.contextmanager
+def unheld(path: Path) -> Iterator[bool]:
+    """The opposite of ``is_held``; in this context nobody takes the lock. Raises likewise."""
     descriptor = os.open(path, _READ)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        free = True
     except BlockingIOError:
-        return True
+        free = False
+    except BaseException:
+        os.close(descriptor)
+        raise
+    try:
+        yield free
     finally:
         os.close(descriptor)
-    return False
 
 
 class LifeLock:

@@ -16,7 +16,6 @@ from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.run_arguments import CLIENT_LABEL, SNAPSHOT
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from envhub_sandbox.sandboxes.lingering import stop_idle
-from envhub_sandbox.sandboxes.owner import identity_of
 from tests.attacks.harness import Arena, Run, answered, new_alias
 from tests.support.processes import eventually
 
@@ -32,31 +31,30 @@ def container_of(env: Any) -> str:
     return found[0]
 
 
-def containers_of(engine: Engine, identity: str) -> list[str]:
+def containers_of(engine: Engine, client: int) -> list[str]:
     """Ids of all containers of a client, whatever their state."""
-    label = f"label={CLIENT_LABEL}={identity}"
+    label = f"label={CLIENT_LABEL}={client}"
     return engine.run("ps", "--all", "--quiet", "--filter", label).split()
 
 
-def folders(identity: str | None = None) -> list[Path]:
+def folders(client: int | None = None) -> list[Path]:
     """The runtime folders of a client's containers, ours by default."""
-    wanted, found = identity or identity_of(os.getpid()), []
+    wanted, found = str(client or os.getpid()), []
     for path in Path(tempfile.gettempdir()).glob("envhub-docker-*"):
         with contextlib.suppress(OSError):
-            if (path / "client").read_text() == wanted:
+            if (path / "alive").read_text().split()[1] == wanted:
                 found.append(path)
     return found
 
 
-def nothing_left(engine: Engine, identity: str | None = None) -> bool:
+def nothing_left(engine: Engine, client: int | None = None) -> bool:
     """Whether no container of a client is left, ours by default; waits for it.
 
     Of ours one may linger until its time comes; that is ended first.
     """
-    if identity is None:
+    if client is None:
         stop_idle()
-    wanted = identity or identity_of(os.getpid())
-    return eventually(lambda: not containers_of(engine, wanted), 60.0)
+    return eventually(lambda: not containers_of(engine, client or os.getpid()), 60.0)
 
 
 def pids_in(engine: Engine, container: str) -> list[int]:

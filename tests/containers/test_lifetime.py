@@ -19,11 +19,11 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import WorkerDiedError, WorkerStartupError
+from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.docker import prune
 from envhub_sandbox.sandboxes.docker.engines import Engine
-from envhub_sandbox.sandboxes.docker.run_arguments import CLIENT_LABEL, USER_LABEL
+from envhub_sandbox.sandboxes.docker.run_arguments import FOLDER_LABEL, USER_LABEL
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
-from envhub_sandbox.sandboxes.owner import identity_of
 from tests.containers.kit import IMAGE, container_of, containers_of, folders, nothing_left, pids_in
 from tests.support.processes import descendants, eventually
 from tests.support.repositories import write_repository
@@ -47,14 +47,13 @@ _CLIENT = """
 import json, os, sys
 from envhub_sandbox import make_env
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
-from envhub_sandbox.sandboxes.owner import identity_of
 docker = DockerSandbox(image=sys.argv[2], engine=sys.argv[3])
 suites = make_env(sys.argv[1], n_envs=2, sandbox=docker)
 env = suites.env
 env.reset(seed=0)
 env.step(env.action_space.sample())
 report = [layer["detail"] for layer in env.sandbox_report if layer["layer"] == "container"]
-print(json.dumps({"identity": identity_of(os.getpid()), "report": report}), flush=True)
+print(json.dumps({"report": report}), flush=True)
 if sys.argv[4] == "exit":
     sys.exit(0)
 if sys.argv[4] == "fork" and os.fork() == 0:
@@ -68,7 +67,6 @@ class Client:
     """A client of its own process, which has a container."""
 
     process: subprocess.Popen[str]
-    identity: str
     container: str
 
     def monitor(self) -> psutil.Process:
@@ -97,7 +95,7 @@ def client(engine: Engine, then: str = "wait") -> Iterator[Client]:
     try:
         said = json.loads(process.stdout.readline())
         container = said["report"][0].rpartition(", ")[2]
-        yield Client(process, said["identity"], container)
+        yield Client(process, container)
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
@@ -111,7 +109,7 @@ def test_closing_leaves_nothing(docker: DockerSandbox, engine: Engine) -> None:
     assert nothing_left(engine)  # of others that linger
     with make_env(sample("counter"), sandbox=docker) as suites:
         suites.env.reset(seed=0)
-        assert len(containers_of(engine, identity_of(os.getpid()))) == 1
+        assert len(containers_of(engine, os.getpid())) == 1
         assert len(folders()) == 1
     assert nothing_left(engine)
     assert folders() == []
@@ -132,9 +130,9 @@ def test_a_container_ends_with_its_client(engine: Engine, how: str) -> None:
         if how != "exit":
             made.process.send_signal(getattr(signal, how))
         made.process.wait()
-        assert nothing_left(engine, made.identity)
+        assert nothing_left(engine, made.process.pid)
         assert eventually(lambda: not any(psutil.pid_exists(pid) for pid in pids))
-        assert eventually(lambda: not folders(made.identity))
+        assert eventually(lambda: not folders(made.process.pid))
 
 
 def test_a_fork_of_the_client_does_not_keep_its_container(engine: Engine) -> None:
@@ -144,7 +142,7 @@ def test_a_fork_of_the_client_does_not_keep_its_container(engine: Engine) -> Non
         [fork] = _forks(made.process.pid)
         made.process.kill()
         made.process.wait()
-        assert nothing_left(engine, made.identity)
+        assert nothing_left(engine, made.process.pid)
         assert psutil.pid_exists(fork)
 
 
@@ -160,8 +158,8 @@ def test_client_and_monitor_killed_together_leave_no_container(engine: Engine) -
         monitor.suspend()
         made.process.kill()
         monitor.kill()
-        assert nothing_left(engine, made.identity)
-        [folder] = folders(made.identity)
+        assert nothing_left(engine, made.process.pid)
+        [folder] = folders(made.process.pid)
         found = [one for one in prune.find().leftovers if one.name == str(folder)]
         assert [one.remove() for one in found] == [True]
         assert not folder.exists()
@@ -223,22 +221,22 @@ def idle_container(engine: Engine, labels: dict[str, str]) -> Iterator[str]:
 
 
 def test_gc_removes_what_is_ours_and_dead_and_nothing_else(engine: Engine) -> None:
-    """A running client's, another user's, another namespace's and a stranger's stay."""
+    """A running client's, another machine's and a stranger's stay."""
     me = str(os.geteuid())
-    ended = subprocess.Popen(["sleep", "60"])
-    dead = identity_of(ended.pid)
-    ended.kill()
-    ended.wait()
-    alive = identity_of(os.getpid())
-    elsewhere = f"{dead.rpartition(':')[0]}:1"
     with contextlib.ExitStack() as stack:
+        kept = [runtime_folder.RuntimeFolder(runtime_folder.CONTAINER) for _ in range(2)]
+        for one in kept:
+            stack.callback(one.remove)
+        alive, dead = [str(one.path) for one in kept]
+        (kept[1].path / "alive").unlink()
+        (kept[1].path / "alive").touch()
         made = {
             who: stack.enter_context(idle_container(engine, labels))
             for who, labels in {
-                "dead": {CLIENT_LABEL: dead, USER_LABEL: me},
-                "alive": {CLIENT_LABEL: alive, USER_LABEL: me},
-                "elsewhere": {CLIENT_LABEL: elsewhere, USER_LABEL: me},
-                "nonsense": {CLIENT_LABEL: "nonsense", USER_LABEL: me},
+                "dead": {FOLDER_LABEL: dead, USER_LABEL: me},
+                "alive": {FOLDER_LABEL: alive, USER_LABEL: me},
+                "elsewhere": {FOLDER_LABEL: "/tmp/envhub-docker-nothere0", USER_LABEL: me},
+                "nonsense": {FOLDER_LABEL: "nonsense", USER_LABEL: me},
                 "stranger": {"org.example": dead},
             }.items()
         }

@@ -28,6 +28,8 @@ def halting(owner, name, when):
     whole = getattr(owner, name)
 
     def halted(*arguments, **options):
+        if not {{"serve", "envhub-"}} & {{*(arguments or [()])[0], options.get("prefix")}}:
+            return whole(*arguments, **options)  # git's, and the store's
         result = whole(*arguments, **options) if when == "after" else None
         say(getattr(result, "pid", 0))
         time.sleep(600)

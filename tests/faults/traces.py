@@ -143,7 +143,7 @@ def _lines(path: str, marker: str) -> list[str]:
 
 def _cgroups() -> Iterator[str]:
     """Groups that servers below this very process have made."""
-    prefix = tuple(f"envhub-{pid}-" for pid in _children())
+    prefix = tuple(f"envhub_{pid}_" for pid in _children())
     for line in _read("/proc/self/cgroup").splitlines():
         _, controller, own = line.split(":", 2)
         for root in {f"/sys/fs/cgroup/{controller}", f"/sys/fs/cgroup/{controller}{own}"}:

@@ -4,20 +4,27 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
+import psutil
 import pytest
 
-from envhub_sandbox.sandboxes.owner import identity_of
+from envhub_sandbox import make_env
+from tests.faults.traces import temporary_root
+from tests.support.samples import sample
 
 
-def gc(temporary: Path, *options: str, check: bool = True) -> subprocess.CompletedProcess[str]:
+def gc(
+    temporary: Path, *options: str, check: bool = True, before: Sequence[str] = ()
+) -> subprocess.CompletedProcess[str]:
     """Run it with a folder for temporary files of its own, and without an engine."""
     variables = {"TMPDIR": str(temporary), "PATH": str(temporary)}
     return subprocess.run(
-        [sys.executable, "-I", "-m", "envhub_sandbox", "gc", *options],
+        [*before, sys.executable, "-I", "-m", "envhub_sandbox", "gc", *options],
         env=os.environ | variables,
         capture_output=True,
         text=True,
@@ -27,12 +34,39 @@ def gc(temporary: Path, *options: str, check: bool = True) -> subprocess.Complet
 
 def left_behind(temporary: Path) -> Path:
     """The folder of a container whose client has ended."""
-    child = subprocess.Popen([sys.executable, "-S", "-c", "input()"], stdin=subprocess.PIPE)
-    folder = temporary / "envhub-docker-abcd0123"
-    folder.mkdir(mode=0o700)
-    (folder / "client").write_text(identity_of(child.pid))
-    child.communicate()
-    return folder
+    code = """
+import os, sys
+from envhub_sandbox.sandboxes.runtime_folder import RuntimeFolder
+folder = RuntimeFolder("envhub-docker-")
+print(folder.path, flush=True)
+os._exit(0)
+"""
+    words, variables = [sys.executable, "-c", code], {"TMPDIR": str(temporary)}
+    done = subprocess.run(
+        words, env=os.environ | variables, capture_output=True, text=True, check=True
+    )
+    return Path(done.stdout.strip())
+
+
+def test_a_running_client_is_left_alone_in_every_namespace() -> None:
+    """Its pid and its start time are other ones there; its lock is the same."""
+    unshare = shutil.which("unshare")
+    assert unshare is not None
+    user = [] if os.geteuid() == 0 else ["--map-root-user"]
+    apart = ["--time", "--boottime", "5000", "--pid", "--mount-proc", "--fork"]
+    with temporary_root() as place:
+        suites = make_env(sample("counter"), timeouts={"server_idle_s": 0})
+        suites.env.reset(seed=1)
+        mine = set(place.glob("envhub-*"))
+        assert mine
+        dead = left_behind(place)  # not before: a client that starts removes it
+        done = gc(place, "--dry-run", "--json", before=[unshare, *user, *apart])
+        found = {one["name"] for one in json.loads(done.stdout)["found"]}
+        assert str(dead) in found
+        assert not found & set(map(str, mine))
+        servers = [child.pid for child in psutil.Process().children()]
+        assert not [name for name in found for pid in servers if f"_{pid}_" in name]
+        suites.close()
 
 
 def test_a_dry_run_removes_nothing(tmp_path: Path) -> None:

@@ -1,9 +1,9 @@
 """What clients that were killed left behind: containers, folders, control groups.
 
-Only what can be told to be ours, and to be nobody's any more. A container names its client in a
-label, a folder in a file or by a lock that nobody holds, a control group by a pid; what does not is
-left alone. So is what belongs to another user, whose processes we may not even see; root sees
-all, and removes every user's containers and control groups.
+Only what can be told to be ours, and to be nobody's any more. Whoever lives holds a lock: a client
+that of its folder, which its container names in a label, and a server those of its folders and
+control groups. What has no such lock is left alone. So is what belongs to another user, whose files
+we may not even see; root sees all, and removes every user's containers and control groups.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from envhub_sandbox.sandboxes.docker.engines import (
     find_engine,
     is_elsewhere,
 )
-from envhub_sandbox.sandboxes.docker.run_arguments import CLIENT_LABEL, USER_LABEL
-from envhub_sandbox.sandboxes.owner import has_ended, is_of_this_boot
+from envhub_sandbox.sandboxes.docker.run_arguments import FOLDER_LABEL, USER_LABEL
+from envhub_sandbox.system.locks import is_held, unheld
 
 _CGROUPS = Path("/sys/fs/cgroup")
 _ENDED = frozenset({"exited", "stopped", "dead"})
-_GROUP = re.compile(r"envhub-(\d+)-\w[\w-]*")
+_GROUP = re.compile(r"envhub_\d+_\w[\w-]*")
 
 
 @dataclass(frozen=True)
@@ -103,10 +103,10 @@ def _containers() -> tuple[list[Leftover], dict[str, str]]:
 def stale_containers(engine: Engine) -> Iterator[Leftover]:
     """Containers of ours whose client has ended, running or not.
 
-    One that runs for a client of another machine, or before this one started, is left alone.
+    One that runs for a client of another machine, whose folder is not here, is left alone.
     """
     listed = engine.run(
-        "ps", "--all", "--no-trunc", "--filter", f"label={CLIENT_LABEL}", "--format", "{{.ID}}"
+        "ps", "--all", "--no-trunc", "--filter", f"label={FOLDER_LABEL}", "--format", "{{.ID}}"
     )
     for container in listed.split():
         with contextlib.suppress(EngineError, ValueError):  # it may have gone meanwhile
@@ -117,10 +117,14 @@ def stale_containers(engine: Engine) -> Iterator[Leftover]:
 
 
 def _is_deserted_container(said: dict[str, Any]) -> bool:
-    client = said["Config"]["Labels"].get(CLIENT_LABEL, "")
-    # an engine may be another machine's: its clients run there, or on a third one
-    judged = is_of_this_boot(client) or said["State"]["Status"] in _ENDED
-    return judged and has_ended(client) is True
+    folder = Path(said["Config"]["Labels"][FOLDER_LABEL])
+    try:
+        return not runtime_folder.is_in_use(folder)
+    except FileNotFoundError:
+        # an engine may be another machine's: its clients run there, or on a third one
+        return said["State"]["Status"] in _ENDED
+    except OSError:
+        return False
 
 
 def _is_mine(user: str | None) -> bool:
@@ -129,17 +133,24 @@ def _is_mine(user: str | None) -> bool:
 
 def stale_groups(root: Path) -> Iterator[Leftover]:
     """Control groups of servers that have ended; the kernel keeps those with processes in them."""
-    folders = {path for level in ("", "*/", "*/*/") for path in root.glob(f"{level}envhub-*")}
+    folders = {path for level in ("", "*/", "*/*/") for path in root.glob(f"{level}envhub_*")}
     for folder in sorted(folders):
-        found = _GROUP.fullmatch(folder.name)
-        if found and not os.path.exists(f"/proc/{found[1]}") and os.access(folder, os.W_OK):
-            yield Leftover("control group", str(folder))
+        with contextlib.suppress(OSError):
+            if _GROUP.fullmatch(folder.name) and _is_deserted_group(folder):
+                yield Leftover("control group", str(folder))
+
+
+def _is_deserted_group(folder: Path) -> bool:
+    processes = folder / "cgroup.procs"
+    used = processes.exists() and processes.read_text()
+    return not used and os.access(folder, os.W_OK) and not is_held(folder)
 
 
 def _remove_groups(folder: Path) -> bool:
-    with contextlib.suppress(OSError):
-        for inner in folder.iterdir():
-            if inner.is_dir():
-                inner.rmdir()
-        folder.rmdir()
+    # a server that has just made it takes the lock next, and makes another if it is gone
+    with contextlib.suppress(OSError), unheld(folder) as free:
+        for inner in [path for path in folder.iterdir() if free and path.is_dir()]:
+            inner.rmdir()
+        if free:
+            folder.rmdir()
     return not folder.exists()

@@ -10,7 +10,9 @@ from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes.docker.engines import Engine
 
 CLIENT_LABEL = "dev.envhub.client"
-"""Whose container it is: ``identity.identity_of`` the client."""
+"""The client's pid, in its own namespace: for people."""
+FOLDER_LABEL = "dev.envhub.folder"
+"""The runtime folder of the client, which is in use as long as the client lives."""
 USER_LABEL = "dev.envhub.user"
 """The user id of the client."""
 

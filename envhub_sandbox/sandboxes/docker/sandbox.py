@@ -13,7 +13,6 @@ import json
 import os
 import secrets
 import select
-import shutil
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -40,8 +39,8 @@ from envhub_sandbox.sandboxes.docker.engines import (
 )
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.lingering import Lingering
-from envhub_sandbox.sandboxes.owner import identity_of
 from envhub_sandbox.sandboxes.refcount import Sharing, Use, Uses
+from envhub_sandbox.sandboxes.runtime_folder import RuntimeFolder
 from envhub_sandbox.transport.forks import Owner
 from envhub_worker.protocol.runtime import OWN, Runtime
 
@@ -159,7 +158,7 @@ class ContainerServer:
         python: Their interpreter; empty for the server's own.
     """
 
-    folder: Path
+    runtime: RuntimeFolder
     process: subprocess.Popen[bytes]
     process_fd: int
     layers: list[Mapping[str, Any]]
@@ -174,12 +173,12 @@ class ContainerServer:
     @property
     def endpoint(self) -> str:
         """Its ZeroMQ endpoint, in the folder that we share."""
-        return f"ipc://{self.folder}/sockets/server"
+        return f"ipc://{self.runtime.path}/sockets/server"
 
     @property
     def fd_path(self) -> str:
         """The socket that takes descriptors."""
-        return f"{self.folder}/sockets/fds"
+        return f"{self.runtime.path}/sockets/fds"
 
     @property
     def runs(self) -> bool:
@@ -194,7 +193,7 @@ class ContainerServer:
         if self.stopped or not self.owner.is_here:
             return
         _end(self.process)
-        shutil.rmtree(self.folder, ignore_errors=True)  # where the monitor was killed itself
+        self.runtime.remove()  # also where the monitor was killed itself
         try:
             self.stopped = True  # once: the number may be somebody else's a moment later
             os.close(self.process_fd)
@@ -237,14 +236,14 @@ class RepositoryContainer:
         return self._servers.acquire(self._key, self._start, idle_s)
 
     def _start(self) -> ContainerServer:
-        folder = runtime_folder.make(runtime_folder.CONTAINER)
+        folder = RuntimeFolder(runtime_folder.CONTAINER)
         ready, ready_end = os.pipe()
         try:
-            wanted = self._wanted(folder)
-            process = _execute(self._engine, wanted, folder, ready_end)
+            wanted = self._wanted(folder.path)
+            process = _execute(self._engine, wanted, folder.path, ready_end)
         except BaseException:
             os.close(ready)
-            shutil.rmtree(folder, ignore_errors=True)
+            folder.remove()
             raise
         finally:
             os.close(ready_end)
@@ -252,17 +251,21 @@ class RepositoryContainer:
             return self._enclosed(wanted, folder, process, _answer(ready, process))
         except BaseException:
             _end(process)
-            shutil.rmtree(folder, ignore_errors=True)
+            folder.remove()
             raise
         finally:
             os.close(ready)
 
     def _enclosed(
-        self, wanted: Container, folder: Path, process: subprocess.Popen[bytes], answer: bytes
+        self,
+        wanted: Container,
+        folder: RuntimeFolder,
+        process: subprocess.Popen[bytes],
+        answer: bytes,
     ) -> ContainerServer:
         _check_started(self._engine, wanted, answer)
         found = attestation.parse(answer)
-        if not (folder / "sockets" / "fds").is_socket():
+        if not (folder.path / "sockets" / "fds").is_socket():
             raise SandboxUnavailableError(
                 f"{self._engine.kind} started a container that shares no socket with this process: "
                 "an engine in a virtual machine, or a runtime with a kernel of its own. Run the "
@@ -287,7 +290,6 @@ class RepositoryContainer:
         sockets.mkdir(mode=0o700)
         if user != os.geteuid():
             os.chown(sockets, user, group)
-        identity = identity_of(os.getpid())
         (folder / "seccomp.json").write_text(json.dumps(seccomp_profile.profile()))
         own = len(os.sched_getaffinity(0))
         limits = (
@@ -300,7 +302,8 @@ class RepositoryContainer:
             name=f"envhub-{secrets.token_hex(6)}",
             image=self._image,
             labels={
-                run_arguments.CLIENT_LABEL: identity,
+                run_arguments.CLIENT_LABEL: str(os.getpid()),
+                run_arguments.FOLDER_LABEL: str(folder),
                 run_arguments.USER_LABEL: str(os.geteuid()),
             },
             sockets=str(sockets),

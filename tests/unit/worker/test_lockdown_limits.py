@@ -66,8 +66,8 @@ def test_v2_tree_enables_and_sets_limits(tmp_path: Path) -> None:
 
     real = os.mkdir
 
-    def mkdir(path: str) -> None:
-        real(path)
+    def mkdir(path: str, mode: int = 0o777) -> None:
+        real(path, mode)
         Path(path, "cgroup.subtree_control").write_text("")
 
     with pytest.MonkeyPatch.context() as patch:
@@ -75,7 +75,7 @@ def test_v2_tree_enables_and_sets_limits(tmp_path: Path) -> None:
         (tmp_path / "cgroup.procs").write_text("")
         tree = Tree(Hierarchy("cgroup-v2", (str(tmp_path),)), "zygote-1")
         tree.group("jail-1", Limits(memory_bytes=GIB, processes=7))
-    folder = tmp_path / f"envhub-{os.getpid()}-zygote-1"
+    folder = tmp_path / f"envhub_{os.getpid()}_zygote-1"
     # A real control file takes one controller at a time and keeps all.
     assert (tmp_path / "cgroup.subtree_control").read_text() == "+pids"
     assert (folder / "cgroup.subtree_control").read_text() == "+pids"
@@ -97,7 +97,7 @@ def test_v2_processes_in_the_way_move_to_a_leaf(tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(*inside.CGROUP_WRITE, lambda path, text: moved.append((path, text)))
         inside.step_aside(str(tmp_path))
-    leaf = f"{tmp_path}/envhub-{os.getpid()}-leaf/cgroup.procs"
+    leaf = f"{tmp_path}/envhub_{os.getpid()}_leaf/cgroup.procs"
     assert moved == [(leaf, "7"), (leaf, "8")]
 
 

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +12,10 @@ import pytest
 from envhub_sandbox.errors import SandboxUnavailableError
 from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.docker import prune
-from envhub_sandbox.sandboxes.docker.run_arguments import CLIENT_LABEL, USER_LABEL
-from envhub_sandbox.sandboxes.owner import identity_of
+from envhub_sandbox.sandboxes.docker.run_arguments import FOLDER_LABEL, USER_LABEL
+from envhub_sandbox.system.locks import LifeLock
+from envhub_worker.lockdown.limits.cgroups import Hierarchy, Tree
 from envhub_worker.lockdown.mechanisms.locked_folder import LockedFolder, remove_deserted
-
-
-@pytest.fixture(scope="module")
-def dead() -> str:
-    """The identity of a process that has ended."""
-    child = subprocess.Popen([sys.executable, "-S", "-c", "input()"], stdin=subprocess.PIPE)
-    name = identity_of(child.pid)
-    child.communicate()
-    return name
 
 
 def folder(root: Path, name: str, files: dict[str, str], mode: int = 0o700) -> Path:
@@ -44,15 +33,23 @@ def found(root: Path) -> set[str]:
     return {path.name for path in runtime_folder.stale_folders(root)}
 
 
-def test_a_containers_folder_is_left_behind_when_its_client_is(tmp_path: Path, dead: str) -> None:
-    """By the identity in it; without one nothing can be told."""
-    alive = identity_of(os.getpid())
-    folder(tmp_path, "envhub-docker-dead0000", {"client": dead})
-    folder(tmp_path, "envhub-docker-alive000", {"client": alive})
+def alive(root: Path, name: str) -> Path:
+    """A folder of a client that lives: this process."""
+    path = folder(root, name, {})
+    locks.append(LifeLock(path / "alive"))
+    return path
+
+
+locks: list[LifeLock] = []
+
+
+def test_a_containers_folder_is_left_behind_when_its_client_is(tmp_path: Path) -> None:
+    """No process holds the lock of its client; without one nothing can be told."""
+    folder(tmp_path, "envhub-docker-dead0000", {"alive": ""})
+    alive(tmp_path, "envhub-docker-alive000")
     folder(tmp_path, "envhub-docker-nothing0", {})
-    folder(tmp_path, "envhub-docker-nonsense", {"client": "?"})
-    folder(tmp_path, "envhub-docker-not-ours-at-all", {"client": dead})
-    folder(tmp_path, "envhub-docker-open0000", {"client": dead}, mode=0o755)
+    folder(tmp_path, "envhub-docker-not-ours-at-all", {"alive": ""})
+    folder(tmp_path, "envhub-docker-open0000", {"alive": ""}, mode=0o755)
     assert found(tmp_path) == {"envhub-docker-dead0000"}
 
 
@@ -75,22 +72,22 @@ def test_a_servers_folder_is_left_behind_when_nobody_holds_its_lock(tmp_path: Pa
 
 
 def test_a_folder_without_a_word_is_left_behind_once_it_is_old(tmp_path: Path) -> None:
-    """Its client was killed before it wrote who it is; one that is new may be about to."""
-    for name, files in (("empty000", {}), ("nobody00", {"client": ""}), ("full0000", {"x": ""})):
+    """Its client was killed before it had its lock; one that is new may be about to."""
+    for name, files in (("empty000", {}), ("begun000", {".alive": ""}), ("full0000", {"x": ""})):
         folder(tmp_path, f"envhub-{name}", files)
     assert found(tmp_path) == set()
     for path in tmp_path.iterdir():
         os.utime(path, (0, 0))
-    assert found(tmp_path) == {"envhub-empty000", "envhub-nobody00"}
+    assert found(tmp_path) == {"envhub-empty000", "envhub-begun000"}
 
 
 def test_what_may_be_another_machines_is_removed_by_hand_only(
-    tmp_path: Path, dead: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A start removes what this machine has left since it runs; ``gc`` finds the other, too."""
-    pid, start, _, namespace = dead.split(":")
-    folder(tmp_path, "envhub-dead0000", {"client": dead})
-    folder(tmp_path, "envhub-another0", {"client": f"{pid}:{start}:another:{namespace}"})
+    boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    folder(tmp_path, "envhub-dead0000", {"alive": f"{boot} 7"})
+    folder(tmp_path, "envhub-another0", {"alive": "another 7"})
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.setattr(runtime_folder, "places", lambda: [tmp_path])
     assert found(tmp_path) == {"envhub-dead0000", "envhub-another0"}
@@ -105,54 +102,59 @@ def test_a_folder_for_sockets_has_a_short_path(
     long = tmp_path / ("x" * 100)
     long.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(long))
-    made = runtime_folder.make(runtime_folder.CONTAINER)
+    made = runtime_folder.RuntimeFolder(runtime_folder.CONTAINER)
     try:
-        assert len(os.fsencode(made / "sockets" / "server")) <= 107
-        assert made.stat().st_mode & 0o777 == 0o700
-        assert made.parent in runtime_folder.places()
+        assert len(os.fsencode(made.path / "sockets" / "server")) <= 107
+        assert made.path.stat().st_mode & 0o777 == 0o700
+        assert made.path.parent in runtime_folder.places()
+        assert runtime_folder.is_in_use(made.path)
     finally:
-        shutil.rmtree(made)
+        made.remove()
+    assert not made.path.exists()
     monkeypatch.setattr(runtime_folder, "places", lambda: [long])
     with pytest.raises(SandboxUnavailableError, match="set TMPDIR to a shorter one"):
-        runtime_folder.make(runtime_folder.SERVER)
+        runtime_folder.RuntimeFolder(runtime_folder.SERVER)
 
 
-def test_a_link_is_not_followed(tmp_path: Path, dead: str) -> None:
+def test_a_link_is_not_followed(tmp_path: Path) -> None:
     """A name in a folder that everybody may write proves nothing."""
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
-    folder(elsewhere, "data", {"client": dead})
+    folder(elsewhere, "data", {"alive": ""})
     (tmp_path / "envhub-docker-link0000").symlink_to(elsewhere / "data")
     assert found(tmp_path) == set()
 
 
-def test_removing_removes_the_folder_and_nothing_beside(tmp_path: Path, dead: str) -> None:
+def test_removing_removes_the_folder_and_nothing_beside(tmp_path: Path) -> None:
     """And says that it did."""
-    folder(tmp_path, "envhub-docker-dead0000", {"client": dead, "seccomp.json": "{}"})
-    beside = folder(tmp_path, "envhub-docker-alive000", {"client": identity_of(os.getpid())})
+    folder(tmp_path, "envhub-docker-dead0000", {"alive": "", "seccomp.json": "{}"})
+    beside = alive(tmp_path, "envhub-docker-alive000")
     [path] = runtime_folder.stale_folders(tmp_path)
     assert prune.Leftover("folder", str(path)).remove()
     assert list(tmp_path.iterdir()) == [beside]
 
 
-def test_control_groups_of_ended_servers_are_left_behind(tmp_path: Path, dead: str) -> None:
-    """By the pid in the name; those of others have other names."""
-    pid = dead.partition(":")[0]
-    names = {f"memory/envhub-{pid}-zygote-1", f"envhub-{os.getpid()}-zygote-1", "envhub-x-y"}
-    for name in names | {f"user-{pid}-zygote-1"}:
+def test_control_groups_of_ended_servers_are_left_behind(tmp_path: Path) -> None:
+    """No process holds their lock, and none is in them; those of others have other names."""
+    living = Tree(Hierarchy("cgroup-v1", (str(tmp_path),)), "zygote-1")
+    for name in ("memory/envhub_1_zygote-1", "envhub_1_leaf", "envhub_x_y", "user_1_zygote-1"):
         (tmp_path / name / "jail-1").mkdir(parents=True)
+    (tmp_path / "envhub_1_leaf" / "cgroup.procs").write_text("7\n")
     groups = list(prune.stale_groups(tmp_path))
-    assert [Path(one.name).name for one in groups] == [f"envhub-{pid}-zygote-1"]
+    assert [Path(one.name).name for one in groups] == ["envhub_1_zygote-1"]
     assert groups[0].remove()
     assert not Path(groups[0].name).exists()
-    assert (tmp_path / f"envhub-{os.getpid()}-zygote-1" / "jail-1").exists()
+    [mine] = tmp_path.glob(f"envhub_{os.getpid()}_zygote-1")
+    assert not prune.Leftover("control group", str(mine)).remove()
+    living.remove()
+    assert not mine.exists()
 
 
 class OneContainer:
     """An engine with one container of our user's."""
 
-    def __init__(self, client: str, status: str) -> None:
-        labels = {CLIENT_LABEL: client, USER_LABEL: str(os.geteuid())}
+    def __init__(self, folder: Path, status: str) -> None:
+        labels = {FOLDER_LABEL: str(folder), USER_LABEL: str(os.geteuid())}
         self.said = {"Name": "/it", "Config": {"Labels": labels}, "State": {"Status": status}}
 
     def run(self, command: str, *_: str) -> str:
@@ -161,20 +163,25 @@ class OneContainer:
 
 
 @pytest.mark.parametrize(
-    ("boot", "status", "stale"),
+    ("client", "status", "stale"),
     [
-        ("", "running", True),
-        ("", "exited", True),
-        ("another", "running", False),
-        ("another", "created", False),
-        ("another", "paused", False),
-        ("another", "exited", True),
+        ("dead", "running", True),
+        ("dead", "exited", True),
+        ("alive", "running", False),
+        ("alive", "exited", False),
+        ("another machine's", "running", False),
+        ("another machine's", "created", False),
+        ("another machine's", "paused", False),
+        ("another machine's", "exited", True),
     ],
 )
 def test_what_runs_for_a_client_of_another_machine_is_left_alone(
-    dead: str, boot: str, status: str, stale: bool
+    tmp_path: Path, client: str, status: str, stale: bool
 ) -> None:
-    """An engine may be reached from many machines: whether their processes live nobody knows."""
-    pid, start, ours, namespace = dead.split(":")
-    engine: Any = OneContainer(":".join([pid, start, boot or ours, namespace]), status)
+    """An engine may be reached from many machines: whether their processes live is unknown here."""
+    if client == "dead":
+        folder(tmp_path, "envhub-docker-client00", {"alive": ""})
+    elif client == "alive":
+        alive(tmp_path, "envhub-docker-client00")
+    engine: Any = OneContainer(tmp_path / "envhub-docker-client00", status)
     assert [one.name for one in prune.stale_containers(engine)] == ["it"] * stale

@@ -15,11 +15,12 @@ import pytest
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.policy import Limits, Policy
-from envhub_sandbox.sandboxes import owner
+from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.docker import attestation, engines, run_arguments, seccomp_profile
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.docker.sandbox import ContainerServer, DockerSandbox
+from envhub_sandbox.sandboxes.runtime_folder import RuntimeFolder
 from envhub_worker.lockdown.seccomp import policy as seccomp_policy
 from envhub_worker.protocol.messages.surroundings import Surroundings
 from envhub_worker.protocol.runtime import Runtime
@@ -306,30 +307,6 @@ def test_what_is_no_name_of_an_image_reaches_no_engine(
     assert asked[-1] == "reg.example:5000/a/b_c@sha256:0"
 
 
-def test_a_process_is_known_by_more_than_its_pid() -> None:
-    """Its start, the boot and the namespace; what cannot be told is not said to have ended."""
-    me = owner.identity_of(os.getpid())
-    pid, start, boot, namespace = me.split(":")
-    assert owner.has_ended(me) is False
-    assert owner.has_ended(f"{pid}:{int(start) - 1}:{boot}:{namespace}") is True
-    assert owner.has_ended(f"{pid}:{start}:another-boot:{namespace}") is True
-    assert owner.has_ended(f"{pid}:{start}:{boot}:1") is None
-    assert owner.has_ended("nonsense") is None
-
-
-def test_a_process_that_was_not_reaped_has_ended() -> None:
-    """Nobody comes back from that."""
-    child = subprocess.Popen([sys.executable, "-S", "-c", "input()"], stdin=subprocess.PIPE)
-    name = owner.identity_of(child.pid)
-    assert owner.has_ended(name) is False
-    assert child.stdin is not None
-    child.stdin.close()
-    os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
-    assert owner.has_ended(name) is True
-    child.wait()
-    assert owner.has_ended(name) is True
-
-
 @pytest.mark.parametrize(
     ("said", "advice"),
     [
@@ -447,14 +424,14 @@ def test_impossible_limits_are_refused(options: dict[str, Any]) -> None:
         DockerSandbox(**options)
 
 
-def test_a_container_whose_monitor_was_killed_leaves_no_folder(tmp_path: Path) -> None:
+def test_a_container_whose_monitor_was_killed_leaves_no_folder() -> None:
     """The monitor cannot remove it then; whoever gives the container up does."""
-    folder = tmp_path / "folder"
-    (folder / "sockets").mkdir(parents=True)
+    folder = RuntimeFolder(runtime_folder.CONTAINER)
+    (folder.path / "sockets").mkdir()
     monitor = subprocess.Popen([sys.executable, "-S", "-c", "input()"], stdin=subprocess.PIPE)
     server = ContainerServer(folder, monitor, os.pidfd_open(monitor.pid), [], "strict", "")
     monitor.kill()
     monitor.communicate()
     assert not server.runs
     server.stop()
-    assert not folder.exists()
+    assert not folder.path.exists()

@@ -8,15 +8,17 @@ opened. Where there is none, ``watchdog`` measures instead.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 from collections.abc import Sequence
 
+from envhub_worker.lockdown.mechanisms.locked_folder import unheld
 from envhub_worker.protocol.confinement import Limits
 from envhub_worker.protocol.records import dataclass
 
 _MOUNTS = "/proc/self/mountinfo"
 _OWN = "/proc/self/cgroup"
-_PREFIX = "envhub-"
+_PREFIX = "envhub_"
 
 
 @dataclass(frozen=True)
@@ -80,24 +82,33 @@ def discover() -> Hierarchy | None:
 
 
 class Tree:
-    """The folder that holds the groups of one spawner's jails."""
+    """The folder that holds the groups of one spawner's jails.
+
+    Its lock is held as long as this process lives: by that others know that it is in use, in
+    whatever namespace they are. The pid in its name is for people.
+    """
 
     def __init__(self, hierarchy: Hierarchy, name: str) -> None:
-        """Make the folder ``envhub-<our pid>-<name>``.
+        """Make the folder ``envhub_<our pid>_<name>``.
 
         Raises:
             OSError: The kernel refuses; use the watchdog.
         """
+        self._locks: list[int] = []
         self.kind = hierarchy.kind
-        self._folders = [f"{folder}/{_PREFIX}{os.getpid()}-{name}" for folder in hierarchy.folders]
+        self._folders = [f"{folder}/{_PREFIX}{os.getpid()}_{name}" for folder in hierarchy.folders]
         _remove_abandoned(hierarchy.folders)
         if self.kind == "cgroup-v2":
             _step_aside(hierarchy.folders[0])
             _enable(hierarchy.folders[0])
-        for folder in self._folders:
-            os.mkdir(folder)
-        if self.kind == "cgroup-v2":
-            _enable(self._folders[0])
+        try:
+            for folder in self._folders:
+                self._locks.append(_made_and_locked(folder))
+            if self.kind == "cgroup-v2":
+                _enable(self._folders[0])
+        except OSError:
+            self.remove()
+            raise
 
     def group(self, name: str, limits: Limits) -> Group:
         """A new group with ``limits``.
@@ -109,17 +120,32 @@ class Tree:
 
     def remove(self) -> None:
         """Remove the folder and every group in it; their processes must have ended."""
-        for folder in self._folders:
+        for folder in self._folders[: len(self._locks)]:  # one that we did not make is another's
             _remove_tree(folder)
+        while self._locks:
+            os.close(self._locks.pop())
+
+
+def _made_and_locked(folder: str, *, exist_ok: bool = False) -> int:
+    """Make a group; gives the descriptor that holds its lock."""
+    while True:
+        os.makedirs(folder, exist_ok=exist_ok)
+        # another server may find it before it is locked, and remove it
+        with contextlib.suppress(FileNotFoundError):
+            lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if os.path.isdir(folder):
+                return lock
+            os.close(lock)
 
 
 def _remove_abandoned(folders: Sequence[str]) -> None:
-    """Remove what servers that were killed have left; the kernel keeps what is in use."""
+    """Remove what servers that were killed have left; the kernel keeps what has processes."""
     for folder in folders:
         for name in os.listdir(folder):
-            pid = name.removeprefix(_PREFIX).partition("-")[0]
-            if name.startswith(_PREFIX) and not os.path.exists(f"/proc/{pid}"):
-                _remove_tree(f"{folder}/{name}")
+            if name.startswith(_PREFIX):
+                with contextlib.suppress(OSError), unheld(f"{folder}/{name}"):
+                    _remove_tree(f"{folder}/{name}")
 
 
 def _remove_tree(folder: str) -> None:
@@ -137,10 +163,13 @@ def _step_aside(folder: str) -> None:
         pids = file.read().split()
     if not pids or not os.path.exists(f"{folder}/cgroup.type"):
         return  # the top one has no type
-    leaf = f"{folder}/{_PREFIX}{os.getpid()}-leaf"
-    os.makedirs(leaf, exist_ok=True)
-    for pid in pids:
-        _write(f"{leaf}/cgroup.procs", pid)
+    leaf = f"{folder}/{_PREFIX}{os.getpid()}_leaf"
+    lock = _made_and_locked(leaf, exist_ok=True)  # until processes keep it
+    try:
+        for pid in pids:
+            _write(f"{leaf}/cgroup.procs", pid)
+    finally:
+        os.close(lock)
 
 
 def _enable(folder: str) -> None:

@@ -11,6 +11,7 @@ import fcntl
 import os
 import re
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 from envhub_worker.lockdown.mechanisms.scratch import remove_tree
@@ -58,16 +59,22 @@ def remove_deserted(place: Path) -> None:
     """Remove folders of ours whose server has gone."""
     for path in filter(lambda path: _NAME.fullmatch(path.name), place.iterdir()):
         with contextlib.suppress(OSError):
-            if path.lstat().st_uid == os.geteuid() and _is_deserted(path / _LOCK):
-                remove_tree(str(path))
+            if path.lstat().st_uid == os.geteuid():
+                with unheld(path / _LOCK):
+                    remove_tree(str(path))
 
 
-def _is_deserted(lock: Path) -> bool:
-    fd = os.open(lock, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+@contextlib.contextmanager
+def unheld(path: str | Path) -> Iterator[None]:
+    """Keep the lock of a file or a folder that no process holds free until this context ends.
+
+    Raises:
+        BlockingIOError: A process holds it.
+        OSError: There is no such file, or that cannot be told.
+    """
+    fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
+        yield
     finally:
         os.close(fd)
-    return True
