@@ -58,12 +58,14 @@ class ProcessServer:
 
     @property
     def runs(self) -> bool:
-        """Whether it has not ended.
+        """Whether it has not ended, and can be reached.
 
         One that was killed is a zombie before its threads are gone, and only then can it be waited
-        for: it takes no requests any more.
+        for: it takes no requests any more. Nor can anyone connect to one whose sockets a cleaner
+        of temporary files has removed; who is connected already goes on.
         """
-        return self.process.poll() is None and not procfs.has_ended(self.process.pid)
+        alive = self.process.poll() is None and not procfs.has_ended(self.process.pid)
+        return alive and self.runtime.has_sockets("server", "fds")
 
     def stop(self) -> None:
         """End it and everything below it, in bounded time. A fork of its owner does nothing.

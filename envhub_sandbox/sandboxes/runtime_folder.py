@@ -54,6 +54,10 @@ class RuntimeFolder:
             shutil.rmtree(self.path, ignore_errors=True)
             raise
 
+    def has_sockets(self, *names: str) -> bool:
+        """Whether all of these are there: others may remove temporary files that look old."""
+        return all((self.path / name).is_socket() for name in names)
+
     def remove(self) -> None:
         """Remove it, with all that is in it. Idempotent."""
         shutil.rmtree(self.path, ignore_errors=True)

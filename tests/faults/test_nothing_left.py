@@ -316,3 +316,21 @@ def test_close_under_a_starting_worker_returns(folder: Path) -> None:
     client.kill()
     finish(client)
     assert is_clean(folder), left(folder)
+
+
+def test_sockets_that_a_cleaner_removed_cost_one_server(folder: Path) -> None:
+    """Open environments go on with theirs; the next one gets a new server at once."""
+    body = """
+import pathlib, shutil
+one = made(timeouts={"startup_s": 600})
+shutil.rmtree(next(pathlib.Path(os.environ["TMPDIR"]).glob("envhub-*")))
+two = made(timeouts={"startup_s": 600})
+one.env.step([0, 0])
+two.env.step([0, 0])
+two.close()
+one.env.step([0, 0])
+one.close()
+say("well")
+"""
+    assert finish(start(folder, body), 300.0).strip() == "well"
+    assert is_clean(folder), left(folder)

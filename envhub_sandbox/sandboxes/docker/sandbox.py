@@ -182,8 +182,9 @@ class ContainerServer:
 
     @property
     def runs(self) -> bool:
-        """Whether it has not ended."""
-        return self.process.poll() is None
+        """Whether it has not ended, and can be reached."""
+        alive = self.process.poll() is None
+        return alive and self.runtime.has_sockets("sockets/server", "sockets/fds")
 
     def stop(self) -> None:
         """End the container, in bounded time. A fork of its owner does nothing.
