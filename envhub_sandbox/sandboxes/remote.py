@@ -28,6 +28,7 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.log import WORKER
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes import upload
@@ -422,7 +423,10 @@ class Host:
         self._thread.start()
 
     def _keep_alive(self) -> None:
-        """Tell the server that we live, and what we hold; what fails is tried again."""
+        """Tell the server that we live, and what we hold; whatever fails is tried again.
+
+        Without this thread the server would end all jails of a client that lives.
+        """
         client: WorkerClient | None = None
         every_s = _FIRST_S
         while not self._stop.wait(every_s):
@@ -432,12 +436,11 @@ class Host:
                     client.hello(Deadline(_KEEP_ALIVE_S))
                     every_s = min(_KEEP_ALIVE_S, client.patience_s / 4 or _KEEP_ALIVE_S)
                 client.request(m.KeepAlive(tuple(self.far.held)), deadline=Deadline(_KEEP_ALIVE_S))
-            except EnvHubError:
-                if client is not None:
-                    client.close()
+            except Exception as error:  # of any kind: too few descriptors are a ZMQError
+                WORKER.debug("%s was not told that this client lives: %s", self.endpoint, error)
+                _close(client)
                 client = None
-        if client is not None:
-            client.close()
+        _close(client)
 
     def _close_jails(self) -> None:
         """Whatever is open there still: at the end of a process that closed nothing."""
@@ -473,6 +476,13 @@ class Host:
         if not self._thread.is_alive():
             self._ended = True  # once: the number may be somebody else's a moment later
             os.close(self.stopped)
+
+
+def _close(client: WorkerClient | None) -> None:
+    """Close a connection, whatever state it is in."""
+    with contextlib.suppress(Exception):
+        if client is not None:
+            client.close()
 
 
 HOSTS: Sharing[Host] = Sharing()

@@ -16,6 +16,12 @@ from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError, WorkerDi
 
 CONNECT_S = 10.0
 """How long a server may take to answer at all, and to come back after the connection was lost."""
+_CUT_S = 3.0
+"""For how long a server may end handshakes until that is no restart any more."""
+_ANOTHER_PROTOCOL = (
+    "it does not speak ZeroMQ with CURVE keys as we do: is it an envhub-worker, and are both of us "
+    "with keys, or both without (insecure_loopback)?"
+)
 _RECONNECT_MS = 100
 _RECONNECT_MAX_MS = 2_000
 _PINGS = 4
@@ -66,6 +72,7 @@ class Link:
         self._up = False
         self._number = 0
         self._lost = 0
+        self._cut_since = 0.0
         self._set_options(socket, far)
         self.monitor = socket.get_monitor_socket(_EVENTS)
 
@@ -115,19 +122,26 @@ class Link:
                 f"the server does not know our key: add {self._far.public_key()} to its "
                 "--authorized-clients, or use the key that it printed"
             )
-        elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL or self._is_plain_and_refused():
-            raise self._refused(
-                "it does not speak ZeroMQ with CURVE keys as we do: is it an envhub-worker, and "
-                "are both of us with keys, or both without (insecure_loopback)?"
-            )
+        elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
+            raise self._refused(_ANOTHER_PROTOCOL)
         elif self._number == 0:
-            raise UnreachableError(
-                f"{self._endpoint}: it ended the handshake, as a server does whose public key is "
-                "another than the server_key that was given"
-            )
+            self._cut_off()
 
-    def _is_plain_and_refused(self) -> bool:
-        return self._far.server_key is None and self._number == 0
+    def _cut_off(self) -> None:
+        """It ended a handshake: libzmq tries again, and so the second or third may succeed.
+
+        A server that stops does so as well, and whoever forwards a port to one that is not there.
+        """
+        self._cut_since = self._cut_since or monotonic()
+        if monotonic() - self._cut_since < _CUT_S:
+            return
+        if self._far.server_key is None:
+            raise self._refused(_ANOTHER_PROTOCOL)
+        raise UnreachableError(
+            f"{self._endpoint}: it has ended every handshake for {_CUT_S:.0f} s, as a server does "
+            "whose public key is another than the server_key that was given, and as one does that "
+            "restarts: compare the key with what it printed, and see whether it runs"
+        )
 
     def _refused(self, why: str) -> EnvHubError:
         text = f"{self._endpoint}: {why}"

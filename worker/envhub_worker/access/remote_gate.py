@@ -175,6 +175,7 @@ class RemoteGate:
         if isinstance(request, m.StartRunners):
             self._find_place(asked, Use(0, request.runners))
         elif isinstance(request, m.Relay):
+            asked.sessions.used(asker.identity, asker.key, request.jail)
             self._tally.asked(self._label_of(asker.key), request.operation)
             size = sum(map(len, asked.payload))
             self._in_flight.add(asker.key, asker, size, self._rules.quotas.inflight_bytes)

@@ -39,7 +39,8 @@ class Session:
         name: The client's own random bytes.
         heard: When it last said anything.
         since: When it said Hello for the first time.
-        held: The jails that it last said it holds, and when; None before it said so.
+        held: The jails that it holds, and when it last said so or used them; None before it said
+            so for the first time.
     """
 
     key: bytes
@@ -137,6 +138,12 @@ class Sessions:
         listed = dict.fromkeys(jails, now)
         before = [item for item in (session.held or {}).items() if item[0] not in listed]
         session.held = dict([*before, *listed.items()][-MAX_HELD:])
+
+    def used(self, identity: bytes, key: bytes, jail: int) -> None:
+        """A connection asks a jail something: its client holds that, whatever it says of it."""
+        session = self._of.get((identity, key))
+        if session is not None and session.held is not None and jail in session.held:
+            session.held[jail] = self._clock()
 
     def unheld(self, session: Session, jail: int, idle_s: float) -> bool:
         """Whether a jail has been held by nobody for so long; the first answer starts the time."""

@@ -1,0 +1,74 @@
+"""A server on another host that ends handshakes: one that restarts, or one with another key."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Iterator
+
+import pytest
+import zmq
+from zmq.utils import z85
+
+from envhub_sandbox.errors import SandboxUnavailableError
+from envhub_sandbox.transport.tcp import Far, Link, UnreachableError
+from tests.support import inside
+from tests.support.processes import eventually
+
+_PUBLIC, _SECRET = zmq.curve_keypair()
+
+
+@contextlib.contextmanager
+def linked(port: int, far: Far) -> Iterator[Link]:
+    """A link that has begun to connect."""
+    with zmq.Context() as context, context.socket(zmq.DEALER) as client:
+        client.linger = 0
+        endpoint = f"tcp://127.0.0.1:{port}"
+        link = Link(client, endpoint, far)
+        client.connect(endpoint)
+        try:
+            yield link
+        finally:
+            link.close()
+
+
+def hangs_up(listener: socket.socket) -> None:
+    """Take one connection, and end it in the midst of the handshake."""
+    connection, _ = listener.accept()
+    connection.recv(10)
+    connection.close()
+
+
+def test_a_server_that_restarts_is_waited_for() -> None:
+    """The handshake that it ended is followed by one that succeeds."""
+    far = Far(_PUBLIC, z85.decode(_SECRET))
+    listener = socket.create_server(("127.0.0.1", 0))
+    port = listener.getsockname()[1]
+    with linked(port, far) as link, zmq.Context() as context:
+        with listener:
+            hangs_up(listener)
+        with context.socket(zmq.ROUTER) as server:
+            server.linger, server.curve_server, server.curve_secretkey = 0, True, _SECRET
+            server.bind(f"tcp://127.0.0.1:{port}")
+            assert eventually(lambda: link.drain() is None and inside.link_is_up(link))
+
+
+@pytest.mark.parametrize("keys", [True, False])
+def test_one_that_ends_every_handshake_is_refused(keys: bool) -> None:
+    """By an error that names every cause that looks like that."""
+    far = Far(_PUBLIC, z85.decode(_SECRET)) if keys else Far(None, None)
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve() -> None:
+            with contextlib.suppress(OSError):
+                while True:
+                    hangs_up(listener)
+
+        threading.Thread(target=serve, daemon=True).start()
+        with linked(listener.getsockname()[1], far) as link:
+            error = UnreachableError if keys else SandboxUnavailableError
+            said = "server_key that was given, and as one does that restarts" if keys else "both"
+            with pytest.raises(error, match=said):
+                eventually(lambda: link.drain() is not None)
+        listener.shutdown(socket.SHUT_RDWR)
