@@ -100,13 +100,22 @@ class _Entry(NamedTuple):
 
 
 def cache_root() -> Path:
-    """``$ENVHUB_CACHE``, or the user's cache folder for ``envhub-sandbox``."""
+    """``$ENVHUB_CACHE``, or the user's cache folder for ``envhub-sandbox``.
+
+    Raises:
+        SnapshotError: The user has none.
+    """
     chosen = os.environ.get(CACHE_VARIABLE)
     if chosen:
         return Path(os.path.abspath(os.path.expanduser(chosen)))
     import platformdirs
 
-    return Path(platformdirs.user_cache_dir("envhub-sandbox", appauthor=False))
+    try:
+        return Path(platformdirs.user_cache_dir("envhub-sandbox", appauthor=False))
+    except RuntimeError:
+        raise SnapshotError(
+            f"this user has no home, and so no folder for a cache; set {CACHE_VARIABLE} to a folder"
+        ) from None
 
 
 def repository_folder(endpoint: str, repo_type: str, repo_id: str) -> Path:

@@ -76,13 +76,15 @@ def _made(prefix: str) -> Path:
     raise SandboxUnavailableError(
         f"there is no folder for sockets: their paths have {_SOCKET_BYTES} bytes at most, and "
         f"{', '.join(map(str, places()))} are too long or cannot be written{why}; set TMPDIR to a "
-        "shorter one, or to one that can be written"
+        "shorter one, or to one that can be written (in a container: --tmpfs /tmp)"
     )
 
 
 def places() -> list[Path]:
     """Where they may lie, best first: a short one stands in for a temporary folder that is not."""
-    found = [Path(tempfile.gettempdir())]
+    found = []
+    with contextlib.suppress(FileNotFoundError):  # nothing can be written here
+        found.append(Path(tempfile.gettempdir()))
     own = os.environ.get("XDG_RUNTIME_DIR", "")
     if os.path.isabs(own) and os.geteuid() != 0:  # root's jails, another user, have to get through
         found.append(Path(own))

@@ -109,3 +109,43 @@ def test_an_unknown_profile_is_usage() -> None:
     done = RUNNER.invoke(app, ["doctor", "--profile", "lax"])
     assert (done.exit_code, done.stdout) == (2, "")
     assert "strict, no-userns, container" in done.stderr
+
+
+def test_a_cache_that_cannot_be_used_hides_no_layer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The layers are tried with a cache of its own, and what is wrong with the caller's is said."""
+    monkeypatch.setenv("ENVHUB_CACHE", "/dev/null/none")
+    done = RUNNER.invoke(app, ["doctor"])
+    assert "strict: available" in done.stdout
+    assert "The cache: /dev/null/none cannot be written: set ENVHUB_CACHE to another" in done.stdout
+    assert done.exit_code == 3
+    assert os.environ["ENVHUB_CACHE"] == "/dev/null/none"
+
+
+def test_a_user_without_a_home_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As any container's user may be."""
+
+    def none(*_: object, **__: object) -> str:
+        raise RuntimeError("could not determine the home directory")
+
+    fail_with(monkeypatch, {})
+    monkeypatch.delenv("ENVHUB_CACHE", raising=False)
+    monkeypatch.setattr("platformdirs.user_cache_dir", none)
+    assert "set ENVHUB_CACHE to a folder" in RUNNER.invoke(app, ["doctor"]).stdout
+    disk = json.loads(RUNNER.invoke(app, ["doctor", "--json"]).stdout)["disk"]
+    assert disk["folder"] is None
+    assert "no home" in disk["problem"]
+
+
+@pytest.mark.parametrize(("command", "code"), [("doctor", 6), ("gc --dry-run", 0)])
+def test_nothing_can_be_written(command: str, code: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a read-only container there is no place for temporary files, and nothing is left there."""
+
+    def none() -> str:
+        raise FileNotFoundError(2, "No usable temporary directory found")
+
+    monkeypatch.setattr("tempfile.gettempdir", none)
+    monkeypatch.setenv("PATH", "/nowhere")
+    done = RUNNER.invoke(app, command.split())
+    assert done.exit_code == code
+    assert "bug" not in done.stderr
+    assert ("--tmpfs /tmp" in done.stderr) is (command == "doctor")

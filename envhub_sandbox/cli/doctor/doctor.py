@@ -7,26 +7,26 @@ missing, so the layers are also tried one by one, to name all of them at once.
 
 from __future__ import annotations
 
+import contextlib
 import json as json_format
 import os
 import platform
 import shutil
 import subprocess
 import sys
-import tempfile
 import time
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from envhub_sandbox.cli.doctor import places
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, show
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, describe, reported
 from envhub_sandbox.cli.shared.memory import free_bytes
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_sandbox.cli.version import versions
-from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError
+from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError, SnapshotError
 from envhub_worker.protocol.confinement import PROFILES
 
 _ENV_PY = '''"""Does nothing: `envhub doctor` runs it to see what confines it."""
@@ -111,9 +111,10 @@ def doctor(
 ) -> None:
     """Try what this host can enforce, say what is missing and how to get it.
 
-    Exits with 0 if the profile (strict by default) can be enforced, and with 6 if it cannot. With
-    a server, asks it over our key: 6 also if it is not reached or does not know us, 5 if it is
-    about to end or refuses.
+    Exits with 0 if the profile (strict by default) can be enforced, with 6 if it cannot, with 5 if
+    the jail died or took too long, and with 3 if only the cache cannot be used. With a server, asks
+    it over our key: 6 also if it is not reached or does not know us, 5 if it is about to end or
+    refuses.
     """
     with reported(debug=debug):
         from envhub_sandbox.policy import Policy
@@ -134,23 +135,28 @@ def doctor(
                 "--server-key and --insecure-loopback are of a server: envhub doctor "
                 "tcp://HOST:PORT"
             )
-        with Bar(quiet=json) as bar, tempfile.TemporaryDirectory(prefix="envhub-doctor-") as folder:
-            (Path(folder) / "env.py").write_text(_ENV_PY)
+        with Bar(quiet=json) as bar, places.of_its_own() as folder:
+            (folder / "idle").mkdir()
+            (folder / "idle" / "env.py").write_text(_ENV_PY)
             findings = []
             for name in PROFILES:
                 bar.begin(f"trying {name}")
-                findings.append(examine(folder, name))
+                findings.append(examine(str(folder / "idle"), name))
             bar.begin("trying each layer")
             probed = probe()
+        cache = places.cache_problem(by_others=profile != "strict" or not findings[0].available)
         if json:
             profiles = [asdict(finding) for finding in findings]
-            told = {"versions": versions(), "engine": engine(), **resources()}
+            told = {"versions": versions(), "engine": engine(), **resources(cache)}
             print_json({"host": host(), **told, "profiles": profiles, **probed})
         else:
             _print(findings)
             _print_missing(probed)
+            if cache is not None:
+                out()
+                out(f"The cache: {safe_line(cache, 1000)}")
         decisive = next(finding for finding in findings if finding.profile == profile)
-        raise typer.Exit(decisive.code)
+        raise typer.Exit(decisive.code or (Exit.SNAPSHOT if cache else Exit.OK))
 
 
 def host() -> dict[str, Any]:
@@ -175,12 +181,14 @@ def engine() -> dict[str, Any]:
     return {**facts, "problem": None}
 
 
-def resources() -> dict[str, Any]:
+def resources(problem: str | None) -> dict[str, Any]:
     """Bytes that are free: of memory, None where the kernel does not tell, and for the cache."""
     from envhub_sandbox.hub.store import cache_root
 
-    folder = next(one for one in (cache_root(), *cache_root().parents) if one.is_dir())
-    disk = {"folder": str(folder), "free_bytes": shutil.disk_usage(folder).free}
+    disk: dict[str, Any] = {"folder": None, "free_bytes": None, "problem": problem}
+    with contextlib.suppress(SnapshotError):  # it is the problem
+        folder = next(one for one in (cache_root(), *cache_root().parents) if one.is_dir())
+        disk |= {"folder": str(folder), "free_bytes": shutil.disk_usage(folder).free}
     return {"free_memory_bytes": free_bytes(), "disk": disk}
 
 

@@ -82,7 +82,8 @@ def _check_readable(spec: JailSpec) -> None:
         raise LayerUnavailableError(
             "unprivileged-user",
             f"the jail's user may not read {entry}",
-            "Make the snapshot's files and folders readable to others, or start as a plain user.",
+            "Keep snapshots where other users may read them (ENVHUB_CACHE=/var/cache/envhub), or "
+            "start as a plain user.",
         )
 
 
