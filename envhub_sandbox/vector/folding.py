@@ -15,8 +15,9 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import ParamSpec, TypeVar
 
-from envhub_sandbox.errors import EnvHubError, RemoteProtocolError
+from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerError
 from envhub_sandbox.log import ERRORS
+from envhub_worker.protocol.shortages import shortage
 
 _VARIABLE, _FULL = "ENVHUB_TRACEBACK", "full"
 _FOLDED = 3
@@ -42,7 +43,10 @@ def folds(error: BaseException) -> bool:
 
 
 def folded(ask: Callable[P, T]) -> Callable[P, T]:
-    """The same function, whose errors have the caller's frames and one of ours."""
+    """The same function, whose errors have the caller's frames and one of ours.
+
+    What the machine has no more of becomes an error of this project, wherever it was needed.
+    """
 
     @functools.wraps(ask)
     def asked(*args: P.args, **kwargs: P.kwargs) -> T:
@@ -53,6 +57,11 @@ def folded(ask: Callable[P, T]) -> Callable[P, T]:
                 raise
             __tracebackhide__ = True  # pytest hides the frame then
             raise error  # ENVHUB_TRACEBACK=full shows where
+        except Exception as error:
+            short = shortage(error, "here")
+            if not short:
+                raise
+            raise WorkerError(short) from error
 
     return asked
 

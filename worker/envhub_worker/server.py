@@ -25,6 +25,7 @@ from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimits
 from envhub_worker.protocol.messages import compression
+from envhub_worker.protocol.shortages import shortage
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from envhub_worker.supervisor.jails import Jails
 from envhub_worker.supervisor.records import Asker
@@ -156,7 +157,8 @@ class Server:
         except Exception as error:
             if not isinstance(error, ProtocolError):  # that is the client's mistake
                 self._gate.witness.failed(error)
-            self.refuse(asker, "WorkerError", f"{type(error).__name__}: {error}")
+            said = f"{type(error).__name__} on the server: {error}"
+            self.refuse(asker, "WorkerError", shortage(error, "on the server") or said)
 
     def _refuse_unread(self, identity: bytes, key: bytes, frame: Any, error: Exception) -> None:
         """A request that cannot be read: as long as its id can be, its sender need not wait."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -74,6 +75,27 @@ def test_what_a_request_meets_is_in_the_log(error: Exception, noted: bool) -> No
     ours = [line for line in said if '"server_error"' in line]
     assert bool(ours) is noted
     assert all("our mistake" in line and "authorize" in line for line in ours)
+
+
+@pytest.mark.parametrize(
+    ("error", "cure"),
+    [
+        (OSError(errno.EMFILE, "Too many open files"), "ulimit -n"),
+        (zmq.ZMQError(errno.ENFILE), "fs.file-max"),
+        (OSError(errno.ENOSPC, "No space left on device", "/state/x"), "df -i"),
+        (OSError(errno.EFBIG, "File too large"), "ulimit -f"),
+    ],
+)
+def test_what_the_machine_lacks_is_no_mistake(error: Exception, cure: str) -> None:
+    """The client reads that it is the server that lacks it, and the operator what to do."""
+    said = list[str]()
+    gate = Failing(error, Log(said.append, form=json_line))
+    with serving(gate) as endpoint:
+        answered = refused(endpoint)
+    assert "on the server: " in answered.message
+    assert cure in answered.message
+    assert [cure in line and "Traceback" not in line for line in said if "out_of_res" in line]
+    assert not [line for line in said if "server_error" in line]
 
 
 class Ticking(LocalGate):

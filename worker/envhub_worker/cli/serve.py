@@ -12,6 +12,7 @@ import gc
 import os
 import select
 import signal
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,11 +40,15 @@ def run(arguments: argparse.Namespace) -> int:
     arguments.runtime_dir.mkdir(mode=0o700, exist_ok=True)
     try:
         return _serve_in(arguments)
-    except BaseException:
+    except BaseException as error:
         if _client_has_gone(arguments):  # one that is there reads our log, and then removes it
             from envhub_worker.lockdown.mechanisms.scratch import remove_tree
 
             remove_tree(str(arguments.runtime_dir))
+        from envhub_worker.protocol.shortages import shortage
+
+        if short := shortage(error, "here"):
+            sys.exit(short)
         raise
 
 

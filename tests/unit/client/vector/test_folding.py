@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import traceback
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from envhub_sandbox.errors import (
     PolicyError,
     RemoteProtocolError,
     WorkerDiedError,
+    WorkerError,
     remote_error,
 )
 from envhub_sandbox.vector.folding import folded
@@ -137,3 +139,16 @@ def test_a_function_keeps_its_face() -> None:
     """Its name, its text and what it takes."""
     assert ask.__name__ == "ask"
     assert ask.__doc__ == "As a method of ours."
+
+
+@pytest.mark.parametrize(
+    ("lack", "cure"),
+    [(errno.EMFILE, "ulimit -n"), (errno.EFBIG, "ulimit -f"), (errno.ENOSPC, "df -i")],
+)
+def test_what_the_machine_lacks_is_an_error_of_ours(lack: int, cure: str) -> None:
+    """With what to do; an error that says nothing of the kind stays what it is."""
+    with pytest.raises(WorkerError, match=rf" here: .*{cure}") as caught:
+        ask(OSError(lack, "lacks"))
+    assert isinstance(caught.value.__cause__, OSError)
+    with pytest.raises(FileNotFoundError):
+        ask(OSError(errno.ENOENT, "missing"))

@@ -13,6 +13,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import KEY_BYTES, key_text
 from envhub_worker.protocol.messages import busy
 from envhub_worker.protocol.messages.busy import Busy
+from envhub_worker.protocol.shortages import shortage
 from envhub_worker.supervisor.records import Asker, JailEntry
 
 
@@ -115,7 +116,11 @@ class Events:
         self._client(entry.session, "jail_closed", "info", **told)
 
     def failed(self, error: Exception) -> None:
-        """Our own mistake, with the way to it."""
+        """Our own mistake, with the way to it; what this machine has no more of is none."""
+        short = shortage(error, "here")
+        if short:
+            self._log.say("out_of_resources", "error", why=short)
+            return
         way = "".join(traceback.format_exception(error))
         why = f"{type(error).__name__}: {error}"
         self._log.say("server_error", "error", why=why, traceback=way)

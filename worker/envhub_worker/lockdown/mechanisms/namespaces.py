@@ -22,6 +22,7 @@ from envhub_worker.lockdown.mechanisms.kernel import (
     unshare,
 )
 from envhub_worker.lockdown.report import LayerUnavailableError
+from envhub_worker.protocol.shortages import shortage
 
 #: The user that a jail sees itself as. Not 0: programs treat that one specially.
 INSIDE_UID = 1000
@@ -137,6 +138,9 @@ def user_namespace_unavailable(
 
 
 def _diagnosis(error: OSError, read: Callable[[str], str | None]) -> tuple[str, str]:
+    short, _, cure = shortage(error, "here").partition(": ")
+    if short:
+        return short, f"{cure.capitalize()}."
     if read("/proc/sys/user/max_user_namespaces") == "0":
         return "user.max_user_namespaces is 0", "Run: sudo sysctl user.max_user_namespaces=15000."
     if read("/proc/sys/kernel/unprivileged_userns_clone") == "0":
