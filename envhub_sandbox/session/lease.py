@@ -176,6 +176,7 @@ class Lease:
             retry_s = self._patience_s(error)
             if deadline.unasked or not (full or retry_s):
                 raise
+            # both, whatever the first one finds: | and not "or"
             room = full and self._launcher.settle() | self.make_room()
             if not room and not retry_s:
                 raise

@@ -14,10 +14,10 @@ from typing import Any, Protocol
 from envhub_sandbox.errors import EnvHubError, WorkerError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError
+from envhub_sandbox.transport.pace import Pace
 from envhub_sandbox.transport.replies import check, typed
 from envhub_sandbox.transport.request import Frames, Request
 from envhub_sandbox.transport.results import Results, StepResult
-from envhub_sandbox.transport.shared_memory.sharding import Pace
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.spaces import batches
 
@@ -224,7 +224,7 @@ class RelayLane:
             self.runners[index] = runner
 
     def pace(self) -> Pace | None:
-        """Nothing: it is the server that spreads."""
+        """None: what a shard takes itself is not known over the server."""
         return None
 
     def traffic(self) -> tuple[int, int, int]:

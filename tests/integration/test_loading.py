@@ -34,6 +34,28 @@ def roll(env: VectorEnv[Any, Any, Any], steps: int = 5) -> Any:
     return [env.step(env.action_space.sample()) for _ in range(steps)][-1]
 
 
+_BATCHED = """
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box
+
+class Batched(gym.Env):
+    num_envs = 1
+    observation_space, action_space = Box(-1, 1, (1, 54)), Box(-1, 1, (1, 6))
+    {single}
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros((1, 54), np.float32), {{}}
+
+    def step(self, action):
+        no = np.zeros(1, bool)
+        return np.zeros((1, 54), np.float32), np.zeros(1), no, no, {{}}
+
+def make_env(n_envs=1, use_async_envs=False):
+    return {form}
+"""
+
+
 class TestWhereTheCodeRuns:
     """The sample ``marker`` leaves traces of where it was imported."""
 
@@ -238,6 +260,29 @@ class TestWhatMakeEnvReturns:
         with make_env(sample("string_tasks"), n_envs=2) as suites:
             assert list(suites["classics"]) == ["balance the pole", "climb/the-hill"]
             assert roll(suites["classics"]["climb/the-hill"])[0].shape == (2, 2)
+
+    @pytest.mark.parametrize("form", ["{'s': {0: ENV}}", "{'s': [ENV]}", "ENV"])
+    def test_a_gym_env_that_is_batched_is_a_vector(self, tmp_path: Path, form: str) -> None:
+        """As LeRobot steps it, when it is in a suite: no dimension is added."""
+        single = (
+            "single_observation_space, single_action_space = Box(-1, 1, (54,)), Box(-1, 1, (6,))"
+        )
+        text = _BATCHED.format(single=single, form=form.replace("ENV", "Batched()"))
+        with make_env(write_repository(tmp_path / "it", text), n_envs=1) as suites:
+            env = suites.env
+            assert (env.num_envs, env.single_observation_space.shape) == (1, (54,))
+            assert env.reset(seed=1)[0].shape == (1, 54)
+            observation, reward, *_ = env.step(env.action_space.sample())
+            assert (observation.shape, reward.shape) == ((1, 54), (1,))
+
+    @pytest.mark.parametrize("form", ["{'s': {0: Batched()}}", "gym.Wrapper(Batched())"])
+    def test_a_batched_env_that_cannot_be_told_apart_is_refused(
+        self, tmp_path: Path, form: str
+    ) -> None:
+        """It would get (1, 1, 54), and nothing would say why."""
+        text = _BATCHED.format(single="", form=form)
+        with pytest.raises(LoadError, match="whose num_envs is 1 and whose spaces are batched"):
+            make_env(write_repository(tmp_path / "it", text), n_envs=1)
 
     def test_duck_typed_vector_env(self) -> None:
         """An object with the methods of a VectorEnv is one, and keeps its attributes."""

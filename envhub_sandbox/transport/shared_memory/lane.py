@@ -15,6 +15,7 @@ from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import RelayLane
+from envhub_sandbox.transport.pace import Pace
 from envhub_sandbox.transport.replies import typed
 from envhub_sandbox.transport.request import Request
 from envhub_sandbox.transport.results import Results, StepResult
@@ -23,7 +24,7 @@ from envhub_sandbox.transport.shared_memory.attachment import Attachment, sleep_
 from envhub_sandbox.transport.shared_memory.observations import RING, ObservationSlab
 from envhub_sandbox.transport.shared_memory.pacing import Pacing
 from envhub_sandbox.transport.shared_memory.shard import LaneShard, Outcome
-from envhub_sandbox.transport.shared_memory.sharding import Pace, awake_shards
+from envhub_sandbox.transport.shared_memory.sharding import awake_shards
 from envhub_sandbox.transport.shared_memory.sizes import fits, step_bytes
 from envhub_sandbox.transport.shared_memory.spin import SpinChooser
 from envhub_worker.protocol import messages as m
@@ -161,7 +162,7 @@ class SharedMemoryLane:
                 raise self.jail.cause_of_death("make_env") from error
             attach = m.Attach(self.number, bounds[index][0], layout.count, layout.slots)
             messages.append((self.runners[index], attach))
-        replies = self.jail.exchange("attach", messages, deadline)
+        replies = self.jail.exchange(m.ATTACH, messages, deadline)
         return all(typed(reply, m.Value).value is True for reply in replies)
 
     # --- steps ---------------------------------------------------------------------------------

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 
+from envhub_sandbox.transport.pace import Cost, Pace
 from envhub_sandbox.transport.shared_memory.shard import LaneShard
-from envhub_sandbox.transport.shared_memory.sharding import ASK_NS, Cost, Pace, Sample, pace_of
+from envhub_sandbox.transport.shared_memory.sharding import ASK_NS, Sample, pace_of
 
 _PACE_STEPS = 256
 """Steps after which what shards cost one another is worth remembering."""

@@ -19,6 +19,7 @@ from pathlib import Path
 from statistics import median
 
 from envhub_sandbox.system.files import write_whole
+from envhub_sandbox.transport.pace import Cost, Pace
 from envhub_sandbox.transport.shared_memory.affinity import CPUS
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces.batches import even_bounds
@@ -37,32 +38,6 @@ _RISE = 2.0
 """Per use of which one step was measured, at most: another process may have run in its midst."""
 _NOTICED_NS = 2_000
 """A wait that is shorter is none: the answer was there already."""
-
-
-@dataclass(frozen=True)
-class Cost:
-    """What a step of a shard took, from the client's call on.
-
-    Attributes:
-        fixed_ns: Until it has begun, and until its end is known.
-        step_ns: For each of its sub-environments.
-    """
-
-    fixed_ns: float
-    step_ns: float
-
-
-@dataclass(frozen=True)
-class Pace:
-    """What an environment took.
-
-    Attributes:
-        awake: A shard that waits awake, on a core of its own.
-        asleep: One that sleeps, and runs on a core that somebody else needs too; None without one.
-    """
-
-    awake: Cost
-    asleep: Cost | None
 
 
 @dataclass(frozen=True)

@@ -131,10 +131,11 @@ class _Maker:
         self._seen: list[Any] = []
 
     def task(self, suite: str, task: TaskId, env: Any, pick: Picker) -> Task:
-        if isinstance(env, VectorEnv) or _is_duck(env):
+        if isinstance(env, VectorEnv) or _is_duck(env) or _has_single_spaces(env):
             made = recording(env)
             return Task(suite, task, recording=made, vector=None if made else env)
         if isinstance(env, gym.Env):
+            _refuse_batched(env.unwrapped)
             return Task(suite, task, recording=self._multiplied(env, pick))
         raise ResultError(
             f"make_env must return a gymnasium VectorEnv, an Env, or a mapping "
@@ -165,6 +166,30 @@ class _Maker:
 
 def _is_duck(env: Any) -> bool:
     return not isinstance(env, (gym.Env, type)) and all(hasattr(env, name) for name in _DUCK)
+
+
+def _has_single_spaces(env: Any) -> bool:
+    """Whether a ``gym.Env`` is a vector environment but for its base, as a simulator's often is."""
+    names = ("num_envs", "single_observation_space", "single_action_space")
+    return isinstance(env, gym.Env) and all(hasattr(env, name) for name in names)
+
+
+def _refuse_batched(env: Any) -> None:
+    """A vector of it would have a dimension too many, and neither library would say so.
+
+    Raises:
+        ResultError: It steps several environments at once.
+    """
+    count = getattr(env, "num_envs", None)
+    spaces = (env.observation_space, env.action_space)
+    if _has_single_spaces(env) or (
+        isinstance(count, int) and all((space.shape or ())[:1] == (count,) for space in spaces)
+    ):
+        raise ResultError(
+            f"make_env returned {_described(env)}, a gym.Env whose num_envs is {count} and whose "
+            "spaces are batched. Return a gymnasium.vector.VectorEnv, or give it "
+            "single_observation_space and single_action_space, and put no gym.Wrapper around it"
+        )
 
 
 def _suite_name(env: Any) -> str:

@@ -1,8 +1,8 @@
 """The descriptor socket: how a client's slabs and doorbells get to a runner.
 
 ZeroMQ carries no descriptors, so they come over a ``SOCK_SEQPACKET`` socket in the server's
-private folder and wait here until the next request to the runner takes them along. That is its
-``Attach``, which the server does not decode. One request a connection: nobody can keep it busy.
+private folder and wait here until the runner's ``Attach`` takes them along. The server does not
+decode that: the operation of its ``Relay`` says so. One request a connection, none keeps it busy.
 """
 
 from __future__ import annotations

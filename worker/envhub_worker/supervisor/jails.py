@@ -167,7 +167,8 @@ class Jails:
                 pending.lost(index, entry.lost[runner])
                 continue
             link = entry.links[runner]
-            fds = self._deposits.take(entry.number, runner)
+            attaches = request.operation == m.ATTACH
+            fds = self._deposits.take(entry.number, runner) if attaches else []
             try:
                 link.send(next(self._packet_ids), frames, (pending, index), fds)
                 if entry.idle is not None and fds:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from envhub_sandbox.transport.pace import Cost, Pace
 from envhub_sandbox.transport.shared_memory.pacing import Pacing
-from envhub_sandbox.transport.shared_memory.sharding import ASK_NS, Cost, Pace
+from envhub_sandbox.transport.shared_memory.sharding import ASK_NS
 
 
 @dataclass

@@ -13,10 +13,9 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
+from envhub_sandbox.transport.pace import Cost, Pace
 from envhub_sandbox.transport.shared_memory import sharding
 from envhub_sandbox.transport.shared_memory.sharding import (
-    Cost,
-    Pace,
     PaceBook,
     Sample,
     bounds_for,

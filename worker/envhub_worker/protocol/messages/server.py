@@ -76,6 +76,10 @@ class StartRunners(Message, kind=6):
     runners: int
 
 
+ATTACH = "attach"
+"""The operation whose runners get the descriptors that wait for them: ``Attach``."""
+
+
 class Relay(Message, kind=7):
     """Hand the frames that follow to runners: ``parts`` is ``((runner, frames), ...)``.
 
