@@ -1,7 +1,7 @@
 """Steps per second over a network, against the same environments in a local sandbox.
 
-``python -m benchmarks.remote [SECONDS]`` starts a server on loopback and a wire to it that delays
-both ways, since kernels without netem cannot.
+``python -m benchmarks.remote [SECONDS [WORKLOAD ...]]`` starts a server on loopback and a wire to
+it that delays both ways, since kernels without netem cannot.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ _DELAYS_MS = (1, 10)
 _WORKLOADS = (("cartpole", 1), ("cartpole", 16), ("halfcheetah", 8), ("cameras", 1), ("plain", 1))
 
 
-def main(seconds: float = 2.0) -> None:
-    """Print a table: one row a workload, one column a way to it."""
+def main(seconds: float = 2.0, *workloads: str) -> None:
+    """Print a table: one row a workload (all by default), one column a way to it."""
     ways = ["process", "frames", "no keys", "CURVE", *(f"CURVE, {ms} ms" for ms in _DELAYS_MS)]
     print("| workload | " + " | ".join(ways) + " |")
     print("|---" * (len(ways) + 1) + "|")
     with _servers() as (keyed, plain, delayed):
-        for name, n_envs in _WORKLOADS:
+        for name, n_envs in (one for one in _WORKLOADS if one[0] in workloads or not workloads):
             options: list[dict[str, Any]] = [
                 {"sandbox": "process"},
                 {"sandbox": "process", "lane": "frames"},
@@ -82,7 +82,7 @@ def _servers() -> Iterator[tuple[RemoteSandbox, RemoteSandbox, list[RemoteSandbo
 @contextmanager
 def _listening(state: Path, *options: str) -> Iterator[str]:
     """A server; its endpoint."""
-    command = [sys.executable, "-m", "envhub_worker", "listen", "--bind", "tcp://127.0.0.1:*"]
+    command = [sys.executable, "-I", "-m", "envhub_worker", "listen", "--bind", "tcp://127.0.0.1:*"]
     command += ["--state-dir", str(state), *options]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     try:
@@ -152,4 +152,4 @@ if __name__ == "__main__":
         wire(sys.argv[2], float(sys.argv[3]) / 1000)
     else:
         os.environ.setdefault("OMP_NUM_THREADS", "1")
-        main(*map(float, sys.argv[1:2]))
+        main(*map(float, sys.argv[1:2]), *sys.argv[2:])

@@ -198,6 +198,8 @@ def main() -> None:
         help="evaluate with LeRobot's own code, in an interpreter that has it",
     )
     options = parser.parse_args()
+    if options.lerobot and not Path(options.lerobot).exists():
+        parser.error(f"there is no {options.lerobot}; first: python -m benchmarks.venvs lerobot")
     evaluator = LEROBOT if options.lerobot else LOOP
     options.variants = options.variants or VARIANTS
     os.chdir(ROOT)

@@ -192,7 +192,7 @@ def hold_server(env: Any, release: Callable[[], None]) -> None:
 
 def order(known: Launcher, of: Any) -> Any:
     """What is asked of a server for a jail of this repository."""
-    return known._order(of)
+    return known._order(of, 1)
 
 
 def _running(env: Any) -> LoadedJail:

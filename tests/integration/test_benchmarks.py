@@ -1,0 +1,56 @@
+"""Each benchmark is started once, as short as can be: it runs, and says nothing about speed.
+
+``soak``, ``monkey`` and ``clients`` have short forms in ``tests/faults``, ``packages`` is a step of
+CI, ``containers`` needs an engine, and ``evaluations`` is what ``suites`` starts.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SHORT = {
+    "breakdown cartpole 1": "| 1 | 1 | chosen |",
+    "doorbells --rounds 1 --trips 20": "of eventfds",
+    "recording --rounds 1 --count 5": "| its own |",
+    "remote 0.01 plain": "| plain, n=1 |",
+    "suites light --rounds 1 --tasks 2 --variants envhub-sync": "| envhub-sync |",
+}
+
+
+def benchmark(checkout: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run one."""
+    return subprocess.run(
+        [sys.executable, "-m", *words],
+        cwd=checkout,
+        env=os.environ | {"PYTHONDONTWRITEBYTECODE": "1"},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+
+
+@pytest.mark.parametrize("words", SHORT)
+def test_a_benchmark_runs(words: str, checkout: Path) -> None:
+    """And prints its table."""
+    done = benchmark(checkout, *f"benchmarks.{words}".split())
+    assert done.returncode == 0, done.stderr[-4000:]
+    assert SHORT[words] in done.stdout
+
+
+def test_the_comparison_runs(checkout: Path, tmp_path: Path) -> None:
+    """Every part of it, with a complete report."""
+    done = benchmark(checkout, "benchmarks", "--quick", "--out", str(tmp_path))
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
+    assert {path.suffix for path in tmp_path.iterdir()} == {".json", ".md"}
+
+
+def test_a_benchmark_that_lacks_its_environment_says_how_to_make_it(checkout: Path) -> None:
+    """Before it does anything."""
+    done = benchmark(checkout, "benchmarks.suites", "--lerobot", "/none/bin/python")
+    assert done.returncode == 2
+    assert "first: python -m benchmarks.venvs lerobot" in done.stderr
