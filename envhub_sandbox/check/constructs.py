@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator
 
 from envhub_sandbox.check.findings import Finding
-from envhub_sandbox.check.parsing import Named, Parsed
+from envhub_sandbox.sources.parsing import Named, Parsed
 
 _NETWORK, _PROCESS, _DYNAMIC, _PICKLE, _NATIVE, _OUTSIDE, _OBSCURE = (
     f"source-{kind}"

@@ -11,22 +11,24 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
+from pathlib import Path
 from typing import Any
 
 from gymnasium.error import CustomSpaceError
 
 from envhub_sandbox import __version__
 from envhub_sandbox.api import make_env
-from envhub_sandbox.check import denials, frames, leaks, parsing, source, traces
+from envhub_sandbox.check import denials, frames, leaks, traces
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.plays import Play, facts_of, film
 from envhub_sandbox.check.survey import survey
 from envhub_sandbox.check.table import CHECKS
 from envhub_sandbox.check.traces import Trace
+from envhub_sandbox.check.undeclared import undeclared
 from envhub_sandbox.check.walls import walls
 from envhub_sandbox.dependencies.choice import chosen
 from envhub_sandbox.dependencies.declared import declared
-from envhub_sandbox.dependencies.prepare import provided
+from envhub_sandbox.dependencies.pipeline import packages_for
 from envhub_sandbox.errors import (
     DependencyError,
     EnvHubError,
@@ -45,6 +47,7 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.hub.snapshot import Snapshot, named
 from envhub_sandbox.policy import policy_from
 from envhub_sandbox.session.recipe import pinned
+from envhub_sandbox.sources import imports, parsing
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol.text import size_text
 
@@ -180,13 +183,14 @@ class _Judge:
                 else {one.requirement.name: one.requirement for one in says.wanted}
             )
             if self._asked.arguments.get("python") is None and self._is_here:
-                made = provided(self._snapshot, choice)
-                packages = None if made is None else made.packages
+                made = packages_for(self._snapshot, choice)
+                packages = None if made is None else Path(made.packages)
         except (RequirementError, ResolutionError, PackageIntegrityError) as error:
             self._report.judged("requirements", [str(error)])
             raise _StoppedError from error
         self._report.judged("requirements", [])
-        found = source.undeclared(source.imports(self._snapshot, self._files), wanted, packages)
+        read = imports.imports(self._snapshot, self._files)
+        found = undeclared(read, wanted, packages)
         for finding in found:
             self._report.add(finding)
         if not found:

@@ -8,15 +8,15 @@ from typing import Any
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from envhub_sandbox.check import parsing, source
 from envhub_sandbox.check.findings import Finding
-from envhub_sandbox.check.source import Import
 from envhub_sandbox.check.survey import File, survey
 from envhub_sandbox.dependencies.declared import Declared, declared
 from envhub_sandbox.dependencies.resolve import WORKERS
 from envhub_sandbox.errors import RequirementError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.session.recipe import pinned
+from envhub_sandbox.sources import imports, parsing
+from envhub_sandbox.sources.imports import Import
 from envhub_worker.protocol.text import printable
 
 _LONGEST = 500
@@ -76,7 +76,7 @@ def static(snapshot: Snapshot) -> Static:
         snapshot=snapshot,
         files=surveyed.files,
         entries=() if entry is None else entry.entries,
-        imports=source.imports(snapshot, parsed),
+        imports=imports.imports(snapshot, parsed),
         declared=says,
         findings=sorted(map(_printable, findings), key=lambda one: one.check.severity.rank),
     )

@@ -15,11 +15,11 @@ from pathlib import Path, PurePosixPath
 from envhub_sandbox.check import contents
 from envhub_sandbox.check.constructs import constructs, long_lines
 from envhub_sandbox.check.findings import Finding
-from envhub_sandbox.check.parsing import MOST_BYTES, Parsed
 from envhub_sandbox.errors import SnapshotError
 from envhub_sandbox.hub.checkout import Checkout
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
 from envhub_sandbox.hub.local import LocalFolder
+from envhub_sandbox.sources.parsing import MOST_BYTES, Parsed
 
 _MOST_BYTES_OF_TEXT = 1 << 20
 _MOST_BYTES_IN_ALL = 32 << 20

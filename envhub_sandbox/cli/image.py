@@ -15,7 +15,7 @@ from envhub_sandbox.cli.shared.progress import Bar
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.declared import Declared
+    from envhub_sandbox.dependencies.request import PackageRequest
     from envhub_sandbox.dependencies.resolve import Target
     from envhub_sandbox.hub.snapshot import Snapshot
 
@@ -85,14 +85,16 @@ def _build(
     exclude_newer: str | None,
     network: str | None,
 ) -> dict[str, Any]:
-    from envhub_sandbox.dependencies.declared import declared
+    from envhub_sandbox.dependencies.choice import Choice
+    from envhub_sandbox.dependencies.request import request_of
     from envhub_sandbox.dependencies.resolve import resolve
     from envhub_sandbox.errors import DependencyError
     from envhub_sandbox.sandboxes.docker import image
     from envhub_sandbox.sandboxes.docker.engines import find_engine, find_image
 
-    found = declared(snapshot.root, snapshot.path)
-    if found is None and not system:
+    request = request_of(snapshot, Choice("own", exclude_newer=exclude_newer))
+    assert request is not None
+    if not (request.wanted or request.supports or system):
         raise DependencyError(
             f"{snapshot.repo_id} declares no packages: it needs no image of its own. Use "
             f"--sandbox docker:{base}"
@@ -100,8 +102,8 @@ def _build(
     engine = find_engine(engine_name)
     identity = find_image(engine, base)
     target = image.target_of(engine, base)
-    _check_python(found, target)
-    lock = resolve(found.wanted if found else (), target, exclude_newer=exclude_newer)
+    _check_python(request, target)
+    lock = resolve(request, target)
     is_local = snapshot.repo_type == "local"
     name = Path(snapshot.repo_id).name if is_local else snapshot.repo_id
     tag = image.tag_for(name, identity, lock, system)
@@ -111,13 +113,13 @@ def _build(
     return {"image": tag, "built": not known, "lock": lock.digest, "packages": lock.packages}
 
 
-def _check_python(found: Declared | None, target: Target) -> None:
+def _check_python(request: PackageRequest, target: Target) -> None:
     from packaging.specifiers import SpecifierSet
 
     from envhub_sandbox.errors import InterpreterUnavailableError
 
-    if found is not None and not SpecifierSet(found.python).contains(f"{target.version}.99"):
+    if not SpecifierSet(request.supports).contains(f"{target.version}.99"):
         raise InterpreterUnavailableError(
-            f"{found.source} asks for Python {found.python}, and the image has {target.version}: "
-            "build envhub-worker from another base (docs/deployment.md)"
+            f"{request.source} asks for Python {request.supports}, and the image has "
+            f"{target.version}: build envhub-worker from another base (docs/deployment.md)"
         )

@@ -54,16 +54,17 @@ def prefetch(
 
 def _environment(snapshot: Snapshot, given: Any, upgrade: bool) -> Environment | None:
     from envhub_sandbox.dependencies.choice import chosen
-    from envhub_sandbox.dependencies.prepare import provided
+    from envhub_sandbox.dependencies.pipeline import ThisMachine, packages_for
 
     choice, _ = chosen(given, None)
-    return provided(snapshot, choice, upgrade=upgrade)
+    made = packages_for(snapshot, choice, ThisMachine(upgrade=upgrade))
+    return None if made is None else made.environment
 
 
-def _of_lock(snapshot: Snapshot, lock: str, given: Any) -> Environment:
+def _of_lock(snapshot: Snapshot, lock: str, given: Any) -> Environment | None:
     from envhub_sandbox.locks import use
 
-    return use.provided(snapshot, use.opened(lock, "process", None, given))
+    return use.provided(snapshot, use.opened(lock, "process", None, given)).environment
 
 
 def _document(snapshot: Snapshot, environment: Environment | None) -> dict[str, Any]:

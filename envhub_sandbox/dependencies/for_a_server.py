@@ -28,10 +28,11 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox import parent
-from envhub_sandbox.dependencies import bounds, environments, host, interpreters, uv
-from envhub_sandbox.dependencies.choice import DATE, Choice
-from envhub_sandbox.dependencies.declared import Declared, one
-from envhub_sandbox.dependencies.prepare import Needs, prepare
+from envhub_sandbox.dependencies import bounds, environments, interpreters, uv
+from envhub_sandbox.dependencies.choice import DATE
+from envhub_sandbox.dependencies.declared import one
+from envhub_sandbox.dependencies.pipeline import HERE
+from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import DependencyError, PackagesTooLargeError, RequirementError
 from envhub_sandbox.hub.store import CACHE_VARIABLE, remove_tree
 from envhub_worker.protocol.text import printable
@@ -91,23 +92,23 @@ def _made(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
     _, most = resource.getrlimit(resource.RLIMIT_FSIZE)  # which a plain user cannot raise
     bound = order["bytes"] if most == resource.RLIM_INFINITY else min(order["bytes"], most)
     resource.setrlimit(resource.RLIMIT_FSIZE, (bound, bound))
-    needed = _needed(order)
-    assert needed.declared is not None
-    if not order["always"] and host.lacks(needed.declared) is None:
+    request = _request(order)
+    if not request.always and HERE.meets(request):
         return {"own": True}
-    made = prepare(needed, lambda line: _say({"told": line[:_WHERE_CHARS]}))
+    made = HERE.make(request, lambda line: _say({"told": line[:_WHERE_CHARS]}))
+    assert made.environment is not None
     return {
         "made": {
-            "name": made.key,
+            "name": made.environment.key,
             "python": made.python,
-            "packages": str(made.packages),
-            "bytes": made.size,
+            "packages": made.packages,
+            "bytes": made.environment.size,
             "facts": made.facts,
         }
     }
 
 
-def _needed(order: Mapping[str, Any]) -> Needs:
+def _request(order: Mapping[str, Any]) -> PackageRequest:
     """What is asked for. Trust: input from a client."""
     wanted = tuple(
         one(text, printable(where, _WHERE_CHARS)) for text, where in order["requirements"]
@@ -123,8 +124,14 @@ def _needed(order: Mapping[str, Any]) -> Needs:
             "the client asks for versions of Python that are none, for an interpreter by its path, "
             "or for a date that is none"
         ) from error
-    declared = Declared("what the client asks for", wanted, order["supports"])
-    return Needs(declared, Choice("own", (), python, until or None))
+    return PackageRequest(
+        "what the client asks for",
+        wanted,
+        supports=order["supports"],
+        python=python,
+        exclude_newer=until or None,
+        always=order["always"],
+    )
 
 
 # --- who watches --------------------------------------------------------------------------------

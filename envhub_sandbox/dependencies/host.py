@@ -16,7 +16,7 @@ from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 from packaging.version import InvalidVersion
 
-from envhub_sandbox.dependencies.declared import Declared
+from envhub_sandbox.dependencies.request import PackageRequest
 
 
 @dataclass(frozen=True)
@@ -33,28 +33,30 @@ class Described:
 
 
 def lacks(
-    declared: Declared, there: Mapping[str, Described] | None = None, version: str | None = None
+    request: PackageRequest,
+    there: Mapping[str, Described] | None = None,
+    version: str | None = None,
 ) -> str | None:
-    """The first requirement that an interpreter does not meet, of those declared or of theirs.
+    """The first requirement that an interpreter does not meet, of those asked for or of theirs.
 
     None if it meets them all. Where hashes are given it never does: nobody knows any more which
     files its packages were made of.
 
     Args:
-        declared: What is required.
+        request: What is required.
         there: What an interpreter elsewhere has; by default it is this one.
         version: That one's version.
     """
-    python = SpecifierSet(declared.python)
+    python = SpecifierSet(request.supports)
     # a Python that was built from a checkout has a plus at the end, which is no version
     found = version or platform.python_version().rstrip("+")
     if not python.contains(found, prereleases=True):
-        return f"python{declared.python}"
-    hashed = next((wanted for wanted in declared.wanted if wanted.hashes), None)
+        return f"python{request.supports}"
+    hashed = next((wanted for wanted in request.wanted if wanted.hashes), None)
     if hashed is not None:
         return str(hashed.requirement)
     installed = _Installed() if there is None else _InstalledElsewhere(there, found)
-    for wanted, met_by in installed.reached(one.requirement for one in declared.wanted):
+    for wanted, met_by in installed.reached(one.requirement for one in request.wanted):
         if met_by is None or not _is_among(met_by, wanted.specifier):
             return str(wanted)
     return None

@@ -11,6 +11,7 @@ from packaging.utils import canonicalize_name
 
 from envhub_sandbox.dependencies import index, interpreters, uv
 from envhub_sandbox.dependencies.declared import Wanted, one
+from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import PackageIntegrityError, ResolutionError
 from envhub_sandbox.option_names import option_name
 
@@ -74,19 +75,17 @@ class Target:
 
 
 def resolve(
-    wanted: Sequence[Wanted],
+    request: PackageRequest,
     target: Target,
     *,
-    exclude_newer: str | None = None,
     refresh: bool = False,
     tell: Callable[[str], None] = lambda line: None,
 ) -> Lock:
     """Pins for a target; wheels only, nothing is built.
 
     Args:
-        wanted: What is asked for; what the worker needs comes on top.
+        request: What is asked for; what the worker needs comes on top.
         target: What the packages are for.
-        exclude_newer: A date: packages of later are not seen.
         refresh: Ask the index anew for what uv has seen a moment ago.
         tell: Gets each line of uv's progress.
 
@@ -95,13 +94,13 @@ def resolve(
         PackageIntegrityError: A version is there, but not with a hash that was asked for.
         DependencyError: There is no uv, or it failed.
     """
-    every = [*wanted, *(one(text, "the worker of envhub-sandbox") for text in WORKERS)]
+    every = [*request.wanted, *(one(text, "the worker of envhub-sandbox") for text in WORKERS)]
     try:
         text = uv.run(
             [
                 *("pip", "compile", "-", *uv.NO_BUILDS, "--generate-hashes", "--no-header"),
                 *("--no-annotate", *target.options, *index.options()),
-                *(() if exclude_newer is None else ("--exclude-newer", exclude_newer)),
+                *(("--exclude-newer", request.exclude_newer) if request.exclude_newer else ()),
                 *(("--refresh",) if refresh else ()),
             ],
             what=f"no versions of the packages could be chosen for {target}",
@@ -111,7 +110,7 @@ def resolve(
         )
     except ResolutionError as error:
         raise ResolutionError(f"{error}\n{_what_to_change(str(error), every)}") from error
-    return Lock(_with_their_hashes(_pins(text), wanted))
+    return Lock(_with_their_hashes(_pins(text), request.wanted))
 
 
 def _pins(text: str) -> list[tuple[str, str, list[str]]]:

@@ -6,9 +6,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from envhub_sandbox.dependencies import interpreters, prepare
 from envhub_sandbox.dependencies.choice import Choice
 from envhub_sandbox.dependencies.declared import one
+from envhub_sandbox.dependencies.pipeline import resolution_for
+from envhub_sandbox.dependencies.request import request_of
 from envhub_sandbox.errors import LockError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.locks import lockfile, pylock
@@ -29,14 +30,12 @@ def locked(
     Raises:
         DependencyError: Versions cannot be chosen.
     """
-    needed = prepare.needs(snapshot, replace(choice, where="own"))
-    assert needed is not None  # which only another choice gives
-    declares = needed.declared.python if needed.declared else ""
-    interpreter = interpreters.find(choice.python, declares)
-    versions = prepare.versions(needed, interpreter, tell, upgrade=upgrade)
+    request = request_of(snapshot, replace(choice, where="own"))
+    assert request is not None  # which only another choice gives
+    found = resolution_for(request, tell, upgrade=upgrade)
     empty = LockFile(
-        *("", "", "", {}, Runner.of(interpreter)),
-        packages=pylock.described(versions, interpreter.path),
+        *("", "", "", {}, Runner.of(found.interpreter)),
+        packages=pylock.described(found.lock, found.interpreter.path),
         extra=tuple(map(str, choice.extra)),
         exclude_newer=choice.exclude_newer,
     )

@@ -11,7 +11,7 @@ from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.option_names import option_name
 
 if TYPE_CHECKING:  # they cost time, and mostly there is no lock
-    from envhub_sandbox.dependencies.environments import Environment
+    from envhub_sandbox.dependencies.pipeline import PackageSet
     from envhub_sandbox.locks.lockfile import LockFile
     from envhub_worker.protocol.manifest.manifest import Manifest
 
@@ -40,7 +40,7 @@ def opened(
     return lockfile.read(path)
 
 
-def provided(snapshot: Snapshot, lock: LockFile) -> Environment:
+def provided(snapshot: Snapshot, lock: LockFile) -> PackageSet:
     """The environment of its packages; made if there is none.
 
     Raises:
@@ -48,6 +48,7 @@ def provided(snapshot: Snapshot, lock: LockFile) -> Environment:
         DependencyError: It cannot be made; a package that was replaced is one of these.
     """
     from envhub_sandbox.dependencies import environments, progress
+    from envhub_sandbox.dependencies.pipeline import PackageSet
     from envhub_sandbox.locks import drift, lockfile, pylock
 
     drift.refuse(drift.files_and_commit(lock, snapshot), snapshot.label)
@@ -55,7 +56,8 @@ def provided(snapshot: Snapshot, lock: LockFile) -> Environment:
         interpreter = lockfile.runner_here(lock)
         drift.refuse(drift.runner(lock, lockfile.Runner.of(interpreter)), snapshot.label)
         with progress.shown("packages") as tell:
-            return environments.provide(pylock.pins(lock.packages), interpreter, tell)
+            made = environments.provide(pylock.pins(lock.packages), interpreter, tell)
+            return PackageSet.of(made)
     except (DependencyError, LockError) as error:
         name_source(error, snapshot.label)
         raise

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from envhub_sandbox import std_streams
 from envhub_sandbox.dependencies.choice import Choice, chosen
 from envhub_sandbox.dependencies.cure import cure
-from envhub_sandbox.dependencies.prepare import provided
+from envhub_sandbox.dependencies.pipeline import HERE, PackageSet, packages_for
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.hub import store
 from envhub_sandbox.hub.snapshot import Snapshot, named
@@ -23,7 +23,7 @@ from envhub_sandbox.making.proxies import Proxies
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy, Timeouts, policy_from, timeouts_from
 from envhub_sandbox.sandboxes import inprocess
-from envhub_sandbox.sandboxes.base import Provided, Provider, Sandbox
+from envhub_sandbox.sandboxes.base import PackageSource, Sandbox
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.provenance import provenance_of
 from envhub_sandbox.session.recipe import Recipe, pinned
@@ -51,27 +51,32 @@ def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSui
     std_streams.occupy()  # before anything of ours is opened
     wanted = _wanted(options.sandbox, options)
     snapshot = _snapshot(reference, options)
-    environment = _environment(snapshot, wanted, options)
-    repository = _repository(snapshot, config, wanted, environment, options)
-    repository.recipe = Recipe(
+    packages = _packages(snapshot, wanted, options)
+    load = LoadArguments(
+        n_envs=options.n_envs,
+        use_async_envs=options.use_async_envs,
+        cfg=None if config is None else plain_config(config),
+        env_kwargs=dict(options.env_kwargs or {}),
+    )
+    recipe = Recipe(
         make_env=make_env,
         reference=pinned(snapshot),
-        config=repository.arguments.cfg,
+        config=load.cfg,
         options=options.for_a_recipe(
-            env_kwargs=repository.arguments.env_kwargs,
+            env_kwargs=load.env_kwargs,
             policy=wanted.policy,
             timeouts=wanted.timeouts,
             python=wanted.python,
             dependencies="auto" if wanted.python is not None else options.dependencies,
         ),
     )
-    further = repository.arguments.env_kwargs
+    repository = _repository(snapshot, load, wanted, packages, options, recipe)
     return Proxies(
         Launcher(repository, wanted.place, store.cache_root() / "snapshots"),
         options.num_workers,
         _ahead(wanted, options),
         _face(options.validate),
-        locks.checker(wanted.lock, snapshot.label, further, config),
+        locks.checker(wanted.lock, snapshot.label, load.env_kwargs, config),
     ).make()
 
 
@@ -96,7 +101,7 @@ def _wanted(sandbox: str | Sandbox, options: Options) -> _Wanted:
     policy = policy_from(options.policy, options.limits)
     timeouts = timeouts_from(options.timeouts)
     place = sandbox_of(sandbox, options.server_key)
-    if choice.where == "own" and sandbox != "process" and not isinstance(place, Provider):
+    if choice.where == "own" and sandbox != "process" and not isinstance(place, PackageSource):
         raise PolicyError(
             f"packages by {option_name('dependencies')} are for this machine, for containers and "
             "for servers on other hosts; this place has packages of its own"
@@ -128,44 +133,38 @@ def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
     return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))
 
 
-def _environment(snapshot: Snapshot, wanted: _Wanted, options: Options) -> Provided | None:
-    """The packages that are made for it; None where its interpreter has them."""
+def _packages(snapshot: Snapshot, wanted: _Wanted, options: Options) -> PackageSet | None:
+    """The packages that are made for it; None for those of the place."""
     if wanted.lock is not None:
         return locks.provided(snapshot, wanted.lock)
-    if options.sandbox == "process":
-        return provided(snapshot, wanted.choice)
     place = wanted.place
-    return place.provided(snapshot, wanted.choice) if isinstance(place, Provider) else None
+    if options.sandbox != "process" and not isinstance(place, PackageSource):
+        return None
+    target = place.package_target() if isinstance(place, PackageSource) else HERE
+    return packages_for(snapshot, wanted.choice, target)
 
 
 def _repository(
     snapshot: Snapshot,
-    config: Any,
+    load: LoadArguments,
     wanted: _Wanted,
-    environment: Provided | None,
+    packages: PackageSet | None,
     options: Options,
+    recipe: Recipe,
 ) -> Repository:
-    runtime = wanted.runtime
-    if environment is not None:
-        runtime = Runtime(environment.python, str(environment.packages))
-    repository = Repository(
+    own = packages is not None
+    return Repository(
         snapshot,
-        LoadArguments(
-            n_envs=options.n_envs,
-            use_async_envs=options.use_async_envs,
-            cfg=None if config is None else plain_config(config),
-            env_kwargs=dict(options.env_kwargs or {}),
-        ),
+        load,
         wanted.policy,
         wanted.timeouts,
-        runtime,
+        Runtime(packages.python, packages.packages) if packages else wanted.runtime,
         options.lane,
         options.copy,
+        recipe=recipe,
+        installed=packages.facts if packages else None,
+        cure=partial(cure, snapshot, wanted.place.name, wanted.choice, wanted.python, own),
     )
-    repository.installed = None if environment is None else environment.facts
-    place, choice, python = wanted.place.name, wanted.choice, wanted.python
-    repository.cure = partial(cure, snapshot, place, choice, python, environment is not None)
-    return repository
 
 
 def _ahead(wanted: _Wanted, options: Options) -> int | None:

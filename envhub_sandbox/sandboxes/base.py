@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.choice import Choice
-    from envhub_sandbox.hub.snapshot import Snapshot
+    from envhub_sandbox.dependencies.pipeline import PackageTarget
     from envhub_sandbox.policy import Policy
     from envhub_sandbox.transport.connection import WorkerClient
     from envhub_sandbox.transport.deadline import Deadline
@@ -157,31 +156,9 @@ class PerRepository(Protocol):
         """
 
 
-class Provided(Protocol):
-    """Packages that were made for a repository.
-
-    Attributes:
-        python: The interpreter that they are for; empty where the place knows it.
-        packages: Their folder, or their name in that place.
-        facts: What is in it, as plain data.
-    """
-
-    @property
-    def python(self) -> str: ...  # noqa: D102
-    @property
-    def packages(self) -> str | Path: ...  # noqa: D102
-    @property
-    def facts(self) -> dict[str, Any]: ...  # noqa: D102
-
-
 @runtime_checkable
-class Provider(Protocol):
-    """A place that has packages made by itself, for what runs there."""
+class PackageSource(Protocol):
+    """A place that has packages of a repository's own."""
 
-    def provided(self, snapshot: Snapshot, choice: Choice) -> Provided | None:
-        """The packages of a repository; None for those that the place has.
-
-        Raises:
-            DependencyError: They cannot be made; the text says what to change.
-            PolicyError: The place makes none, and the choice asks for some.
-        """
+    def package_target(self) -> PackageTarget:
+        """Makes them for what runs there; the place is asked only once it has to make some."""

@@ -11,15 +11,15 @@ import contextlib
 import ipaddress
 import os
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from envhub_sandbox.dependencies import progress
-from envhub_sandbox.dependencies.choice import Choice
+from envhub_sandbox.dependencies.pipeline import PackageSet
+from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import (
     DependencyError,
     EnvHubError,
@@ -27,13 +27,11 @@ from envhub_sandbox.errors import (
     SandboxUnavailableError,
 )
 from envhub_sandbox.hub.logins import without_login
-from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.log import WORKER
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy
-from envhub_sandbox.sandboxes import upload
+from envhub_sandbox.sandboxes import remote_packages, upload
 from envhub_sandbox.sandboxes.base import ServerUse
-from envhub_sandbox.sandboxes.far_packages import FarEnvironment, Order, order_of
 from envhub_sandbox.sandboxes.refcount import Sharing, Use, Uses
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
@@ -78,7 +76,9 @@ class RemoteSandbox:
     heartbeat_s: float = 30.0
     retry_s: float = 0.0
     name: str = field(default="remote", init=False)
-    _orders: dict[str, Order] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _orders: dict[str, m.NeedPackages] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     def __post_init__(self) -> None:
         address_of(self.endpoint)
@@ -116,25 +116,31 @@ class RemoteSandbox:
             needed = Needed(runtime.packages, self._orders[runtime.packages])
         return RemoteRepository(self.endpoint, self.far(), snapshot, policy, self.retry_s, needed)
 
-    def provided(self, snapshot: Snapshot, choice: Choice) -> FarEnvironment | None:
-        """The packages that the server makes for a repository; None for those that it has.
+    def package_target(self) -> RemoteSandbox:
+        """The server makes packages itself."""
+        return self
+
+    def meets(self, request: PackageRequest) -> bool:
+        """Unknown here: the server looks at its own packages when it is asked for some."""
+        return False
+
+    def make(self, request: PackageRequest, tell: Callable[[str], None]) -> PackageSet | None:
+        """The packages that the server makes; None where its own are enough.
 
         Raises:
             DependencyError: They cannot be made; the text says what to change.
             PolicyError: The server's operator does not permit it.
             ServerBusyError: Others of the same key are at it.
         """
-        order = order_of(snapshot, choice)
-        if order is None:
-            return None
+        order = remote_packages.order_of(request)
         where = (self.endpoint, self.far())
         use = HOSTS.acquire(where, partial(Host, *where))
         host = use.shared
         try:
             client = WorkerClient(self.endpoint, host.stopped, far=host.far)
-            with contextlib.closing(client), progress.shown("packages") as tell:
+            with contextlib.closing(client):
                 client.hello(Deadline(_HELLO_S))
-                made = order.bring(client, Deadline(_MAKE_S), tell)
+                made = remote_packages.bring(order, client, Deadline(_MAKE_S), tell)
         finally:
             use.release()
         if made is not None:
@@ -292,7 +298,7 @@ class Needed:
     """
 
     name: str
-    order: Order
+    order: m.NeedPackages
 
     def bring(self, client: WorkerClient, deadline: Deadline) -> None:
         """See that they are there: the server may have been replaced, or have needed the room.
@@ -300,11 +306,11 @@ class Needed:
         Raises:
             DependencyError: It would make others today, or can make none.
         """
-        made = self.order.bring(client, deadline)
+        made = remote_packages.bring(self.order, client, deadline)
         if made is None or made.packages != self.name:
             raise DependencyError(
-                f"{self.order.label}: the server has lost the packages that it had made, and would "
-                "make others now: make the environment again"
+                "the server has lost the packages that it had made, and would make others now: "
+                "make the environment again"
             )
 
 

@@ -68,15 +68,15 @@ class Repository:
         runtime: The interpreter of the jails, and their packages.
         lane: ``"auto"`` or ``"frames"``.
         copy: Whether observations are copied for the caller, or lent.
+        recipe: How to make it again.
+        installed: What was installed for it, for the provenance.
+        cure: Says what to do where a module is missing.
 
     Attributes:
-        cure: Says what to do where a module is missing.
-        installed: What was installed for it, for the provenance.
         heard: What it has warned of, in any jail.
         latest_report: The layers of the jail that was opened last, for the provenance of what was
             made. Which of them hold for an environment, only its own jail says.
         latest_profile: Of that jail; in a container it may be less than the policy names.
-        recipe: How to make it again.
     """
 
     def __init__(
@@ -88,6 +88,10 @@ class Repository:
         runtime: Runtime,
         lane: str,
         copy: bool,
+        *,
+        recipe: Recipe,
+        installed: dict[str, Any] | None,
+        cure: Callable[[], str],
     ) -> None:
         self.snapshot = snapshot
         self.arguments = arguments
@@ -99,9 +103,9 @@ class Repository:
         self.heard = Heard()
         self.latest_report: list[dict[str, Any]] = []
         self.latest_profile: str | None = None
-        self.recipe: Recipe | None = None
-        self.cure: Callable[[], str] = str
-        self.installed: dict[str, Any] | None = None
+        self.recipe = recipe
+        self.installed = installed
+        self._cure = cure
 
     @property
     def label(self) -> str:
@@ -120,7 +124,7 @@ class Repository:
             yield
         except EnvHubError as error:
             if isinstance(error, DependencyError) and not str(error).startswith(self.label):
-                error.args = (f"{error}. {self.cure()}",)
+                error.args = (f"{error}. {self._cure()}",)
             name_source(error, self.label)
             point_out(error, self.snapshot)
             raise
@@ -173,10 +177,9 @@ class Repository:
             loaded: Its jail.
             shared: Whether other environments lived in it.
         """
-        ours = self.policy.crash_history and error.bundle is None and self.recipe is not None
+        ours = self.policy.crash_history and error.bundle is None
         if not ours or getattr(error, "reason", "") in ("killed", "idle", "gone", "connection"):
             return
-        assert self.recipe is not None
         manifest = None if loaded is None else loaded.manifest
         report = self.latest_report if loaded is None else loaded.jail.report
         told = manifest, report, self.installed, self.latest_profile

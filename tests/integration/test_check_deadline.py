@@ -18,9 +18,9 @@ from xml.etree import ElementTree
 import pytest
 from typer.testing import CliRunner
 
-from envhub_sandbox.check import parser
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.check.deadline import DeadlineReached, deadline_alarm
+from envhub_sandbox.sources import parser
 from tests.hub.stub_hub import StubHub
 from tests.integration.test_cli_run import envhub
 from tests.support.processes import descendants, eventually

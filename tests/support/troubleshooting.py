@@ -48,7 +48,7 @@ _PARTS = (
         "Servers on other hosts",
         (
             "envhub_sandbox/sandboxes/remote.py",
-            "envhub_sandbox/sandboxes/far_packages.py",
+            "envhub_sandbox/sandboxes/remote_packages.py",
             "envhub_sandbox/transport/tcp.py",
             "envhub_sandbox/transport/connection.py",
             "envhub_worker/access",

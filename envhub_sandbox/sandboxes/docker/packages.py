@@ -7,25 +7,24 @@ has to be of the kind of the image's, and no wheel may need a newer glibc than t
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from envhub_sandbox.dependencies.choice import Choice
-from envhub_sandbox.dependencies.files import may_declare
-from envhub_sandbox.errors import (
-    DependencyError,
-    InterpreterUnavailableError,
-    SandboxUnavailableError,
-    name_source,
-)
-from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.dependencies.pipeline import HERE, PackageSet
+from envhub_sandbox.dependencies.request import PackageRequest
+from envhub_sandbox.errors import InterpreterUnavailableError, SandboxUnavailableError
 from envhub_sandbox.option_names import option_name
-from envhub_sandbox.sandboxes.docker.engines import Engine, EngineError, own_limits
+from envhub_sandbox.sandboxes.docker.engines import (
+    Engine,
+    EngineError,
+    find_image,
+    own_limits,
+)
 from envhub_sandbox.sandboxes.docker.image import INTERPRETER
 
 if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.declared import Declared
     from envhub_sandbox.dependencies.host import Described
     from envhub_sandbox.dependencies.interpreters import Interpreter
 
@@ -41,61 +40,39 @@ print(json.dumps([*facts, platform.libc_ver()[1], there]))
 """
 
 
-@dataclass(frozen=True)
-class Mounted:
-    """An environment of this machine, for a container.
-
-    Attributes:
-        packages: Its folder.
-        facts: What is in it.
-        python: Nothing: the interpreter is the image's.
-    """
-
-    packages: str
-    facts: dict[str, Any]
-    python: str = ""
-
-
-def provided(snapshot: Snapshot, choice: Choice, engine: Engine, image: str) -> Mounted | None:
-    """The packages of a repository, for an image; None where the image has them.
+class ImageTarget:
+    """The Python of an image.
 
     Args:
-        snapshot: The verified files.
-        choice: What the caller says.
-        engine: Who has the image.
-        image: Its id.
-
-    Raises:
-        DependencyError: They cannot be made, or not for that image.
-        SandboxUnavailableError: It is no image of ours.
+        engine: Gives the engine, once there is something to ask it.
+        image: The image's name.
     """
-    if choice.where == "host" or (
-        choice.where == "auto" and not may_declare(snapshot.root, snapshot.path)
-    ):
-        return None
-    try:
-        return _provided(snapshot, choice, engine, image)
-    except DependencyError as error:
-        name_source(error, snapshot.label)
-        raise
 
+    def __init__(self, engine: Callable[[], Engine], image: str) -> None:
+        self._engine = engine
+        self._image = image
 
-def _provided(snapshot: Snapshot, choice: Choice, engine: Engine, image: str) -> Mounted | None:
-    from envhub_sandbox.dependencies import host, progress
-    from envhub_sandbox.dependencies.declared import declared
-    from envhub_sandbox.dependencies.prepare import Needs, prepare
+    def _inside(self) -> tuple[Interpreter, dict[str, Described]]:
+        engine = self._engine()
+        return inside(engine, find_image(engine, self._image))
 
-    found = declared(snapshot.root, snapshot.path)
-    if choice.where == "auto" and found is None:
-        return None
-    interpreter, there = inside(engine, image)
-    has_all = found is not None and host.lacks(found, there, interpreter.version) is None
-    if choice.where == "auto" and has_all:
-        return None
-    ours = fitting(interpreter, choice, found)
-    with progress.shown("packages") as tell:
-        made = prepare(Needs(found, replace(choice, where="own", python=ours.path)), tell)
-    return Mounted(str(made.packages), made.facts)
+    def meets(self, request: PackageRequest) -> bool:
+        """Whether the image has all of it; raises as ``inside``."""
+        from envhub_sandbox.dependencies import host
+
+        interpreter, there = self._inside()
+        return host.lacks(request, there, interpreter.version) is None
+
+    def make(self, request: PackageRequest, tell: Callable[[str], None]) -> PackageSet:
+        """An environment of this machine, to be mounted; its interpreter is the image's.
+
+        Raises:
+            DependencyError: It cannot be made, or not for that image.
+            SandboxUnavailableError: It is no image of ours.
+        """
+        ours = fitting(self._inside()[0], request)
+        made = HERE.make(replace(request, python=ours.path), tell)
+        return replace(made, python="")
 
 
 @lru_cache(maxsize=16)
@@ -126,7 +103,7 @@ def inside(engine: Engine, image: str) -> tuple[Interpreter, dict[str, Described
     return Interpreter(INTERPRETER, *facts), installed
 
 
-def fitting(theirs: Interpreter, choice: Choice, found: Declared | None) -> Interpreter:
+def fitting(theirs: Interpreter, request: PackageRequest) -> Interpreter:
     """An interpreter of this machine whose packages the image's can import.
 
     Raises:
@@ -137,9 +114,9 @@ def fitting(theirs: Interpreter, choice: Choice, found: Declared | None) -> Inte
 
     from envhub_sandbox.dependencies import interpreters
 
-    asked = SpecifierSet(found.python if found else "")
-    if not theirs.fits(asked) or (choice.python and not _is_asked(theirs, choice.python)):
-        wanted = choice.python or str(asked)
+    asked = SpecifierSet(request.supports)
+    if not theirs.fits(asked) or (request.python and not _is_asked(theirs, request.python)):
+        wanted = request.python or str(asked)
         raise InterpreterUnavailableError(
             f"it is to run in Python {wanted}, and the image has {theirs.version}: build "
             "envhub-worker from another base (docs/deployment.md)"

@@ -21,9 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox import parent
-from envhub_sandbox.dependencies.choice import Choice
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
-from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes import runtime_folder
@@ -121,17 +119,9 @@ class DockerSandbox:
         image, packages = find_image(engine, self.image), runtime.packages
         return RepositoryContainer(self, engine, image, snapshot, policy, packages)
 
-    def provided(self, snapshot: Snapshot, choice: Choice) -> packages.Mounted | None:
-        """The packages of a repository, for the image's Python; None where the image has them.
-
-        Raises:
-            DependencyError: They cannot be made, or not for that image.
-            SandboxUnavailableError: There is no engine, no image, or no permission.
-        """
-        if choice.where == "host":
-            return None
-        engine = find_engine(self.engine)
-        return packages.provided(snapshot, choice, engine, find_image(engine, self.image))
+    def package_target(self) -> packages.ImageTarget:
+        """Packages are made on this machine, for the image's Python."""
+        return packages.ImageTarget(lambda: find_engine(self.engine), self.image)
 
     def acquire(self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0) -> ServerUse:
         """Not without a repository: a container sees the files of one only."""

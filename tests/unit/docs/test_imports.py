@@ -69,7 +69,7 @@ MAY_IMPORT = {
     },
     "envhub_sandbox.check": {
         *("", "api", "dependencies", "hub", "locks", "parent", "policy", "rollouts", "session"),
-        "vector",
+        *("sources", "vector"),
     },
     "envhub_sandbox.rollouts": set(),
     "envhub_sandbox.gym": {"api", "vector"},
@@ -83,6 +83,7 @@ MAY_IMPORT = {
     "envhub_sandbox.transport": set(),
     "envhub_sandbox.locks": {"dependencies", "hub"},
     "envhub_sandbox.dependencies": {"folders", "hub", "parent"},
+    "envhub_sandbox.sources": {"hub"},
     "envhub_sandbox.hub": {"folders"},
     "envhub_sandbox.policy": set(),
     "envhub_sandbox.folders": set(),

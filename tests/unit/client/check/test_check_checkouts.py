@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.check import parsing
 from envhub_sandbox.check.findings import Finding
 from envhub_sandbox.check.survey import survey
 from envhub_sandbox.check.table import Severity
 from envhub_sandbox.errors import SnapshotError
 from envhub_sandbox.hub import checkout
 from envhub_sandbox.hub.snapshot import local
+from envhub_sandbox.sources import parsing
 from tests.hub.olah_server import GitRepository
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="needs git")

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from envhub_sandbox.check import parsing
 from envhub_sandbox.check.survey import survey
 from envhub_sandbox.check.table import Severity
 from envhub_sandbox.hub.snapshot import local
+from envhub_sandbox.sources import parsing
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
 _COMMITTER = "author A <a@b> 0 +0000\ncommitter A <a@b> 0 +0000\n"

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envhub_sandbox.check import parser, parsing
 from envhub_sandbox.check.survey import survey
 from envhub_sandbox.check.table import Severity
 from envhub_sandbox.hub.snapshot import local
+from envhub_sandbox.sources import parser, parsing
 from tests.support.repositories import write_repository
 
 _PIECES = (

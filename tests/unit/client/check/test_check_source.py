@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-from envhub_sandbox.check import parser, parsing, source
+from envhub_sandbox.check.undeclared import undeclared
 from envhub_sandbox.hub.snapshot import Snapshot, local
+from envhub_sandbox.sources import imports as source
+from envhub_sandbox.sources import parser, parsing
 from tests.support.repositories import write_repository
 
 _ENTRY = """
@@ -65,10 +67,10 @@ def test_what_is_declared_brings_what_it_needs(tmp_path: Path) -> None:
     """Of this interpreter's packages: pytest needs pluggy; nothing declared needs pytest."""
     text = "import numpy, pytest, pluggy\ndef make_env(): pass"
     found = imports(local(write_repository(tmp_path / "r", text)))
-    nothing = source.undeclared(found, {}, None)
+    nothing = undeclared(found, {}, None)
     assert [one.message.split()[0] for one in nothing] == ["pluggy", "pytest"]
     assert {(one.file, one.line) for one in nothing} == {("env.py", 1)}
-    assert source.undeclared(found, {"pytest": Requirement("pytest")}, None) == []
+    assert undeclared(found, {"pytest": Requirement("pytest")}, None) == []
 
 
 def test_an_environment_of_its_own_brings_what_lies_in_it(tmp_path: Path) -> None:
@@ -78,7 +80,7 @@ def test_an_environment_of_its_own_brings_what_lies_in_it(tmp_path: Path) -> Non
     (packages / "single.py").touch()
     text = "import yaml, single, pytest\ndef make_env(): pass"
     found = imports(local(write_repository(tmp_path / "r", text)))
-    missing = source.undeclared(found, {}, packages)
+    missing = undeclared(found, {}, packages)
     assert [one.message.split()[0] for one in missing] == ["pytest"]
 
 

@@ -15,8 +15,9 @@ import pytest
 from envhub_sandbox.dependencies import host, interpreters
 from envhub_sandbox.dependencies.choice import AUTO, HOST, chosen
 from envhub_sandbox.dependencies.cure import cure
-from envhub_sandbox.dependencies.declared import Declared, one
-from envhub_sandbox.dependencies.prepare import needs
+from envhub_sandbox.dependencies.declared import one
+from envhub_sandbox.dependencies.pipeline import HERE
+from envhub_sandbox.dependencies.request import PackageRequest, request_of
 from envhub_sandbox.errors import InterpreterUnavailableError, PolicyError, RequirementError
 from envhub_sandbox.hub.snapshot import Snapshot, local
 from tests.support.wheels import make_wheel
@@ -24,10 +25,10 @@ from tests.support.wheels import make_wheel
 NUMPY = metadata.version("numpy")
 
 
-def declares(*lines: str, python: str = "") -> Declared:
+def declares(*lines: str, python: str = "") -> PackageRequest:
     """What a requirements.txt of these lines declares."""
     wanted = (one(line, f"line {n} of requirements.txt") for n, line in enumerate(lines, start=1))
-    return Declared("requirements.txt", tuple(wanted), python)
+    return PackageRequest("requirements.txt", tuple(wanted), python)
 
 
 def snapshot(folder: Path, requirements: str | None = None) -> Snapshot:
@@ -151,9 +152,12 @@ def test_only_what_is_missing_makes_an_environment(tmp_path: Path) -> None:
         folder = tmp_path / str(text).strip()
         folder.mkdir()
         found = snapshot(folder, text)
-        assert needs(found, HOST) is None
-        assert (needs(found, AUTO) is not None) == auto
-        assert needs(found, own) is not None
+        assert request_of(found, HOST) is None
+        request = request_of(found, AUTO)
+        assert (request is not None and not HERE.meets(request)) == auto
+        always = request_of(found, own)
+        assert always is not None
+        assert always.always
 
 
 def test_this_interpreter_without_its_packages_comes_first() -> None:

@@ -16,10 +16,12 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.dependencies import bounds, environments, prepare, uv_cache
+from envhub_sandbox.dependencies import bounds, environments, uv_cache
 from envhub_sandbox.dependencies import index as index_settings
 from envhub_sandbox.dependencies.choice import chosen
 from envhub_sandbox.dependencies.environments import Environment
+from envhub_sandbox.dependencies.pipeline import ThisMachine
+from envhub_sandbox.dependencies.request import request_of
 from envhub_sandbox.errors import (
     DependencyError,
     IndexUnavailableError,
@@ -45,9 +47,12 @@ def repository(folder: Path, *lines: str) -> Path:
 
 def made(folder: Path, **options: Any) -> Environment:
     """Its environment."""
-    needed = prepare.needs(local(folder), OWN)
-    assert needed is not None
-    return prepare.prepare(needed, **options)
+    tell = options.pop("tell", lambda line: None)
+    request = request_of(local(folder), OWN)
+    assert request is not None
+    found = ThisMachine(**options).make(request, tell).environment
+    assert found is not None
+    return found
 
 
 def left_behind() -> list[str]:

@@ -18,6 +18,7 @@ from envhub_sandbox.dependencies import index as places
 from envhub_sandbox.dependencies import interpreters, uv
 from envhub_sandbox.dependencies import resolve as module
 from envhub_sandbox.dependencies.declared import one
+from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.dependencies.resolve import Lock, Target
 from envhub_sandbox.errors import (
     DependencyError,
@@ -36,7 +37,10 @@ HERE = Target(python=os.path.realpath(sys.executable))
 def resolve(*lines: str, target: Target = HERE, **options: Any) -> Lock:
     """The lock for these lines of a requirements.txt."""
     wanted = [one(line, f"line {n} of requirements.txt") for n, line in enumerate(lines, start=1)]
-    return module.resolve(wanted, target, **options)
+    refresh = options.pop("refresh", False)
+    return module.resolve(
+        PackageRequest("requirements.txt", tuple(wanted), **options), target, refresh=refresh
+    )
 
 
 def test_every_package_has_its_version_and_hashes(index: Index) -> None:

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 
 from envhub_sandbox.dependencies import host, interpreters
-from envhub_sandbox.dependencies.choice import AUTO, chosen
-from envhub_sandbox.dependencies.declared import Declared, one
+from envhub_sandbox.dependencies.declared import one
 from envhub_sandbox.dependencies.host import Described
+from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import InterpreterUnavailableError
 from envhub_sandbox.sandboxes.docker.packages import fitting
 
@@ -21,9 +21,10 @@ THERE = {
 }
 
 
-def declares(*lines: str, python: str = "") -> Declared:
-    """What a repository may declare."""
-    return Declared("requirements.txt", tuple(one(line, "a line") for line in lines), python)
+def declares(*lines: str, supports: str = "", python: str = "") -> PackageRequest:
+    """What a repository may declare, and the Python that the caller asks for."""
+    wanted = tuple(one(line, "a line") for line in lines)
+    return PackageRequest("requirements.txt", wanted, supports, python)
 
 
 @pytest.mark.parametrize(
@@ -46,7 +47,7 @@ def test_what_an_image_has_is_read_off_its_metadata(
 def test_an_interpreter_of_its_kind_fits() -> None:
     """Another patch release does; wheels that were chosen for an older glibc do."""
     minor = ".".join(OURS.version.split(".")[:2])
-    assert fitting(replace(NEWER, version=f"{minor}.99"), AUTO, None).path == OURS.path
+    assert fitting(replace(NEWER, version=f"{minor}.99"), declares()).path == OURS.path
 
 
 @pytest.mark.parametrize(
@@ -62,16 +63,16 @@ def test_an_interpreter_of_its_kind_fits() -> None:
 def test_one_of_another_kind_does_not(theirs: interpreters.Interpreter, said: str) -> None:
     """A wheel that was chosen for the one may crash in the other; the text has the other way."""
     with pytest.raises(InterpreterUnavailableError, match=said) as caught:
-        fitting(theirs, AUTO, None)
+        fitting(theirs, declares())
     assert "envhub image build" in str(caught.value)
 
 
 def test_the_images_python_is_the_one_that_there_is() -> None:
     """Who asks for another one, or declares one, hears so."""
-    for choice, found in (
-        (chosen({"python": "3.99"}, None)[0], None),
-        (chosen({"python": "/usr/bin/python3"}, None)[0], None),
-        (AUTO, declares(python=">=3.99")),
+    for request in (
+        declares(python="3.99"),
+        declares(python="/usr/bin/python3"),
+        declares(supports=">=3.99"),
     ):
         with pytest.raises(InterpreterUnavailableError, match="the image has"):
-            fitting(NEWER, choice, found)
+            fitting(NEWER, request)

@@ -1,4 +1,4 @@
-"""What a repository's code imports, read as data, and whether that is declared.
+"""What a repository's code imports, read as data.
 
 Nothing is imported or run. What is found in code is a hint for a person and no wall: who wants to
 hide a call can. The walls are the sandbox's.
@@ -9,16 +9,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from importlib import metadata
-from pathlib import Path
 
-from packaging.requirements import Requirement
-
-from envhub_sandbox.check.findings import Finding
-from envhub_sandbox.check.parsing import Named, Parsed
-from envhub_sandbox.dependencies import host
-from envhub_sandbox.dependencies.resolve import WORKERS
 from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.sources.parsing import Named, Parsed
 
 Files = Mapping[str, Parsed | None]
 
@@ -77,40 +70,3 @@ def _own(name: str, folder: str, files: set[str]) -> str:
             if candidate in files:
                 return candidate
     return ""
-
-
-def undeclared(
-    found: list[Import], declared: Mapping[str, Requirement], packages: Path | None
-) -> list[Finding]:
-    """The imports that nothing declared brings along.
-
-    Args:
-        found: What is imported.
-        declared: What the repository declares, by canonical name.
-        packages: The environment that was made of it; None where this interpreter serves.
-    """
-    brought = _in_folder(packages) if packages else _of_this_interpreter(declared)
-    return [
-        Finding(
-            "imports", f"{one.name} is imported, and nothing declares it", "", one.file, one.line
-        )
-        for one in found
-        if one.name not in brought
-    ]
-
-
-def _in_folder(packages: Path) -> set[str]:
-    brought = {path.name.partition(".")[0] for path in packages.iterdir()}
-    return brought | _of_this_interpreter({})
-
-
-def _of_this_interpreter(declared: Mapping[str, Requirement]) -> set[str]:
-    wanted = [*map(Requirement, WORKERS), *declared.values()]
-    return {module for one in host.brought(wanted) for module in _modules(one)}
-
-
-def _modules(found: metadata.Distribution) -> set[str]:
-    """What a distribution lets one import; Python 3.10 itself overlooks some of it."""
-    named = (found.read_text("top_level.txt") or "").split()
-    tops = {file.parts[0] for file in found.files or () if file.suffix in (".py", ".so")}
-    return {*named, *(top.partition(".")[0] for top in tops)}

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from envhub_sandbox.check import parser
 from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.sources import parser
 
 MOST_BYTES = 256 << 10
 """Of one file."""

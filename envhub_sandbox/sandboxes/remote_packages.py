@@ -1,0 +1,91 @@
+"""A repository's packages on another host: what is asked of its server, and what it says.
+
+The server's operator decides whether it installs any. What is declared is read here, and again
+there; what is made lies there, and no file of it comes here.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+from envhub_sandbox.dependencies.pipeline import PackageSet
+from envhub_sandbox.dependencies.request import PackageRequest
+from envhub_sandbox.errors import PolicyError, RemoteProtocolError
+from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.replies import expect
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.text import printable
+
+_POLL_S = 0.5
+_NAME_CHARS = 64
+_FACTS = ("lock", "packages")
+_MAX_PINS = 10_000
+_MAX_CHARS = 300
+
+
+def order_of(request: PackageRequest) -> m.NeedPackages:
+    """What a server is asked for.
+
+    Raises:
+        PolicyError: The request names a path of this machine.
+    """
+    if os.sep in request.python:
+        raise PolicyError(
+            f"python in dependencies is {request.python!r}, an interpreter of this machine, and a "
+            "remote server has its own: name a version, such as '3.12'"
+        )
+    rows = tuple((str(one), one.where) for one in request.wanted)
+    until = request.exclude_newer or ""
+    return m.NeedPackages(rows, request.supports, request.python, until, request.always)
+
+
+def bring(
+    order: m.NeedPackages,
+    client: WorkerClient,
+    deadline: Deadline,
+    tell: Callable[[str], None] = lambda line: None,
+) -> PackageSet | None:
+    """Have packages made; None where the server's own do.
+
+    Raises:
+        DependencyError: They cannot be made; the text says what to change.
+        PolicyError: The server's operator does not permit it.
+        ServerBusyError: Others of the same key are at it.
+        WorkerTimeoutError: It took too long.
+    """
+    told = ""
+    while True:
+        reply, _ = client.request(order, deadline=deadline)
+        found = expect(reply, m.Packages)
+        if found.state == "own":
+            return None
+        if found.state == "made":
+            return PackageSet(_name(found.name), _facts(found.facts))
+        if found.state != "making":
+            raise RemoteProtocolError("the server has packages in a state that there is not")
+        line = printable(found.told[:_MAX_CHARS], _MAX_CHARS)
+        if line != told:
+            tell(line)
+            told = line
+        left = deadline.left_s()
+        time.sleep(_POLL_S if left is None else min(_POLL_S, left))
+
+
+def _name(name: str) -> str:
+    """What we shall hand back. Trust: the server's word, for the server itself."""
+    if not 0 < len(name) <= _NAME_CHARS or not name.isalnum():
+        raise RemoteProtocolError("the server has packages of a name that is none")
+    return name
+
+
+def _facts(facts: dict[str, object]) -> dict[str, Any]:
+    """What is kept for the provenance. Trust: the server's word, checked for its types alone."""
+    lock, pins = (facts.get(name) for name in _FACTS)
+    if not isinstance(lock, str) or not isinstance(pins, (list, tuple)) or len(pins) > _MAX_PINS:
+        raise RemoteProtocolError("the server does not say which packages it has made")
+    texts = [printable(str(pin)[:_MAX_CHARS], _MAX_CHARS) for pin in pins]
+    return {"lock": printable(lock[:_MAX_CHARS], _MAX_CHARS), "packages": texts}
