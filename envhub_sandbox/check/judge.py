@@ -173,7 +173,7 @@ class _Judge:
 
     def _resolve(self) -> None:
         self._asked.tell("reading and installing what it declares")
-        packages, wanted = None, {}
+        packages, wanted, taken = None, {}, set[str]()
         try:
             choice, _ = chosen(self._asked.arguments.get("dependencies", "auto"), None)
             says = declared(self._snapshot.root, self._snapshot.path)
@@ -184,13 +184,15 @@ class _Judge:
             )
             if self._asked.arguments.get("python") is None and self._is_here:
                 made = packages_for(self._snapshot, choice)
-                packages = None if made is None else Path(made.packages)
+                if made is not None:
+                    packages = Path(made.packages)
+                    taken = {one["module"] for one in made.facts.get("inferred", ())}
         except (RequirementError, ResolutionError, PackageIntegrityError) as error:
             self._report.judged("requirements", [str(error)])
             raise _StoppedError from error
         self._report.judged("requirements", [])
         read = imports.imports(self._snapshot, self._files)
-        found = undeclared(read, wanted, packages)
+        found = undeclared(read, wanted, packages, taken)
         for finding in found:
             self._report.add(finding)
         if not found:

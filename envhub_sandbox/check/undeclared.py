@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from importlib import metadata
 from pathlib import Path
 
@@ -15,7 +15,10 @@ from envhub_sandbox.sources.imports import Import
 
 
 def undeclared(
-    found: list[Import], declared: Mapping[str, Requirement], packages: Path | None
+    found: list[Import],
+    declared: Mapping[str, Requirement],
+    packages: Path | None,
+    taken: Collection[str] = (),
 ) -> list[Finding]:
     """The imports that nothing declared brings along.
 
@@ -23,6 +26,7 @@ def undeclared(
         found: What is imported.
         declared: What the repository declares, by canonical name.
         packages: The environment that was made of it; None where this interpreter serves.
+        taken: Modules that were installed although nothing declares them.
     """
     brought = _in_folder(packages) if packages else _of_this_interpreter(declared)
     return [
@@ -30,7 +34,7 @@ def undeclared(
             "imports", f"{one.name} is imported, and nothing declares it", "", one.file, one.line
         )
         for one in found
-        if one.name not in brought
+        if one.name not in brought or one.name in taken
     ]
 
 

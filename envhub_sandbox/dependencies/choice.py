@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from envhub_sandbox.dependencies.declared import Wanted
 
 DATE = re.compile(r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}:\d{2}(Z|[+-]\d{2}:\d{2}))?")
-_NAMES = ("extra", "python", "exclude_newer")
+_NAMES = ("extra", "only", "without", "override", "python", "fetch_python", "exclude_newer")
 
 
 @dataclass(frozen=True)
@@ -29,15 +29,25 @@ class Choice:
         extra: Further requirements.
         python: A version or versions, or a path; empty for what the repository runs in.
         exclude_newer: A date: packages of later are not seen.
+        infer: Whether what it imports and does not declare is installed, too.
+        only: Requirements instead of those that it declares; None for those.
+        without: Names of packages that are left out, whoever needs them.
+        override: Requirements that hold instead of all others of the same package.
+        fetch_python: Whether uv may download an interpreter that this machine lacks.
     """
 
     where: Literal["auto", "host", "own"]
     extra: tuple[Wanted, ...] = ()
     python: str = ""
     exclude_newer: str | None = None
+    infer: bool = True
+    only: tuple[Wanted, ...] | None = None
+    without: tuple[str, ...] = ()
+    override: tuple[Wanted, ...] = ()
+    fetch_python: bool = False
 
 
-AUTO, HOST = Choice("auto"), Choice("host")
+AUTO, HOST, DECLARED = Choice("auto"), Choice("host"), Choice("auto", infer=False)
 
 
 def chosen(
@@ -57,14 +67,15 @@ def chosen(
         if python is not None:
             raise _both()
         return _adjusted(dependencies), None
-    if dependencies == "auto":
-        return (AUTO, None) if python is None else (HOST, python)
+    if dependencies in ("auto", "declared"):
+        auto = AUTO if dependencies == "auto" else DECLARED
+        return (auto, None) if python is None else (HOST, python)
     if dependencies == "host":
         return HOST, python
     if not isinstance(dependencies, (str, os.PathLike)) or os.sep not in os.fspath(dependencies):
         raise PolicyError(
-            f"dependencies is {dependencies!r}; it is 'auto', 'host', the path of an interpreter "
-            "or a virtual environment such as './.venv', or a mapping of "
+            f"dependencies is {dependencies!r}; it is 'auto', 'declared', 'host', the path of an "
+            "interpreter or a virtual environment such as './.venv', or a mapping of "
             f"{', '.join(_NAMES)}"
         )
     if python is not None:
@@ -85,13 +96,42 @@ def _adjusted(given: Mapping[str, Any]) -> Choice:
     unknown = sorted(str(name) for name in given if name not in _NAMES)
     if unknown:
         raise PolicyError(f"dependencies has no {', '.join(unknown)}; it takes {', '.join(_NAMES)}")
-    extra = given.get("extra", ())
-    if isinstance(extra, str) or not all(isinstance(text, str) for text in extra):
-        raise PolicyError(f"extra in dependencies is {extra!r}; it takes a list of requirements")
-    from envhub_sandbox.dependencies.declared import one
+    fetch = given.get("fetch_python", False)
+    if not isinstance(fetch, bool):
+        raise PolicyError(f"fetch_python in dependencies is {fetch!r}; it takes True or False")
+    only = given.get("only")
+    return Choice(
+        "own",
+        _requirements(given, "extra"),
+        _python(given.get("python")),
+        _date(given.get("exclude_newer")),
+        infer=only is None,
+        only=None if only is None else _requirements(given, "only"),
+        without=_names(given),
+        override=_requirements(given, "override"),
+        fetch_python=fetch,
+    )
 
-    wanted = tuple(one(text, f"{text[:80]!r} in dependencies") for text in extra)
-    return Choice("own", wanted, _python(given.get("python")), _date(given.get("exclude_newer")))
+
+def _requirements(given: Mapping[str, Any], name: str) -> tuple[Wanted, ...]:
+    found = given.get(name, ())
+    if not isinstance(found, (list, tuple)) or not all(isinstance(text, str) for text in found):
+        raise PolicyError(f"{name} in dependencies is {found!r}; it takes a list of requirements")
+    from envhub_sandbox.dependencies.declared import parse_requirement
+
+    return tuple(parse_requirement(text, f"{text[:80]!r} in dependencies") for text in found)
+
+
+def _names(given: Mapping[str, Any]) -> tuple[str, ...]:
+    from packaging.utils import canonicalize_name
+
+    found = _requirements(given, "without")
+    for one in found:
+        if str(one.requirement) != one.requirement.name:
+            raise PolicyError(
+                f"without in dependencies has {str(one)!r}; it takes names of packages"
+            )
+    return tuple(canonicalize_name(one.requirement.name) for one in found)
 
 
 def _python(given: object) -> str:

@@ -3,11 +3,14 @@
 The files are a stranger's. pip and uv obey options, URLs and paths in them, some of which build and
 run code at once, so only plain requirements get through, each parsed and printed anew. The first of
 these that there is counts, as the most particular one: the metadata of a script (PEP 723) in the
-entry file, ``requirements.txt``, and ``[project]`` of ``pyproject.toml``.
+entry file, ``requirements.txt`` beside it or else at the root, and ``[project]`` of
+``pyproject.toml``.
 """
 
 from __future__ import annotations
 
+import codecs
+import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
@@ -17,8 +20,9 @@ from typing import Any
 
 from packaging.requirements import InvalidRequirement, Requirement
 from packaging.specifiers import InvalidSpecifier, SpecifierSet
+from packaging.utils import canonicalize_name
 
-from envhub_sandbox.dependencies.files import LOOKED_AT, PROJECT, REQUIREMENTS, SCRIPT
+from envhub_sandbox.dependencies.files import LOOKED_AT, PROJECT, SCRIPT, requirements_file
 from envhub_sandbox.errors import RequirementError
 from envhub_sandbox.option_names import option_name
 
@@ -29,6 +33,8 @@ else:
 
 MAX_BYTES = 256 * 1024
 MAX_REQUIREMENTS = 1000
+MAX_FILES = 16
+"""That a ``requirements.txt`` leads to."""
 MAX_LINE = 2000
 MAX_DOTS = 2000
 """In TOML: the time that its parser takes grows with the square of the parts of a key."""
@@ -36,6 +42,9 @@ MAX_DOTS = 2000
 _HASH = re.compile(r"--hash[= ](sha256:[0-9a-f]{64}|sha384:[0-9a-f]{96}|sha512:[0-9a-f]{128})")
 _QUOTED = re.compile(r"'[^']*'|\"[^\"]*\"")
 _CLOSES = "# ///"
+_INCLUDES = re.compile(r"(-r|--requirement|-c|--constraint)[ =]\s*(\S+)")
+_BYTE_ORDER_MARKS = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
+_NOT_READ = ("environment.yml", "environment.yaml", "setup.py", "setup.cfg", "Pipfile", "uv.lock")
 
 
 @dataclass(frozen=True)
@@ -64,11 +73,13 @@ class Declared:
         source: The file that says so.
         wanted: Its requirements; there may be none.
         python: The versions of Python that it runs in, as in ``">=3.11"``; empty for any.
+        constraints: What holds for packages if something needs them.
     """
 
     source: str
     wanted: tuple[Wanted, ...]
     python: str = ""
+    constraints: tuple[Wanted, ...] = ()
 
 
 def declared(root: Path, entry: str) -> Declared | None:
@@ -85,13 +96,45 @@ def declared(root: Path, entry: str) -> Declared | None:
     if script is not None:
         return script
     project = _project(root / PROJECT)
-    if (root / REQUIREMENTS).is_file():
+    listed = requirements_file(root, entry)
+    if listed is not None:
         python = "" if project is None else project.python
-        return Declared(REQUIREMENTS, tuple(read(root / REQUIREMENTS)), python)
+        wanted, constraints = read(root, listed)
+        return Declared(listed, tuple(wanted), python, tuple(constraints))
     return project if project is not None and (project.wanted or project.python) else None
 
 
-def one(text: str, where: str) -> Wanted:
+def optional(root: Path, entry: str) -> dict[str, Wanted]:
+    """What optional extras of a project bring, by canonical name; empty where none can be read."""
+    try:
+        project = _toml(_text(root / PROJECT, PROJECT), PROJECT).get("project", {})
+        extras = project.get("optional-dependencies", {}) if isinstance(project, dict) else {}
+        rows = extras.values() if isinstance(extras, dict) else ()
+        where = f"[project.optional-dependencies] of {PROJECT}"
+        found = [wanted for row in rows for wanted in _list(row, where)]
+    except RequirementError:
+        return {}
+    return {canonicalize_name(one.requirement.name): one for one in found}
+
+
+def not_read(root: Path, entry: str) -> list[str]:
+    """What says there which packages are needed, in a form that is not read."""
+    beside = (root / entry).parent
+    found = [name for name in _NOT_READ if (beside / name).is_file() or (root / name).is_file()]
+    try:
+        data = _toml(_text(root / PROJECT, PROJECT), PROJECT)
+    except RequirementError:
+        return found
+    tool, project = data.get("tool"), data.get("project")
+    if isinstance(tool, dict) and isinstance(tool.get("poetry"), dict):
+        found.append(f"[tool.poetry] of {PROJECT}")
+    dynamic = project.get("dynamic") if isinstance(project, dict) else None
+    if isinstance(dynamic, list) and "dependencies" in dynamic:
+        found.append(f"dynamic dependencies of {PROJECT}")
+    return found
+
+
+def parse_requirement(text: str, where: str) -> Wanted:
     """A requirement that somebody wrote, with the hashes behind it.
 
     Raises:
@@ -135,16 +178,44 @@ def _is_literal(text: str) -> bool:
     )
 
 
-def read(path: Path) -> list[Wanted]:
-    """The plain requirements in a ``requirements.txt``.
+def read(root: Path, name: str) -> tuple[list[Wanted], list[Wanted]]:
+    """The plain requirements in a ``requirements.txt``, and the constraints.
+
+    Further files of the repository that it names (``-r``, ``-c``) are read, too.
 
     Raises:
         RequirementError: It holds something else, or is no text.
     """
-    text = _text(path, path.name)
-    lines = list(_joined(text.splitlines()))
-    _bounded(len(lines), path.name)
-    return [one(line, f"line {number} of {path.name}") for number, line in lines]
+    wanted: list[Wanted] = []
+    constraints: list[Wanted] = []
+    waiting, seen = [(name, False)], {(name, False)}
+    while waiting:
+        file, constrains = waiting.pop(0)
+        for number, line in _joined(_text(root / file, file).splitlines()):
+            where = f"line {number} of {file}"
+            if included := _INCLUDES.fullmatch(line):
+                further = _beside(root, file, included[2], where)
+                row = (further, constrains or included[1] in ("-c", "--constraint"))
+                if row not in seen:
+                    seen.add(row)
+                    waiting.append(row)
+            else:
+                (constraints if constrains else wanted).append(parse_requirement(line, where))
+        _bounded(len(wanted) + len(constraints), name)
+        if len(seen) > MAX_FILES:
+            raise RequirementError(f"{name} leads to more than {MAX_FILES} files. {_advice()}")
+    return wanted, constraints
+
+
+def _beside(root: Path, file: str, named: str, where: str) -> str:
+    """A file of the repository that another one names, relative to the root."""
+    path = os.path.normpath(os.path.join(os.path.dirname(file), named))
+    inside = not os.path.isabs(path) and path.split(os.sep)[0] != ".." and "://" not in named
+    if not inside or not (root / path).is_file():
+        raise RequirementError(
+            f"{where} names {named[:200]!r}, which is no file of the repository. {_advice()}"
+        )
+    return path
 
 
 def _joined(lines: Sequence[str]) -> Iterator[tuple[int, str]]:
@@ -224,7 +295,7 @@ def _list(found: object, where: str) -> tuple[Wanted, ...]:
     if not isinstance(found, list) or not all(isinstance(item, str) for item in found):
         raise RequirementError(f"dependencies in {where} is no list of texts. {_advice()}")
     _bounded(len(found), where)
-    return tuple(one(item, f"{item[:80]!r} in {where}") for item in found)
+    return tuple(parse_requirement(item, f"{item[:80]!r} in {where}") for item in found)
 
 
 def _specifier(found: object, where: str) -> str:
@@ -250,7 +321,8 @@ def _text(path: Path, name: str) -> str:
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
-        text = data.decode("utf-8-sig")
+        # PowerShell writes UTF-16
+        text = data.decode(_BYTE_ORDER_MARKS.get(data[:2], "utf-8-sig"))
     except (OSError, UnicodeDecodeError) as error:
         raise RequirementError(f"{name} cannot be read: {error}") from error
     if len(data) > MAX_BYTES:
@@ -263,6 +335,7 @@ def _text(path: Path, name: str) -> str:
 def _advice() -> str:
     return (
         "If you trust it, install the packages into an interpreter of your own and give that with "
-        f"{option_name('python', 'PATH')}, or take this one as it is with "
-        f"{option_name('dependencies', 'host')}"
+        f"{option_name('python', 'PATH')}, take this one as it is with "
+        f"{option_name('dependencies', 'host')}, or say what it needs yourself with "
+        f"{option_name('dependencies', {'only': ['NAME']})}"
     )

@@ -299,7 +299,7 @@ def _install(
         [
             *("pip", "install", *uv.NO_BUILDS, "--require-hashes", "--no-deps"),
             *("--link-mode", "copy", "--python", interpreter.path, "--target", str(packages)),
-            *(*index.options(), "-r", str(pins)),
+            *(*index.options(), *lock.options, "-r", str(pins)),
         ],
         what="the packages could not be installed",
         timeout_s=_INSTALL_S,

@@ -30,7 +30,7 @@ from typing import Any
 from envhub_sandbox import parent
 from envhub_sandbox.dependencies import bounds, environments, interpreters, uv
 from envhub_sandbox.dependencies.choice import DATE
-from envhub_sandbox.dependencies.declared import one
+from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.pipeline import HERE
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import DependencyError, PackagesTooLargeError, RequirementError
@@ -111,7 +111,8 @@ def _made(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
 def _request(order: Mapping[str, Any]) -> PackageRequest:
     """What is asked for. Trust: input from a client."""
     wanted = tuple(
-        one(text, printable(where, _WHERE_CHARS)) for text, where in order["requirements"]
+        parse_requirement(text, printable(where, _WHERE_CHARS))
+        for text, where in order["requirements"]
     )
     python, until = order["python"], order["exclude_newer"]
     try:

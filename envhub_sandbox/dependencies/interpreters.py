@@ -1,4 +1,6 @@
-"""Interpreters of this machine that a repository can run in. None is ever downloaded.
+"""Interpreters of this machine that a repository can run in.
+
+None is downloaded unless the caller permits it (``fetch_python``); then uv does.
 
 A repository's packages lie in a folder of their own, so what is wanted is an interpreter and
 nothing of its packages: the one that a virtual environment was made of, and not the environment.
@@ -6,6 +8,7 @@ nothing of its packages: the one that a virtual environment was made of, and not
 
 from __future__ import annotations
 
+import contextlib
 import glob
 import json
 import os
@@ -23,6 +26,7 @@ from envhub_sandbox.option_names import option_name
 
 _ASK_S = 60.0
 _FIND_S = 120.0
+_FETCH_S = 600.0
 _OLDEST = SpecifierSet(">=3.10")
 _ASK = (
     "import json, os, platform, sys; print(json.dumps([sys.implementation.name,"
@@ -49,6 +53,11 @@ class Interpreter:
     machine: str
     libc: str
 
+    @property
+    def series(self) -> str:
+        """Which wheels it takes: ``"cpython 3.11"``."""
+        return f"{self.implementation} {'.'.join(self.version.split('.')[:2])}"
+
     def fits(self, versions: SpecifierSet) -> bool:
         """Whether it is among these versions."""
         return versions.contains(self.version, prereleases=True)
@@ -74,13 +83,14 @@ def release(version: str) -> str:
     return version.rstrip("+")
 
 
-def find(asked: str, declared: str = "") -> Interpreter:
+def find(asked: str, declared: str = "", *, fetch: bool = False) -> Interpreter:
     """An interpreter that fits: this one if it does, else the newest that is at hand.
 
     Args:
         asked: The caller's choice: a version (``"3.11"``), versions (``">=3.11,<3.13"``) or a path;
             empty for none.
         declared: The versions that the repository runs in.
+        fetch: Whether uv may download one where none is at hand.
 
     Raises:
         InterpreterUnavailableError: There is none.
@@ -91,15 +101,34 @@ def find(asked: str, declared: str = "") -> Interpreter:
     ours = own()
     if ours.fits(wanted):
         return ours
-    found = [one for one in _others(wanted) if one.fits(wanted)]
+    found = _others(wanted)
+    if not found and fetch:
+        _fetch(wanted)
+        found = _others(wanted)
     if found:
-        return max(found, key=lambda one: Version(one.version))
+        return found[0]
     why = f"you ask for Python {asked!r}" if asked else f"it runs in Python {declared}"
+    named = option_name("dependencies", {"python": "/path/to/python3"})
+    fetched = option_name("dependencies", {"python": asked or "3.12", "fetch_python": True})
     raise InterpreterUnavailableError(
         f"{why}, and this machine has none that is 3.10 or later and fits; this one is "
-        f"{ours.version} ({ours.path}). Install one ('uv python install' does), or name one: "
-        f"{option_name('dependencies', {'python': '/path/to/python3'})}. None is downloaded by "
-        "itself"
+        f"{ours.version} ({ours.path}). Install one ('uv python install' does), have it "
+        f"downloaded with {fetched}, or name one: {named}"
+    )
+
+
+def others(declared: str, first: Interpreter) -> list[Interpreter]:
+    """The other releases on this machine that a repository may run in, the newest first."""
+    found = _others(SpecifierSet(declared) & _OLDEST)
+    return [one for one in found if one.series != first.series]
+
+
+def _fetch(wanted: SpecifierSet) -> None:
+    uv.run(
+        ["python", "install", "--no-config", str(wanted)],
+        what=f"no interpreter for Python {wanted} could be downloaded",
+        timeout_s=_FETCH_S,
+        variables={"UV_PYTHON_DOWNLOADS": "manual"},
     )
 
 
@@ -139,25 +168,35 @@ def _at(path: str) -> Interpreter:
     return Interpreter(real, implementation, release(version), *facts)
 
 
-def _others(versions: SpecifierSet) -> list[Interpreter]:
-    """What uv finds, and what pyenv keeps where uv does not look. All of it is this machine's."""
+def _others(wanted: SpecifierSet) -> list[Interpreter]:
+    """What uv finds, and what pyenv keeps where uv does not look; one of each series."""
     paths = [*_pyenvs()]
     try:
         found = uv.run(
-            ["python", "find", "--no-config", "--no-project", "--system", str(versions)],
+            ["python", "list", "--no-config", "--only-installed", "--output-format", "json"],
             what="no interpreter was found",
             timeout_s=_FIND_S,
         )
-        paths.append(found.strip())
-    except DependencyError:
-        pass  # which says that it found none
-    interpreters = []
-    for path in dict.fromkeys(os.path.realpath(path) for path in paths if path):
-        try:
-            interpreters.append(_at(path))
-        except InterpreterUnavailableError:
-            continue
-    return interpreters
+        paths += [str(row["path"]) for row in json.loads(found) if _may_be(row)]
+    except (DependencyError, ValueError, LookupError, TypeError):
+        pass  # there is none that uv finds
+    newest: dict[str, Interpreter] = {}
+    for path in dict.fromkeys(os.path.realpath(path) for path in paths):
+        with contextlib.suppress(InterpreterUnavailableError):
+            one = _at(path)
+            known = newest.get(one.series)
+            if one.fits(wanted) and (
+                known is None or Version(known.version) < Version(one.version)
+            ):
+                newest[one.series] = one
+    fitting = [one for one in newest.values() if one.fits(wanted)]
+    return sorted(fitting, key=lambda one: Version(one.version), reverse=True)
+
+
+def _may_be(row: dict[str, object]) -> bool:
+    """Whether it is worth asking: pyenv's shims are no interpreters, and 3.14t is another ABI."""
+    default = row.get("variant", "default") == "default"
+    return default and row.get("implementation") == "cpython" and "/shims/" not in str(row["path"])
 
 
 def _pyenvs() -> list[str]:

@@ -7,19 +7,30 @@ and a server on another host is a ``PackageTarget``.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 from envhub_sandbox.dependencies import progress
 from envhub_sandbox.dependencies.choice import Choice
 from envhub_sandbox.dependencies.request import PackageRequest, request_of
-from envhub_sandbox.errors import DependencyError, name_source
+from envhub_sandbox.errors import (
+    DependencyError,
+    IndexUnavailableError,
+    ResolutionError,
+    name_source,
+)
 from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.log import DEPENDENCIES
+from envhub_sandbox.option_names import option_name
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.environments import Environment
+    from envhub_sandbox.dependencies.guesses import Guess
+    from envhub_sandbox.dependencies.interpreters import Interpreter
     from envhub_sandbox.dependencies.resolutions import Resolution
+    from envhub_sandbox.dependencies.resolve import Lock, Target
 
 Tell = Callable[[str], None]
 
@@ -68,23 +79,25 @@ class ThisMachine:
 
     def meets(self, request: PackageRequest) -> bool:
         """Whether this process's interpreter has all of it."""
-        from envhub_sandbox.dependencies import host
+        from envhub_sandbox.dependencies import guesses, host
 
-        return host.lacks(request) is None
+        return host.lacks(request) is None and all(map(guesses.is_here, request.guesses))
 
     def make(self, request: PackageRequest, tell: Tell) -> PackageSet:
         """An environment; raises as ``resolution_for`` and ``environments.provide``."""
         from envhub_sandbox.dependencies import environments
 
         found = resolution_for(request, tell, upgrade=self._upgrade)
-        return PackageSet.of(environments.provide(found.lock, found.interpreter, tell))
+        made = PackageSet.of(environments.provide(found.lock, found.interpreter, tell))
+        inferred = [one.facts for one in request.guesses if one.module in found.taken]
+        return replace(made, facts=made.facts | {"inferred": inferred}) if inferred else made
 
 
 HERE = ThisMachine()
 
 
 def packages_for(
-    snapshot: Snapshot, choice: Choice, target: PackageTarget = HERE
+    snapshot: Snapshot, choice: Choice, target: PackageTarget = HERE, *, gpu: bool = False
 ) -> PackageSet | None:
     """The packages that a repository runs with; None for those that the place has.
 
@@ -94,11 +107,18 @@ def packages_for(
         DependencyError: They cannot be made; the text says what to change.
     """
     try:
-        request = request_of(snapshot, choice)
+        request = request_of(snapshot, choice, gpu=gpu)
         if request is None or (not request.always and target.meets(request)):
             return None
         with progress.shown("packages") as tell:
-            return target.make(request, tell)
+            try:
+                return target.make(request, tell)
+            except (ResolutionError, IndexUnavailableError) as error:
+                if request.wanted or request.always:
+                    raise
+                # what it imports was read, and not said: it may do without
+                DEPENDENCIES.warning("%s: nothing is installed for it: %s", snapshot.label, error)
+                return None
     except DependencyError as error:
         name_source(error, snapshot.label)
         raise
@@ -114,16 +134,86 @@ def resolution_for(
         DependencyError: There is no interpreter, no index, or no uv.
     """
     from envhub_sandbox.dependencies import interpreters, resolutions
-    from envhub_sandbox.dependencies.resolutions import Resolution
-    from envhub_sandbox.dependencies.resolve import Target, resolve
 
-    interpreter = interpreters.find(request.python, request.supports)
-    key = resolutions.key_of(request, interpreter)
-    known = None if upgrade else resolutions.recall(key, interpreter)
+    first = interpreters.find(request.python, request.supports, fetch=request.fetch_python)
+    key = resolutions.key_of(request, first)
+    known = None if upgrade else resolutions.recall(key)
     if known is not None:
         return known
     tell(f"choosing versions for {request.source}")
-    lock = resolve(request, Target(python=interpreter.path), refresh=upgrade, tell=tell)
-    found = Resolution(lock, interpreter)
+    found = _chosen(request, first, upgrade, tell)
+    for one in request.guesses:
+        if one.module in found.taken:
+            warnings.warn(_taken(one), stacklevel=2)
     resolutions.remember(key, found)
     return found
+
+
+def _taken(one: Guess) -> str:
+    strict = option_name("dependencies", "declared")
+    return (
+        f"{one.wanted.requirement} is installed, which nothing declares ({one.wanted.where}); "
+        f"{strict} takes what is declared alone"
+    )
+
+
+def _chosen(request: PackageRequest, first: Interpreter, refresh: bool, tell: Tell) -> Resolution:
+    """By the first interpreter that has versions; without guesses only if none has them."""
+    from envhub_sandbox.dependencies import interpreters, resolve
+
+    tried: list[Interpreter] = []
+    failed: list[ResolutionError] = []
+    without = [replace(request, guesses=())] if request.guesses and request.wanted else []
+    for attempt in (request, *without):
+        failed.clear()
+        for one in _candidates(first, request, interpreters.others):
+            tried.append(one)
+            try:
+                return _for_interpreter(attempt, one, refresh, tell)
+            except ResolutionError as error:
+                failed.append(error)
+                if not resolve.is_about_python(error):
+                    break
+    versions = list(dict.fromkeys(one.version for one in tried))
+    what = resolve.advice(request.python, versions, failed[0])
+    raise ResolutionError(f"{failed[0]}\n{what}") from failed[0]
+
+
+def _candidates(
+    first: Interpreter,
+    request: PackageRequest,
+    others: Callable[[str, Interpreter], list[Interpreter]],
+) -> Iterator[Interpreter]:
+    yield first
+    if not request.python:
+        yield from others(request.supports, first)
+
+
+def _for_interpreter(
+    request: PackageRequest, interpreter: Interpreter, refresh: bool, tell: Tell
+) -> Resolution:
+    from envhub_sandbox.dependencies.resolutions import Resolution
+    from envhub_sandbox.dependencies.resolve import Target
+
+    lock, taken = versions_for(request, Target(python=interpreter.path), refresh, tell)
+    return Resolution(lock, interpreter, tuple(one.module for one in taken))
+
+
+def versions_for(
+    request: PackageRequest, target: Target, refresh: bool = False, tell: Tell = lambda line: None
+) -> tuple[Lock, tuple[Guess, ...]]:
+    """Versions for one interpreter, and what was taken that nothing else brings.
+
+    Raises:
+        ResolutionError: There are none.
+    """
+    from envhub_sandbox.dependencies.resolve import resolve
+
+    taken = request.guesses
+    if request.wanted or not taken:
+        lock = resolve(request, target, refresh=refresh, tell=tell)
+        names = {pin.partition("==")[0] for pin in lock.packages}
+        taken = tuple(one for one in request.guesses if not one.is_among(names))
+        if not taken:
+            return lock, ()
+    return resolve(request.plus(taken), target, refresh=refresh, tell=tell), taken

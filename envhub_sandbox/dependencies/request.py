@@ -5,7 +5,7 @@ One value, whichever place the repository runs in. Reading it runs nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from envhub_sandbox.dependencies.choice import Choice
@@ -14,6 +14,7 @@ from envhub_sandbox.hub.snapshot import Snapshot
 
 if TYPE_CHECKING:  # they cost time, and most repositories need none of them
     from envhub_sandbox.dependencies.declared import Wanted
+    from envhub_sandbox.dependencies.guesses import Guess
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,12 @@ class PackageRequest:
         python: The version or versions that the caller asks for, or a path; empty for none.
         exclude_newer: A date: packages of later are not seen.
         always: Whether it gets an environment of its own even where the place meets all of it.
+        guesses: What it imports; what no other package brings is installed, too.
+        constraints: What holds for packages if something needs them.
+        without: Names of packages that are left out, whoever needs them.
+        override: Requirements that hold instead of all others of the same package.
+        fetch_python: Whether uv may download an interpreter that this machine lacks.
+        gpu: Whether its jails are given one.
     """
 
     source: str
@@ -35,27 +42,60 @@ class PackageRequest:
     python: str = ""
     exclude_newer: str | None = None
     always: bool = False
+    guesses: tuple[Guess, ...] = ()
+    constraints: tuple[Wanted, ...] = ()
+    without: tuple[str, ...] = ()
+    override: tuple[Wanted, ...] = ()
+    fetch_python: bool = False
+    gpu: bool = False
+
+    def plus(self, guesses: tuple[Guess, ...]) -> PackageRequest:
+        """The same with these as requirements, and no guesses."""
+        wanted = (*self.wanted, *(one.wanted for one in guesses))
+        return replace(self, wanted=wanted, guesses=())
 
 
-def request_of(snapshot: Snapshot, choice: Choice) -> PackageRequest | None:
+def request_of(snapshot: Snapshot, choice: Choice, *, gpu: bool = False) -> PackageRequest | None:
     """What a repository is to have; None where the place's own packages are used as they are.
 
     Raises:
         RequirementError: What the repository declares cannot be taken.
     """
-    auto = choice.where == "auto"
-    if choice.where == "host" or (auto and not may_declare(snapshot.root, snapshot.path)):
+    if choice.where == "host":
         return None
-    from envhub_sandbox.dependencies.declared import declared
+    auto, found = choice.where == "auto", None
+    if choice.only is None and may_declare(snapshot.root, snapshot.path):
+        from envhub_sandbox.dependencies.declared import declared
 
-    found = declared(snapshot.root, snapshot.path)
-    if found is None and auto:
+        found = declared(snapshot.root, snapshot.path)
+    guesses = _guesses(snapshot, choice)
+    if auto and found is None and not guesses:
         return None
+    says = choice.only if choice.only is not None else (found.wanted if found else ())
     return PackageRequest(
-        source=found.source if found else "the argument dependencies",
-        wanted=(*(found.wanted if found else ()), *choice.extra),
+        source=found.source if found else _source(choice),
+        wanted=(*says, *choice.extra),
         supports=found.python if found else "",
         python=choice.python,
         exclude_newer=choice.exclude_newer,
         always=not auto,
+        guesses=guesses,
+        constraints=found.constraints if found else (),
+        without=choice.without,
+        override=choice.override,
+        fetch_python=choice.fetch_python,
+        gpu=gpu,
     )
+
+
+def _guesses(snapshot: Snapshot, choice: Choice) -> tuple[Guess, ...]:
+    if not choice.infer:
+        return ()
+    from envhub_sandbox.dependencies.guesses import guessed
+
+    left_out = set(choice.without)
+    return tuple(one for one in guessed(snapshot) if left_out.isdisjoint(one.brought_by))
+
+
+def _source(choice: Choice) -> str:
+    return "what it imports" if choice.where == "auto" else "the argument dependencies"

@@ -6,22 +6,19 @@ and needs no index a second time.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
+import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from envhub_sandbox import folders
-from envhub_sandbox.dependencies import index
+from envhub_sandbox.dependencies import index, remembered
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.dependencies.resolve import WORKERS, Lock
 from envhub_sandbox.hub.store import cache_root
-from envhub_sandbox.system.files import write_whole
 
-_FORMAT = 1
-_MAX_BYTES = 16 * 1024 * 1024
+_FORMAT = 2
 
 
 @dataclass(frozen=True)
@@ -31,10 +28,12 @@ class Resolution:
     Attributes:
         lock: The versions.
         interpreter: What they are for.
+        taken: Modules that are imported and not declared, and were installed for it.
     """
 
     lock: Lock
     interpreter: Interpreter
+    taken: tuple[str, ...] = ()
 
 
 def root() -> Path:
@@ -44,26 +43,42 @@ def root() -> Path:
 
 def key_of(request: PackageRequest, interpreter: Interpreter) -> str:
     """The name of a resolution: the hash of what it depends on, the places of packages included."""
-    asked = sorted(map(str, request.wanted))
-    facts = [_FORMAT, WORKERS, asked, asdict(interpreter), request.exclude_newer, index.places()]
+    asked = [
+        sorted(map(str, rows)) for rows in (request.wanted, request.constraints, request.override)
+    ]
+    asked.append(sorted(str(one.wanted.requirement) for one in request.guesses))
+    rest = [request.without, request.exclude_newer, request.python, request.supports, request.gpu]
+    facts = [_FORMAT, WORKERS, asked, asdict(interpreter), rest, index.places()]
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
 
-def recall(key: str, interpreter: Interpreter) -> Resolution | None:
-    """What was chosen, if that is known."""
-    path = root() / key
+def recall(key: str) -> Resolution | None:
+    """What was chosen, if that is known, and its interpreter is still the same."""
     try:
-        if not folders.is_ours_alone(path.parent) or path.stat().st_size > _MAX_BYTES:
-            return None
-        lock = Lock(path.read_text("utf-8"))
+        facts = json.loads(remembered.recall(root(), key) or "{}")
+        lock = Lock(str(facts["lock"]), tuple(map(str, facts["options"])))
+        interpreter = Interpreter(**facts["interpreter"])
         # what the worker needs is in each: an empty one was lost
-        return Resolution(lock, interpreter) if lock.packages else None
-    except (OSError, ValueError):
-        return None
+        if lock.packages and _stamp(interpreter) == facts["stamp"]:
+            return Resolution(lock, interpreter, tuple(map(str, facts["taken"])))
+    except (OSError, ValueError, LookupError, TypeError):
+        pass
+    return None
 
 
 def remember(key: str, found: Resolution) -> None:
     """Keep a choice. A cache that cannot be written is no error."""
-    with contextlib.suppress(OSError):
-        folders.make_private(root())
-        write_whole(root() / key, found.lock.text.encode())
+    facts = {
+        "lock": found.lock.text,
+        "options": found.lock.options,
+        "interpreter": asdict(found.interpreter),
+        "stamp": _stamp(found.interpreter),
+        "taken": found.taken,
+    }
+    remembered.keep(root(), key, json.dumps(facts))
+
+
+def _stamp(interpreter: Interpreter) -> list[int]:
+    """Another release under the same name is another file."""
+    status = os.stat(interpreter.path)
+    return [status.st_size, status.st_mtime_ns]

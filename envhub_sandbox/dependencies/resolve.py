@@ -8,9 +8,10 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from packaging.utils import canonicalize_name
+from packaging.version import Version
 
 from envhub_sandbox.dependencies import index, interpreters, uv
-from envhub_sandbox.dependencies.declared import Wanted, one
+from envhub_sandbox.dependencies.declared import Wanted, parse_requirement
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import PackageIntegrityError, ResolutionError
 from envhub_sandbox.option_names import option_name
@@ -20,6 +21,11 @@ WORKERS = ("cloudpickle>=3", "gymnasium>=0.29", "msgpack>=1.0.5", "numpy>=1.26")
 Gymnasium may be older in a jail than outside."""
 _RESOLVE_S = 600.0
 _PIN = re.compile(r"([a-z0-9][a-z0-9.-]*)==([A-Za-z0-9.!+_-]+) \\")
+_IS_PYTHON = re.compile(
+    r"does not satisfy Python|with a matching Python|no usable wheels|requires? Python"
+)
+_NO_WHEELS = re.compile(r"Wheels are required for `([A-Za-z0-9._-]+)`")
+_NEEDS_PYTHON = re.compile(r"does not satisfy Python>=(3\.\d+)")
 _HASH = re.compile(r"    --hash=(sha(?:256|384|512):[0-9a-f]+)( \\)?")
 
 
@@ -29,9 +35,11 @@ class Lock:
 
     Attributes:
         text: As pip's ``--require-hashes`` reads it.
+        options: For uv: where the index does not have all of them.
     """
 
     text: str
+    options: tuple[str, ...] = ()
 
     @property
     def digest(self) -> str:
@@ -78,14 +86,16 @@ def resolve(
     request: PackageRequest,
     target: Target,
     *,
+    options: Sequence[str] = (),
     refresh: bool = False,
     tell: Callable[[str], None] = lambda line: None,
 ) -> Lock:
     """Pins for a target; wheels only, nothing is built.
 
     Args:
-        request: What is asked for; what the worker needs comes on top.
+        request: What is asked for; what the worker needs comes on top. Guesses are not looked at.
         target: What the packages are for.
+        options: Further ones, which the installation needs, too.
         refresh: Ask the index anew for what uv has seen a moment ago.
         tell: Gets each line of uv's progress.
 
@@ -94,23 +104,49 @@ def resolve(
         PackageIntegrityError: A version is there, but not with a hash that was asked for.
         DependencyError: There is no uv, or it failed.
     """
-    every = [*request.wanted, *(one(text, "the worker of envhub-sandbox") for text in WORKERS)]
+    ours = (parse_requirement(text, "the worker of envhub-sandbox") for text in WORKERS)
+    every = [*request.wanted, *ours]
+    files = {
+        "--constraints": _lines(request.constraints),
+        "--overrides": _lines(request.override),
+        "--excludes": "".join(f"{name}\n" for name in request.without),
+    }
+    named = {option: f"{option[2:]}.txt" for option, text in files.items() if text}
     try:
         text = uv.run(
             [
                 *("pip", "compile", "-", *uv.NO_BUILDS, "--generate-hashes", "--no-header"),
-                *("--no-annotate", *target.options, *index.options()),
+                *("--no-annotate", *target.options, *index.options(), *options),
                 *(("--exclude-newer", request.exclude_newer) if request.exclude_newer else ()),
+                *(word for pair in named.items() for word in pair),
                 *(("--refresh",) if refresh else ()),
             ],
             what=f"no versions of the packages could be chosen for {target}",
-            given="".join(f"{one.requirement}\n" for one in every),
+            given=_lines(every),
             timeout_s=_RESOLVE_S,
             tell=tell,
+            files={name: files[option] for option, name in named.items()},
         )
     except ResolutionError as error:
-        raise ResolutionError(f"{error}\n{_what_to_change(str(error), every)}") from error
-    return Lock(_with_their_hashes(_pins(text), request.wanted))
+        more = [*request.constraints, *request.override]
+        raise ResolutionError(
+            f"{error}\n{_what_is_required(str(error), [*every, *more])}"
+        ) from error
+    return Lock(_with_their_hashes(_pins(text), request.wanted), tuple(options))
+
+
+def _lines(wanted: Iterable[Wanted]) -> str:
+    return "".join(f"{one.requirement}\n" for one in wanted)
+
+
+def is_about_python(error: ResolutionError) -> bool:
+    """Whether another Python may help, as far as uv's text says."""
+    return _IS_PYTHON.search(str(error)) is not None
+
+
+def without_wheels(error: ResolutionError) -> list[str]:
+    """Packages that have no wheel, as far as uv's text says."""
+    return _NO_WHEELS.findall(str(error))
 
 
 def _pins(text: str) -> list[tuple[str, str, list[str]]]:
@@ -149,17 +185,33 @@ def _with_their_hashes(pins: Iterable[tuple[str, str, list[str]]], wanted: Seque
     return "".join(f"{line}\n" for line in lines)
 
 
-def _what_to_change(said: str, every: Sequence[Wanted]) -> str:
+def _what_is_required(said: str, every: Sequence[Wanted]) -> str:
     """The requirements that an explanation speaks of, with where each stands."""
     words = {canonicalize_name(word) for word in re.findall(r"[A-Za-z0-9][A-Za-z0-9._-]*", said)}
     told = [one for one in every if canonicalize_name(one.requirement.name) in words]
     lines = [f"  {one.requirement}  ({one.where})" for one in (told or every)[:20]]
-    return "\n".join(
-        [
-            "What is required of these packages:",
-            *lines,
-            "Change one of them in the repository; or ask for another Python, "
-            f"{option_name('dependencies', {'python': '3.12'})}; or install what fits into an "
-            f"interpreter of your own and give that with {option_name('python', 'PATH')}",
-        ]
+    return "\n".join(["What is required of these packages:", *lines])
+
+
+def advice(asked: str, tried: Sequence[str], error: ResolutionError) -> str:
+    """What to do where nothing satisfies all requirements.
+
+    Args:
+        asked: The Python that the caller asks for; empty for none.
+        tried: Versions of the interpreters that were tried.
+        error: Of the first of them.
+    """
+    others = ""
+    needed = _NEEDS_PYTHON.findall(str(error))
+    if needed and (asked or len(tried) > 1):
+        python = {"python": max(needed, key=Version), "fetch_python": True}
+        others = f" have uv fetch another Python, {option_name('dependencies', python)};"
+    elif needed:
+        others = f" name another Python, {option_name('dependencies', {'python': max(needed)})};"
+    also = f"Python {', '.join(tried)} of this machine were tried. " if len(tried) > 1 else ""
+    change = option_name("dependencies", {"override": ["NAME<2"], "without": ["NAME"]})
+    return (
+        f"{also}Change one of them in the repository, or for this run with {change};{others} or "
+        "install what fits into an interpreter of your own and give that with "
+        f"{option_name('python', 'PATH')}"
     )

@@ -14,8 +14,9 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
+from pathlib import Path
 
 from envhub_sandbox.dependencies import index
 from envhub_sandbox.errors import (
@@ -86,6 +87,8 @@ def run(
     keep: Iterable[int] = (),
     watch: Callable[[], None] = lambda: None,
     file_bytes: int | None = None,
+    files: Mapping[str, str] = {},
+    variables: Mapping[str, str] = {},
 ) -> str:
     """Run uv to its end, and return what it printed.
 
@@ -98,19 +101,23 @@ def run(
         keep: Descriptors that it keeps open for as long as it lives.
         watch: Called now and then; what it raises ends it.
         file_bytes: The largest file that it may write.
+        files: Texts that it finds in its folder, by name.
+        variables: Of its environment, instead of ours.
 
     Raises:
         DependencyError: It failed, or there is none.
     """
     with tempfile.TemporaryDirectory(prefix="envhub-uv-") as nowhere:
         # uv reads projects and settings of the folder that it runs in
+        for name, text in files.items():
+            Path(nowhere, name).write_text(text, "utf-8")
         process = subprocess.Popen(
             [command(), *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             cwd=nowhere,
-            env=index.environment(),
+            env={**index.environment(), **variables},
             pass_fds=tuple(keep),
             text=True,
             errors="replace",

@@ -16,7 +16,7 @@ from typing import Any
 
 from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.choice import DATE
-from envhub_sandbox.dependencies.declared import one
+from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.errors import LockError, RequirementError
 from envhub_sandbox.hub.snapshot import Snapshot
@@ -199,7 +199,9 @@ class _Reader:
         if not isinstance(extra, list) or not all(isinstance(item, str) for item in extra):
             raise self._wrong("extra")
         try:
-            return tuple(str(one(item, f"{item[:80]!r} in {self._where}")) for item in extra)
+            return tuple(
+                str(parse_requirement(item, f"{item[:80]!r} in {self._where}")) for item in extra
+            )
         except RequirementError as error:
             raise LockError(str(error)) from error
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from envhub_sandbox.dependencies.choice import Choice
-from envhub_sandbox.dependencies.declared import one
+from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.pipeline import resolution_for
 from envhub_sandbox.dependencies.request import request_of
 from envhub_sandbox.errors import LockError
@@ -44,7 +44,7 @@ def locked(
 
 def again(lock: LockFile) -> Choice:
     """The choice that led to a lock."""
-    extra = tuple(one(text, f"{text[:80]!r} in the lock") for text in lock.extra)
+    extra = tuple(parse_requirement(text, f"{text[:80]!r} in the lock") for text in lock.extra)
     return Choice("own", extra, lock.runner.python, lock.exclude_newer)
 
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox import std_streams
 from envhub_sandbox.dependencies.choice import Choice, chosen
-from envhub_sandbox.dependencies.cure import cure
+from envhub_sandbox.dependencies.missing_module import MissingModule
 from envhub_sandbox.dependencies.pipeline import HERE, PackageSet, packages_for
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.hub import store
@@ -141,7 +140,7 @@ def _packages(snapshot: Snapshot, wanted: _Wanted, options: Options) -> PackageS
     if options.sandbox != "process" and not isinstance(place, PackageSource):
         return None
     target = place.package_target() if isinstance(place, PackageSource) else HERE
-    return packages_for(snapshot, wanted.choice, target)
+    return packages_for(snapshot, wanted.choice, target, gpu=bool(wanted.policy.gpu))
 
 
 def _repository(
@@ -163,7 +162,7 @@ def _repository(
         options.copy,
         recipe=recipe,
         installed=packages.facts if packages else None,
-        cure=partial(cure, snapshot, wanted.place.name, wanted.choice, wanted.python, own),
+        advice=MissingModule(snapshot, wanted.place.name, wanted.choice, wanted.python, own).advice,
     )
 
 

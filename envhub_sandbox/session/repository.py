@@ -70,7 +70,7 @@ class Repository:
         copy: Whether observations are copied for the caller, or lent.
         recipe: How to make it again.
         installed: What was installed for it, for the provenance.
-        cure: Says what to do where a module is missing.
+        advice: Says what to do where a module is missing, for the error's text.
 
     Attributes:
         heard: What it has warned of, in any jail.
@@ -91,7 +91,7 @@ class Repository:
         *,
         recipe: Recipe,
         installed: dict[str, Any] | None,
-        cure: Callable[[], str],
+        advice: Callable[[str], str],
     ) -> None:
         self.snapshot = snapshot
         self.arguments = arguments
@@ -105,7 +105,7 @@ class Repository:
         self.latest_profile: str | None = None
         self.recipe = recipe
         self.installed = installed
-        self._cure = cure
+        self._advice = advice
 
     @property
     def label(self) -> str:
@@ -124,7 +124,7 @@ class Repository:
             yield
         except EnvHubError as error:
             if isinstance(error, DependencyError) and not str(error).startswith(self.label):
-                error.args = (f"{error}. {self._cure()}",)
+                error.args = (f"{error}. {self._advice(str(error))}",)
             name_source(error, self.label)
             point_out(error, self.snapshot)
             raise

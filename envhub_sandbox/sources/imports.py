@@ -16,37 +16,73 @@ from envhub_sandbox.sources.parsing import Named, Parsed
 Files = Mapping[str, Parsed | None]
 
 
+_MOST_ROUNDS = 100
+
+
 @dataclass(frozen=True)
 class Import:
-    """A module that is imported: its first name, and where."""
+    """A module that is imported: its first name, where, and its whole name."""
 
     name: str
     file: str
     line: int
+    module: str = ""
 
 
 def imports(snapshot: Snapshot, files: Files) -> list[Import]:
     """What the entry file imports, and the repository's own modules that it leads to.
 
-    What is imported within ``try`` may be missing, and what nobody imports is not needed.
+    A function's or class's own imports count if something that runs uses its name, as far as the
+    text says. What may be missing does not count, nor what nothing leads to.
     """
-    names = {record.path for record in snapshot.files}
-    waiting, seen, found = [snapshot.path], {snapshot.path}, []
-    while waiting:
-        file = waiting.pop()
-        parsed = files.get(file)
-        for one in () if parsed is None else parsed.imports:
-            for name, own in _targets(one, file, names) if one.unguarded else ():
-                if own and own not in seen:
-                    seen.add(own)
-                    waiting.append(own)
-                elif not own and name and name not in sys.stdlib_module_names:
-                    found.append(Import(name, file, one.line))
-    return sorted(set(found), key=lambda one: (one.file, one.line, one.name))
+    found = _Reached(snapshot, files).imports
+    return sorted(found, key=lambda one: (one.file, one.line, one.name))
+
+
+def ids(snapshot: Snapshot, files: Files) -> list[tuple[str, str, int]]:
+    """Texts such as ``"Ant-v5"`` in the entry file and what it leads to, with file and line."""
+    reached = sorted(_Reached(snapshot, files).files)
+    return [
+        (text, file, line) for file in reached if (one := files[file]) for text, line in one.ids
+    ]
+
+
+class _Reached:
+    """What runs where ``make_env`` does, by the names that it uses."""
+
+    def __init__(self, snapshot: Snapshot, files: Files) -> None:
+        self._parsed = files
+        self._names = {record.path for record in snapshot.files}
+        self._used = {"make_env"}
+        self.files = {snapshot.path} & files.keys()
+        self.imports: set[Import] = set()
+        for _ in range(_MOST_ROUNDS):
+            before = len(self.files), len(self._used)
+            for file in sorted(self.files):
+                self._follow(file)
+            if (len(self.files), len(self._used)) == before:
+                return
+
+    def _follow(self, file: str) -> None:
+        parsed = self._parsed[file] or Parsed()
+        for name, used in parsed.definitions:
+            if not name or name in self._used:
+                self._used.update(used)
+        for one in parsed.imports:
+            if one.required and (not one.within or one.within in self._used):
+                for module, own in _targets(one, file, self._names):
+                    self._add(module, own, file, one.line)
+
+    def _add(self, module: str, own: str, file: str, line: int) -> None:
+        name = module.partition(".")[0]
+        if own in self._parsed:
+            self.files.add(own)
+        elif not own and name and name not in sys.stdlib_module_names:
+            self.imports.add(Import(name, file, line, module))
 
 
 def _targets(one: Named, file: str, files: set[str]) -> Iterator[tuple[str, str]]:
-    """Each module that is named: its first name, and the repository's own file if it is one."""
+    """Each module that is named, and the repository's own file if it is one."""
     folder = file.rpartition("/")[0]
     for _ in range(one.level - 1):
         folder = folder.rpartition("/")[0]
@@ -59,7 +95,7 @@ def _targets(one: Named, file: str, files: set[str]) -> Iterator[tuple[str, str]
         foreign = one.level < 0 or (one.level == 0 and number == 0)
         is_package = _own(name.partition(".")[0], folder, files)
         if own or (foreign and not is_package):
-            yield name.partition(".")[0], own
+            yield name, own
 
 
 def _own(name: str, folder: str, files: set[str]) -> str:

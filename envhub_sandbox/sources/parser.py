@@ -40,6 +40,9 @@ _OUTSIDE = re.compile(
     r"|(HF|HUGGING|GITHUB|GH|GITLAB|AWS|AZURE|GOOGLE|OPENAI|ANTHROPIC|WANDB)[A-Z_]*"
     r"_(TOKEN|SECRET|PASSWORD|KEY)[A-Z_]*"
 )
+_ID = re.compile(r"[A-Za-z0-9_./-]{1,80}-v\d{1,3}")
+_ENTRY_POINT = re.compile(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)")
+_MISSING = {"BaseException", "Exception", "ImportError", "ModuleNotFoundError"}
 _WORDLESS = re.compile(r"(?<![A-Za-z0-9+/=_\\-])[A-Za-z0-9+/=_\\-]{1000,}")
 
 
@@ -90,28 +93,87 @@ def encoding(data: bytes) -> str:
 
 
 def _rows(tree: ast.Module) -> dict[str, list[Any]]:
-    unguarded = {id(node) for node in _unguarded(tree)}
+    required = {id(node) for node in _required(tree)}
+    within = _places(tree)
     aliases = _aliases(tree)
     found: dict[str, list[Any]] = {
-        kind: [] for kind in ("imports", "calls", "uses", "fetches", "texts", "entries")
+        kind: [] for kind in ("imports", "calls", "uses", "fetches", "texts", "entries", "ids")
     }
     for node in ast.walk(tree):
         if isinstance(node, (ast.Import, ast.ImportFrom)):
-            found["imports"].append([*_import(node), id(node) in unguarded, node.lineno])
+            found["imports"].append(
+                [*_import(node), id(node) in required, node.lineno, within.get(id(node), "")]
+            )
         elif isinstance(node, ast.Call) and (name := _meant(node.func, aliases)):
             found["calls"].append([name, node.lineno])
             found["fetches"] += _fetched(name, node, aliases)
+            for module, names in _imported_by_name(name, node):
+                place = within.get(id(node), "")
+                found["imports"].append(
+                    [*(0, module, names, id(node) in required, node.lineno), place]
+                )
         elif isinstance(node, (ast.Name, ast.Attribute)):
             if (name := _meant(node, aliases)) and "." in name:
                 found["uses"].append([name, node.lineno])
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             found["texts"] += _text(node)
+            if _ID.fullmatch(node.value):
+                found["ids"].append([node.value, node.lineno])
     found["entries"] += [
         [ast.unparse(node.args)[:LONGEST], node.lineno]
         for node in tree.body
         if isinstance(node, ast.FunctionDef) and node.name == "make_env"
     ]
+    found["definitions"] = _definitions(tree)
     return found
+
+
+def _definition_of(statement: ast.stmt) -> str:
+    """The name of a function or class at the top of a file; decorated ones are used at once."""
+    kinds = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+    if isinstance(statement, kinds) and not statement.decorator_list:
+        return statement.name[:_LONGEST_TEXT]
+    return ""
+
+
+def _places(tree: ast.Module) -> dict[int, str]:
+    """The function or class at the top of the file that a node lies in."""
+    return {
+        id(node): name
+        for statement in tree.body
+        if (name := _definition_of(statement))
+        for node in ast.walk(statement)
+    }
+
+
+def _definitions(tree: ast.Module) -> list[list[Any]]:
+    """Each function and class at the top with the names that it uses; without a name: the rest."""
+    found: dict[str, dict[str, None]] = {"": {}}
+    left = MOST
+    for statement in tree.body:
+        if _is_program(statement):
+            continue
+        names = found.setdefault(_definition_of(statement), {})
+        for node in ast.walk(statement):
+            name = getattr(node, "id", "") or getattr(node, "attr", "")
+            if isinstance(node, (ast.Name, ast.Attribute)) and left and name not in names:
+                names[name[:_LONGEST_TEXT]] = None
+                left -= 1
+    return [[name, list(names)] for name, names in found.items()]
+
+
+def _imported_by_name(called: str, node: ast.Call) -> Iterator[tuple[str, list[str]]]:
+    """``import_module("a.b")``, and ``register(..., entry_point="a.b:C")``."""
+    first = node.args[0] if node.args else None
+    if called == "importlib.import_module" and isinstance(first, ast.Constant):
+        if isinstance(first.value, str) and not first.value.startswith("."):
+            yield first.value[:LONGEST], []
+        return
+    for keyword in node.keywords:
+        value = keyword.value.value if isinstance(keyword.value, ast.Constant) else None
+        text = value[:LONGEST] if isinstance(value, str) else ""
+        if keyword.arg == "entry_point" and (found := _ENTRY_POINT.fullmatch(text)):
+            yield found[1], [found[2]]
 
 
 def _aliases(tree: ast.Module) -> dict[str, str]:
@@ -168,18 +230,66 @@ def _import(node: ast.Import | ast.ImportFrom) -> list[Any]:
     return [node.level, (node.module or "")[:LONGEST], names]
 
 
-def _unguarded(tree: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
+def _required(tree: ast.AST) -> Iterator[ast.AST]:
+    """Every node but those of imports that may fail, or are for other programs."""
     waiting = [tree]  # no recursion: a stranger chose how deep it is
     while waiting:
-        for node in ast.iter_child_nodes(waiting.pop()):
-            if isinstance(node, (ast.Import, ast.ImportFrom)):
-                yield node
-            elif not isinstance(node, ast.Try) and not _is_for_types(node):
-                waiting.append(node)
+        node = waiting.pop()
+        yield node
+        waiting += _needed_below(node)
 
 
-def _is_for_types(node: ast.AST) -> bool:
-    return isinstance(node, ast.If) and _dotted(node.test).endswith("TYPE_CHECKING")
+def _needed_below(node: ast.AST) -> list[ast.AST]:
+    if isinstance(node, ast.If) and (_is_for_types(node) or _is_program(node) or _asks(node)):
+        return [*node.orelse]
+    if isinstance(node, ast.With) and any(_suppresses(item.context_expr) for item in node.items):
+        return []
+    if isinstance(node, ast.Try) and (catching := list(filter(_catches, node.handlers))):
+        forgives = not all(_gives_up(handler) for handler in catching)
+        return [*(() if forgives else node.body), *node.orelse, *node.finalbody]
+    return list(ast.iter_child_nodes(node))
+
+
+def _catches(handler: ast.ExceptHandler) -> bool:
+    """Whether it is where a missing module leads to."""
+    kinds = handler.type.elts if isinstance(handler.type, ast.Tuple) else [handler.type]
+    return any(kind is None or _last(kind) in _MISSING for kind in kinds)
+
+
+def _gives_up(handler: ast.ExceptHandler) -> bool:
+    end = handler.body[-1]
+    called = end.value if isinstance(end, ast.Expr) else None
+    leaves = isinstance(called, ast.Call) and _last(called.func) == "exit"
+    return isinstance(end, ast.Raise) or leaves
+
+
+def _suppresses(node: ast.expr) -> bool:
+    return (
+        isinstance(node, ast.Call)
+        and _last(node.func) == "suppress"
+        and any(_last(one) in _MISSING for one in node.args)
+    )
+
+
+def _asks(node: ast.If) -> bool:
+    """``if importlib.util.find_spec("a"):``"""
+    return any(
+        isinstance(one, ast.expr) and _last(one) == "find_spec" for one in ast.walk(node.test)
+    )
+
+
+def _last(node: ast.expr) -> str:
+    return _dotted(node).rpartition(".")[2]
+
+
+def _is_for_types(node: ast.If) -> bool:
+    return _last(node.test) == "TYPE_CHECKING"
+
+
+def _is_program(node: ast.AST) -> bool:
+    """``if __name__ == "__main__":``"""
+    test = node.test if isinstance(node, ast.If) else None
+    return isinstance(test, ast.Compare) and _dotted(test.left) == "__name__"
 
 
 def _dotted(node: ast.expr) -> str:

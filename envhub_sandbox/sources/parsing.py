@@ -37,15 +37,18 @@ class Named:
         level: Of a relative ``from``; -1 for ``import``.
         module: Behind ``from``.
         names: What is imported.
-        unguarded: Not within ``try``, nor for type checkers alone.
+        required: Whether the file does not work without: it is not within a ``try`` that goes on
+            without it, nor for type checkers or for the file as a program.
         line: Where it stands.
+        within: The function or class at the top of the file that it stands in; empty for none.
     """
 
     level: int
     module: str
     names: tuple[str, ...]
-    unguarded: bool
+    required: bool
     line: int
+    within: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +62,9 @@ class Parsed:
         fetches: Of ``getattr``: of what, and by which name; None for one that is computed.
         texts: ``"outside"`` with a text that names a place beyond, or ``"wordless"``; its length.
         entries: The arguments of each ``make_env``.
+        ids: Texts such as ``"Ant-v5"``.
+        definitions: The functions and classes at the top, each with the names that it uses; an
+            empty one for what is beside them.
         encoding: Where it is neither UTF-8 nor ASCII, and so has not been read: its name, or an
             empty one where there is none.
         is_python: Of this version.
@@ -70,6 +76,8 @@ class Parsed:
     fetches: tuple[tuple[str, str | None, int], ...] = ()
     texts: tuple[tuple[str, str, int, int], ...] = ()
     entries: tuple[tuple[str, int], ...] = ()
+    ids: tuple[tuple[str, int], ...] = ()
+    definitions: tuple[tuple[str, tuple[str, ...]], ...] = ()
     encoding: str | None = None
     is_python: bool = True
 
@@ -161,10 +169,13 @@ def _answer(row: Any) -> Parsed | None:
     if not row or "encoding" in row:
         return Parsed(is_python=bool(row), **row)
     imports = (
-        Named(level, module, tuple(names), unguarded, line)
-        for level, module, names, unguarded, line in row["imports"]
+        Named(level, module, tuple(names), required, line, within)
+        for level, module, names, required, line, within in row["imports"]
     )
+    definitions = ((name, tuple(names)) for name, names in row["definitions"])
     rest: dict[str, Any] = {
-        kind: tuple(map(tuple, rows)) for kind, rows in row.items() if kind != "imports"
+        kind: tuple(map(tuple, rows))
+        for kind, rows in row.items()
+        if kind not in ("imports", "definitions")
     }
-    return Parsed(imports=tuple(imports), **rest)
+    return Parsed(imports=tuple(imports), definitions=tuple(definitions), **rest)

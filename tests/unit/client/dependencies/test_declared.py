@@ -102,15 +102,79 @@ def test_a_line_joined_by_backslashes_is_one_requirement(tmp_path: Path) -> None
 def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
     """Or too long to be one that somebody wrote."""
     path = tmp_path / "requirements.txt"
-    path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(RequirementError, match="cannot be read"):
-        read(path)
+    for data in (b"\xff\xfe\x00", b"\x80numpy"):
+        path.write_bytes(data)
+        with pytest.raises(RequirementError, match="cannot be read"):
+            read(tmp_path, path.name)
     path.write_text("numpy\n" * module.MAX_BYTES)
     with pytest.raises(RequirementError, match="bytes"):
-        read(path)
+        read(tmp_path, path.name)
     path.write_text("numpy\n" * (module.MAX_REQUIREMENTS + 1))
     with pytest.raises(RequirementError, match="requirements"):
-        read(path)
+        read(tmp_path, path.name)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-8-sig"])
+def test_what_windows_writes_is_read(tmp_path: Path, encoding: str) -> None:
+    """PowerShell's redirection gives UTF-16, editors a byte order mark."""
+    (tmp_path / "requirements.txt").write_bytes("numpy>=2\r\nfoo\r\n".encode(encoding))
+    assert [str(one) for one in read(tmp_path, "requirements.txt")[0]] == ["numpy>=2", "foo"]
+
+
+def test_further_files_of_the_repository_are_read(tmp_path: Path) -> None:
+    """Relative to the file that names them, each once; what a constraint file leads to is one."""
+    (tmp_path / "more").mkdir()
+    (tmp_path / "more/base.txt").write_text("numpy\n-r ../requirements.txt\n-c=held.txt\n")
+    (tmp_path / "more/held.txt").write_text("foo<2\n-r deeper.txt\n")
+    (tmp_path / "more/deeper.txt").write_text("bar<3\n")
+    found = repository(tmp_path, requirements__txt="a\n-r more/base.txt\n")
+    assert found is not None
+    assert [str(one) for one in found.wanted] == ["a", "numpy"]
+    assert [(str(one), one.where) for one in found.constraints] == [
+        ("foo<2", "line 1 of more/held.txt"),
+        ("bar<3", "line 1 of more/deeper.txt"),
+    ]
+
+
+@pytest.mark.parametrize(
+    "named", ["../outside.txt", "/etc/hostname", "more", "https://a.example/r"]
+)
+def test_no_file_beyond_the_repository_is_read(tmp_path: Path, named: str) -> None:
+    """Whatever a line names."""
+    (tmp_path / "outside.txt").write_text("numpy\n")
+    (tmp_path / "repo/more").mkdir(parents=True)
+    with pytest.raises(RequirementError, match="no file of the repository"):
+        repository(tmp_path / "repo", requirements__txt=f"-r {named}\n")
+
+
+def test_a_chain_of_files_ends(tmp_path: Path) -> None:
+    """Before it has a thousand."""
+    for number in range(module.MAX_FILES + 1):
+        (tmp_path / f"{number}.txt").write_text(f"-r {number + 1}.txt\n")
+    with pytest.raises(RequirementError, match="leads to more than"):
+        repository(tmp_path, requirements__txt="-r 0.txt\n")
+
+
+def test_the_file_beside_the_entry_counts(tmp_path: Path) -> None:
+    """Before the one at the root."""
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep/env.py").write_text("")
+    (tmp_path / "requirements.txt").write_text("of-root\n")
+    assert plain(declared(tmp_path, "deep/env.py")) == ["of-root"]
+    (tmp_path / "deep/requirements.txt").write_text("of-entry\n")
+    assert plain(declared(tmp_path, "deep/env.py")) == ["of-entry"]
+
+
+def test_what_was_seen_and_not_read_is_said(tmp_path: Path) -> None:
+    """Files of other programs, and what is known only once it is built."""
+    for name in ("environment.yml", "setup.py"):
+        (tmp_path / name).write_text("")
+    text = "[project]\nname = 'x'\ndynamic = ['dependencies']\n[tool.poetry]\n"
+    assert repository(tmp_path, pyproject__toml=text) is None
+    assert module.not_read(tmp_path, "env.py") == [
+        *("environment.yml", "setup.py", "[tool.poetry] of pyproject.toml"),
+        "dynamic dependencies of pyproject.toml",
+    ]
 
 
 def test_the_most_particular_file_counts(tmp_path: Path) -> None:

@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from envhub_sandbox.dependencies import host, interpreters
-from envhub_sandbox.dependencies.choice import AUTO, HOST, chosen
-from envhub_sandbox.dependencies.cure import cure
-from envhub_sandbox.dependencies.declared import one
+from envhub_sandbox.dependencies.choice import AUTO, DECLARED, HOST, chosen
+from envhub_sandbox.dependencies.declared import parse_requirement
+from envhub_sandbox.dependencies.missing_module import MissingModule
 from envhub_sandbox.dependencies.pipeline import HERE
 from envhub_sandbox.dependencies.request import PackageRequest, request_of
 from envhub_sandbox.errors import InterpreterUnavailableError, PolicyError, RequirementError
@@ -27,7 +27,10 @@ NUMPY = metadata.version("numpy")
 
 def declares(*lines: str, python: str = "") -> PackageRequest:
     """What a requirements.txt of these lines declares."""
-    wanted = (one(line, f"line {n} of requirements.txt") for n, line in enumerate(lines, start=1))
+    wanted = (
+        parse_requirement(line, f"line {n} of requirements.txt")
+        for n, line in enumerate(lines, start=1)
+    )
     return PackageRequest("requirements.txt", tuple(wanted), python)
 
 
@@ -50,6 +53,10 @@ def test_what_the_caller_says(tmp_path: Path) -> None:
     assert python is None
     assert (choice.where, choice.python) == ("own", "3.12")
     assert [str(wanted) for wanted in choice.extra] == ["scipy>=1"]
+    assert chosen("declared", None) == (DECLARED, None)
+    only, _ = chosen({"only": ["a>1"], "without": ["B_c"], "override": ["d<2"]}, None)
+    assert (list(map(str, only.only or ())), only.infer) == (["a>1"], False)
+    assert (only.without, list(map(str, only.override))) == (("b-c",), ["d<2"])
     assert chosen({"exclude_newer": datetime.date(2026, 1, 31)}, None)[0].exclude_newer == (
         "2026-01-31"
     )
@@ -59,6 +66,8 @@ def test_what_the_caller_says(tmp_path: Path) -> None:
     "wrong",
     [
         *("hots", "", 3, None, {"extras": []}, {"extra": "scipy"}, {"extra": [3]}),
+        *({"only": "scipy"}, {"without": ["a<2"]}, {"without": "a"}, {"override": [1]}),
+        {"fetch_python": 1},
         *({"python": "soon"}, {"python": 3.11}, {"exclude_newer": "yesterday"}),
         *({"exclude_newer": "2026-01-01 --index-url=x"}, {"exclude_newer": 2026}),
     ],
@@ -103,7 +112,7 @@ def test_what_is_here_is_not_installed_again(lines: list[str]) -> None:
 )
 def test_what_is_not_here_is_named(line: str) -> None:
     """Another version is not here; nor is one whose files nobody can compare."""
-    assert host.lacks(declares("gymnasium", line)) == str(one(line, "").requirement)
+    assert host.lacks(declares("gymnasium", line)) == str(parse_requirement(line, "").requirement)
 
 
 @pytest.mark.parametrize("marker", ["os_name ~= 'posix'", "python_version ~= '3'", "'a' ~= 'b'"])
@@ -215,7 +224,7 @@ def test_a_missing_module_has_one_cure(
     tmp_path: Path, place: str, choice: Any, python: Any, own: bool, said: str
 ) -> None:
     """It depends on the place, and what the repository declares is told."""
-    text = cure(snapshot(tmp_path, "numpy>=1\n"), place, choice, python, own)
+    text = MissingModule(snapshot(tmp_path, "numpy>=1\n"), place, choice, python, own).advice()
     assert said in text
     assert place == "process" or "python=" not in text  # which is refused elsewhere
     assert "Its requirements.txt declares numpy>=1" in text
@@ -223,6 +232,8 @@ def test_a_missing_module_has_one_cure(
 
 def test_a_repository_that_declares_nothing_is_said_to(tmp_path: Path) -> None:
     """And one whose file cannot be taken, why."""
-    assert "declares no packages" in cure(snapshot(tmp_path), "process", AUTO, None, False)
-    said = cure(snapshot(tmp_path, "-e .\n"), "docker", AUTO, None, False)
+    nothing = MissingModule(snapshot(tmp_path), "process", AUTO, None, False).advice()
+    assert "declares no packages" in nothing
+    wrong = snapshot(tmp_path, "-e .\n")
+    said = MissingModule(wrong, "docker", AUTO, None, False).advice()
     assert "line 1 of requirements.txt" in said

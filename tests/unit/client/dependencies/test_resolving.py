@@ -17,7 +17,7 @@ import pytest
 from envhub_sandbox.dependencies import index as places
 from envhub_sandbox.dependencies import interpreters, uv
 from envhub_sandbox.dependencies import resolve as module
-from envhub_sandbox.dependencies.declared import one
+from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.dependencies.resolve import Lock, Target
 from envhub_sandbox.errors import (
@@ -36,7 +36,10 @@ HERE = Target(python=os.path.realpath(sys.executable))
 
 def resolve(*lines: str, target: Target = HERE, **options: Any) -> Lock:
     """The lock for these lines of a requirements.txt."""
-    wanted = [one(line, f"line {n} of requirements.txt") for n, line in enumerate(lines, start=1)]
+    wanted = [
+        parse_requirement(line, f"line {n} of requirements.txt")
+        for n, line in enumerate(lines, start=1)
+    ]
     refresh = options.pop("refresh", False)
     return module.resolve(
         PackageRequest("requirements.txt", tuple(wanted), **options), target, refresh=refresh
@@ -124,6 +127,44 @@ def test_a_package_that_is_nowhere(index: Index) -> None:
     """Its line is named."""
     with pytest.raises(ResolutionError, match=r"no-such-package  \(line 1"):
         resolve("no-such-package")
+
+
+def test_a_requirement_is_left_out_or_replaced(index: Index) -> None:
+    """Whoever needs it."""
+    make_wheel(index.folder, "one", requires=["shared<2", "unwanted"])
+    make_wheel(index.folder, "shared", "1.0")
+    make_wheel(index.folder, "shared", "2.0")
+    changed = resolve(
+        *("one", "unwanted"),
+        without=("unwanted",),
+        override=(parse_requirement("shared>=2", "an argument"),),
+    ).packages
+    assert "shared==2.0" in changed
+    assert not [pin for pin in changed if pin.startswith("unwanted")]
+
+
+def test_a_constraint_holds_only_for_what_is_needed(index: Index) -> None:
+    """And is named where nothing satisfies it."""
+    make_wheel(index.folder, "one", requires=["shared"])
+    make_wheel(index.folder, "shared", "1.0")
+    make_wheel(index.folder, "shared", "2.0")
+    held = tuple(parse_requirement(text, "line 7 of c.txt") for text in ("shared<2", "absent<1"))
+    assert "shared==1.0" in resolve("one", constraints=held).packages
+    with pytest.raises(ResolutionError, match=r"shared<2  \(line 7 of c.txt\)"):
+        resolve("one", "shared>1", constraints=held)
+
+
+def test_another_python_is_told_from_another_fault(index: Index) -> None:
+    """By what uv says."""
+    make_wheel(index.folder, "newer", python=">=3.99")
+    make_wheel(index.folder, "tagged", tag="cp399-cp399-any")
+    for name in ("newer", "tagged"):
+        with pytest.raises(ResolutionError) as caught:
+            resolve(name)
+        assert module.is_about_python(caught.value)
+    with pytest.raises(ResolutionError) as caught:
+        resolve("no-such-package")
+    assert not module.is_about_python(caught.value)
 
 
 def test_what_would_have_to_be_built_is_refused(index: Index, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from envhub_sandbox.dependencies import host, interpreters
-from envhub_sandbox.dependencies.declared import one
+from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.host import Described
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import InterpreterUnavailableError
@@ -23,7 +23,7 @@ THERE = {
 
 def declares(*lines: str, supports: str = "", python: str = "") -> PackageRequest:
     """What a repository may declare, and the Python that the caller asks for."""
-    wanted = tuple(one(line, "a line") for line in lines)
+    wanted = tuple(parse_requirement(line, "a line") for line in lines)
     return PackageRequest("requirements.txt", wanted, supports, python)
 
 

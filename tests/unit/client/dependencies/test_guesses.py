@@ -1,0 +1,284 @@
+"""What a repository imports and does not declare is installed for it, where it is known what."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox.dependencies import guesses, interpreters, pipeline
+from envhub_sandbox.dependencies import resolve as resolving
+from envhub_sandbox.dependencies.choice import AUTO, DECLARED, Choice, chosen
+from envhub_sandbox.dependencies.guesses import guessed
+from envhub_sandbox.dependencies.interpreters import Interpreter
+from envhub_sandbox.dependencies.missing_module import MissingModule
+from envhub_sandbox.dependencies.pipeline import PackageSet, packages_for
+from envhub_sandbox.dependencies.request import PackageRequest, request_of
+from envhub_sandbox.dependencies.resolve import Lock, Target
+from envhub_sandbox.errors import ResolutionError
+from envhub_sandbox.hub.snapshot import Snapshot, local
+from envhub_sandbox.sources import parsing
+from tests.support.wheels import Index, make_wheel
+
+MAKE = "\ndef make_env(n_envs=1, use_async_envs=False): ..."
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "cache"))
+
+
+def snapshot(folder: Path, text: str, **files: str) -> Snapshot:
+    """A repository of this entry file; ``__`` in other names is a dot."""
+    folder.mkdir(exist_ok=True)
+    (folder / "env.py").write_text(text)
+    for name, content in files.items():
+        (folder / name.replace("__", ".")).write_text(content)
+    return local(folder)
+
+
+def requirements(found: Snapshot) -> list[str]:
+    """What is guessed."""
+    return [str(one.wanted.requirement) for one in guessed(found)]
+
+
+def made(found: Snapshot, choice: Choice = AUTO) -> PackageSet | None:
+    """Its packages, and no warning is an error."""
+    return packages_for(found, choice)
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("import cv2" + MAKE, ["opencv-python-headless"]),
+        ("from google.protobuf import message" + MAKE, ["protobuf"]),
+        ("import os, numpy, gymnasium, nobody_knows_this" + MAKE, []),
+        ("def make_env():\n    import chess", ["chess"]),
+        ("def make_env(): return C()\nclass C:\n  def render(self):\n    import chess", ["chess"]),
+        ("try:\n  import chess\nexcept ImportError as e:\n  raise E from e" + MAKE, ["chess"]),
+        ("try:\n  import chess\nfinally:\n  pass" + MAKE, ["chess"]),
+        ("r(id='a', entry_point='chess.envs:C')" + MAKE, ["chess"]),
+        ("import importlib\nx = importlib.import_module('chess')" + MAKE, ["chess"]),
+        ("import gymnasium\nx = gymnasium.make('Ant-v5')" + MAKE, ["gymnasium[mujoco]"]),
+        (
+            "x = 'LunarLander-v3', 'ALE/Pong-v5', 'CartPole-v1'" + MAKE,
+            ["gymnasium[box2d]", "gymnasium[atari]"],
+        ),
+        # what it does without, or nothing leads to
+        ("try:\n  import chess\nexcept ImportError:\n  chess = None" + MAKE, []),
+        ("try:\n  import chess\nexcept Exception:\n  pass" + MAKE, []),
+        ("import contextlib\nwith contextlib.suppress(ImportError):\n  import chess" + MAKE, []),
+        ("from importlib.util import find_spec\nif find_spec('chess'):\n  import chess" + MAKE, []),
+        ("from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n  import chess" + MAKE, []),
+        ("if __name__ == '__main__':\n  import chess" + MAKE, []),
+        ("def train():\n  import chess" + MAKE, []),
+    ],
+)
+def test_what_it_needs_is_read_off_its_text(tmp_path: Path, text: str, wanted: list[str]) -> None:
+    """What is imported where make_env leads to, unless it goes on without."""
+    assert requirements(snapshot(tmp_path / "r", text)) == wanted
+
+
+def test_a_commit_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It costs a process; what was read is remembered, also by the next process."""
+    found = snapshot(tmp_path / "r", "import chess" + MAKE)
+    assert requirements(found) == ["chess"]
+    monkeypatch.setattr(parsing, "read", lambda snapshot: pytest.fail("read again"))
+    monkeypatch.setattr(guesses, "_READ", {})
+    assert requirements(found) == ["chess"]
+
+
+def test_it_is_installed_and_told(index: Index, tmp_path: Path) -> None:
+    """With what is declared; once it is known it is not told again."""
+    for name in ("declared", "chess"):
+        make_wheel(index.folder, name)
+    found = snapshot(tmp_path / "r", "import chess" + MAKE, requirements__txt="declared\n")
+    with pytest.warns(UserWarning, match=r"chess is installed, .*env\.py, line 1"):
+        first = made(found)
+    assert first is not None
+    assert {"declared==1.0", "chess==1.0"} <= set(first.facts["packages"])
+    assert [one["module"] for one in first.facts["inferred"]] == ["chess"]
+    assert made(found) == first
+    strict = made(found, DECLARED)
+    assert strict is not None
+    assert "chess==1.0" not in strict.facts["packages"]
+    assert "inferred" not in strict.facts
+
+
+def test_what_a_declared_package_brings_is_declared(index: Index, tmp_path: Path) -> None:
+    """By any of the distributions that bring the module."""
+    make_wheel(index.folder, "declared", requires=["opencv-contrib-python"])
+    make_wheel(index.folder, "opencv-contrib-python")
+    found = snapshot(tmp_path / "r", "import cv2" + MAKE, requirements__txt="declared\n")
+    resolved = made(found, chosen({}, None)[0])
+    assert resolved is not None
+    assert "inferred" not in resolved.facts
+
+
+def test_an_extra_of_its_own_says_which(index: Index, tmp_path: Path) -> None:
+    """By name or by the table, with its versions; also of a module that the table lacks."""
+    project = "[project]\nname = 'x'\n[project.optional-dependencies]\n"
+    project += "all = ['chess<2', 'nobody-knows-this>1', 'unrelated']\n"
+    text = "import chess, nobody_knows_this" + MAKE
+    assert requirements(snapshot(tmp_path / "r", text, pyproject__toml=project)) == [
+        *("chess<2", "nobody-knows-this>1"),
+    ]
+
+
+def test_no_index_is_asked_for_the_name_of_a_module(index: Index, tmp_path: Path) -> None:
+    """Anybody may have published it there."""
+    make_wheel(index.folder, "nobody-knows-this")
+    make_wheel(index.folder, "chess")
+    found = snapshot(tmp_path / "r", "import nobody_knows_this, chess" + MAKE)
+    with pytest.warns(UserWarning, match="chess is installed"):
+        assert made(found) is not None
+    assert any("chess" in path for path in index.asked)
+    assert not any("nobody" in path for path in index.asked)
+    said = MissingModule(found, "process", AUTO, None, True).advice(
+        "No module named 'nobody_knows_this'"
+    )
+    assert "env.py, line 1 imports nobody_knows_this" in said
+    assert "{'extra': ['NAME-OF-THE-PACKAGE']}" in said
+    known = MissingModule(found, "process", AUTO, None, True).advice("No module named 'cv2.aruco'")
+    assert "{'extra': ['opencv-python-headless']}" in known
+
+
+def test_a_guess_never_stands_in_the_way(
+    index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is declared comes without it; where nothing is declared, this interpreter serves."""
+    monkeypatch.setattr(interpreters, "others", lambda declared, first: [])
+    make_wheel(index.folder, "declared")
+    found = snapshot(tmp_path / "r", "import chess" + MAKE, requirements__txt="declared\n")
+    resolved = made(found)
+    assert resolved is not None
+    assert "declared==1.0" in resolved.facts["packages"]
+    assert "inferred" not in resolved.facts
+    assert made(snapshot(tmp_path / "s", "import chess" + MAKE)) is None
+    with pytest.raises(ResolutionError, match="chess"):
+        made(snapshot(tmp_path / "s", "import chess" + MAKE), chosen({}, None)[0])
+
+
+def test_what_is_here_is_not_installed(index: Index, tmp_path: Path) -> None:
+    """As long as this interpreter has all of it."""
+    found = snapshot(tmp_path / "r", "import rich, zmq" + MAKE)
+    assert requirements(found) == ["rich", "pyzmq"]
+    assert made(found) is None
+    assert index.asked == []
+
+
+@pytest.mark.parametrize(
+    ("dependencies", "wanted", "guessed"),
+    [
+        ({"only": ["b"]}, ["b"], []),
+        ({"only": []}, [], []),
+        ({"extra": ["b"]}, ["a", "b"], ["chess"]),
+        ({"without": ["chess"]}, ["a"], []),
+    ],
+)
+def test_the_caller_has_the_last_word(
+    tmp_path: Path, dependencies: Any, wanted: list[str], guessed: list[str]
+) -> None:
+    """On what is declared, and on what is imported."""
+    found = snapshot(tmp_path / "r", "import chess" + MAKE, requirements__txt="a\n")
+    request = request_of(found, chosen(dependencies, None)[0])
+    assert request is not None
+    assert list(map(str, request.wanted)) == wanted
+    assert [one.module for one in request.guesses] == guessed
+
+
+# --- another interpreter --------------------------------------------------------------------
+
+
+OURS = interpreters.own()
+OTHERS = [replace(OURS, version=version) for version in ("3.99.1", "3.98.0")]
+
+
+@pytest.fixture
+def tried(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """A machine with two other releases, where uv has versions for the last of them alone."""
+    found: list[str] = []
+    by_path = {f"/opt/{one.version}": one for one in OTHERS}
+    others = [replace(one, path=path) for path, one in by_path.items()]
+    monkeypatch.setattr(interpreters, "others", lambda declared, first: others)
+
+    def resolve(request: PackageRequest, target: Target, **options: Any) -> Lock:
+        found.append(target.python)
+        if any(one.requirement.name == "nowhere" for one in request.wanted):
+            raise ResolutionError("Because nowhere was not found in the package registry")
+        if target.python != "/opt/3.98.0" or request.wanted[0].requirement.name == "never":
+            raise ResolutionError("does not satisfy Python>=3.98 and a depends on Python>=3.98")
+        return Lock("a==1 \\\n    --hash=sha256:00\n")
+
+    monkeypatch.setattr(resolving, "resolve", resolve)
+    return found
+
+
+def request(name: str, **fields: Any) -> PackageRequest:
+    """A repository that needs one package."""
+    wanted = resolving.parse_requirement(name, "line 1 of requirements.txt")
+    return PackageRequest("requirements.txt", (wanted,), **fields)
+
+
+def test_another_release_is_tried_and_remembered(
+    tried: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The newest first, after our own; the next time it is known which."""
+    stamps = {"/opt/3.98.0": [1, 1]}
+    monkeypatch.setattr(
+        "envhub_sandbox.dependencies.resolutions._stamp",
+        lambda one: stamps.get(one.path, [0, 0]),
+    )
+    found = pipeline.resolution_for(request("a"))
+    assert found.interpreter.version == "3.98.0"
+    assert tried == [OURS.path, "/opt/3.99.1", "/opt/3.98.0"]
+    assert pipeline.resolution_for(request("a")) == found
+    assert len(tried) == 3
+    stamps["/opt/3.98.0"] = [1, 2]  # another release under its name
+    pipeline.resolution_for(request("a"))
+    assert len(tried) == 6
+
+
+def test_all_that_were_tried_are_named(tried: list[str]) -> None:
+    """With the way to one that this machine lacks."""
+    with pytest.raises(ResolutionError) as caught:
+        pipeline.resolution_for(request("never"))
+    said = str(caught.value)
+    assert f"Python {OURS.version}, 3.99.1, 3.98.0 of this machine were tried" in said
+    assert "{'python': '3.98', 'fetch_python': True}" in said
+
+
+@pytest.mark.parametrize(
+    ("name", "fields"), [("nowhere", {}), ("never", {"python": OURS.version[:4]})]
+)
+def test_no_other_release_is_tried_in_vain(
+    tried: list[str], name: str, fields: dict[str, Any]
+) -> None:
+    """Where Python is not the matter, or the caller has chosen it."""
+    with pytest.raises(ResolutionError) as caught:
+        pipeline.resolution_for(request(name, **fields))
+    assert tried == [OURS.path]
+    assert ("fetch_python" in str(caught.value)) == bool(fields)
+
+
+def test_uv_fetches_an_interpreter_only_where_it_may(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By its own command, which downloads nothing otherwise."""
+    asked: list[Any] = []
+    here: list[Interpreter] = []
+    monkeypatch.setattr(interpreters, "_others", lambda wanted: list(here))
+
+    def run(arguments: Any, **options: Any) -> str:
+        asked.append((arguments[:2], arguments[-1], options["variables"]["UV_PYTHON_DOWNLOADS"]))
+        here.append(OTHERS[0])
+        return ""
+
+    monkeypatch.setattr(interpreters.uv, "run", run)
+    with pytest.raises(interpreters.InterpreterUnavailableError, match="fetch_python"):
+        interpreters.find("3.99")
+    assert asked == []
+    assert interpreters.find("3.99", fetch=True) == OTHERS[0]
+    [(words, versions, downloads)] = asked
+    assert (words, downloads) == (["python", "install"], "manual")
+    assert "==3.99.*" in versions
