@@ -86,6 +86,7 @@ def _build(
     network: str | None,
 ) -> dict[str, Any]:
     from envhub_sandbox.dependencies.choice import Choice
+    from envhub_sandbox.dependencies.pipeline import versions_for
     from envhub_sandbox.dependencies.request import request_of
     from envhub_sandbox.dependencies.resolve import resolve
     from envhub_sandbox.errors import DependencyError
@@ -94,7 +95,7 @@ def _build(
 
     request = request_of(snapshot, Choice("own", exclude_newer=exclude_newer))
     assert request is not None
-    if not (request.wanted or request.supports or system):
+    if not (request.wanted or request.supports or request.guesses or system):
         raise DependencyError(
             f"{snapshot.repo_id} declares no packages: it needs no image of its own. Use "
             f"--sandbox docker:{base}"
@@ -103,7 +104,7 @@ def _build(
     identity = find_image(engine, base)
     target = image.target_of(engine, base)
     _check_python(request, target)
-    lock = resolve(request, target)
+    lock, _ = versions_for(request, lambda asked: resolve(asked, target))
     is_local = snapshot.repo_type == "local"
     name = Path(snapshot.repo_id).name if is_local else snapshot.repo_id
     tag = image.tag_for(name, identity, lock, system)

@@ -23,6 +23,7 @@ from packaging.specifiers import InvalidSpecifier, SpecifierSet
 from packaging.utils import canonicalize_name
 
 from envhub_sandbox.dependencies.files import LOOKED_AT, PROJECT, SCRIPT, requirements_file
+from envhub_sandbox.dependencies.sources import of_git
 from envhub_sandbox.errors import RequirementError
 from envhub_sandbox.option_names import option_name
 
@@ -156,7 +157,7 @@ def parse_requirement(text: str, where: str) -> Wanted:
             "with hashes or without: options, links, paths and files can build and run code while "
             f"they are installed. {_advice()}"
         ) from error
-    if requirement.url is not None:
+    if requirement.url is not None and of_git(requirement, where) is None:
         raise RequirementError(
             f"{where} takes {requirement.name} from {requirement.url[:200]!r}; only packages of "
             f"the index are installed. {_advice()}"

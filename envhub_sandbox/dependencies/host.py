@@ -39,8 +39,8 @@ def lacks(
 ) -> str | None:
     """The first requirement that an interpreter does not meet, of those asked for or of theirs.
 
-    None if it meets them all. Where hashes are given it never does: nobody knows any more which
-    files its packages were made of.
+    None if it meets them all. Where hashes or a repository are given it never does: nobody knows
+    any more what its packages were made of.
 
     Args:
         request: What is required.
@@ -52,7 +52,7 @@ def lacks(
     found = version or platform.python_version().rstrip("+")
     if not python.contains(found, prereleases=True):
         return f"python{request.supports}"
-    hashed = next((wanted for wanted in request.wanted if wanted.hashes), None)
+    hashed = next((one for one in request.wanted if one.hashes or one.requirement.url), None)
     if hashed is not None:
         return str(hashed.requirement)
     installed = _Installed() if there is None else _InstalledElsewhere(there, found)

@@ -8,8 +8,9 @@ and a server on another host is a ``PackageTarget``.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from envhub_sandbox.dependencies import progress
@@ -30,9 +31,12 @@ if TYPE_CHECKING:
     from envhub_sandbox.dependencies.guesses import Guess
     from envhub_sandbox.dependencies.interpreters import Interpreter
     from envhub_sandbox.dependencies.resolutions import Resolution
-    from envhub_sandbox.dependencies.resolve import Lock, Target
+    from envhub_sandbox.dependencies.resolve import Lock
+    from envhub_sandbox.dependencies.sources import Builder
 
 Tell = Callable[[str], None]
+BUILDER: Builder | None = None
+"""Makes wheels of packages that have none."""
 
 
 @dataclass(frozen=True)
@@ -158,13 +162,15 @@ def _taken(one: Guess) -> str:
 
 
 def _chosen(request: PackageRequest, first: Interpreter, refresh: bool, tell: Tell) -> Resolution:
-    """By the first interpreter that has versions; without guesses only if none has them."""
+    """By the first interpreter that has versions, of wheels alone if that can be.
+
+    What is only guessed stands in nobody's way: in the end it is done without.
+    """
     from envhub_sandbox.dependencies import interpreters, resolve
 
     tried: list[Interpreter] = []
     failed: list[ResolutionError] = []
-    without = [replace(request, guesses=())] if request.guesses and request.wanted else []
-    for attempt in (request, *without):
+    for attempt in _attempts(request):
         failed.clear()
         for one in _candidates(first, request, interpreters.others):
             tried.append(one)
@@ -179,6 +185,15 @@ def _chosen(request: PackageRequest, first: Interpreter, refresh: bool, tell: Te
     raise ResolutionError(f"{failed[0]}\n{what}") from failed[0]
 
 
+def _attempts(request: PackageRequest) -> Iterator[_Attempt]:
+    wheels_alone = BUILDER is None or not any(one.requirement.url for one in request.wanted)
+    ways = [*([None] if wheels_alone else []), *([BUILDER] if BUILDER else [])]
+    less = [replace(request, guesses=())] if request.guesses and request.wanted else []
+    for asked in (request, *less):
+        for builder in ways:
+            yield _Attempt(asked, builder)
+
+
 def _candidates(
     first: Interpreter,
     request: PackageRequest,
@@ -190,30 +205,103 @@ def _candidates(
 
 
 def _for_interpreter(
-    request: PackageRequest, interpreter: Interpreter, refresh: bool, tell: Tell
+    attempt: _Attempt, interpreter: Interpreter, refresh: bool, tell: Tell
 ) -> Resolution:
     from envhub_sandbox.dependencies.resolutions import Resolution
-    from envhub_sandbox.dependencies.resolve import Target
 
-    lock, taken = versions_for(request, Target(python=interpreter.path), refresh, tell)
+    lock, taken = versions_for(
+        attempt.request,
+        lambda request: attempt.lock(request, interpreter, refresh, tell),
+    )
     return Resolution(lock, interpreter, tuple(one.module for one in taken))
 
 
+@dataclass(frozen=True)
+class _Attempt:
+    """A way to come by versions: of wheels alone, or with a builder of what has none.
+
+    Attributes:
+        request: What is asked for.
+        builder: Makes wheels of sources.
+    """
+
+    request: PackageRequest
+    builder: Builder | None
+
+    def lock(
+        self, request: PackageRequest, interpreter: Interpreter, refresh: bool, tell: Tell
+    ) -> Lock:
+        """Versions; each round builds what has no wheel and then looks at what that needs."""
+        from envhub_sandbox.dependencies.resolve import (
+            Target,
+            needs_other_python,
+            resolve,
+            sources_of,
+            without_wheels,
+        )
+
+        target = Target(python=interpreter.path)
+        links: list[str] = []
+        if self.builder is not None:
+            request, links = _built_from_git(request, self.builder, interpreter, tell)
+        seen: set[str] = set()
+        while True:
+            try:
+                return resolve(request, target, options=links, refresh=refresh, tell=tell)
+            except ResolutionError as error:
+                names = sorted(set(without_wheels(error)) - seen)
+                if self.builder is None or not names or needs_other_python(error):
+                    raise
+            seen.update(names)
+            sources = sources_of(request, target, names, links)
+            links += _links(self.builder(sources, interpreter, tell))
+
+
+def _links(wheels: Sequence[Path]) -> list[str]:
+    folders = dict.fromkeys(str(wheel.parent) for wheel in wheels)
+    return [word for folder in folders for word in ("--find-links", folder)]
+
+
+def _built_from_git(
+    request: PackageRequest, builder: Builder, interpreter: Interpreter, tell: Tell
+) -> tuple[PackageRequest, list[str]]:
+    """The request with versions of wheels instead of repositories, and where these wheels are."""
+    from packaging.utils import parse_wheel_filename
+
+    from envhub_sandbox.dependencies.declared import parse_requirement
+    from envhub_sandbox.dependencies.sources import of_git
+
+    wanted, wheels = [], []
+    for one in request.wanted:
+        source = of_git(one.requirement, one.where) if one.requirement.url else None
+        if source is None:
+            wanted.append(one)
+            continue
+        [wheel] = builder([source], interpreter, tell)
+        wheels.append(wheel)
+        extras = ",".join(sorted(one.requirement.extras))
+        text = f"{source.name}[{extras}]=={parse_wheel_filename(wheel.name)[1]}"
+        wanted.append(parse_requirement(text, one.where))
+    return replace(request, wanted=tuple(wanted)), _links(wheels)
+
+
 def versions_for(
-    request: PackageRequest, target: Target, refresh: bool = False, tell: Tell = lambda line: None
+    request: PackageRequest, resolved: Callable[[PackageRequest], Lock]
 ) -> tuple[Lock, tuple[Guess, ...]]:
-    """Versions for one interpreter, and what was taken that nothing else brings.
+    """Versions, and what was taken that nothing else brings.
+
+    Args:
+        request: What is asked for.
+        resolved: Gives versions for a request, without its guesses.
 
     Raises:
         ResolutionError: There are none.
     """
-    from envhub_sandbox.dependencies.resolve import resolve
-
     taken = request.guesses
     if request.wanted or not taken:
-        lock = resolve(request, target, refresh=refresh, tell=tell)
+        lock = resolved(request)
         names = {pin.partition("==")[0] for pin in lock.packages}
         taken = tuple(one for one in request.guesses if not one.is_among(names))
         if not taken:
             return lock, ()
-    return resolve(request.plus(taken), target, refresh=refresh, tell=tell), taken
+    return resolved(request.plus(taken)), taken

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Iterable, Sequence
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from packaging.utils import canonicalize_name
@@ -13,8 +14,14 @@ from packaging.version import Version
 from envhub_sandbox.dependencies import index, interpreters, uv
 from envhub_sandbox.dependencies.declared import Wanted, parse_requirement
 from envhub_sandbox.dependencies.request import PackageRequest
-from envhub_sandbox.errors import PackageIntegrityError, ResolutionError
+from envhub_sandbox.dependencies.sources import Source
+from envhub_sandbox.errors import PackageIntegrityError, RequirementError, ResolutionError
 from envhub_sandbox.option_names import option_name
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 WORKERS = ("cloudpickle>=3", "gymnasium>=0.29", "msgpack>=1.0.5", "numpy>=1.26")
 """What the worker's jails import besides: the repository's versions must be among these.
@@ -104,6 +111,19 @@ def resolve(
         PackageIntegrityError: A version is there, but not with a hash that was asked for.
         DependencyError: There is no uv, or it failed.
     """
+    words = [*uv.NO_BUILDS, "--generate-hashes", *options, *(["--refresh"] if refresh else [])]
+    text = _compiled(request, target, words, tell)
+    return Lock(_with_their_hashes(_pins(text), request.wanted), tuple(options))
+
+
+def _compiled(
+    request: PackageRequest,
+    target: Target,
+    words: Sequence[str],
+    tell: Callable[[str], None],
+    settings: Mapping[str, str] = {},
+) -> str:
+    """What ``uv pip compile`` prints; raises as ``resolve``."""
     ours = (parse_requirement(text, "the worker of envhub-sandbox") for text in WORKERS)
     every = [*request.wanted, *ours]
     files = {
@@ -113,35 +133,73 @@ def resolve(
     }
     named = {option: f"{option[2:]}.txt" for option, text in files.items() if text}
     try:
-        text = uv.run(
+        return uv.run(
             [
-                *("pip", "compile", "-", *uv.NO_BUILDS, "--generate-hashes", "--no-header"),
-                *("--no-annotate", *target.options, *index.options(), *options),
+                *("pip", "compile", "-", "--no-header", "--no-annotate"),
+                *(*target.options, *index.options(), *words),
                 *(("--exclude-newer", request.exclude_newer) if request.exclude_newer else ()),
                 *(word for pair in named.items() for word in pair),
-                *(("--refresh",) if refresh else ()),
             ],
             what=f"no versions of the packages could be chosen for {target}",
             given=_lines(every),
             timeout_s=_RESOLVE_S,
             tell=tell,
-            files={name: files[option] for option, name in named.items()},
+            files={**{name: files[option] for option, name in named.items()}, **settings},
         )
     except ResolutionError as error:
-        more = [*request.constraints, *request.override]
-        raise ResolutionError(
-            f"{error}\n{_what_is_required(str(error), [*every, *more])}"
-        ) from error
-    return Lock(_with_their_hashes(_pins(text), request.wanted), tuple(options))
+        what = _what_is_required(str(error), [*every, *request.constraints, *request.override])
+        raise ResolutionError(f"{error}\n{what}") from error
+
+
+def sources_of(
+    request: PackageRequest, target: Target, names: Sequence[str], links: Sequence[str]
+) -> list[Source]:
+    """The source distributions that are chosen for packages without wheels. Nothing is built.
+
+    What each needs is not known yet: it counts once there is a wheel of it.
+
+    Raises:
+        ResolutionError: There is no solution either.
+    """
+    tables = "".join(
+        f'[[dependency-metadata]]\nname = "{name}"\nrequires-dist = []\n' for name in names
+    )
+    quoted = ", ".join(f'"{name}"' for name in names)
+    settings = f"no-build = true\nno-binary-package = [{quoted}]\n{tables}"
+    text = _compiled(
+        request,
+        target,
+        ["--config-file", "uv.toml", "--format", "pylock.toml", *links],
+        lambda line: None,
+        {"uv.toml": settings},
+    )
+    rows = tomllib.loads(text).get("packages", [])
+    return [
+        Source(row["name"], row["version"], sdist["url"], sdist["hashes"]["sha256"])
+        for row in rows
+        if (sdist := row.get("sdist")) and not row.get("wheels")
+    ]
 
 
 def _lines(wanted: Iterable[Wanted]) -> str:
+    wanted = list(wanted)
+    for one in wanted:
+        if one.requirement.url is not None:
+            raise RequirementError(
+                f"{one.where} takes {one.requirement.name} from {one.requirement.url[:200]!r}, "
+                "which is not built here; only packages of the index are installed"
+            )
     return "".join(f"{one.requirement}\n" for one in wanted)
 
 
 def is_about_python(error: ResolutionError) -> bool:
     """Whether another Python may help, as far as uv's text says."""
     return _IS_PYTHON.search(str(error)) is not None
+
+
+def needs_other_python(error: ResolutionError) -> bool:
+    """Whether a version of Python is asked for that this is not."""
+    return _NEEDS_PYTHON.search(str(error)) is not None
 
 
 def without_wheels(error: ResolutionError) -> list[str]:

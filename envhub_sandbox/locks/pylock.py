@@ -71,7 +71,8 @@ def described(lock: Lock, python: str) -> tuple[Package, ...]:
         PackageIntegrityError: No file of a package is one that the pins permit.
         DependencyError: As with uv.
     """
-    found = listed([line.partition(" ")[0] for line in lock.text.splitlines()], python)
+    versions = [line.partition(" ")[0] for line in lock.text.splitlines()]
+    found = listed(versions, python, lock.options)
     permitted = set(re.findall(r"--hash=sha256:([0-9a-f]{64})", lock.text))
     kept = []
     for package in found:
@@ -85,7 +86,9 @@ def described(lock: Lock, python: str) -> tuple[Package, ...]:
     return tuple(kept)
 
 
-def listed(versions: Sequence[str], python: str, *, refresh: bool = False) -> tuple[Package, ...]:
+def listed(
+    versions: Sequence[str], python: str, options: Sequence[str] = (), *, refresh: bool = False
+) -> tuple[Package, ...]:
     """What the index has of each ``name==version``.
 
     Raises:
@@ -94,7 +97,13 @@ def listed(versions: Sequence[str], python: str, *, refresh: bool = False) -> tu
     text = uv.run(
         [
             *("pip", "compile", "-", *uv.NO_BUILDS, "--no-deps", "--format", "pylock.toml"),
-            *("--no-header", "--no-annotate", *Target(python=python).options, *index.options()),
+            *(
+                "--no-header",
+                "--no-annotate",
+                *Target(python=python).options,
+                *index.options(),
+                *options,
+            ),
             *(("--refresh",) if refresh else ()),
         ],
         what="the files of the packages could not be listed",
