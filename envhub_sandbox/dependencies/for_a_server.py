@@ -23,14 +23,17 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from packaging.utils import canonicalize_name
 
 from envhub_sandbox import parent
 from envhub_sandbox.dependencies import bounds, environments, interpreters, uv
 from envhub_sandbox.dependencies.choice import DATE
-from envhub_sandbox.dependencies.declared import parse_requirement
+from envhub_sandbox.dependencies.declared import Wanted, parse_requirement
+from envhub_sandbox.dependencies.guesses import Guess
 from envhub_sandbox.dependencies.pipeline import HERE
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import DependencyError, PackagesTooLargeError, RequirementError
@@ -110,10 +113,6 @@ def _made(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
 
 def _request(order: Mapping[str, Any]) -> PackageRequest:
     """What is asked for. Trust: input from a client."""
-    wanted = tuple(
-        parse_requirement(text, printable(where, _WHERE_CHARS))
-        for text, where in order["requirements"]
-    )
     python, until = order["python"], order["exclude_newer"]
     try:
         interpreters.check_versions(python or ">=3")
@@ -127,12 +126,28 @@ def _request(order: Mapping[str, Any]) -> PackageRequest:
         ) from error
     return PackageRequest(
         "what the client asks for",
-        wanted,
+        _wanted(order["requirements"]),
         supports=order["supports"],
         python=python,
         exclude_newer=until or None,
         always=order["always"],
+        guesses=tuple(
+            Guess(module, _wanted([row])[0], tuple(map(canonicalize_name, names.split())))
+            for *row, module, names in order["guesses"]
+        ),
+        constraints=_wanted(order["constraints"]),
+        override=_wanted(order["override"]),
+        without=tuple(one.requirement.name for one in _wanted(_named(order["without"]))),
+        gpu=order["gpu"],
     )
+
+
+def _wanted(rows: Iterable[Sequence[str]]) -> tuple[Wanted, ...]:
+    return tuple(parse_requirement(text, printable(where, _WHERE_CHARS)) for text, where in rows)
+
+
+def _named(rows: Iterable[Sequence[str]]) -> Iterator[Sequence[str]]:
+    return ((name, "without, of the client") for [name] in rows)
 
 
 # --- who watches --------------------------------------------------------------------------------

@@ -68,6 +68,12 @@ def uv_cache() -> Path:
     return Path(found.get("UV_CACHE_DIR") or os.path.join(home, "uv"))
 
 
+def is_chosen() -> bool:
+    """Whether the user has named an index."""
+    found = environment()
+    return any(name in found for name in _CHOOSE_AN_INDEX)
+
+
 def options() -> tuple[str, ...]:
     """What uv is told on its command line: it has no variable for that there is no index."""
     return ("--no-index",) if environment().get("UV_NO_INDEX", "").lower() in _YES else ()

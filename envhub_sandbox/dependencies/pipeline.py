@@ -232,6 +232,7 @@ class _Attempt:
         self, request: PackageRequest, interpreter: Interpreter, refresh: bool, tell: Tell
     ) -> Lock:
         """Versions; each round builds what has no wheel and then looks at what that needs."""
+        from envhub_sandbox.dependencies import torch_cpu
         from envhub_sandbox.dependencies.resolve import (
             Target,
             needs_other_python,
@@ -247,7 +248,8 @@ class _Attempt:
         seen: set[str] = set()
         while True:
             try:
-                return resolve(request, target, options=links, refresh=refresh, tell=tell)
+                lock = resolve(request, target, options=links, refresh=refresh, tell=tell)
+                break
             except ResolutionError as error:
                 names = sorted(set(without_wheels(error)) - seen)
                 if self.builder is None or not names or needs_other_python(error):
@@ -255,6 +257,11 @@ class _Attempt:
             seen.update(names)
             sources = sources_of(request, target, names, links)
             links += _links(self.builder(sources, interpreter, tell))
+        return torch_cpu.smaller(
+            request,
+            lock,
+            lambda asked, more: resolve(asked, target, options=[*links, *more], tell=tell),
+        )
 
 
 def _links(wheels: Sequence[Path]) -> list[str]:

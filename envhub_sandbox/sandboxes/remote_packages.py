@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, cast
 
 from envhub_sandbox.dependencies.pipeline import PackageSet
 from envhub_sandbox.dependencies.request import PackageRequest
@@ -19,6 +19,9 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.replies import expect
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.text import printable
+
+if TYPE_CHECKING:
+    from envhub_sandbox.dependencies.declared import Wanted
 
 _POLL_S = 0.5
 _NAME_CHARS = 64
@@ -38,9 +41,30 @@ def order_of(request: PackageRequest) -> m.NeedPackages:
             f"python in dependencies is {request.python!r}, an interpreter of this machine, and a "
             "remote server has its own: name a version, such as '3.12'"
         )
-    rows = tuple((str(one), one.where) for one in request.wanted)
-    until = request.exclude_newer or ""
-    return m.NeedPackages(rows, request.supports, request.python, until, request.always)
+    if request.fetch_python:
+        raise PolicyError(
+            "fetch_python in dependencies is for this machine; a server's operator installs its "
+            "interpreters"
+        )
+    return m.NeedPackages(
+        _rows(request.wanted),
+        request.supports,
+        request.python,
+        request.exclude_newer or "",
+        request.always,
+        guesses=tuple(
+            (str(one.wanted), one.wanted.where, one.module, " ".join(one.brought_by))
+            for one in request.guesses
+        ),
+        constraints=_rows(request.constraints),
+        override=_rows(request.override),
+        without=request.without,
+        gpu=request.gpu,
+    )
+
+
+def _rows(wanted: Sequence[Wanted]) -> tuple[tuple[str, str], ...]:
+    return tuple((str(one), one.where) for one in wanted)
 
 
 def bring(
@@ -64,7 +88,7 @@ def bring(
         if found.state == "own":
             return None
         if found.state == "made":
-            return PackageSet(_name(found.name), _facts(found.facts))
+            return PackageSet(_name(found.name), _facts(found.facts, order))
         if found.state != "making":
             raise RemoteProtocolError("the server has packages in a state that there is not")
         line = printable(found.told[:_MAX_CHARS], _MAX_CHARS)
@@ -82,10 +106,23 @@ def _name(name: str) -> str:
     return name
 
 
-def _facts(facts: dict[str, object]) -> dict[str, Any]:
+def _facts(facts: dict[str, object], order: m.NeedPackages) -> dict[str, Any]:
     """What is kept for the provenance. Trust: the server's word, checked for its types alone."""
     lock, pins = (facts.get(name) for name in _FACTS)
     if not isinstance(lock, str) or not isinstance(pins, (list, tuple)) or len(pins) > _MAX_PINS:
         raise RemoteProtocolError("the server does not say which packages it has made")
     texts = [printable(str(pin)[:_MAX_CHARS], _MAX_CHARS) for pin in pins]
-    return {"lock": printable(lock[:_MAX_CHARS], _MAX_CHARS), "packages": texts}
+    kept = {"lock": printable(lock[:_MAX_CHARS], _MAX_CHARS), "packages": texts}
+    inferred = _inferred(facts.get("inferred"), order)
+    return {**kept, "inferred": inferred} if inferred else kept
+
+
+def _inferred(said: object, order: m.NeedPackages) -> list[dict[str, str]]:
+    """What was taken that nothing declares, of what we have guessed. Trust: the server's word."""
+    rows = said if isinstance(said, (list, tuple)) else ()
+    modules = {str(row.get("module")) for row in rows[:_MAX_PINS] if isinstance(row, dict)}
+    return [
+        {"module": module, "requirement": requirement, "where": where}
+        for requirement, where, module, _ in cast("tuple[tuple[str, ...], ...]", order.guesses)
+        if module in modules
+    ]

@@ -69,6 +69,22 @@ def test_a_server_makes_what_the_repository_declares(
     assert server_facts.ask(permitting.sandbox()).dependencies
 
 
+def test_what_it_imports_and_does_not_declare_is_made_there(
+    permitting: Listening, real_index: Index, tmp_path: Path
+) -> None:
+    """By the client's table; the provenance says so in the client's words."""
+    make_wheel(real_index.folder, "chess")
+    folder = write_repository(tmp_path / "repo", f"import chess\n{ENV}")
+    (folder / "requirements.txt").write_text("wanted==1.0\n")
+    with make_env(folder, sandbox=permitting.sandbox()) as suites:
+        suites.env.reset(seed=0)
+        installed = suites.provenance["installed"]
+    assert {"wanted==1.0", "chess==1.0"} <= set(installed["packages"])
+    assert installed["inferred"] == [
+        {"module": "chess", "requirement": "chess", "where": "env.py, line 1, which needs chess"}
+    ]
+
+
 def test_what_cannot_be_made_is_told_here(
     permitting: Listening, real_index: Index, tmp_path: Path
 ) -> None:
@@ -298,6 +314,9 @@ def test_a_program_that_cannot_be_started_is_not_tried_for_ever(
         lambda: order("p" * (server_side.MAX_TEXT + 1)),
         lambda: m.NeedPackages(("p",), "", "", "", True),
         lambda: m.NeedPackages((("p", 1),), "", "", "", True),
+        lambda: m.NeedPackages((), "", "", "", True, guesses=(("p", "line 1", "p"),)),
+        lambda: m.NeedPackages((), "", "", "", True, without=(1,)),
+        lambda: m.NeedPackages((), "", "", "", True, override=(("p", "l"),) * 1001),
         lambda: m.NeedPackages((), "", "3" * (server_side.MAX_TEXT + 1), "", True),
     ],
 )

@@ -386,25 +386,38 @@ def checked(request: m.NeedPackages) -> dict[str, Any]:
     Raises:
         RefusedError: It is none.
     """
-    rows = request.requirements
-    good = len(rows) <= MAX_REQUIREMENTS and all(
-        type(row) is tuple and [type(part) for part in row] == [str, str] for row in rows
-    )
-    texts = [request.supports, request.python, request.exclude_newer]
-    if good:
-        texts += [text for row in rows if isinstance(row, tuple) for text in row]
-    if not good or max(map(len, texts)) > MAX_TEXT:
+    rows: dict[str, tuple[tuple[Any, ...], int]] = {
+        "requirements": (request.requirements, 2),
+        "guesses": (request.guesses, 4),
+        "constraints": (request.constraints, 2),
+        "override": (request.override, 2),
+        "without": (tuple((name,) for name in request.without), 1),
+    }
+    good = all(_are_texts(given, width) for given, width in rows.values())
+    if not good or max(map(len, (request.supports, request.python, request.exclude_newer))) > (
+        MAX_TEXT
+    ):
         raise RefusedError(
             "LocalProtocolError",
-            f"an order has at most {MAX_REQUIREMENTS} pairs of texts of {MAX_TEXT} characters",
+            f"an order has at most {MAX_REQUIREMENTS} rows of texts of {MAX_TEXT} characters",
         )
     return {
-        "requirements": [list(row) for row in rows if isinstance(row, tuple)],
+        **{name: [list(row) for row in given] for name, (given, _) in rows.items()},
         "supports": request.supports,
         "python": request.python,
         "exclude_newer": request.exclude_newer,
         "always": request.always,
+        "gpu": request.gpu,
     }
+
+
+def _are_texts(rows: tuple[Any, ...], width: int) -> bool:
+    return len(rows) <= MAX_REQUIREMENTS and all(
+        type(row) is tuple
+        and len(row) == width
+        and all(type(text) is str and len(text) <= MAX_TEXT for text in row)
+        for row in rows
+    )
 
 
 def _not_here(request: m.NeedPackages) -> m.Packages:

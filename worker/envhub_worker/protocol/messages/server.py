@@ -292,7 +292,10 @@ class NeedPackages(Message, kind=31):
     It makes them in its own time, and says at once how far it is: whoever wants them asks again.
     ``requirements`` has pairs, a plain requirement and where it stands; ``supports`` are the
     versions of Python that the repository runs in, ``python`` the version that the caller asks for.
-    Where ``always`` is not set, the server's own packages do if they meet all of it.
+    Where ``always`` is not set, the server's own packages do if they meet all of it. ``guesses``
+    are taken only where nothing else brings the module: a requirement, where it stands, the module,
+    and the names of the distributions that bring it, with spaces between them. ``constraints`` and
+    ``override`` are pairs as ``requirements`` are, ``without`` names of packages.
     """
 
     requirements: tuple[object, ...]
@@ -300,6 +303,11 @@ class NeedPackages(Message, kind=31):
     python: str
     exclude_newer: str
     always: bool
+    guesses: tuple[object, ...] = ()
+    constraints: tuple[object, ...] = ()
+    override: tuple[object, ...] = ()
+    without: tuple[object, ...] = ()
+    gpu: bool = False
 
 
 class Packages(Message, kind=32):
