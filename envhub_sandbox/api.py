@@ -63,10 +63,12 @@ def make_env(
         python: The interpreter that runs the repository; this one by default. It needs cloudpickle,
             gymnasium, msgpack and numpy beside the repository's own packages.
         dependencies: Where its packages come from. ``"auto"`` makes an environment of its own from
-            what it declares, wheels only, where this interpreter lacks some of that; ``"host"``
-            takes this interpreter as it is; a path that interpreter or virtual environment. A
-            mapping always makes one: ``{"extra": ["scipy"], "python": "3.12", "exclude_newer":
-            "2026-01-31"}``. See ``docs/dependencies.md``; for ``sandbox="process"``.
+            what it declares and what it imports besides, wheels only, where this interpreter lacks
+            some of that; ``"declared"`` takes only what it declares; ``"host"`` takes this
+            interpreter as it is; a path that interpreter or virtual environment. A mapping always
+            makes one: ``{"extra": ["scipy"], "python": "3.12", "exclude_newer": "2026-01-31"}``,
+            also with ``only``, ``without``, ``override`` and ``fetch_python``. See
+            ``docs/dependencies.md``; for ``sandbox="process"``.
         lock: A file that ``envhub lock`` wrote: its packages are used and no others, and whatever
             differs from it (commit, files, Python, spaces) is refused. For ``sandbox="process"``.
         num_workers: Processes over which the sub-environments are spread; by default one, or with

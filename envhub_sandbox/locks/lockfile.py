@@ -82,6 +82,10 @@ class LockFile:
         extra: Requirements that the caller added.
         exclude_newer: The date before which versions were chosen, if there was one.
         spaces: What the environments looked like; None where nothing was run.
+        only: Those that he gave instead of what is declared; None where that counts.
+        override: Those that hold instead of all others of the same package.
+        without: Packages that he left out.
+        inferred: What was taken though nothing declares it, and where it is imported.
     """
 
     repository: str
@@ -93,6 +97,10 @@ class LockFile:
     extra: tuple[str, ...] = ()
     exclude_newer: str | None = None
     spaces: Spaces | None = None
+    only: tuple[str, ...] | None = None
+    override: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
+    inferred: tuple[str, ...] = ()
 
 
 def repository_of(snapshot: Snapshot) -> str:
@@ -167,7 +175,11 @@ class _Reader:
                 text(self._ours, "machine", _WORD),
             ),
             packages=packages,
-            extra=self._extra(),
+            extra=self._requirements("extra"),
+            only=self._requirements("only") if "only" in self._ours else None,
+            override=self._requirements("override"),
+            without=self._requirements("without"),
+            inferred=self._texts("inferred"),
             exclude_newer=newer,
             spaces=self._spaces(),
         )
@@ -194,13 +206,17 @@ class _Reader:
             raise self._wrong("files")
         return {name: self._text(files, name, _DIGEST) for name in files}
 
-    def _extra(self) -> tuple[str, ...]:
-        extra = self._ours.get("extra", [])
-        if not isinstance(extra, list) or not all(isinstance(item, str) for item in extra):
-            raise self._wrong("extra")
+    def _texts(self, name: str) -> tuple[str, ...]:
+        rows = self._ours.get(name, [])
+        if not isinstance(rows, list) or len(rows) > MAX_TASKS:
+            raise self._wrong(name)
+        return tuple(self._text({name: row}, name) for row in rows)
+
+    def _requirements(self, name: str) -> tuple[str, ...]:
         try:
             return tuple(
-                str(parse_requirement(item, f"{item[:80]!r} in {self._where}")) for item in extra
+                str(parse_requirement(text, f"{text[:80]!r} in {self._where}"))
+                for text in self._texts(name)
             )
         except RequirementError as error:
             raise LockError(str(error)) from error
@@ -248,7 +264,19 @@ def written(lock: LockFile) -> str:
         facts["exclude-newer"] = lock.exclude_newer
     ours = ["", "[tool.envhub]", f"format = {FORMAT}"]
     ours += [f"{name} = {quoted(value)}" for name, value in facts.items()]
-    ours += [f"extra = [{', '.join(map(quoted, lock.extra))}]", "", "[tool.envhub.files]"]
+    lists = {
+        "extra": lock.extra,
+        "only": lock.only,
+        "override": lock.override or None,
+        "without": lock.without or None,
+        "inferred": lock.inferred or None,
+    }
+    ours += [
+        f"{name} = [{', '.join(map(quoted, texts))}]"
+        for name, texts in lists.items()
+        if texts is not None
+    ]
+    ours += ["", "[tool.envhub.files]"]
     ours += [f"{quoted(name)} = {quoted(digest)}" for name, digest in sorted(lock.files.items())]
     if lock.spaces is not None:
         ours += ["", "[tool.envhub.spaces]", f"env-kwargs = {quoted(lock.spaces.arguments)}"]

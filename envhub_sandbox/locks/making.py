@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from envhub_sandbox.dependencies.choice import Choice
-from envhub_sandbox.dependencies.declared import parse_requirement
+from envhub_sandbox.dependencies.declared import Wanted, parse_requirement
 from envhub_sandbox.dependencies.pipeline import resolution_for
 from envhub_sandbox.dependencies.request import request_of
 from envhub_sandbox.errors import LockError
@@ -37,6 +37,14 @@ def locked(
         *("", "", "", {}, Runner.of(found.interpreter)),
         packages=pylock.described(found.lock, found.interpreter.path),
         extra=tuple(map(str, choice.extra)),
+        only=None if choice.only is None else tuple(map(str, choice.only)),
+        override=tuple(map(str, choice.override)),
+        without=choice.without,
+        inferred=tuple(
+            f"{one.wanted.requirement} ({one.wanted.where})"
+            for one in request.guesses
+            if one.module in found.taken
+        ),
         exclude_newer=choice.exclude_newer,
     )
     return with_files(empty, snapshot)
@@ -44,8 +52,20 @@ def locked(
 
 def again(lock: LockFile) -> Choice:
     """The choice that led to a lock."""
-    extra = tuple(parse_requirement(text, f"{text[:80]!r} in the lock") for text in lock.extra)
-    return Choice("own", extra, lock.runner.python, lock.exclude_newer)
+    return Choice(
+        "own",
+        _parsed(lock.extra),
+        lock.runner.python,
+        lock.exclude_newer,
+        infer=lock.only is None,
+        only=None if lock.only is None else _parsed(lock.only),
+        without=lock.without,
+        override=_parsed(lock.override),
+    )
+
+
+def _parsed(texts: Sequence[str]) -> tuple[Wanted, ...]:
+    return tuple(parse_requirement(text, f"{text[:80]!r} in the lock") for text in texts)
 
 
 def relisted(lock: LockFile) -> LockFile:

@@ -21,7 +21,7 @@ import zmq
 from envhub_sandbox import folders
 from envhub_sandbox.check import denials
 from envhub_sandbox.crash import writer
-from envhub_sandbox.dependencies import environments
+from envhub_sandbox.dependencies import environments, guesses, interpreters, resolutions
 from envhub_sandbox.making import making
 from envhub_sandbox.sandboxes import remote
 from envhub_sandbox.sandboxes.docker import sandbox
@@ -372,3 +372,18 @@ def door_is_shut(doorman: Doorman) -> bool:
 def making_an_environment(step: str) -> Spot:
     """A step of it: ``install``, ``size``, ``compile``, ``close`` or ``publish``."""
     return environments, f"_{step}"
+
+
+def imports_in_memory() -> Spot:
+    """What was read of repositories in this process."""
+    return guesses, "_READ"
+
+
+def finding_interpreters() -> Spot:
+    """Gives the interpreters of this machine."""
+    return interpreters, "_others"
+
+
+def telling_releases_apart() -> Spot:
+    """Says which release lies at an interpreter's path."""
+    return resolutions, "_stamp"

@@ -79,11 +79,12 @@ Python = Annotated[
 Dependencies = Annotated[
     str,
     typer.Option(
-        metavar="auto|host|PATH|JSON",
-        autocompletion=_one_of("auto", "host"),
+        metavar="auto|declared|host|PATH|JSON",
+        autocompletion=_one_of("auto", "declared", "host"),
         help="Where its packages come from: an environment of its own where this interpreter lacks "
-        "some; this interpreter; another, or a virtual environment; or one of its own, adjusted: "
-        '\'{"extra": ["scipy"], "python": "3.12", "exclude_newer": "2026-01-31"}\'.',
+        "something that it declares or imports; only what it declares; this interpreter; another, "
+        "or a virtual environment; or one of its own, adjusted: "
+        '\'{"extra": ["scipy"], "without": ["torch"], "python": "3.12"}\'.',
         rich_help_panel=_CODE,
     ),
 ]

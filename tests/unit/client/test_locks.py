@@ -48,6 +48,14 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     path = tmp_path / "pylock.repo.toml"
     lockfile.write(LOCK, path)
     assert lockfile.read(path) == LOCK
+    full = changed(
+        only=("a<2",), override=("b==1",), without=("c",), inferred=("d (env.py, line 1)",)
+    )
+    lockfile.write(full, path)
+    assert lockfile.read(path) == full
+    choice = making.again(full)
+    assert (list(map(str, choice.only or ())), choice.infer) == (["a<2"], False)
+    assert (list(map(str, choice.override)), choice.without) == (["b==1"], ("c",))
     plain = changed(spaces=None, exclude_newer=None, extra=())
     lockfile.write(plain, path)
     assert lockfile.read(path) == plain

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.dependencies import guesses, interpreters, pipeline
+from envhub_sandbox.dependencies import interpreters, pipeline
 from envhub_sandbox.dependencies import resolve as resolving
 from envhub_sandbox.dependencies.choice import AUTO, DECLARED, Choice, chosen
 from envhub_sandbox.dependencies.guesses import guessed
@@ -20,6 +20,7 @@ from envhub_sandbox.dependencies.resolve import Lock, Target
 from envhub_sandbox.errors import ResolutionError
 from envhub_sandbox.hub.snapshot import Snapshot, local
 from envhub_sandbox.sources import parsing
+from tests.support import inside
 from tests.support.wheels import Index, make_wheel
 
 MAKE = "\ndef make_env(n_envs=1, use_async_envs=False): ..."
@@ -86,7 +87,7 @@ def test_a_commit_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     found = snapshot(tmp_path / "r", "import chess" + MAKE)
     assert requirements(found) == ["chess"]
     monkeypatch.setattr(parsing, "read", lambda snapshot: pytest.fail("read again"))
-    monkeypatch.setattr(guesses, "_READ", {})
+    monkeypatch.setattr(*inside.imports_in_memory(), {})
     assert requirements(found) == ["chess"]
 
 
@@ -228,7 +229,7 @@ def test_another_release_is_tried_and_remembered(
     """The newest first, after our own; the next time it is known which."""
     stamps = {"/opt/3.98.0": [1, 1]}
     monkeypatch.setattr(
-        "envhub_sandbox.dependencies.resolutions._stamp",
+        *inside.telling_releases_apart(),
         lambda one: stamps.get(one.path, [0, 0]),
     )
     found = pipeline.resolution_for(request("a"))
@@ -267,7 +268,7 @@ def test_uv_fetches_an_interpreter_only_where_it_may(monkeypatch: pytest.MonkeyP
     """By its own command, which downloads nothing otherwise."""
     asked: list[Any] = []
     here: list[Interpreter] = []
-    monkeypatch.setattr(interpreters, "_others", lambda wanted: list(here))
+    monkeypatch.setattr(*inside.finding_interpreters(), lambda wanted: list(here))
 
     def run(arguments: Any, **options: Any) -> str:
         asked.append((arguments[:2], arguments[-1], options["variables"]["UV_PYTHON_DOWNLOADS"]))
