@@ -147,18 +147,26 @@ def read(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
 
     A commit's are remembered: they are read in a process of their own.
     """
+    place = snapshot.root, snapshot.path  # a root holds one commit
+    if place not in _READ:
+        if len(_READ) >= _MOST:
+            _READ.clear()
+        _READ[place] = _recalled(snapshot)
+    return _READ[place]
+
+
+def _recalled(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
     folder = cache_root() / "imports"
     facts = json.dumps([_FORMAT, sys.version_info[:2], snapshot.commit, snapshot.path])
     key = hashlib.sha256(facts.encode()).hexdigest()
-    if (folder, key) not in _READ:
-        text = remembered.recall(folder, key)
-        if text is None:
-            text = json.dumps(_parsed(snapshot))
-            remembered.keep(folder, key, text)
-        if len(_READ) >= _MOST:
-            _READ.clear()
-        _READ[folder, key] = tuple((name, file, line) for name, file, line in json.loads(text))
-    return _READ[folder, key]
+    text = remembered.recall(folder, key)
+    try:
+        rows = json.loads(text or "")
+        return tuple((str(name), str(file), int(line)) for name, file, line in rows)
+    except (ValueError, TypeError):
+        rows = _parsed(snapshot)
+        remembered.keep(folder, key, json.dumps(rows))
+        return tuple(rows)
 
 
 def _parsed(snapshot: Snapshot) -> list[tuple[str, str, int]]:

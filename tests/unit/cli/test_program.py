@@ -92,7 +92,7 @@ def test_brackets_are_in_some_help() -> None:
         ("doctor --profile ", {"strict", "no-userns", "container"}),
         ("check x --fail-on ", {"error", "warning", "note"}),
         ("inspect x --fail-on w", {"warning"}),
-        ("run x --dependencies ", {"auto", "host"}),
+        ("run x --dependencies ", {"auto", "declared", "host"}),
         ("run x --sandbox ", {"process", "docker", "tcp://", "none"}),
         ("check x --sandbox ", {"process", "docker", "tcp://"}),
     ],
