@@ -173,7 +173,7 @@ class _Judge:
 
     def _resolve(self) -> None:
         self._asked.tell("reading and installing what it declares")
-        packages, wanted, taken = None, {}, set[str]()
+        packages, wanted, taken = None, {}, dict[str, str]()
         try:
             choice, _ = chosen(self._asked.arguments.get("dependencies", "auto"), None)
             says = declared(self._snapshot.root, self._snapshot.path)
@@ -186,7 +186,8 @@ class _Judge:
                 made = packages_for(self._snapshot, choice)
                 if made is not None:
                     packages = Path(made.packages)
-                    taken = {one["module"] for one in made.facts.get("inferred", ())}
+                    inferred = made.facts.get("inferred", ())
+                    taken = {one["module"]: one["where"] for one in inferred}
         except (RequirementError, ResolutionError, PackageIntegrityError) as error:
             self._report.judged("requirements", [str(error)])
             raise _StoppedError from error

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
+from types import MappingProxyType
 
 from packaging.requirements import Requirement
 
@@ -18,7 +19,7 @@ def undeclared(
     found: list[Import],
     declared: Mapping[str, Requirement],
     packages: Path | None,
-    taken: Collection[str] = (),
+    taken: Mapping[str, str] = MappingProxyType({}),
 ) -> list[Finding]:
     """The imports that nothing declared brings along.
 
@@ -26,16 +27,19 @@ def undeclared(
         found: What is imported.
         declared: What the repository declares, by canonical name.
         packages: The environment that was made of it; None where this interpreter serves.
-        taken: Modules that were installed although nothing declares them.
+        taken: Modules that were installed although nothing declares them, and what needs them.
     """
     brought = _in_folder(packages) if packages else _of_this_interpreter(declared)
+    missing = [one for one in found if one.name not in brought or one.name in taken]
+    named = {one.name for one in missing}
     return [
-        Finding(
-            "imports", f"{one.name} is imported, and nothing declares it", "", one.file, one.line
-        )
-        for one in found
-        if one.name not in brought or one.name in taken
+        *(_finding(f"{one.name} is imported", one.file, one.line) for one in missing),
+        *(_finding(where) for module, where in taken.items() if module not in named),
     ]
+
+
+def _finding(what: str, file: str = "", line: int = 0) -> Finding:
+    return Finding("imports", f"{what}, and nothing declares it", "", file, line)
 
 
 def _in_folder(packages: Path) -> set[str]:

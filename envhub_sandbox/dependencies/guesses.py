@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 from envhub_sandbox.dependencies import remembered
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.hub.store import cache_root
+from envhub_worker.protocol.text import printable
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.declared import Wanted
@@ -94,7 +95,9 @@ def _guessed(root: Path, entry: str, rows: tuple[tuple[str, str, int], ...]) -> 
         known = _of_id(name) if "-" in name else _of_module(name, extras)
         if known is not None and len(found) < _MOST:
             module, requirement, brought_by = known
-            wanted = parse_requirement(requirement, f"{file}, line {line}, which needs {module}")
+            wanted = parse_requirement(
+                requirement, f"{printable(file, 200)}, line {line}, which needs {module}"
+            )
             found.setdefault(requirement, Guess(module, wanted, tuple(brought_by)))
     return tuple(found.values())
 

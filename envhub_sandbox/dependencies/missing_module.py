@@ -12,6 +12,7 @@ from envhub_sandbox.dependencies.choice import Choice
 from envhub_sandbox.errors import RequirementError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.option_names import option_name
+from envhub_worker.protocol.text import printable
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.declared import Declared
@@ -58,7 +59,7 @@ class MissingModule:
 
         for name, file, line in guesses.read(self.snapshot) if module else ():
             if name.partition(".")[0] == module.partition(".")[0]:
-                return f" {file}, line {line} imports {name}."
+                return f" {printable(file, 200)}, line {line} imports {name}."
         return ""
 
     def _cure(self, module: str, says: Declared | None) -> str:

@@ -17,6 +17,7 @@ from envhub_sandbox.dependencies.resolve import Lock
 from envhub_sandbox.errors import DependencyError
 
 _OF_TORCH = ("torch", "torchvision", "torchaudio")
+_PYTORCHS_INDEX = ("--torch-backend", "cpu")
 _CUDA = ("nvidia-", "cuda-")
 
 
@@ -44,6 +45,13 @@ def smaller(
     return lock
 
 
+def options_for(lock: Lock) -> tuple[str, ...]:
+    """What uv needs to find these versions again, where only they are known."""
+    pins = lock.packages
+    without = any(pin.partition("==")[0] in _OF_TORCH and pin.endswith("+cpu") for pin in pins)
+    return _PYTORCHS_INDEX if without and not index.is_chosen() else ()
+
+
 def _has_cuda(lock: Lock) -> bool:
     pins = lock.packages
     return any(pin.startswith("torch==") for pin in pins) and any(
@@ -61,4 +69,4 @@ def _ways(request: PackageRequest, lock: Lock) -> Iterator[tuple[PackageRequest,
     )
     yield replace(request, constraints=(*request.constraints, *held)), ()
     if not index.is_chosen():
-        yield request, ("--torch-backend", "cpu")
+        yield request, _PYTORCHS_INDEX

@@ -76,7 +76,8 @@ def relisted(lock: LockFile) -> LockFile:
     """
     pins = [f"{package.name}=={package.version}" for package in lock.packages]
     interpreter = lockfile.runner_here(lock)
-    return replace(lock, packages=pylock.listed(pins, interpreter.path, refresh=True))
+    options = pylock.pins(lock.packages).options
+    return replace(lock, packages=pylock.listed(pins, interpreter.path, options, refresh=True))
 
 
 def with_spaces(

@@ -9,12 +9,12 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from packaging.version import InvalidVersion, Version
 
-from envhub_sandbox.dependencies import index, uv
+from envhub_sandbox.dependencies import index, torch_cpu, uv
 from envhub_sandbox.dependencies.resolve import Lock, Target
 from envhub_sandbox.errors import LockError, PackageIntegrityError
 from envhub_sandbox.hub.logins import without_login
@@ -61,7 +61,8 @@ class Package:
 
 def pins(packages: Sequence[Package]) -> Lock:
     """What is installed for them."""
-    return Lock("".join(package.pin for package in packages))
+    lock = Lock("".join(package.pin for package in packages))
+    return replace(lock, options=torch_cpu.options_for(lock))
 
 
 def described(lock: Lock, python: str) -> tuple[Package, ...]:

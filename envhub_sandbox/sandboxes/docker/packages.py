@@ -58,10 +58,14 @@ class ImageTarget:
 
     def meets(self, request: PackageRequest) -> bool:
         """Whether the image has all of it; raises as ``inside``."""
+        from packaging.utils import canonicalize_name
+
         from envhub_sandbox.dependencies import host
 
         interpreter, there = self._inside()
-        return host.lacks(request, there, interpreter.version) is None
+        names = set(map(canonicalize_name, there))
+        known = all(one.is_among(names) for one in request.guesses)
+        return known and host.lacks(request, there, interpreter.version) is None
 
     def make(self, request: PackageRequest, tell: Callable[[str], None]) -> PackageSet:
         """An environment of this machine, to be mounted; its interpreter is the image's.

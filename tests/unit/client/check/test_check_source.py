@@ -82,6 +82,15 @@ def test_an_environment_of_its_own_brings_what_lies_in_it(tmp_path: Path) -> Non
     found = imports(local(write_repository(tmp_path / "r", text)))
     missing = undeclared(found, {}, packages)
     assert [one.message.split()[0] for one in missing] == ["pytest"]
+    taken = {
+        "yaml": "env.py, line 1, which needs yaml",
+        "Box2D": "env.py, line 9, which needs Box2D",
+    }
+    told = undeclared(found, {}, packages, taken)
+    assert [one.message.partition(",")[0] for one in told] == [
+        *("pytest is imported", "yaml is imported", "env.py"),
+    ]
+    assert "line 9, which needs Box2D, and nothing declares it" in told[2].message
 
 
 def test_a_file_does_not_choose_how_it_is_read(tmp_path: Path) -> None:

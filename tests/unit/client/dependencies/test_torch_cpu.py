@@ -80,3 +80,6 @@ def test_pytorchs_own_index_is_asked_only_by_who_has_chosen_none(
 
         assert torch_cpu.smaller(TORCH, lock, resolved) is (lock if chosen else without)
         assert given == asked
+        # a lock file has versions alone
+        assert torch_cpu.options_for(without) == (() if chosen else ("--torch-backend", "cpu"))
+        assert torch_cpu.options_for(lock) == ()

@@ -8,9 +8,11 @@ import pytest
 
 from envhub_sandbox.dependencies import host, interpreters
 from envhub_sandbox.dependencies.declared import parse_requirement
+from envhub_sandbox.dependencies.guesses import Guess
 from envhub_sandbox.dependencies.host import Described
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import InterpreterUnavailableError
+from envhub_sandbox.sandboxes.docker import packages
 from envhub_sandbox.sandboxes.docker.packages import fitting
 
 OURS = interpreters.own()
@@ -42,6 +44,16 @@ def test_what_an_image_has_is_read_off_its_metadata(
 ) -> None:
     """With the markers of the image's Python, and nothing of this one."""
     assert host.lacks(declares(line), THERE, python) == lacking
+
+
+def test_what_it_imports_is_in_the_image_or_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the names of distributions: nothing of an image is imported to see."""
+    monkeypatch.setattr(packages, "find_image", lambda engine, image: image)
+    monkeypatch.setattr(packages, "inside", lambda engine, image: (NEWER, THERE))
+    target = packages.ImageTarget(lambda: None, "image")  # type: ignore[arg-type, return-value]
+    for brought_by, met in ((("absent", "wanted-one"), True), (("absent",), False)):
+        guess = Guess("module", parse_requirement("absent", "env.py, line 1"), brought_by)
+        assert target.meets(replace(declares(), guesses=(guess,))) == met
 
 
 def test_an_interpreter_of_its_kind_fits() -> None:
