@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import tempfile
 from pathlib import Path
 
 from envhub_sandbox import folders
+from envhub_sandbox.system.files import write_whole
 
 _MAX_BYTES = 16 * 1024 * 1024
 
@@ -27,7 +26,4 @@ def keep(folder: Path, key: str, text: str) -> None:
     """Remember a text. A cache that cannot be written is no error."""
     with contextlib.suppress(OSError):
         folders.make_private(folder)
-        fd, temporary = tempfile.mkstemp(dir=folder)
-        with os.fdopen(fd, "w", encoding="utf-8") as file:
-            file.write(text)
-        os.replace(temporary, folder / key)
+        write_whole(folder / key, text.encode())
