@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from envhub_worker.lockdown.mechanisms.mounts import View
 from envhub_worker.lockdown.mechanisms.scratch import Scratch
 from envhub_worker.lockdown.plan import Plan
 from envhub_worker.lockdown.spec import JailSpec
@@ -64,6 +65,7 @@ class Common:
         namespaced: Whether the jails have namespaces.
         trees: Read-only trees of the private root.
         roots: The snapshot folders, symbolic links resolved.
+        packages: ``config.packages``, symbolic links resolved.
         devices: Device nodes that may be used.
         covered: (files, folders) of /proc to hide.
         landlock_abi: 0 where there is none.
@@ -79,6 +81,7 @@ class Common:
     namespaced: bool
     trees: tuple[str, ...]
     roots: tuple[str, ...]
+    packages: str
     devices: tuple[str, ...]
     covered: tuple[list[str], list[str]]
     landlock_abi: int
@@ -98,6 +101,7 @@ class JailContext:
         common: What the zygote gives.
         plan: Which layers hold.
         scratch: The writable folders.
+        view: How it sees its snapshot and its packages.
         processes: Cap for ``RLIMIT_NPROC``.
     """
 
@@ -105,4 +109,5 @@ class JailContext:
     common: Common
     plan: Plan
     scratch: Scratch
+    view: View
     processes: int

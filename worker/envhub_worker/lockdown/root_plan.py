@@ -18,7 +18,7 @@ TEMPORARY = "/tmp"
 SHARED_MEMORY = "/dev/shm"
 
 #: Mount points that each jail fills for itself.
-OWN_FOLDERS = (HOME, WORK, TEMPORARY, SHARED_MEMORY, "/proc", "/.scratch")
+OWN_FOLDERS = (HOME, WORK, TEMPORARY, SHARED_MEMORY, "/proc", "/.scratch", "/.skeleton")
 
 _SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32")
 _ETC_FOLDERS = ("/etc/alternatives", "/etc/fonts", "/etc/glvnd", "/etc/vulkan", "/etc/OpenCL")

@@ -36,7 +36,7 @@ from envhub_worker.lockdown.context import Common, JailContext
 from envhub_worker.lockdown.limits.monitor import Guard
 from envhub_worker.lockdown.mechanisms import process, reap
 from envhub_worker.lockdown.plan import HostFacts, plan
-from envhub_worker.lockdown.report import Layer, LayerUnavailableError
+from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp import notify, paths
 from envhub_worker.lockdown.seccomp.syscalls import name_of
 from envhub_worker.lockdown.spec import JailSpec
@@ -126,11 +126,11 @@ class Init:
             common=self._common,
             plan=wanted,
             scratch=scratch,
+            view=view,
             processes=jail.process_limit(spec.confinement.limits, wanted.namespaced),
         )
         self._guard = Guard(self._jail, events)
-        working = Layer("working-view", True, f"the snapshot, writable as {view}")
-        report = [layer.to_wire() for layer in (*wanted.layers, working)]
+        report = [layer.to_wire() for layer in (*wanted.layers, jail.working_view(view))]
         self._channel.send({"event": "ready", "report": report})
 
     def _stop(self, *_: object) -> None:

@@ -112,7 +112,7 @@ def confine(order: Order, init: Channel) -> None:
     cgroups.join(order.joins)
     process.reset_signals(reap.HANDLED)
     descriptors = {0, 1, 2, order.status, *order.fds}
-    process.close_all_but(descriptors)
+    process.close_all_but({*descriptors, *order.jail.view.shared.values()})
     _forget_the_zygote(order.jail)
     runner.enter(order.jail, descriptors, lambda listener: init.send({"broker": True}, [listener]))
 

@@ -1,7 +1,8 @@
 """Building a private, read-only root, and what each jail mounts over it.
 
 Twice: the zygote builds the root that its jails have in common, once; a jail's init then hides
-all snapshots but its own, and mounts its scratch, its proc and its working view. Mount points
+all snapshots but its own, mounts its scratch and its proc, and puts its snapshot and its packages
+under overlays: it may write there, and what is shared stays as it is. Mount points
 that a jail needs lie where the path says, so a snapshot below ``/tmp`` is no special case.
 """
 
@@ -9,11 +10,15 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import stat
 from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 from envhub_worker.lockdown import root_plan
+from envhub_worker.lockdown.mechanisms import namespaces
 from envhub_worker.lockdown.mechanisms.kernel import (
+    ATTR_IDMAP,
     ATTR_NODEV,
     ATTR_NOEXEC,
     ATTR_NOSUID,
@@ -35,6 +40,7 @@ from envhub_worker.lockdown.root_plan import HOME, SHARED_MEMORY, TEMPORARY, WOR
 
 _READ_ONLY = ATTR_RDONLY | ATTR_NOSUID | ATTR_NODEV
 _SCRATCH = "/.scratch"
+_SKELETON = "/.skeleton"
 
 # Of what /proc shows about the host, this stays: libraries ask for it. The rest is covered.
 _PROC_KEPT = frozenset(
@@ -58,14 +64,22 @@ _PROC_KEPT = frozenset(
 )
 
 
-def build_root(plan: RootPlan, place: str) -> None:
+def build_root(plan: RootPlan, place: str, copied: Sequence[str], user: int | None) -> None:
     """Make ``place`` a new root with what ``plan`` says, and the host's /proc. Not yet entered.
 
     Needs a mount namespace of our own; nothing propagates out of it.
+
+    Args:
+        plan: What is in it.
+        place: An empty folder.
+        copied: Folders whose files are to be the jails' own there, so that overlays can copy them.
+        user: The user of the jails, where that is not this process's own.
     """
     mount("none", "/", "none", MS_REC | MS_PRIVATE)
     # Before the new root is mounted, which may itself lie below one of the trees.
-    trees = _take(root_plan.outermost((*plan.trees, *plan.roots)), _READ_ONLY)
+    own = {} if user is None else _take_for(user, root_plan.outermost(copied))
+    shown = root_plan.outermost((*plan.trees, *plan.roots))
+    trees = _take((path for path in shown if path not in own), _READ_ONLY)
     trees |= _take(plan.devices, ATTR_NOSUID | ATTR_NOEXEC)
     # A new proc may be mounted only where an unmasked one is in sight, so bring the old along.
     trees |= _take(("/proc",), 0)
@@ -74,7 +88,7 @@ def build_root(plan: RootPlan, place: str) -> None:
     mount("sandbox", place, "tmpfs", MS_NOSUID | MS_NODEV, "size=4m,nr_inodes=4096,mode=755")
     for path in plan.folders:
         os.makedirs(place + path, 0o755, exist_ok=True)
-    _put(trees, place)
+    _put(trees | own, place)  # in this order: one of the latter may lie in one of the former
     for path, content in files.items():
         _write(place + path, content)
     for path, target in plan.links.items():
@@ -88,6 +102,21 @@ def _take(paths: Iterable[str], attributes: int) -> dict[str, int]:
         trees[path] = clone_tree(path)
         if attributes:
             restrict_tree(trees[path], attributes)
+    return trees
+
+
+def _take_for(user: int, paths: Iterable[str]) -> dict[str, int]:
+    """As ``_take``, with root's files as those of ``user``; without what cannot show them so."""
+    trees: dict[str, int] = {}
+    with contextlib.suppress(OSError):
+        users = namespaces.mapped_to(user)
+        for path in paths:
+            trees |= _take([path], _READ_ONLY)
+            try:
+                restrict_tree(trees[path], ATTR_IDMAP, userns=users)
+            except OSError:  # this file system cannot
+                os.close(trees.pop(path))
+        os.close(users)
     return trees
 
 
@@ -124,9 +153,9 @@ def _link(path: str, target: str) -> None:
         os.symlink(target, path)
 
 
-def enter_root(plan: RootPlan, place: str) -> None:
+def enter_root(plan: RootPlan, place: str, copied: Sequence[str], user: int | None) -> None:
     """Make ``place`` a root with what ``plan`` says, enter it and detach the old one."""
-    build_root(plan, place)
+    build_root(plan, place, copied, user)
     os.chdir(place)
     pivot_root(".", ".")
     unmount(".")
@@ -166,20 +195,46 @@ def _bind(source: str, target: str) -> None:
     os.close(tree)
 
 
+class View(NamedTuple):
+    """How a jail sees its snapshot and its packages.
+
+    Attributes:
+        shared: Path of each that is copy on write: descriptor of the shared folder below.
+        refused: Path of each that is read-only: why this host has no overlay for it.
+    """
+
+    shared: dict[str, int]
+    refused: dict[str, str]
+
+
+def mount_skeleton(packages: str) -> None:
+    """The folders of ``packages`` once more, as the jails' own, for ``mount_jail`` of each jail.
+
+    The shared folders are read-only and perhaps another user's, and so they would be in a view.
+    """
+    mount("skeleton", _SKELETON, "tmpfs", MS_NOSUID | MS_NODEV, "mode=755")
+    _mirror_folders(packages, f"{_SKELETON}/packages")
+    restrict_mount(_SKELETON, ATTR_RDONLY)
+
+
 def mount_jail(
-    snapshot: str, roots: Iterable[str], trees: Iterable[str], *, size: int, inodes: int
-) -> str:
+    snapshot: str,
+    packages: str,
+    roots: Iterable[str],
+    trees: Iterable[str],
+    *,
+    size: int,
+    inodes: int,
+) -> View:
     """Everything that is one jail's own; needs a mount namespace of its own.
 
     Args:
         snapshot: Shown at this path; everything else below ``roots`` is hidden.
+        packages: Folder of packages of its own, with a skeleton; or empty.
         roots: Folders that snapshots lie in.
         trees: What the zygote's root shows (``RootPlan.trees``).
         size: Bytes of the scratch, all of it together.
         inodes: Files and folders in it.
-
-    Returns:
-        How the working directory shows the snapshot: ``"overlay"`` or ``"links"``.
     """
     hidden = [*roots, TEMPORARY, SHARED_MEMORY, HOME, WORK]
     buried = [path for path in trees if any(within(path, folder) for folder in hidden)]
@@ -191,7 +246,7 @@ def mount_jail(
     for folder in roots:
         with contextlib.suppress(OSError):
             restrict_mount(folder, ATTR_RDONLY)
-    view = _mount_view(snapshot)
+    view = _mount_views(snapshot, packages)
     unmount(_SCRATCH)
     return view
 
@@ -206,25 +261,49 @@ def _mount_scratch(size: int, inodes: int) -> None:
     os.mkdir(f"{TEMPORARY}/runtime", 0o700)
 
 
-def _mount_view(snapshot: str) -> str:
-    upper, inner = f"{_SCRATCH}/upper", f"{_SCRATCH}/inner"
+def _mount_views(snapshot: str, packages: str) -> View:
+    view = View({}, {})
+    _mirror_folders(snapshot, f"{_SCRATCH}/snapshot")
+    _mount_copy_on_write(snapshot, f"{_SCRATCH}/snapshot", (), view)
+    if packages:
+        os.mkdir(f"{_SCRATCH}/packages", 0o755)
+        _mount_copy_on_write(packages, f"{_SCRATCH}/packages", (f"{_SKELETON}/packages",), view)
+        unmount(_SKELETON)
+    if snapshot in view.shared:
+        _bind(snapshot, WORK)
+    else:
+        _mount_links(snapshot)
+    return view
+
+
+def _mount_copy_on_write(path: str, upper: str, skeleton: Sequence[str], view: View) -> None:
+    """Have what is written to ``path`` land in ``upper``, where this host has overlays."""
+    below = os.open(path, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    inner = f"{upper}-inner"
     os.mkdir(inner, 0o700)
-    _mirror_folders(snapshot, upper)
-    lower = snapshot.replace("\\", "\\\\").replace(":", "\\:").replace(",", "\\,")
+    lower = ":".join(re.sub(r"([\\:,])", r"\\\1", place) for place in (*skeleton, path))
     options = f"lowerdir={lower},upperdir={upper},workdir={inner},userxattr"
     try:
-        mount("work", WORK, "overlay", MS_NOSUID | MS_NODEV, options)
-    except OSError:
-        _bind(inner, WORK)
-        for name in os.listdir(snapshot):
-            os.symlink(f"{snapshot}/{name}", f"{WORK}/{name}")
-        return "links"
-    return "overlay"
+        mount("copy-on-write", path, "overlay", MS_NOSUID | MS_NODEV, options)
+    except OSError as error:
+        os.close(below)
+        view.refused[path] = f"mounting an overlay answers {error.strerror}"
+    else:
+        view.shared[path] = below
 
 
-def _mirror_folders(snapshot: str, upper: str) -> None:
-    """The snapshot's folders are read-only, and another user's: in the view they are the jail's."""
-    os.mkdir(upper, 0o755)
-    for folder, names, _ in os.walk(snapshot):
+def _mount_links(snapshot: str) -> None:
+    os.mkdir(f"{_SCRATCH}/work", 0o700)
+    _bind(f"{_SCRATCH}/work", WORK)
+    for name in os.listdir(snapshot):
+        os.symlink(f"{snapshot}/{name}", f"{WORK}/{name}")
+
+
+def _mirror_folders(source: str, target: str) -> None:
+    """What is shared is read-only, and perhaps another user's: in a view folders are the jail's."""
+    os.mkdir(target, 0o755)
+    for folder, names, _ in os.walk(source):
         for name in names:
-            os.mkdir(upper + os.path.join(folder, name)[len(snapshot) :], 0o755)
+            path = os.path.join(folder, name)
+            if not os.path.islink(path):
+                os.mkdir(target + path[len(source) :], 0o755)

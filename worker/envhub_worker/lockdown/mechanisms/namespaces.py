@@ -6,10 +6,12 @@ import contextlib
 import errno
 import fcntl
 import os
+import signal
 import socket
 import struct
 from collections.abc import Callable
 
+from envhub_worker.lockdown.mechanisms import process
 from envhub_worker.lockdown.mechanisms.kernel import (
     CLONE_NEWCGROUP,
     CLONE_NEWIPC,
@@ -60,6 +62,25 @@ def enter_user_namespace(uid: int, gid: int) -> None:
 def _write(path: str, text: str) -> None:
     with open(path, "w") as file:
         file.write(text)
+
+
+def mapped_to(user: int) -> int:
+    """Descriptor of a user namespace for mounts on which root's files are ``user``'s. As root."""
+    parent = os.getpid()
+    pid = os.fork()
+    if pid == 0:
+        process.die_with_parent(parent)
+        with contextlib.suppress(OSError):
+            unshare(CLONE_NEWUSER)
+        signal.raise_signal(signal.SIGSTOP)
+    try:
+        os.waitpid(pid, os.WUNTRACED)
+        for name in ("uid_map", "gid_map"):
+            _write(f"/proc/{pid}/{name}", f"0 {user} 1")
+        return os.open(f"/proc/{pid}/ns/user", os.O_RDONLY | os.O_CLOEXEC)
+    finally:
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
 
 
 def unshare_for_zygote(network: str) -> None:

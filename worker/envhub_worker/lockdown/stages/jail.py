@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import signal
 
 from envhub_worker.lockdown.context import Common
 from envhub_worker.lockdown.mechanisms import capabilities, mounts, namespaces, process
+from envhub_worker.lockdown.mechanisms.mounts import View
 from envhub_worker.lockdown.mechanisms.scratch import Scratch
-from envhub_worker.lockdown.report import LayerUnavailableError
+from envhub_worker.lockdown.report import Layer, LayerUnavailableError
 from envhub_worker.lockdown.root_plan import SHARED_MEMORY, within
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.confinement import Limits
 
 
-def enter(spec: JailSpec, common: Common, folder: str) -> tuple[Scratch, str]:
+def enter(spec: JailSpec, common: Common, folder: str) -> tuple[Scratch, View]:
     """Confine this init as far as all of its runners are.
 
     Args:
@@ -24,7 +26,7 @@ def enter(spec: JailSpec, common: Common, folder: str) -> tuple[Scratch, str]:
         folder: A private folder of the host for a jail without a mount namespace.
 
     Returns:
-        The jail's writable folders, and how the working one shows the snapshot.
+        The jail's writable folders, and how it sees its snapshot and its packages.
 
     Raises:
         LayerUnavailableError: The host lacks a layer that the profile names.
@@ -35,25 +37,25 @@ def enter(spec: JailSpec, common: Common, folder: str) -> tuple[Scratch, str]:
         process.set_dumpable(False)
         # A container has a /dev/shm of its own; the user's own one is full of other programs'.
         own = spec.confinement.profile == "container"
-        return Scratch.on_host(folder, SHARED_MEMORY if own else None), "links"
+        why = f"the profile {spec.confinement.profile} mounts nothing"
+        view = View({}, {path: why for path in (spec.snapshot, common.packages) if path})
+        return Scratch.on_host(folder, SHARED_MEMORY if own else None), view
     try:
         view = _mount(spec, common)
     except OSError as error:
-        where = f" at {error.filename}" if error.filename else ""
-        raise LayerUnavailableError(
-            "mount-namespace", f"{error.strerror}{where}", "This kernel is not supported yet."
-        ) from error
+        raise _unmountable(error, spec, common) from error
     _check_readable(spec)
     _leave_the_zygote()
     return Scratch.in_namespace(), view
 
 
-def _mount(spec: JailSpec, common: Common) -> str:
+def _mount(spec: JailSpec, common: Common) -> View:
     limits = spec.confinement.limits
     _check_snapshot(spec, common)
     namespaces.unshare_for_jail(common.config.network)
     view = mounts.mount_jail(
         spec.snapshot,
+        common.packages,
         common.roots,
         common.trees,
         size=limits.disk_bytes,
@@ -65,6 +67,46 @@ def _mount(spec: JailSpec, common: Common) -> str:
         namespaces.shrink_tcp()
         namespaces.raise_loopback()
     return view
+
+
+def _unmountable(error: OSError, spec: JailSpec, common: Common) -> LayerUnavailableError:
+    where = f" at {error.filename}" if error.filename else ""
+    for what, path in (
+        ("the snapshot", spec.snapshot),
+        ("the folder of packages", common.packages),
+    ):
+        if path and not _has_content(path):
+            return LayerUnavailableError(
+                "mount-namespace",
+                f"{what} {path} was removed after this server began to use it",
+                "Close what uses it and call make_env again: what is missing is fetched anew.",
+            )
+    if error.errno == errno.ENOSPC:
+        return LayerUnavailableError(
+            "scratch",
+            f"the scratch has no room for the folders of the snapshot{where}",
+            "Raise disk_files or disk_bytes of the limits.",
+        )
+    return LayerUnavailableError(
+        "mount-namespace",
+        f"{error.strerror}{where}",
+        "Please report this with the output of `envhub doctor --json`.",
+    )
+
+
+def _has_content(folder: str) -> bool:
+    with contextlib.suppress(OSError):
+        return bool(os.listdir(folder))
+    return False
+
+
+def working_view(view: View) -> Layer:
+    """How a jail sees what it shares with others, for its report."""
+    detail = "the repository and its packages, copy on write: the scratch takes what is written"
+    if view.refused:
+        path, why = next(iter(view.refused.items()))
+        detail = f"links into the repository; {path} is read-only: {why}"
+    return Layer("working-view", True, detail)
 
 
 def _check_snapshot(spec: JailSpec, common: Common) -> None:

@@ -9,7 +9,6 @@ from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.limits import rlimits
 from envhub_worker.lockdown.mechanisms import capabilities, landlock, process
 from envhub_worker.lockdown.mechanisms.landlock import DEVICE, READ, READ_DIR, WRITE, Rule
-from envhub_worker.lockdown.mechanisms.scratch import Scratch
 from envhub_worker.lockdown.seccomp import filter
 from envhub_worker.lockdown.seccomp.paths import Own
 from envhub_worker.lockdown.stages import selftest
@@ -86,12 +85,12 @@ def rules(jail: JailContext, pid: int) -> list[Rule]:
         jail: The jail.
         pid: The runner's own: without a pid namespace it may read only its own ``/proc`` folder.
     """
-    common, scratch = jail.common, jail.scratch
+    common = jail.common
     readable = [*common.trees, jail.spec.snapshot]
     own = f"/proc/{pid}"
     own_files = [f"{own}/{name}" for name in _OWN_FILES.split()]
     readable += ["/proc", "/etc", "/dev"] if common.namespaced else [*_HOST_FILES, *own_files]
-    writable = _writable(scratch)
+    writable = _writable(jail)
     return [
         *(Rule(path, READ) for path in readable),
         *([] if common.namespaced else [Rule(own, READ_DIR)]),
@@ -100,16 +99,17 @@ def rules(jail: JailContext, pid: int) -> list[Rule]:
     ]
 
 
-def _writable(scratch: Scratch) -> list[str]:
+def _writable(jail: JailContext) -> list[str]:
+    scratch = jail.scratch
     shared = [] if scratch.shared_memory is None else [scratch.shared_memory]
-    return [scratch.home, scratch.temporary, scratch.work, *shared]
+    return [scratch.home, scratch.temporary, scratch.work, *shared, *jail.view.shared]
 
 
 def own(jail: JailContext, pid: int, thread: int) -> Own:
     """What a process may change and read, by the names that it has for it."""
     streams = ("/dev/fd", "/dev/stdin", "/dev/stdout", "/dev/stderr")
     itself = ("/proc/self", "/proc/thread-self", f"/proc/{pid}", f"/proc/{thread}")
-    scratch = tuple(_writable(jail.scratch))
+    scratch = tuple(_writable(jail))
     changed = (*scratch, *jail.common.devices, *streams, *itself)
     read = (*jail.common.trees, jail.spec.snapshot, *changed)
     return Own(changed=changed, read=read, scratch=scratch)

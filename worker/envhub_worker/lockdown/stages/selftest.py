@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import secrets
 import socket
 from collections.abc import Callable, Iterable
+from functools import partial
 
 from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.mechanisms import capabilities, process
@@ -26,16 +29,16 @@ def run(jail: JailContext, descriptors: Iterable[int]) -> None:
     _hold("no capability is left", capabilities.held() == 0)
     _hold("no_new_privs is set", process.has_no_new_privileges())
     _hold("a system call filter is installed", filter.installed())
+    for path, shared in jail.view.shared.items():
+        _hold(f"what is written to {path} stays in the jail", _stays_inside(path, shared))
     _hold("only named descriptors are open", _open_descriptors() <= set(descriptors))
     for claim, attempt in _denials(jail).items():
         _hold(claim, _denied(attempt))
 
 
 def _denials(jail: JailContext) -> dict[str, Callable[[], object]]:
-    entry = os.path.join(jail.spec.snapshot, jail.spec.entry)
     init = os.getppid()
     denials: dict[str, Callable[[], object]] = {
-        "the snapshot cannot be written": lambda: os.open(entry, os.O_WRONLY),
         "no user namespace can be made": lambda: unshare(CLONE_NEWUSER),
         "nothing can be mounted": lambda: mount("none", "/tmp", "tmpfs"),
         "init cannot be traced": lambda: syscall(number("ptrace"), _PTRACE_ATTACH, init, 0, 0),
@@ -43,11 +46,8 @@ def _denials(jail: JailContext) -> dict[str, Callable[[], object]]:
             number("prlimit64"), init, _RLIMIT_CORE, 0, 0
         ),
     }
-    packages = jail.common.config.packages
-    if packages:  # a file without a name: if it can be made, it is gone at once
-        denials["the packages cannot be written"] = lambda: os.open(
-            packages, os.O_TMPFILE | os.O_WRONLY, 0o600
-        )
+    for path in jail.view.refused:
+        denials[f"{path} cannot be written"] = partial(_make_unnamed, path)
     if jail.plan.landlock or jail.common.namespaced:
         canary = jail.common.config.canary
         denials["files outside cannot be read"] = lambda: os.open(canary, os.O_RDONLY)
@@ -56,6 +56,32 @@ def _denials(jail: JailContext) -> dict[str, Callable[[], object]]:
     if jail.common.config.network == "none":
         denials["no internet socket can be made"] = lambda: socket.socket(socket.AF_INET)
     return denials
+
+
+def _make_unnamed(path: str, folder: int | None = None) -> None:
+    """A file without a name: if it can be made, it is gone at once."""
+    os.open(path, os.O_TMPFILE | os.O_WRONLY, 0o600, dir_fd=folder)
+
+
+def _stays_inside(path: str, shared: int) -> bool:
+    """Make a file in a view, and look for it in the folder ``shared``; which takes none itself."""
+    name = f".{secrets.token_hex(16)}"
+    try:
+        with contextlib.suppress(OSError):  # where a runner before filled the scratch, for example
+            os.close(os.open(f"{path}/{name}", os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+        return not _is_there(name, shared) and _denied(lambda: _make_unnamed(".", shared))
+    finally:
+        with contextlib.suppress(OSError):
+            os.unlink(f"{path}/{name}")
+        os.close(shared)  # nothing but this test looks below a view
+
+
+def _is_there(name: str, folder: int) -> bool:
+    try:
+        os.lstat(name, dir_fd=folder)
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def _denied(attempt: Callable[[], object]) -> bool:

@@ -14,6 +14,7 @@ import pwd
 import signal
 import sys
 from collections.abc import Iterable
+from functools import partial
 
 import envhub_worker
 from envhub_worker.lockdown import gpus, root_plan
@@ -46,8 +47,11 @@ def enter(config: ZygoteConfig) -> Common:
             _become(config)
             _check_interpreter()
         covered = ([], [])
-    if config.packages:
-        _check_packages(config.packages)
+    packages = os.path.realpath(config.packages) if config.packages else ""
+    if packages:
+        _check_packages(packages)
+        if namespaced:
+            mounts.mount_skeleton(packages)
     abi = landlock.version()
     brokered = needs_broker(namespaced=namespaced, landlock_abi=abi)
     # A driver keeps more out of sight than a filter could deny.
@@ -69,6 +73,7 @@ def enter(config: ZygoteConfig) -> Common:
         namespaced=namespaced,
         trees=plan.trees,
         roots=plan.roots,
+        packages=packages,
         devices=plan.devices,
         covered=covered,
         landlock_abi=abi,
@@ -122,15 +127,19 @@ def _mapped_folders() -> Iterable[str]:
 
 
 def _enter_namespaces(config: ZygoteConfig, plan: root_plan.RootPlan) -> None:
+    packages = [os.path.realpath(config.packages)] if config.packages else []
+    enter_root = partial(
+        mounts.enter_root, plan, config.place, [*plan.roots, *packages], config.user
+    )
     try:
         if config.user is not None:
             unshare(CLONE_NEWNS)
-            mounts.enter_root(plan, config.place)
+            enter_root()
             _become(config)
         namespaces.enter_user_namespace(os.getuid(), os.getgid())
         namespaces.unshare_for_zygote(config.network)
         if config.user is None:
-            mounts.enter_root(plan, config.place)
+            enter_root()
         _be_the_first_process()
         mounts.mount_proc()
     except OSError as error:
