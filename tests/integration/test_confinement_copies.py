@@ -15,6 +15,7 @@ from tests.integration.confinement_kit import (
     Cell,
     Ready,
     RunnerStarted,
+    cell_in,
     make_snapshot,
     new_cell,
     open_folder,
@@ -23,7 +24,7 @@ from tests.integration.confinement_kit import (
     wait_until,
 )
 from tests.support.environments import base_interpreter
-from tests.support.interpreter import needs
+from tests.support.interpreter import can_run, needs
 from tests.support.trees import fingerprint
 
 pytestmark = needs("strict")
@@ -195,3 +196,48 @@ def test_report_says_how_files_are_seen(cell: Cell) -> None:
     report = cell.wait_for(Ready).report
     [view] = [layer for layer in report if layer["layer"] == "working-view"]
     assert "copy on write" in view["detail"]
+
+
+ADVICE = """
+from envhub_worker.runner.exceptions import raised
+def advice(path, mode):
+    try:
+        open(path, mode)
+    except OSError as error:
+        return raised(error, "step", {root!r}).message
+result = [advice({root!r} + "/new", "w"), advice({root!r} + "/env.py", "a")]
+"""
+
+
+@pytest.mark.parametrize("how", ["strict", "no-userns"])
+def test_where_nothing_can_be_mounted_the_error_names_file_and_cure(how: str) -> None:
+    """A mount's options are one page: a path of colons, which are escaped, is too long for them."""
+    if not can_run(how):
+        pytest.skip(f"this host has no {how}")
+    confinement = Confinement(profile=how)
+    with open_folder() as folder:
+        deep = folder.joinpath(*[":" * 250] * 8)
+        deep.mkdir(parents=True)
+        with spawner_in(folder, confinement) as spawner:
+            cell = new_cell(spawner, make_snapshot(deep), confinement)
+            cell.start()
+            root = cell.jail.spec.snapshot
+            created, opened = outcome(cell, ADVICE.format(root=root))
+            for text, path in ((created, f"{root}/new"), (opened, f"{root}/env.py")):
+                assert f"{path} lies in the repository, which this jail only reads" in text
+                assert "on Linux 5.11 or later" in text
+            report = cell.wait_for(Ready).report
+            [view] = [layer["detail"] for layer in report if layer["layer"] == "working-view"]
+            assert "read-only" in view
+            assert outcome(cell, "result = open('env.py').read()") == "VALUE = 7\n"
+
+
+def test_a_shared_file_that_is_opened_to_write_says_how_to_replace_it(folder: Path) -> None:
+    """Its mode is that of the store; its folder is the jail's own."""
+    with cell_in(folder, STRICT) as cell:
+        root = cell.jail.spec.snapshot
+        created, opened = outcome(cell, ADVICE.format(root=root))
+        assert created is None
+        assert f"{root}/env.py is shared and has mode 0444" in opened
+        source = f"import os; os.chmod('env.py', 0o644); open({root!r} + '/env.py', 'a').write('#')"
+        assert outcome(cell, f"{source}; result = open('env.py').read()") == "VALUE = 7\n#"

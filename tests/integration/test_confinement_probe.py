@@ -35,6 +35,7 @@ def test_this_host_can_enforce_every_layer() -> None:
         "user-namespace",
         "namespaces",
         "mount-namespace",
+        "copy-on-write",
         "capabilities",
         "landlock",
         "seccomp",

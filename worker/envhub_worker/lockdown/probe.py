@@ -24,6 +24,7 @@ from envhub_worker.lockdown.mechanisms import (
     capabilities,
     kernel,
     landlock,
+    mounts,
     namespaces,
     process,
     user,
@@ -157,6 +158,25 @@ def _mounting() -> int:
     return 0
 
 
+def _copy_on_write() -> str:
+    _user_namespace()
+    kernel.unshare(kernel.CLONE_NEWNS)
+    kernel.mount("none", "/", "none", kernel.MS_REC | kernel.MS_PRIVATE)
+    kernel.mount("scratch", "/tmp", "tmpfs", kernel.MS_NODEV, "size=64k")
+    for name in ("shared", "written"):
+        os.mkdir(f"/tmp/{name}")
+    try:
+        mounts.mount_overlay("/tmp/shared", ["/tmp/shared"], "/tmp/written")
+    except OSError as error:
+        raise LayerUnavailableError(
+            "copy-on-write",
+            f"mounting an overlay answers {error.strerror}",
+            "Optional: with Linux 5.11 or later and its overlay module, jails may write beside "
+            "the repository's files and packages. Without it they only read these.",
+        ) from error
+    return "overlays, for the repository and its packages"
+
+
 def _landlock() -> str:
     process.set_no_new_privileges()
     abi = landlock.version()
@@ -205,6 +225,7 @@ _LAYERS: dict[str, Callable[[], str]] = {
     "user-namespace": _user_namespace,
     "namespaces": _namespaces,
     "mount-namespace": _mounts,
+    "copy-on-write": _copy_on_write,
     "capabilities": _capabilities,
     "landlock": _landlock,
     "seccomp": _seccomp,

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import builtins
+import contextlib
 import os
 import traceback
 from collections.abc import Iterator
 
 from envhub_worker.protocol.messages import Raised
 from envhub_worker.protocol.text import printable
+from envhub_worker.runner.unwritable import why_unwritable
 from envhub_worker.unreadable import why_hidden
 
 _MAX_MESSAGE = 8_192
@@ -27,11 +29,14 @@ def raised(error: BaseException, stage: str, root: str = "") -> Raised:
         root: The repository's folder: its files are told by their names in it.
     """
     # a package that may not be read is imported all the same, as one without a file of its own
+    why = ""
     nowhere = isinstance(error, ImportError) and error.path is None
     hidden = why_hidden(str(getattr(error, "name", ""))) if nowhere else ""
     if hidden:
         denied = PermissionError(f"{_text(error)}, but {hidden}")
         error = denied.with_traceback(error.__traceback__)
+    with contextlib.suppress(Exception):  # the error may be of a class of the repository's
+        why = why_unwritable(error, root)
     kind = type(error)
     name = kind.__qualname__
     if kind.__module__ not in ("builtins", "__main__"):
@@ -39,7 +44,7 @@ def raised(error: BaseException, stage: str, root: str = "") -> Raised:
     return Raised(
         builtin=_builtin(kind),
         type_name=printable(name, 512),
-        message=printable(_text(error), _MAX_MESSAGE),
+        message=printable(". ".join(filter(None, (_text(error), why))), _MAX_MESSAGE),
         traceback=printable(_traceback(error, root), _MAX_TRACEBACK),
         stage=stage,
     )

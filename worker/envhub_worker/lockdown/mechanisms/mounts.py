@@ -279,17 +279,26 @@ def _mount_views(snapshot: str, packages: str) -> View:
 def _mount_copy_on_write(path: str, upper: str, skeleton: Sequence[str], view: View) -> None:
     """Have what is written to ``path`` land in ``upper``, where this host has overlays."""
     below = os.open(path, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
-    inner = f"{upper}-inner"
-    os.mkdir(inner, 0o700)
-    lower = ":".join(re.sub(r"([\\:,])", r"\\\1", place) for place in (*skeleton, path))
-    options = f"lowerdir={lower},upperdir={upper},workdir={inner},userxattr"
     try:
-        mount("copy-on-write", path, "overlay", MS_NOSUID | MS_NODEV, options)
+        mount_overlay(path, (*skeleton, path), upper)
     except OSError as error:
         os.close(below)
         view.refused[path] = f"mounting an overlay answers {error.strerror}"
     else:
         view.shared[path] = below
+
+
+def mount_overlay(path: str, lower: Sequence[str], upper: str) -> None:
+    """Over ``path`` the folders ``lower``, the first one on top; ``upper`` takes what is written.
+
+    Raises:
+        OSError: There is no overlay in a user namespace before Linux 5.11, for example.
+    """
+    inner = f"{upper}-inner"
+    os.mkdir(inner, 0o700)
+    folders = ":".join(re.sub(r"([\\:,])", r"\\\1", folder) for folder in lower)
+    options = f"lowerdir={folders},upperdir={upper},workdir={inner},userxattr"
+    mount("copy-on-write", path, "overlay", MS_NOSUID | MS_NODEV, options)
 
 
 def _mount_links(snapshot: str) -> None:

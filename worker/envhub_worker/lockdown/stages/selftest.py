@@ -46,6 +46,9 @@ def _denials(jail: JailContext) -> dict[str, Callable[[], object]]:
             number("prlimit64"), init, _RLIMIT_CORE, 0, 0
         ),
     }
+    if jail.spec.snapshot in jail.view.refused:
+        entry = os.path.join(jail.spec.snapshot, jail.spec.entry)
+        denials["the snapshot cannot be written"] = lambda: os.open(entry, os.O_WRONLY)
     for path in jail.view.refused:
         denials[f"{path} cannot be written"] = partial(_make_unnamed, path)
     if jail.plan.landlock or jail.common.namespaced:
