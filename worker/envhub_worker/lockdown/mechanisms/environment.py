@@ -53,7 +53,7 @@ def jail_environment(
         **_HEADLESS,
         "HOME": home,
         "LOGNAME": "sandbox",
-        # the snapshot is read-only, also for the repository's own child processes
+        # it would be written into the scratch, once for each jail; child processes inherit this
         "PYTHONDONTWRITEBYTECODE": "1",
         "TMPDIR": temporary,
         "USER": "sandbox",
