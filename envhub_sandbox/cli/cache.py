@@ -187,10 +187,13 @@ def remove(
             found, made = _chosen(found, made, names or [], unused_for)
         for one in found:
             store.remove_tree(one.home)
-        for environment in made:
-            environments.remove(environment)
+        kept = {one.key: why for one in made if (why := environments.remove(one))}
         environments.remove_abandoned()
-        say(f"Removed {_told(found, made)}.")
+        say(f"Removed {_told(found, [one for one in made if one.key not in kept])}.")
+        if kept and names:
+            raise UsageError("; ".join(kept.values()))
+        for why in kept.values():
+            say(f"Kept: {why}.")
 
 
 def _chosen(

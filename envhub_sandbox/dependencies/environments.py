@@ -39,6 +39,8 @@ from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.resolve import Lock
 from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.hub.store import CACHE_VARIABLE, cache_root, remove_tree
+from envhub_sandbox.system import locks, procfs
+from envhub_worker.protocol.runtime import RECORD
 
 _FORMAT = 1
 _BUILDING = ".building-"
@@ -137,26 +139,42 @@ def provide(
         except OSError as error:
             raise _not_writable(error) from error
     with contextlib.suppress(OSError):
-        os.utime(made.home / "environment.json")
+        os.utime(made.home / RECORD)
     return made
 
 
 def every() -> list[Environment]:
     """All of them, the latest used first."""
-    found = [_read(record.parent) for record in root().glob("[!.]*/environment.json")]
+    found = [_read(record.parent) for record in root().glob(f"[!.]*/{RECORD}")]
     return sorted((one for one in found if one is not None), key=lambda one: -one.used)
 
 
-def remove(environment: Environment) -> None:
-    """Remove one. Not while somebody runs in it."""
-    lock = root() / f"{environment.key}.lock"
+def remove(environment: Environment) -> str:
+    """Remove one. Not while somebody makes or uses it: then the answer says who, else it is empty.
+
+    Whoever starts jails with it, or could, shares the lock of its record.
+    """
+    lock, record = root() / f"{environment.key}.lock", environment.home / RECORD
     gone = root() / f"{_BUILDING}{environment.key}-gone"
-    with contextlib.suppress(OSError), _taken(lock) as descriptor:
-        if descriptor is not None:
+    try:
+        with locks.held(lock), locks.held(record):
             # another name first: what bears the key is complete, or not there
             os.rename(environment.home, gone)
             remove_tree(gone)
             lock.unlink()
+    except TimeoutError:
+        return _users(environment, [*locks.sharers(record), *locks.sharers(lock)])
+    except OSError:
+        return ""  # another has removed it
+    return ""
+
+
+def _users(environment: Environment, pids: list[int]) -> str:
+    who = ", ".join(f"process {pid} ({procfs.command(pid)})" for pid in pids)
+    return (
+        f"the environment {environment.key[:12]} is in use by "
+        f"{who or 'a process that is not seen from here'}. Close its environments there, or end it"
+    )
 
 
 def half_made() -> list[Path]:
@@ -176,7 +194,7 @@ def remove_abandoned() -> None:
 
 def _read(home: Path) -> Environment | None:
     try:
-        record = home / "environment.json"
+        record = home / RECORD
         facts = json.loads(record.read_bytes())
         if facts.pop("format") != _FORMAT or not (home / "packages").is_dir():
             return None
@@ -261,7 +279,7 @@ def _made(
 
 
 def _publish(building: Path, key: str, facts: dict[str, object]) -> None:
-    (building / "environment.json").write_text(json.dumps(facts, indent=1))
+    (building / RECORD).write_text(json.dumps(facts, indent=1))
     building.chmod(folders.SHARED_MODE)
     try:
         os.rename(building, root() / key)

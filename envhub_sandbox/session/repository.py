@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -28,13 +29,14 @@ from envhub_sandbox.session.author_lines import point_out
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.provenance import provenance_of
 from envhub_sandbox.session.recipe import Recipe
+from envhub_sandbox.system.locks import SharedLock
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.warned import Heard
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import LACKS_PACKAGES
 from envhub_worker.protocol.limits import WireLimits
 from envhub_worker.protocol.manifest.manifest import EnvManifest
-from envhub_worker.protocol.runtime import Runtime
+from envhub_worker.protocol.runtime import RECORD, Runtime
 from envhub_worker.protocol.text import printable
 
 
@@ -98,6 +100,9 @@ class Repository:
         self.policy = policy
         self.timeouts = timeouts
         self.runtime = runtime
+        # nobody removes its packages before the last environment is gone that may start a jail
+        if os.path.isabs(runtime.packages):  # else they have a name, on another host
+            self._in_use = SharedLock(Path(runtime.packages).with_name(RECORD))
         self.lane = lane
         self.copy = copy
         self.heard = Heard()

@@ -150,6 +150,21 @@ def test_environments_are_removed(environment: str, named: bool) -> None:
     assert not half.exists()
 
 
+def test_environments_in_use_are_kept(environment: str) -> None:
+    """Named, that is an error which says by whom; among others, a line."""
+    lock = SharedLock(environments.root() / environment / RECORD)
+    user = f"{environment[:12]} is in use by process {os.getpid()}"
+    named = RUNNER.invoke(app, ["cache", "remove", environment[:9]])
+    assert named.exit_code == 2
+    assert user in " ".join(named.stderr.split())
+    swept = RUNNER.invoke(app, ["cache", "remove", "--unused-for", "0"])
+    assert swept.exit_code == 0
+    assert "0 environments" in swept.stderr
+    assert user in " ".join(swept.stderr.split())
+    assert len(environments.every()) == 1
+    lock.release()
+
+
 def test_newer_versions_are_chosen_when_asked_for(
     index: Index, environment: str, tmp_path: Path
 ) -> None:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from envhub_sandbox.system.locks import held, sharers
 from envhub_worker.protocol.confinement import Confinement
-from envhub_worker.protocol.runtime import Runtime
+from envhub_worker.protocol.runtime import RECORD, Runtime
 from envhub_worker.spawn.spawner import RUNNER_TARGET, Failed, RunnerExited
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from tests.integration.confinement_kit import (
@@ -135,6 +137,40 @@ def test_packages_that_cannot_be_read_are_told(
     assert failed.layer == "packages"
     assert str(runtime.packages) in failed.reason
     assert "chmod -R a+rX" in failed.fix
+
+
+def test_a_server_keeps_packages_from_being_removed(
+    folder: Path, confinement: Confinement, runtime: Runtime
+) -> None:
+    """From the start of their zygote to its end, whether a jail runs or not."""
+    record = folder / RECORD
+    record.touch()
+    with spawner_in(folder, confinement, runtime=runtime):
+        with pytest.raises(TimeoutError), held(record):
+            pass
+        assert sharers(record) == [os.getpid()]
+    with held(record):
+        pass
+
+
+@pytest.mark.parametrize("what", ["packages", "snapshot"])
+def test_what_is_removed_all_the_same_is_not_blamed_on_the_kernel(
+    folder: Path, runtime: Runtime, what: str
+) -> None:
+    """The next jail of the zygote says which folder is not there any more."""
+    confinement = Confinement(profile="strict")
+    with spawner_in(folder, confinement, runtime=runtime) as spawner:
+        snapshot = make_snapshot(folder)
+        cell = new_cell(spawner, snapshot, confinement)
+        cell.start()
+        assert cell.run("result = 1") == {"result": 1}
+        gone = runtime.packages if what == "packages" else snapshot
+        shutil.rmtree(gone)
+        late = new_cell(spawner, snapshot, confinement)
+        failed = late.wait_for(Failed)
+    assert gone in failed.reason
+    assert "was removed after this server began to use it" in failed.reason
+    assert "call make_env again" in failed.fix
 
 
 def test_what_every_jail_imports_is_named_where_it_is_missing(

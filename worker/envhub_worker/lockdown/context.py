@@ -23,8 +23,8 @@ class ZygoteConfig:
         network: Their network.
         gpu: Whether they get all GPUs, or the indices of those that they get.
         readable: Further paths that they read.
-        packages: The folder of packages that their code comes with, or empty. Not trusted: only a
-            runner imports from it, once it is confined.
+        packages: The folder of packages that their code comes with, symbolic links resolved, or
+            empty. Not trusted: only a runner imports from it, once it is confined.
         roots: Folders that snapshots lie in.
         place: An empty folder of the zygote's own.
         canary: A file that exists and that no jail may read.
@@ -65,7 +65,6 @@ class Common:
         namespaced: Whether the jails have namespaces.
         trees: Read-only trees of the private root.
         roots: The snapshot folders, symbolic links resolved.
-        packages: ``config.packages``, symbolic links resolved.
         devices: Device nodes that may be used.
         covered: (files, folders) of /proc to hide.
         landlock_abi: 0 where there is none.
@@ -81,7 +80,6 @@ class Common:
     namespaced: bool
     trees: tuple[str, ...]
     roots: tuple[str, ...]
-    packages: str
     devices: tuple[str, ...]
     covered: tuple[list[str], list[str]]
     landlock_abi: int

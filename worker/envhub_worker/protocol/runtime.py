@@ -22,5 +22,9 @@ class Runtime(NamedTuple):
     packages: str = ""
 
 
+RECORD = "environment.json"
+"""A file beside a folder of packages. Whoever uses these shares its lock; who removes them has it
+alone. No jail sees it."""
+
 OWN = Runtime("")
 """The worker server's own interpreter, with its packages."""

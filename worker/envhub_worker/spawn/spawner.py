@@ -7,6 +7,7 @@ events from ``Spawner.poll`` and ``Jail.poll``, whenever their descriptors are r
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import select
 import signal
@@ -25,7 +26,7 @@ from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.records import dataclass
-from envhub_worker.protocol.runtime import OWN, Runtime
+from envhub_worker.protocol.runtime import OWN, RECORD, Runtime
 from envhub_worker.spawn.channel import Channel, close_fds
 from envhub_worker.spawn.events import (
     Denied,
@@ -106,6 +107,7 @@ class Spawner:
         self._cgroups = self._make_cgroups()
         self._log = self._process.log
         self._channel = self._process.channel
+        self._in_use = _keep(runtime.packages)
         config = self._config(confinement, readable_roots, target, runtime.packages)
         self._channel.send(asdict(config))
 
@@ -241,6 +243,21 @@ class Spawner:
         remove_tree(str(self._folder))
         if self._apart is not None:
             self._apart.remove()
+        if self._in_use is not None:
+            os.close(self._in_use)
+            self._in_use = None
+
+
+def _keep(packages: str) -> int | None:
+    """Have nobody remove these packages: a descriptor with the lock of their record, if any."""
+    if not packages:
+        return None
+    record = os.path.join(os.path.dirname(os.path.realpath(packages)), RECORD)
+    descriptor = None
+    with contextlib.suppress(OSError):  # none, or they are being removed: a jail then says so
+        descriptor = os.open(record, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    return descriptor
 
 
 def _usable(ahead: ZygoteProcess | None, runtime: Runtime) -> ZygoteProcess | None:

@@ -29,6 +29,8 @@ from envhub_sandbox.errors import (
     PackagesTooLargeError,
 )
 from envhub_sandbox.hub.snapshot import local
+from envhub_sandbox.system.locks import SharedLock
+from envhub_worker.protocol.runtime import RECORD
 from tests.support import inside
 from tests.support.processes import eventually
 from tests.support.wheels import Index, make_wheel
@@ -302,6 +304,18 @@ def test_one_that_is_removed_is_made_again(index: Index, tmp_path: Path) -> None
     assert environments.every() == []
     assert left_behind() == []
     assert made(folder).home == env.home
+
+
+def test_one_that_is_used_stays_and_the_answer_names_its_user(index: Index, tmp_path: Path) -> None:
+    """By a server that could start a jail, or a client whose environment could."""
+    env = made(repository(tmp_path / "repo"))
+    used = SharedLock(env.home / RECORD)
+    why = environments.remove(env)
+    assert f"{env.key[:12]} is in use by process {os.getpid()} (" in why
+    assert environments.every() == [env]
+    used.release()
+    assert environments.remove(env) == ""
+    assert environments.every() == []
 
 
 def test_a_file_that_is_not_the_one_of_its_hash(index: Index, tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ def enter(spec: JailSpec, common: Common, folder: str) -> tuple[Scratch, View]:
         # A container has a /dev/shm of its own; the user's own one is full of other programs'.
         own = spec.confinement.profile == "container"
         why = f"the profile {spec.confinement.profile} mounts nothing"
-        view = View({}, {path: why for path in (spec.snapshot, common.packages) if path})
+        view = View({}, {path: why for path in (spec.snapshot, common.config.packages) if path})
         return Scratch.on_host(folder, SHARED_MEMORY if own else None), view
     try:
         view = _mount(spec, common)
@@ -55,7 +55,7 @@ def _mount(spec: JailSpec, common: Common) -> View:
     namespaces.unshare_for_jail(common.config.network)
     view = mounts.mount_jail(
         spec.snapshot,
-        common.packages,
+        common.config.packages,
         common.roots,
         common.trees,
         size=limits.disk_bytes,
@@ -73,7 +73,7 @@ def _unmountable(error: OSError, spec: JailSpec, common: Common) -> LayerUnavail
     where = f" at {error.filename}" if error.filename else ""
     for what, path in (
         ("the snapshot", spec.snapshot),
-        ("the folder of packages", common.packages),
+        ("the folder of packages", common.config.packages),
     ):
         if path and not _has_content(path):
             return LayerUnavailableError(

@@ -47,11 +47,10 @@ def enter(config: ZygoteConfig) -> Common:
             _become(config)
             _check_interpreter()
         covered = ([], [])
-    packages = os.path.realpath(config.packages) if config.packages else ""
-    if packages:
-        _check_packages(packages)
+    if config.packages:
+        _check_packages(config.packages)
         if namespaced:
-            mounts.mount_skeleton(packages)
+            mounts.mount_skeleton(config.packages)
     abi = landlock.version()
     brokered = needs_broker(namespaced=namespaced, landlock_abi=abi)
     # A driver keeps more out of sight than a filter could deny.
@@ -73,7 +72,6 @@ def enter(config: ZygoteConfig) -> Common:
         namespaced=namespaced,
         trees=plan.trees,
         roots=plan.roots,
-        packages=packages,
         devices=plan.devices,
         covered=covered,
         landlock_abi=abi,
@@ -127,10 +125,8 @@ def _mapped_folders() -> Iterable[str]:
 
 
 def _enter_namespaces(config: ZygoteConfig, plan: root_plan.RootPlan) -> None:
-    packages = [os.path.realpath(config.packages)] if config.packages else []
-    enter_root = partial(
-        mounts.enter_root, plan, config.place, [*plan.roots, *packages], config.user
-    )
+    copied = [*plan.roots, *([config.packages] if config.packages else [])]
+    enter_root = partial(mounts.enter_root, plan, config.place, copied, config.user)
     try:
         if config.user is not None:
             unshare(CLONE_NEWNS)
