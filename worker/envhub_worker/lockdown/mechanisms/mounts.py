@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import stat
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
@@ -268,7 +267,9 @@ def _mount_views(snapshot: str, packages: str) -> View:
     if packages:
         os.mkdir(f"{_SCRATCH}/packages", 0o755)
         _mount_copy_on_write(packages, f"{_SCRATCH}/packages", (f"{_SKELETON}/packages",), view)
-        unmount(_SKELETON)
+        # covered and not unmounted: the kernel would wait for all its readers, some milliseconds
+        os.mkdir(f"{_SCRATCH}/empty", 0o500)
+        _bind(f"{_SCRATCH}/empty", _SKELETON)
     if snapshot in view.shared:
         _bind(snapshot, WORK)
     else:
@@ -296,9 +297,13 @@ def mount_overlay(path: str, lower: Sequence[str], upper: str) -> None:
     """
     inner = f"{upper}-inner"
     os.mkdir(inner, 0o700)
-    folders = ":".join(re.sub(r"([\\:,])", r"\\\1", folder) for folder in lower)
+    folders = ":".join(map(_escaped, lower))
     options = f"lowerdir={folders},upperdir={upper},workdir={inner},userxattr"
     mount("copy-on-write", path, "overlay", MS_NOSUID | MS_NODEV, options)
+
+
+def _escaped(path: str) -> str:
+    return path.replace("\\", "\\\\").replace(":", "\\:").replace(",", "\\,")
 
 
 def _mount_links(snapshot: str) -> None:
