@@ -39,7 +39,8 @@ from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.resolve import Lock
 from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.hub.store import CACHE_VARIABLE, cache_root, remove_tree
-from envhub_sandbox.system import locks, procfs
+from envhub_sandbox.system import locks
+from envhub_sandbox.system.shared_lock import sharers
 from envhub_worker.protocol.runtime import RECORD
 
 _FORMAT = 1
@@ -163,14 +164,14 @@ def remove(environment: Environment) -> str:
             remove_tree(gone)
             lock.unlink()
     except TimeoutError:
-        return _users(environment, [*locks.sharers(record), *locks.sharers(lock)])
+        return _users(environment, {**sharers(record), **sharers(lock)})
     except OSError:
         return ""  # another has removed it
     return ""
 
 
-def _users(environment: Environment, pids: list[int]) -> str:
-    who = ", ".join(f"process {pid} ({procfs.command(pid)})" for pid in pids)
+def _users(environment: Environment, users: dict[int, str]) -> str:
+    who = ", ".join(f"process {pid} ({command})" for pid, command in users.items())
     return (
         f"the environment {environment.key[:12]} is in use by "
         f"{who or 'a process that is not seen from here'}. Close its environments there, or end it"

@@ -11,7 +11,6 @@ import contextlib
 import fcntl
 import os
 import time
-import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -131,41 +130,10 @@ class LifeLock:
 
     def release(self) -> None:
         """Give it back. Idempotent, and nothing in a fork."""
-        _release(self._descriptor)
+        if self._descriptor in _held_for_life:
+            _held_for_life.discard(self._descriptor)
+            os.close(self._descriptor)
         self._descriptor = -1
-
-
-class SharedLock:
-    """A file's lock that this process shares until ``release``, or until nobody has this object.
-
-    A fork does not hold it. Nothing is held where there is no such file, or another has it alone.
-
-    Attributes:
-        release: Gives it back. Idempotent.
-    """
-
-    def __init__(self, path: Path) -> None:
-        descriptor = -1
-        with contextlib.suppress(OSError):
-            descriptor = os.open(path, _READ)
-            _held_for_life.add(descriptor)
-            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        self.release = weakref.finalize(self, _release, descriptor)
-
-
-def _release(descriptor: int) -> None:
-    if descriptor in _held_for_life:
-        _held_for_life.discard(descriptor)
-        os.close(descriptor)
-
-
-def sharers(path: Path) -> list[int]:
-    """The processes, as far as they are seen from here, that hold the lock of a file."""
-    status = path.stat()
-    device = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
-    rows = [row.split() for row in Path("/proc/locks").read_text().splitlines()]
-    held = {int(row[4]) for row in rows if row[1] == "FLOCK" and row[5] == device}
-    return sorted(pid for pid in held if pid > 0)
 
 
 _held_for_life: set[int] = set()

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.system.locks import held, sharers
+from envhub_sandbox.system.locks import held
+from envhub_sandbox.system.shared_lock import sharers
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.runtime import RECORD, Runtime
 from envhub_worker.spawn.spawner import RUNNER_TARGET, Failed, RunnerExited
@@ -148,7 +149,7 @@ def test_a_server_keeps_packages_from_being_removed(
     with spawner_in(folder, confinement, runtime=runtime):
         with pytest.raises(TimeoutError), held(record):
             pass
-        assert sharers(record) == [os.getpid()]
+        assert list(sharers(record)) == [os.getpid()]
     with held(record):
         pass
 

@@ -1,0 +1,68 @@
+"""A lock that several processes share while they use a file, and who they are."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import weakref
+from pathlib import Path
+
+_COMMAND_CHARS = 80
+
+
+class SharedLock:
+    """A file's lock that this process shares until ``release``, or until nobody has this object.
+
+    A fork does not hold it. Nothing is held where there is no such file, or another has it alone.
+
+    Attributes:
+        release: Gives it back. Idempotent, and nothing in a fork.
+    """
+
+    def __init__(self, path: Path) -> None:
+        descriptor = -1
+        with contextlib.suppress(OSError):
+            descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+            _shared.add(descriptor)
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        self.release = weakref.finalize(self, _release, descriptor)
+
+
+def sharers(path: Path) -> dict[int, str]:
+    """The processes that hold the lock of a file, as far as they are seen from here.
+
+    Returns:
+        Pid to the first words of the command line.
+    """
+    status = path.stat()
+    device = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
+    rows = [row.split() for row in Path("/proc/locks").read_text().splitlines()]
+    held = {int(row[4]) for row in rows if row[1] == "FLOCK" and row[5] == device}
+    return {pid: _command(pid) for pid in sorted(held) if pid > 0}
+
+
+def _command(pid: int) -> str:
+    with contextlib.suppress(OSError):
+        words = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ")
+        return words.decode("utf-8", "replace").strip()[:_COMMAND_CHARS]
+    return ""
+
+
+_shared: set[int] = set()
+
+
+def _release(descriptor: int) -> None:
+    if descriptor in _shared:
+        _shared.discard(descriptor)
+        os.close(descriptor)
+
+
+def _forked() -> None:
+    for descriptor in _shared:
+        with contextlib.suppress(OSError):
+            os.close(descriptor)
+    _shared.clear()
+
+
+os.register_at_fork(after_in_child=_forked)
