@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from envhub_sandbox.hub.store import remove_tree
 from envhub_sandbox.system.locks import held
 from envhub_sandbox.system.shared_lock import sharers
 from envhub_worker.protocol.confinement import Confinement
@@ -166,7 +166,7 @@ def test_what_is_removed_all_the_same_is_not_blamed_on_the_kernel(
         cell.start()
         assert cell.run("result = 1") == {"result": 1}
         gone = runtime.packages if what == "packages" else snapshot
-        shutil.rmtree(gone)
+        remove_tree(Path(gone))
         late = new_cell(spawner, snapshot, confinement)
         failed = late.wait_for(Failed)
     assert gone in failed.reason
