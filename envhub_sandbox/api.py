@@ -11,11 +11,11 @@ from envhub_sandbox.making.making import make
 from envhub_sandbox.making.options import Options
 from envhub_sandbox.policy import Limits, Policy, Timeouts
 from envhub_sandbox.sandboxes.base import Sandbox
-from envhub_sandbox.vector.folding import folded
 from envhub_sandbox.vector.suites import EnvSuites
+from envhub_sandbox.vector.tracebacks import short_traceback
 
 
-@folded
+@short_traceback
 def make_env(
     cfg: Any,
     n_envs: int = 1,

@@ -15,9 +15,9 @@ import gymnasium
 from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.api import make_env
-from envhub_sandbox.vector.folding import folded
 from envhub_sandbox.vector.single_env import SingleEnv
 from envhub_sandbox.vector.suites import EnvSuites
+from envhub_sandbox.vector.tracebacks import short_traceback
 
 ID = "Hub-v0"
 
@@ -37,7 +37,7 @@ class SandboxEnv(SingleEnv):
         EnvHubError: As ``make_env``.
     """
 
-    @folded
+    @short_traceback
     def __init__(
         self,
         ref: Any,
@@ -55,7 +55,7 @@ class SandboxEnv(SingleEnv):
             raise
 
 
-@folded
+@short_traceback
 def make_vector(
     ref: Any,
     num_envs: int = 1,

@@ -25,7 +25,7 @@ from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.refusals import refusal
 from envhub_sandbox.session.survival.failures import Failures
 from envhub_sandbox.session.survival.recovery import Recovery
-from envhub_sandbox.session.survival.reseed import marked
+from envhub_sandbox.session.survival.revived_rows import marked
 from envhub_sandbox.session.turns import Turns, collision
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline
 from envhub_sandbox.transport.jail import RunnersDiedError

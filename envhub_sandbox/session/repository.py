@@ -31,7 +31,7 @@ from envhub_sandbox.session.provenance import provenance_of
 from envhub_sandbox.session.recipe import Recipe
 from envhub_sandbox.system.shared_lock import SharedLock
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.warned import Heard
+from envhub_sandbox.transport.remote_warnings import RemoteWarnings
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import LACKS_PACKAGES
 from envhub_worker.protocol.limits import WireLimits
@@ -105,7 +105,7 @@ class Repository:
             self._in_use = SharedLock(Path(runtime.packages).with_name(RECORD))
         self.lane = lane
         self.copy = copy
-        self.heard = Heard()
+        self.heard = RemoteWarnings()
         self.latest_report: list[dict[str, Any]] = []
         self.latest_profile: str | None = None
         self.recipe = recipe
@@ -136,7 +136,7 @@ class Repository:
 
     def tell(self) -> None:
         """Warn the caller of what it has warned of, and of what he has not been told yet."""
-        self.heard.tell(self.label)
+        self.heard.show(self.label)
 
     @contextmanager
     def starting(self, deadline: Deadline) -> Iterator[None]:

@@ -16,8 +16,8 @@ from envhub_sandbox.errors import (
     WorkerError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.transport import ended
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.exit_status import describe_exit
 from envhub_sandbox.transport.forks import Owner, foreign
 from envhub_sandbox.transport.replies import expect
 from envhub_sandbox.transport.tcp import Far, Link
@@ -218,7 +218,7 @@ class WorkerClient:
                 raise WorkerTimeoutError(f"the worker took no request for {_ROOM_S:.0f} s")
 
     def _has_ended(self) -> WorkerDiedError:
-        text = f"the worker server has ended{ended.how(self._process_fd)}"
+        text = f"the worker server has ended{describe_exit(self._process_fd)}"
         return WorkerDiedError(text, reason="server")
 
     def _take(self) -> list[Buffer]:

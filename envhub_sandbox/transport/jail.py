@@ -17,12 +17,12 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.remote_warnings import RemoteWarnings
 from envhub_sandbox.transport.replies import check, death, expect, typed
 from envhub_sandbox.transport.values import pickles
 from envhub_sandbox.transport.values.described import Described
 from envhub_sandbox.transport.values.tensors import to_tensor
-from envhub_sandbox.transport.warned import Heard
-from envhub_sandbox.transport.watched import Watched
+from envhub_sandbox.transport.watched_values import WatchedValues
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.limits import WireLimits
@@ -87,8 +87,8 @@ class JailHandle:
         self.kept = False
         self.report = report
         self.before_end: Callable[[], None] = _nothing
-        self.heard = Heard()
-        self.watched = Watched()
+        self.heard = RemoteWarnings()
+        self.watched = WatchedValues()
         self._limits = limits
         self._asked: dict[int, int] = {}  # how many runners, by request
 

@@ -112,7 +112,7 @@ class Asking:
 
         Never while a reply is handled: what the caller's filters raise is his.
         """
-        if self._repository.heard.untold:
+        if self._repository.heard.unshown:
             self._repository.tell()
 
     def tell_beside_an_error(self) -> None:

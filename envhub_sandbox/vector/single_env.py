@@ -16,8 +16,8 @@ from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
-from envhub_sandbox.vector.folding import folded, folds
 from envhub_sandbox.vector.infos import of_one
+from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_worker.protocol.manifest.names import absent, is_servable
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
@@ -70,7 +70,7 @@ class SingleEnv(gym.Env[Any, Any]):
         """The vector environment below, with ``stats``, ``sandbox_report`` and the rest."""
         return self._vector
 
-    @folded
+    @short_traceback
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
@@ -104,7 +104,7 @@ class SingleEnv(gym.Env[Any, Any]):
         try:
             result = self._vector.step(self._batch(action))
         except BaseException as error:
-            if folds(error):
+            if shortened(error):
                 __tracebackhide__ = True  # pytest hides the frame then
                 raise error  # ENVHUB_TRACEBACK=full shows where
             raise
@@ -123,7 +123,7 @@ class SingleEnv(gym.Env[Any, Any]):
             observation, info = last, last_info
         return observation, float(rewards[0]), terminated, truncated, info
 
-    @folded
+    @short_traceback
     def render(self) -> Any:
         """What the environment renders in its ``render_mode``."""
         frames = self._vector.render()
@@ -147,7 +147,7 @@ class SingleEnv(gym.Env[Any, Any]):
     _np_random = np_random
 
     @property
-    @folded
+    @short_traceback
     def np_random_seed(self) -> int:
         """The seed of its generator, as Gymnasium has it: -1 if it is not known."""
         found: Any = self._vector.np_random_seed

@@ -15,7 +15,7 @@ import gymnasium as gym
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_sandbox.transport.replies import typed
 from envhub_sandbox.transport.values import generators
-from envhub_sandbox.vector.folding import folded
+from envhub_sandbox.vector.tracebacks import short_traceback
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject
 from envhub_worker.protocol.manifest.names import is_servable
@@ -78,24 +78,24 @@ class SubEnvironment(gym.Env[Any, Any]):
 
     # --- what every environment has ------------------------------------------------------------
 
-    @folded
+    @short_traceback
     def reset(self, *args: Any, **kwargs: Any) -> Any:
         """Reset this one alone. The vector environment goes on as if it had not been."""
         self._refuse_unless_sync("reset")
         return self._restored(self._call("reset", args, kwargs))
 
-    @folded
+    @short_traceback
     def step(self, *args: Any, **kwargs: Any) -> Any:
         """Step this one alone; as ``reset``."""
         self._refuse_unless_sync("step")
         return self._restored(self._call("step", args, kwargs))
 
-    @folded
+    @short_traceback
     def render(self, *args: Any, **kwargs: Any) -> Any:
         """What this one renders."""
         return self._call("render", args, kwargs)
 
-    @folded
+    @short_traceback
     def close(self) -> None:
         """Close it, if there are no others.
 
@@ -117,7 +117,7 @@ class SubEnvironment(gym.Env[Any, Any]):
         return SubEnvironment(self._vector, self._ask, self._index, None)
 
     @property
-    @folded
+    @short_traceback
     def env(self) -> Any:
         """What this wrapper wraps.
 
@@ -158,19 +158,19 @@ class SubEnvironment(gym.Env[Any, Any]):
         return self._vector.render_mode if self._is_shown else self._get("render_mode")
 
     @property
-    @folded
+    @short_traceback
     def spec(self) -> Any:  # type: ignore[override]
         """Its spec: facts, of which ``gym.make`` makes nothing."""
         return self._get("spec")
 
     @property  # type: ignore[misc]  # there is nothing to set
-    @folded
+    @short_traceback
     def np_random(self) -> Any:
         """A copy of its generator."""
         return self._get("np_random")
 
     @property
-    @folded
+    @short_traceback
     def np_random_seed(self) -> Any:
         """Its seed."""
         seed = self._get("np_random_seed")
@@ -184,24 +184,24 @@ class SubEnvironment(gym.Env[Any, Any]):
 
     # --- what this one has ---------------------------------------------------------------------
 
-    @folded
+    @short_traceback
     def has_wrapper_attr(self, name: str) -> bool:
         """Whether it has an attribute, or a wrapper of it."""
         found = self._call("has_wrapper_attr", (name,), {})
         with UNTRUSTED:  # of an array, nobody can say
             return bool(found)
 
-    @folded
+    @short_traceback
     def get_wrapper_attr(self, name: str) -> Any:
         """An attribute of the outermost wrapper that has it."""
         return self._get(name, _SEARCHED)
 
-    @folded
+    @short_traceback
     def set_wrapper_attr(self, name: str, value: Any, **kwargs: Any) -> Any:
         """Set an attribute of the outermost wrapper that has it."""
         return self._call("set_wrapper_attr", (name, value), kwargs)
 
-    @folded
+    @short_traceback
     def __getattr__(self, name: str) -> Any:
         """An attribute, or a function that calls the method of that name."""
         if not is_servable(name):
@@ -211,7 +211,7 @@ class SubEnvironment(gym.Env[Any, Any]):
             )
         return self._get(name)
 
-    @folded
+    @short_traceback
     def __setattr__(self, name: str, value: Any) -> None:
         """Set an attribute of it, there."""
         if name in _OURS:
@@ -245,7 +245,7 @@ class SubEnvironment(gym.Env[Any, Any]):
         if not isinstance(reply, m.Method):
             raise RemoteProtocolError(f"the worker answered GetOne with {type(reply).__name__}")
 
-        @folded
+        @short_traceback
         def method(*args: Any, **kwargs: Any) -> Any:
             return self._call(name, args, kwargs, where)
 

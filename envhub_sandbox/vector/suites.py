@@ -10,7 +10,7 @@ from typing import Any
 from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.session.recipe import Recipe
-from envhub_sandbox.vector.shown import suites_html
+from envhub_sandbox.vector.html_repr import suites_html
 from envhub_sandbox.vector.single_env import SingleEnv
 
 Envs = Mapping[str, Mapping[int | str, VectorEnv[Any, Any, Any]]]

@@ -18,7 +18,7 @@ from gymnasium.vector.utils import iterate
 from envhub_sandbox.errors import ActionError, ObservationError
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.transport.results import StepResult
-from envhub_sandbox.vector.folding import folded
+from envhub_sandbox.vector.tracebacks import short_traceback
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES, OpaqueSpace
@@ -46,12 +46,12 @@ class ValidatedVectorEnv(SandboxVectorEnv):
         self._check_batch("reset", observations)
         return observations, infos
 
-    @folded
+    @short_traceback
     def step(self, actions: Any) -> StepResult:
         """As ``SandboxVectorEnv.step``, checked."""
         return self._checked(super().step(actions))
 
-    @folded
+    @short_traceback
     def step_wait(self, timeout: float | None = None) -> StepResult:
         """As ``SandboxVectorEnv.step_wait``, checked."""
         return self._checked(super().step_wait(timeout))

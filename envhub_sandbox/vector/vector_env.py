@@ -24,10 +24,10 @@ from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.transport.values import generators
 from envhub_sandbox.vector import from_manifest
 from envhub_sandbox.vector.asking import Asking
-from envhub_sandbox.vector.folding import folded, folds
-from envhub_sandbox.vector.shown import environment_html
+from envhub_sandbox.vector.html_repr import environment_html
 from envhub_sandbox.vector.sub_environment import MessageFor as OneMessageFor
 from envhub_sandbox.vector.sub_environment import SubEnvironment
+from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.names import absent, is_servable
 from envhub_worker.protocol.untrusted import UNTRUSTED
@@ -57,7 +57,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         self._exchange = session.exchange
         self._manifest = manifest
         self._timeouts = session.repository.timeouts
-        self._untold = session.repository.heard.untold
+        self._unshown = session.repository.heard.unshown
         self._asking = Asking(session.exchange, session.repository, type(self).__name__)
         self._read_actions = from_manifest.action_reader(manifest)
         self.num_envs = manifest.num_envs
@@ -81,7 +81,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         """Whether ``close`` has been called."""
         return self._asking.closed
 
-    @folded
+    @short_traceback
     def prewarm(self) -> None:
         """Start its processes now, in the background; returns at once.
 
@@ -95,7 +95,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
     # --- reset and step ------------------------------------------------------------------------
 
-    @folded
+    @short_traceback
     def reset(
         self,
         *,
@@ -121,7 +121,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         self._send_reset(seed, options)
         return self._end_reset(self._timeouts.reset_s)
 
-    @folded
+    @short_traceback
     def reset_async(
         self,
         seed: int | Sequence[int | None] | None = None,
@@ -149,7 +149,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
         self._asking.submit("reset", message)
 
-    @folded
+    @short_traceback
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
         """The results of ``reset_async``; ``timeout`` in seconds, else ``Timeouts.reset_s``."""
         self._asking.end_wait("reset")
@@ -186,15 +186,15 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             asking.tell_beside_an_error()
             if isinstance(error, WorkerDiedError):
                 asking.refuse_if_closed()  # close() in another thread ended it under us
-            if folds(error):
+            if shortened(error):
                 __tracebackhide__ = True  # pytest hides the frame then
                 raise error  # ENVHUB_TRACEBACK=full shows where
             raise
-        if self._untold:
+        if self._unshown:
             asking.tell()
         return result
 
-    @folded
+    @short_traceback
     def step_async(self, actions: Any) -> None:
         """Send the actions; ``step_wait`` returns the results."""
         self._asking.refuse_if_busy("step_async")
@@ -202,7 +202,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         self._asking.unwarned(self._exchange.submit_step, batch)
         self._asking.waiting = "step"
 
-    @folded
+    @short_traceback
     def step_wait(self, timeout: float | None = None) -> StepResult:
         """The results of ``step_async``; ``timeout`` in seconds, else ``Timeouts.step_s``."""
         self._asking.end_wait("step")
@@ -211,7 +211,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
     # --- everything else -----------------------------------------------------------------------
 
-    @folded
+    @short_traceback
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method, or read an attribute, of every sub-environment: a tuple of results."""
         self._asking.refuse_if_busy("call_async")
@@ -236,7 +236,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         attributes.learn(name, values, watched=all(reply.watched for reply in replies))
         return values
 
-    @folded
+    @short_traceback
     def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
         """Send the call; ``call_wait`` returns its results."""
         self._asking.refuse_if_busy("call_async")
@@ -257,7 +257,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             )
         self._asking.submit("call", lambda number, _: m.Call(number, name, args, kwargs), instead)
 
-    @folded
+    @short_traceback
     def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
         """The results of ``call_async``; ``timeout`` in seconds, else ``Timeouts.call_s``."""
         self._asking.end_wait("call")
@@ -273,12 +273,12 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             with self._exchange.handling():
                 raise
 
-    @folded
+    @short_traceback
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """An attribute of every sub-environment."""
         return self.call(name)
 
-    @folded
+    @short_traceback
     def set_attr(self, name: str, values: Any) -> None:
         """Set an attribute of every sub-environment: one value each, or one for all."""
         _check_name(name)
@@ -293,7 +293,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             lambda number, bounds: m.SetAttr(number, name, tuple(each[bounds[0] : bounds[1]])),
         )
 
-    @folded
+    @short_traceback
     def render(self) -> tuple[Any, ...] | None:
         """What each sub-environment renders; None where the environment gives None."""
         replies = self._asking.ask("render", lambda number, _: m.Render(number))
@@ -303,7 +303,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             return self._exchange.results.one_each("render", replies)
 
     @property  # type: ignore[misc]  # there is nothing to set, as in SyncVectorEnv
-    @folded
+    @short_traceback
     def np_random(self) -> Any:
         """Copies of the generators: ``SyncVectorEnv`` has one for each sub-environment."""
         replies = self._asking.ask("np_random", lambda number, _: m.GetRandom(number))
@@ -314,7 +314,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             return tuple(generators.generator(state) for state in states)
 
     @property
-    @folded
+    @short_traceback
     def np_random_seed(self) -> Any:
         """Their seeds."""
         name = "np_random_seed"
@@ -393,7 +393,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     def close_extras(self, **kwargs: Any) -> None:
         """There is nothing beyond ``close``."""
 
-    @folded
+    @short_traceback
     def __getattr__(self, name: str) -> Any:
         """An attribute that the repository's vector environment has beyond Gymnasium's."""
         manifest = self.__dict__.get("_manifest")
@@ -409,7 +409,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         if not isinstance(reply, m.Method):
             raise RemoteProtocolError(f"the worker answered GetOwn with {type(reply).__name__}")
 
-        @folded
+        @short_traceback
         def method(*args: Any, **kwargs: Any) -> Any:
             self._asking.refuse_if_busy(name)
             result = self._asking.own(name, m.CallOwn, name, args, kwargs)

@@ -14,7 +14,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError, RemoteEnvWarning, RemoteProtocolError
-from envhub_sandbox.transport.warned import MOST
+from envhub_sandbox.transport.remote_warnings import MOST
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.messages import warned
 from tests.attacks.lying_server import NUM_ENVS, Asked, Frames, LyingSandbox, lying, step_done

@@ -15,7 +15,7 @@ from gymnasium.error import ClosedEnvironmentError
 
 from envhub_sandbox import errors, make_env
 from envhub_sandbox.making import proxies
-from envhub_sandbox.session.survival.reseed import derived_seed
+from envhub_sandbox.session.survival.seeds import derived_seed
 from envhub_sandbox.transport.shared_memory.sharding import bounds_for
 from envhub_worker.protocol.lifecycle import State
 from tests.support import inside

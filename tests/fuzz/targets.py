@@ -22,12 +22,12 @@ from envhub_sandbox.hub.listing import FileRecord, Snapshot
 from envhub_sandbox.session.author_lines import point_out
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError, open_jail
+from envhub_sandbox.transport.remote_warnings import MOST, RemoteWarnings
 from envhub_sandbox.transport.replies import check, death, expect, raised
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.values import described, specs
 from envhub_sandbox.transport.values.described import Described
 from envhub_sandbox.transport.values.generators import generator
-from envhub_sandbox.transport.warned import MOST, Heard
 from envhub_sandbox.vector import from_manifest
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import decode, encode
@@ -385,7 +385,7 @@ def relay(dice: Dice) -> None:
 
 def warnings(dice: Dice) -> None:
     """What is told of warnings is short, plain text, however it is said; the reply is the same."""
-    rng, heard = dice.rng, Heard()
+    rng, heard = dice.rng, RemoteWarnings()
     reply = rng.choice(dice.corpus)
     for _ in range(rng.randrange(1, 9)):
         some = [(f"UserWarning {rng.random()}", "x" * rng.randrange(3000)) for _ in range(3)]
@@ -398,8 +398,8 @@ def warnings(dice: Dice) -> None:
             frames = dice.spoiler.frames(frames, dice.corpus)
         rest = heard.take(frames)
         demand(list(rest) in (list(frames), list(frames[1:])), "another reply")
-    demand(len(heard.untold) <= MOST + 1, "a flood")
-    for one in heard.untold:
+    demand(len(heard.unshown) <= MOST + 1, "a flood")
+    for one in heard.unshown:
         demand(tuple(map(type, one)) == (str, str), "no text")
         demand(max(map(len, one)) <= warned.MAX_TEXT, "a giant")
 

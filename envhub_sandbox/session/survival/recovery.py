@@ -1,7 +1,7 @@
 """What becomes of a request when processes die under it: it fails, or they are brought back.
 
 With ``restart="transparent"`` a death is survived: the dead shards come back in fresh runners, and
-the others go on. Otherwise it is told. What the fresh are asked is in ``reseed``.
+the others go on. Otherwise it is told. What the fresh are seeded with is in ``seeds``.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ from envhub_sandbox.errors import WorkerDiedError, WorkerError, WorkerTimeoutErr
 from envhub_sandbox.log import WORKER
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.survival.failures import Failures
-from envhub_sandbox.session.survival.reseed import SeedBook, Settings, marked, resets, truncated
 from envhub_sandbox.session.survival.restart_policy import Restarts
+from envhub_sandbox.session.survival.revived_rows import marked, truncated
+from envhub_sandbox.session.survival.seeds import SeedBook, Settings, resets
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Lane

@@ -9,7 +9,7 @@ from typing import Any, cast
 import pytest
 
 from envhub_sandbox.errors import RemoteEnvWarning
-from envhub_sandbox.transport.warned import Heard
+from envhub_sandbox.transport.remote_warnings import RemoteWarnings
 from envhub_sandbox.vector.asking import Asking
 from envhub_sandbox.vector.suites import EnvSuites
 
@@ -17,19 +17,19 @@ from envhub_sandbox.vector.suites import EnvSuites
 class _Exchange:
     """One that hears a warning with whatever it does."""
 
-    def __init__(self, heard: Heard) -> None:
+    def __init__(self, heard: RemoteWarnings) -> None:
         self.heard = heard
         self.sent = 0
         self.ends_in: BaseException | None = None
 
     def submit(self, operation: str, message_for: object, instead: object = None) -> None:
         """Sent."""
-        self.heard.untold.append(("Warning", f"sent {self.sent}"))
+        self.heard.unshown.append(("Warning", f"sent {self.sent}"))
         self.sent += 1
 
     def collect(self, timeout_s: float | None) -> list[Any]:
         """Nobody answers."""
-        self.heard.untold.append(("Warning", f"answered {self.sent}"))
+        self.heard.unshown.append(("Warning", f"answered {self.sent}"))
         if self.ends_in is not None:
             raise self.ends_in
         return []
@@ -37,11 +37,11 @@ class _Exchange:
 
 def asking() -> tuple[Asking, _Exchange]:
     """With a repository that warns."""
-    heard = Heard()
+    heard = RemoteWarnings()
     repository = SimpleNamespace(
         heard=heard,
         timeouts=SimpleNamespace(call_s=1.0, reset_s=1.0, step_s=1.0),
-        tell=lambda: heard.tell("a/b"),
+        tell=lambda: heard.show("a/b"),
     )
     exchange = _Exchange(heard)
     return Asking(cast("Any", exchange), cast("Any", repository), "Env"), exchange

@@ -12,9 +12,9 @@ import pytest
 from gymnasium import spaces
 
 from envhub_sandbox.session.env_session import EnvSession
+from envhub_sandbox.transport.remote_warnings import RemoteWarnings
 from envhub_sandbox.transport.shared_memory import shard
 from envhub_sandbox.transport.shared_memory.shard import LaneShard
-from envhub_sandbox.transport.warned import Heard
 from envhub_sandbox.vector import vector_env
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol import messages as m
@@ -30,7 +30,7 @@ class _Session:
     def __init__(self) -> None:
         self.manifest = env_manifest()
         timeouts = SimpleNamespace(reset_s=1.0, step_s=1.0, call_s=1.0)
-        said = {"timeouts": timeouts, "heard": Heard(), "label": "a/b", "copy": True}
+        said = {"timeouts": timeouts, "heard": RemoteWarnings(), "label": "a/b", "copy": True}
         self.repository = SimpleNamespace(**said)
         self.results = SimpleNamespace(one_each=lambda what, replies: replies[0].value)
         self.attributes = SimpleNamespace(known=lambda _: None, wanted=lambda _: False)

@@ -1,7 +1,7 @@
-"""What a notebook shows of environments: the client's own words, and a worker's names escaped.
+"""HTML for notebooks: tables of environments, in which all that comes from a worker is escaped.
 
-Nothing is asked of a worker for it. Of a worker's are names of suites and tasks and the spaces,
-which the manifest has: they are bounded here, and are text, never markup.
+No request is sent. Names of suites and tasks and the spaces come from the manifest, and so from the
+worker: they are bounded here, and are text, never markup.
 """
 
 from __future__ import annotations

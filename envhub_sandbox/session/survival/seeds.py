@@ -1,20 +1,13 @@
-"""What ``restart="transparent"`` promises: rows of a shard that died, in its fresh runner.
-
-Nothing here asks anybody: it makes the requests for a fresh runner and reads its replies.
-"""
+"""Seeds and attributes for the fresh runner of a dead shard, with ``restart="transparent"``."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from envhub_sandbox.transport.results import is_batch
 from envhub_worker.protocol import messages as m
-
-RESTARTED = "worker_restarted"
-"""In the infos: whether a sub-environment was lost and came back reset."""
 
 Bounds = tuple[int, int]
 Seeds = list[int | None]
@@ -113,28 +106,3 @@ def _filled(seeds: Any, derived: Any) -> Any:
     if not isinstance(seeds, list) or not isinstance(derived, list):
         return derived if seeds is None else seeds
     return [new if seed is None else seed for seed, new in zip(seeds, derived, strict=True)]
-
-
-def truncated(reply: m.StepDone, count: int) -> m.StepDone:
-    """A fresh runner's rows of the step in which another died. Trust: its flags are not asked.
-
-    Nor is anything but an array for a shape, which it has paid for: that of a space is only told.
-    """
-    rewards: Any = reply.rewards
-    return m.StepDone(
-        reply.observation,
-        np.zeros(rewards.shape if is_batch(rewards) else (count,)),
-        np.zeros(count, np.bool_),
-        np.ones(count, np.bool_),
-        marked(reply.info, count),
-    )
-
-
-def marked(
-    info: dict[Any, Any], count: int, bounds: Iterable[tuple[int, int]] | None = None
-) -> dict[Any, Any]:
-    """Infos that say of each sub-environment, or of those within, that it came back."""
-    yes = np.zeros(count, np.bool_)
-    for start, stop in [(0, count)] if bounds is None else bounds:
-        yes[start:stop] = True
-    return {**info, RESTARTED: yes, f"_{RESTARTED}": yes.copy()}

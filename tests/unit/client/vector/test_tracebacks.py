@@ -19,7 +19,7 @@ from envhub_sandbox.errors import (
     WorkerError,
     remote_error,
 )
-from envhub_sandbox.vector.folding import folded
+from envhub_sandbox.vector.tracebacks import short_traceback
 
 WHOLE = ["asked", "ask", "deep", "deeper"]
 
@@ -36,13 +36,13 @@ def deep(error: BaseException, cause: BaseException | None) -> None:
     deeper(error, cause)
 
 
-@folded
+@short_traceback
 def ask(error: BaseException, cause: BaseException | None = None) -> None:
     """As a method of ours."""
     deep(error, cause)
 
 
-@folded
+@short_traceback
 def ask_by_another(error: BaseException) -> None:
     """As a method of ours that asks another one."""
     ask(error)

@@ -1,8 +1,8 @@
-"""What the runners of a jail watch for us: attributes that stay as they are until they say other.
+"""Values of attributes that the runners of a jail watch for changes.
 
-Each reply says by its silence that they are what they were, so an evaluation that asks for its
-task after every step need not be answered by anybody. Trust: values are the worker's words, as
-those of a ``call`` are; what is kept cannot be changed by whoever gets it.
+A reply names the attributes that have changed before it; the others have the values that are kept
+here, and need no request. Trust: the values come from the worker, as those of a ``call`` do. They
+are of immutable types, so a caller cannot change what is kept.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from envhub_worker.protocol.messages import changed
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 
-class Watched:
+class WatchedValues:
     """The values, by the number of the environment and the attribute's name."""
 
     def __init__(self) -> None:
         self._values: dict[changed.Attribute, tuple[Any, ...]] = {}
 
     def note(self, number: int, name: str, values: tuple[Any, ...]) -> bool:
-        """Keep what was read, as long as it is watched; whether it can be kept."""
+        """Keep values that were read. Returns whether they can be kept."""
         if not all(type(value) in changed.WATCHED_TYPES for value in values):
             return False
         self._values[number, name] = values
         return True
 
     def values(self, number: int, name: str) -> tuple[Any, ...] | None:
-        """One for each sub-environment; None if nobody knows."""
+        """One for each sub-environment; None if they are not known."""
         return self._values.get((number, name))
 
     def forget(self) -> None:
-        """Other runners are there, or a reply was lost."""
+        """Drop all: a runner was replaced, or a reply was lost."""
         self._values.clear()
 
     def take(self, frames: Sequence[Buffer]) -> Sequence[Buffer]:

@@ -10,26 +10,26 @@ from typing import Any
 import pytest
 
 from envhub_sandbox.errors import RemoteEnvWarning
-from envhub_sandbox.transport.warned import MOST, Heard
+from envhub_sandbox.transport.remote_warnings import MOST, RemoteWarnings
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.messages import warned
 
 REPLY = m.pack(m.Value(1))
 
 
-def told(heard: Heard, *some: tuple[str, str]) -> list[Any]:
+def told(heard: RemoteWarnings, *some: tuple[str, str]) -> list[Any]:
     """What the caller is told after a reply with these."""
     if some:
         assert heard.take(warned.in_front(some, REPLY)) == REPLY
     with warnings.catch_warnings(record=True) as shown:
         warnings.simplefilter("always")
-        heard.tell("a/b@c")
+        heard.show("a/b@c")
     return shown
 
 
 def test_each_is_told_once() -> None:
     """Whichever process has said it, and however often."""
-    heard = Heard()
+    heard = RemoteWarnings()
     assert heard.take(REPLY) is REPLY
     [one, other] = told(heard, ("UserWarning", "slow"), ("x.Own", "slow"), ("x.Own", "slow"))
     assert str(one.message) == "a/b@c: UserWarning: slow"
@@ -40,19 +40,19 @@ def test_each_is_told_once() -> None:
 
 def test_it_stands_where_the_caller_does() -> None:
     """At his line, not in one of ours; Python's filters go by that."""
-    [one] = told(Heard(), ("UserWarning", "slow"))
+    [one] = told(RemoteWarnings(), ("UserWarning", "slow"))
     assert one.filename == __file__
 
 
 def test_nothing_is_painted() -> None:
     """Neither by the text nor by the name of the category."""
-    [one] = told(Heard(), ("\x1b]0;owned\x07\n", "\x1b[2J\r\u202eslow"))
+    [one] = told(RemoteWarnings(), ("\x1b]0;owned\x07\n", "\x1b[2J\r\u202eslow"))
     assert str(one.message).isprintable()
 
 
 def test_a_flood_ends_with_a_word() -> None:
     """Who has more than so many different ones is not listened to any more."""
-    heard, shown = Heard(), []
+    heard, shown = RemoteWarnings(), []
     for number in range(3 * MOST):
         shown += told(heard, ("UserWarning", str(number)))
     assert len(shown) == MOST + 1
@@ -61,12 +61,12 @@ def test_a_flood_ends_with_a_word() -> None:
 
 def test_what_the_filters_raise_leaves_the_rest() -> None:
     """As an error it comes out; what follows is told the next time."""
-    heard = Heard()
+    heard = RemoteWarnings()
     heard.take(warned.in_front([("UserWarning", "one"), ("UserWarning", "two")], REPLY))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(RemoteEnvWarning, match="one"):
-            heard.tell("a/b@c")
+            heard.show("a/b@c")
     [two] = told(heard)
     assert two.message.text == "two"
 

@@ -1,9 +1,9 @@
-"""Leaves our own frames out of the traceback of an error that says by itself where it comes from.
+"""Short tracebacks: our own frames are removed from errors whose text says what went wrong.
 
-What a repository raises ends in its author's line, and what is wrong with what was asked for is in
-the text. A dozen frames of this package between the caller's line and that text hide both: what is
-left is the caller's frames and the one that raises it again. ``ENVHUB_TRACEBACK=full`` leaves all
-of them, and the logger ``envhub_sandbox.errors`` has them at DEBUG.
+An error of the repository ends with its author's line, and an error about an argument names it. A
+dozen frames of this package between the caller's line and that text hide both. So the caller's
+frames stay, and one of ours, which raises the error again. ``ENVHUB_TRACEBACK=full`` keeps all
+frames; the logger ``envhub_sandbox.errors`` has them at DEBUG.
 """
 
 from __future__ import annotations
@@ -20,30 +20,30 @@ from envhub_sandbox.log import ERRORS
 from envhub_worker.protocol.shortages import shortage
 
 _VARIABLE, _FULL = "ENVHUB_TRACEBACK", "full"
-_FOLDED = 3
-"""As many frames are left where what was folded comes through another method of ours."""
+_SHORT = 3
+"""Frames of an error that was shortened before, and passes another method of ours."""
 _CHAINED = 20
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def folds(error: BaseException) -> bool:
-    """Whether it is to be raised again: its frames are told of then, and it has none any more.
+def shortened(error: BaseException) -> bool:
+    """Remove the frames of an error, and say whether that was done: then raise it again.
 
-    A broken rule of the wire keeps them, and so does whatever is no error of this project: there,
-    the frames are what is known.
+    A protocol error keeps its frames, and so does an error of another package: there, the frames
+    say where to look.
     """
-    if not _tells_where(error) or os.environ.get(_VARIABLE) == _FULL:
+    if not _text_suffices(error) or os.environ.get(_VARIABLE) == _FULL:
         return False
-    if ERRORS.isEnabledFor(logging.DEBUG) and _depth(error.__traceback__) > _FOLDED:
+    if ERRORS.isEnabledFor(logging.DEBUG) and _depth(error.__traceback__) > _SHORT:
         ERRORS.debug("the whole traceback of what is raised", exc_info=error)
-    _fold_causes(error)
+    _shorten_causes(error)
     error.__traceback__ = None
     return True
 
 
-def folded(ask: Callable[P, T]) -> Callable[P, T]:
-    """The same function, whose errors have the caller's frames and one of ours.
+def short_traceback(ask: Callable[P, T]) -> Callable[P, T]:
+    """Decorate a function: its errors have the caller's frames and one of ours.
 
     What the machine has no more of becomes an error of this project, wherever it was needed.
     """
@@ -53,7 +53,7 @@ def folded(ask: Callable[P, T]) -> Callable[P, T]:
         try:
             return ask(*args, **kwargs)
         except EnvHubError as error:
-            if not folds(error):
+            if not shortened(error):
                 raise
             __tracebackhide__ = True  # pytest hides the frame then
             raise error  # ENVHUB_TRACEBACK=full shows where
@@ -66,17 +66,17 @@ def folded(ask: Callable[P, T]) -> Callable[P, T]:
     return asked
 
 
-def _tells_where(error: BaseException) -> bool:
+def _text_suffices(error: BaseException) -> bool:
     return isinstance(error, EnvHubError) and not isinstance(error, RemoteProtocolError)
 
 
-def _fold_causes(error: BaseException) -> None:
-    """What it was made of, as far as that is ours, has its text; others' errors stay whole."""
+def _shorten_causes(error: BaseException) -> None:
+    """Do the same to its causes, as far as they are errors of this project."""
     cause = error.__cause__
     for _ in range(_CHAINED):
         if cause is None:
             return
-        if _tells_where(cause):
+        if _text_suffices(cause):
             cause.__traceback__ = None
         cause = cause.__cause__
 

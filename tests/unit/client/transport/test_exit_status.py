@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from envhub_sandbox.transport import ended
+from envhub_sandbox.transport.exit_status import describe_exit
 
 
 @contextmanager
@@ -38,7 +38,7 @@ def process(script: str) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
 def test_its_end_is_told(script: str, says: str, code: int) -> None:
     """By itself, or as an engine tells of its container's program."""
     with process(script) as (child, pidfd):
-        told = ended.how(pidfd)
+        told = describe_exit(pidfd)
         assert told.startswith(says)
         assert told.endswith("starts another")
         assert ("DockerSandbox(memory=" in told) == (code == 137)
@@ -49,9 +49,9 @@ def test_what_another_has_reaped_ended_somehow() -> None:
     """As far as we know; what lives has not."""
     with process("exit 3") as (child, pidfd):
         child.wait()
-        assert ended.how(pidfd).startswith(". The next")
+        assert describe_exit(pidfd).startswith(". The next")
     living = os.pidfd_open(os.getpid())
     try:
-        assert ended.how(living).startswith(". The next")
+        assert describe_exit(living).startswith(". The next")
     finally:
         os.close(living)

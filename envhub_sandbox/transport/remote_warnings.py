@@ -1,7 +1,7 @@
-"""What a repository has warned of, on its way to the caller: a warning of Python's, once each.
+"""The warnings of a repository, which become warnings of Python's in the client, once each.
 
-Heard where a reply comes in, on whatever thread that is, and told where the caller has asked for
-something: his filters may make an error of it, which is not the worker's then.
+They are collected where a reply comes in, on any thread, and shown at the end of the caller's
+request: a filter of the caller's may make an error of one, and that must not count as the worker's.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from envhub_worker.protocol.text import printable
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 MOST = 100
-"""Different warnings of one repository. Whoever has more floods."""
+"""Different warnings of one repository that are shown."""
 _PACKAGE = __name__.partition(".")[0]
 _NO_MORE = (
     "Warning",
@@ -27,15 +27,15 @@ _NO_MORE = (
 )
 
 
-class Heard:
-    """What one repository has warned of, in any of its processes.
+class RemoteWarnings:
+    """The warnings of one repository, from any of its processes.
 
     Attributes:
-        untold: What the caller has not been told yet. Always the same object.
+        unshown: Those that the caller has not seen yet. Always the same object.
     """
 
     def __init__(self) -> None:
-        self.untold: deque[warned.Told] = deque()
+        self.unshown: deque[warned.Told] = deque()
         self._known: set[warned.Told] = set()
 
     def take(self, frames: Sequence[Buffer]) -> Sequence[Buffer]:
@@ -48,25 +48,25 @@ class Heard:
             return frames
         with UNTRUSTED:
             for one in warned.read(frames[0]):
-                self._hear(one)
+                self._collect(one)
         return frames[1:]
 
-    def _hear(self, one: warned.Told) -> None:
+    def _collect(self, one: warned.Told) -> None:
         known = self._known
         if one in known or len(known) > MOST:
             return
         known.add(one)
-        self.untold.append(one if len(known) <= MOST else _NO_MORE)
+        self.unshown.append(one if len(known) <= MOST else _NO_MORE)
 
-    def tell(self, label: str) -> None:
-        """Warn the caller of what he has not been told yet, where his own code stands.
+    def show(self, label: str) -> None:
+        """Show those that are new, with the line of the caller's own code.
 
         Raises:
-            RemoteEnvWarning: His filters say so. What comes after it is told the next time.
+            RemoteEnvWarning: A filter of the caller's says so. The rest is shown the next time.
         """
-        while self.untold:
+        while self.unshown:
             try:
-                category, text = self.untold.popleft()
+                category, text = self.unshown.popleft()
             except IndexError:  # another thread was faster
                 return
             warning = RemoteEnvWarning(

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from envhub_sandbox.vector.shown import environment_html, suites_html
+from envhub_sandbox.vector.html_repr import environment_html, suites_html
 
 SCRIPT = "<script>steal()</script><img src=x onerror=steal()>\x1b[2J"
 OURS = {"table", "tr", "th", "td", "code", "p"}
