@@ -8,14 +8,14 @@ sent are copied: the caller may change what they were made of afterwards.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.transport.request import Request, whole
+from envhub_sandbox.transport.lane import Request
 from envhub_sandbox.transport.values.tensors import to_tensor
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
@@ -278,11 +278,34 @@ def _nothing(actions: Any) -> None:
 def _entry(request: Request) -> _Sent | Requested:
     """What is kept of a request. What only pickle could carry is described at once."""
     if not request.plain:
-        return encoded(whole(request.messages, request.bounds))
+        return encoded(_whole(request.messages, request.bounds))
     kept = request.kept()
     if not isinstance(request.messages[0], _SLICED):
         kept = kept[:1]  # the others have been sent the same
     return _Sent(kept, request.bounds)
+
+
+def _whole(messages: Sequence[m.Message], bounds: Sequence[tuple[int, int]]) -> m.Message:
+    """One message of those for all shards, to no environment in particular."""
+    first: Any = messages[0]
+    changes: dict[str, Any] = {"env": 0}
+    others: Sequence[Any] = messages
+    if isinstance(first, m.Reset):
+        if isinstance(first.seeds, list):
+            changes["seeds"] = [seed for one in others for seed in one.seeds]
+        if first.mask is not None:
+            changes["mask"] = np.concatenate([one.mask for one in others])
+    if isinstance(first, m.SetAttr):
+        changes["values"] = tuple(value for one in others for value in one.values)
+    if isinstance(first, (m.GetOne, m.CallOne)):
+        places = [
+            start + one.index
+            for (start, _), one in zip(bounds, others, strict=True)
+            if one.index is not None
+        ]
+        changes["index"] = places[0] if places else None
+    made: m.Message = m.replace(first, **changes)
+    return made
 
 
 def _requested(entry: _Sent | Requested) -> Requested:
@@ -290,7 +313,7 @@ def _requested(entry: _Sent | Requested) -> Requested:
     if isinstance(entry, Requested):
         return entry
     messages = [m.unpack(frames, tensors=to_tensor) for frames in entry.frames]
-    return encoded(whole(messages, entry.bounds))
+    return encoded(_whole(messages, entry.bounds))
 
 
 def _heads(entry: _Sent | Requested) -> bytes:

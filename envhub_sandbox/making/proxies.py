@@ -13,7 +13,7 @@ from envhub_sandbox.session.jails.line import wait_in_line
 from envhub_sandbox.session.jails.loaded import Known, LoadedJail
 from envhub_sandbox.session.jails.sources import JailSource, OwnJails, SharedJail
 from envhub_sandbox.session.manifest_cache import ManifestCache, manifest_key
-from envhub_sandbox.session.prewarming import Prewarming
+from envhub_sandbox.session.prewarm import Prewarm, SuitePrewarm
 from envhub_sandbox.session.provenance import provenance_of
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.shared_memory.sharding import bounds_for
@@ -64,13 +64,13 @@ class Proxies:
             try:
                 loaded = wait_in_line(ask, self._launcher.retry_s, deadline, repository.label)
             except BaseException:
-                repository.tell()
+                repository.show_warnings()
                 raise
         self._cache.save(loaded.value)
         try:
             self._agrees(loaded.manifest)
             suites = self._suites(loaded.manifest, loaded)
-            repository.tell()
+            repository.show_warnings()
             return suites
         except BaseException:
             self._launcher.close(loaded)
@@ -83,13 +83,13 @@ class Proxies:
         if loaded is not None and shared is None:
             self._use(loaded, sessions)
         envs: dict[str, dict[Any, Any]] = {}
-        suites: dict[str, list[EnvSession]] = {}
+        suites: dict[str, list[Prewarm]] = {}
         for session in sessions:
             env = session.manifest
             envs.setdefault(env.suite, {})[env.task] = self._face(session)
-            suites.setdefault(env.suite, []).append(session)
+            suites.setdefault(env.suite, []).append(session.prewarm)
         if shared is None and self._prewarm != 0:
-            Prewarming(list(suites.values()), self._prewarm)
+            SuitePrewarm(list(suites.values()), self._prewarm)
         return EnvSuites(
             envs,
             lambda: provenance_of(
@@ -123,6 +123,6 @@ class Proxies:
         """The jail that told the manifest becomes the only task's; a suite holds none in stock."""
         if len(sessions) == 1:
             with self._repository.named():
-                sessions[0].head_start.adopt(loaded)
+                sessions[0].prewarm.adopt(loaded)
         else:
             self._launcher.close(loaded)

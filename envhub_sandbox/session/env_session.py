@@ -1,9 +1,9 @@
 """One task's environment: its life, from the first jail to the last.
 
-It *has* a ``Lease``, its hold on a jail and the lane there; ``Turns``, since one thread uses it
-at a time; a ``HeadStart``, which starts it; an ``Exchange``, which is what ``vector_env``
-asks; and a ``Recovery``, which stands in for those that die. None of these knows it. Here it is
-brought back before a reset, closed, and abandoned in a fork.
+It has a ``Lease``, its hold on a jail and the lane there; ``Turns``, since one thread uses it at a
+time; a ``Prewarm``, which starts it; ``Requests``, which ``vector_env`` uses; and, with
+``restart="transparent"``, a ``Recovery``. None of these knows it. Here it is recovered before a
+reset, closed, and abandoned in a fork.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
 from envhub_sandbox.log import WORKER
 from envhub_sandbox.session.counters import LEDGER, Counters, Labels
-from envhub_sandbox.session.exchange import Exchange
-from envhub_sandbox.session.head_start import INTERRUPT_S, LOOK_S, HeadStart
 from envhub_sandbox.session.jails.sources import JailSource
 from envhub_sandbox.session.lease import Lease
+from envhub_sandbox.session.prewarm import INTERRUPT_S, LOOK_S, Prewarm
 from envhub_sandbox.session.repository import Repository
+from envhub_sandbox.session.requests import Requests
 from envhub_sandbox.session.survival.failures import Failures
-from envhub_sandbox.session.survival.recovery import Fail, Recovery, Revive
+from envhub_sandbox.session.survival.recovery import Recovery
 from envhub_sandbox.session.survival.restart_policy import Restarts
 from envhub_sandbox.session.turns import Turns
 from envhub_sandbox.transport.deadline import Deadline
@@ -52,8 +52,8 @@ class EnvSession:
         paces: Takes note of what its steps took.
 
     Attributes:
-        exchange: Asks it something.
-        head_start: Starts it, also ahead of the first request.
+        requests: What it is asked.
+        prewarm: Starts it, also ahead of the first request.
     """
 
     def __init__(
@@ -75,12 +75,12 @@ class EnvSession:
         self._restarts = Restarts(policy)
         self._failures = failures = Failures(lease, results, counters, history)
         self.turns = turns = Turns(lease, failures)
-        recovery: Recovery = Fail()
+        recovery: Recovery | None = None
         if policy.restart == "transparent":
-            recovery = Revive(lease, results, self._restarts, failures)
-        self.head_start = HeadStart(lease, turns, counters, history, recovery)
-        self.exchange = Exchange(
-            lease, turns, self.head_start, results, counters, history, failures, recovery
+            recovery = Recovery(lease, results, self._restarts, failures, counters, history)
+        self.prewarm = Prewarm(lease, turns, counters, history, recovery)
+        self.requests = Requests(
+            lease, turns, self.prewarm, results, counters, history, failures, recovery
         )
         labels = Labels(self.repository.label, manifest.suite, str(manifest.task))
         LEDGER.add(self, labels, self._restarts)
@@ -116,15 +116,20 @@ class EnvSession:
     def recover(self) -> None:
         """Before a reset: catch up with a late reply, or give up the jail that owes it.
 
-        A reply that nobody waits for any more, because of Ctrl-C, counts as late. After a death
-        a fresh jail is started only if the policy says ``restart="on_reset"``.
+        A reply whose wait was interrupted counts as late. After a death a fresh jail is started
+        only if the policy says ``restart="on_reset"``.
         """
-        self.head_start.note_if_awaited()
+        ready = self.lifecycle.state is State.READY and not self.prewarm.unused
+        if ready and self.repository.timeouts.idle_s is None:
+            return
+        self.prewarm.note_if_awaited()
         with self.turns.take("reset"):
-            self.head_start.look_whether_it_lives()
-            self.exchange.refuse_others("reset")
+            # The order matters. First what ended unnoticed becomes EXPIRED, then what another
+            # thread waits for is refused, and only then a pending reply counts as late.
+            self.prewarm.look_whether_it_lives()
+            self.requests.refuse_others("reset")
             if self.lifecycle.state is State.PENDING:
-                self.exchange.note_interruption()
+                self._failures.note_interruption()
             if self.lifecycle.state is State.READY and self.repository.timeouts.idle_s is not None:
                 self._see_whether_it_expired()
             if self.lifecycle.state is State.EXPIRED:
@@ -139,8 +144,8 @@ class EnvSession:
         lane, request = self.lease.lane, self.lifecycle.request
         try:
             if lane is None or request is None:
-                raise WorkerError("an earlier attempt gave the jail up, or nobody knows how far")
-            self.lease.forget_watched()  # also where nobody waited yet when it was interrupted
+                raise WorkerError("the jail was given up, or how far the request came is not known")
+            self.lease.forget_watched()  # also where it was interrupted before the wait
             lane.catch_up(Deadline(_GRACE_S))
         except RunnersDiedError:
             pass  # the reset that follows meets them
@@ -152,8 +157,7 @@ class EnvSession:
         except EnvHubError:
             self._forget()
             return
-        self.lifecycle.request = None
-        self.lifecycle.on(Event.REPLY)
+        self.lifecycle.answered()
 
     def _see_whether_it_expired(self) -> None:
         try:
@@ -161,7 +165,7 @@ class EnvSession:
         except WorkerDiedError as error:
             if error.reason == "idle":
                 self.lifecycle.moved(Event.EXPIRY)
-        # of any other death the reset that follows hears as of its own
+        # any other death is met by the reset that follows
 
     def _forget(self) -> None:
         """Give up the jail; the next request opens another, in the same server."""

@@ -75,7 +75,7 @@ class Repository:
         advice: Says what to do where a module is missing, for the error's text.
 
     Attributes:
-        heard: What it has warned of, in any jail.
+        warnings: Those that it gave, in any jail.
         latest_report: The layers of the jail that was opened last, for the provenance of what was
             made. Which of them hold for an environment, only its own jail says.
         latest_profile: Of that jail; in a container it may be less than the policy names.
@@ -105,7 +105,7 @@ class Repository:
             self._in_use = SharedLock(Path(runtime.packages).with_name(RECORD))
         self.lane = lane
         self.copy = copy
-        self.heard = RemoteWarnings()
+        self.warnings = RemoteWarnings()
         self.latest_report: list[dict[str, Any]] = []
         self.latest_profile: str | None = None
         self.recipe = recipe
@@ -134,9 +134,9 @@ class Repository:
             point_out(error, self.snapshot)
             raise
 
-    def tell(self) -> None:
-        """Warn the caller of what it has warned of, and of what he has not been told yet."""
-        self.heard.show(self.label)
+    def show_warnings(self) -> None:
+        """Show the caller its new warnings."""
+        self.warnings.show(self.label)
 
     @contextmanager
     def starting(self, deadline: Deadline) -> Iterator[None]:

@@ -114,13 +114,13 @@ def _uses(innermost: FrameType, exchange: object) -> bool:
         if name.startswith(_OURS) and frame.f_code.co_name != "close":
             own = frame.f_locals.get("self")
             has = getattr(own, "__dict__", {})
-            if own is exchange or exchange in (has.get("exchange"), has.get("_exchange")):
+            if own is exchange or exchange in (has.get("requests"), has.get("_requests")):
                 return True
         frame = frame.f_back
     return False
 
 
 _OURS = (
-    *("envhub_sandbox.session.env_session", "envhub_sandbox.session.exchange"),
+    *("envhub_sandbox.session.env_session", "envhub_sandbox.session.requests"),
     "envhub_sandbox.vector.",
 )

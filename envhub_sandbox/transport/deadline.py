@@ -52,17 +52,16 @@ class StepDeadline(Deadline):
     Most replies are there before anybody has to sleep, and to make a deadline and read the clock
     for it costs more than one per cent of a short step. How long a lane waits awake before it asks
     (a fraction of a millisecond) does not count.
+
+    Attributes:
+        running: Whether it counts already; False when the next step begins.
     """
 
-    __slots__ = ("_running",)
+    __slots__ = ("running",)
 
     def __init__(self, timeout_s: float | None) -> None:
         super().__init__(timeout_s)
-        self._running = False
-
-    def again(self) -> None:
-        """The next step begins."""
-        self._running = False
+        self.running = False
 
     def left_s(self) -> float | None:
         """As ``Deadline``; the first time it starts to count."""
@@ -76,8 +75,8 @@ class StepDeadline(Deadline):
         return super().passed
 
     def _run(self) -> None:
-        if not self._running:
-            self._running = True
+        if not self.running:
+            self.running = True
             self._at = None if self.timeout_s is None else monotonic() + self.timeout_s
 
 

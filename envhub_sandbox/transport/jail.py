@@ -68,9 +68,10 @@ class JailHandle:
         kept: Whether it goes on without a runner that has died.
         report: One mapping per layer of the confinement: ``layer``, ``enforced``, ``detail``; of
             a container around it too.
+        limits: Of its messages.
         before_end: Runs before it is ended; brings what it has printed last.
-        heard: What its repository has warned of.
-        watched: What its runners watch for us.
+        warnings: Those of its repository.
+        watched: The values that its runners watch.
     """
 
     def __init__(
@@ -87,15 +88,15 @@ class JailHandle:
         self.kept = False
         self.report = report
         self.before_end: Callable[[], None] = _nothing
-        self.heard = RemoteWarnings()
+        self.warnings = RemoteWarnings()
         self.watched = WatchedValues()
-        self._limits = limits
+        self.limits = limits
         self._asked: dict[int, int] = {}  # how many runners, by request
 
     def through(self, client: WorkerClient) -> JailHandle:
         """The same jail over another connection of ours."""
-        jail = JailHandle(client, self.number, self.runners, self.report, self._limits)
-        jail.before_end, jail.heard, jail.watched = self.before_end, self.heard, self.watched
+        jail = JailHandle(client, self.number, self.runners, self.report, self.limits)
+        jail.before_end, jail.warnings, jail.watched = self.before_end, self.warnings, self.watched
         return jail
 
     def start_runners(self, count: int, deadline: Deadline) -> list[int]:
@@ -124,13 +125,8 @@ class JailHandle:
 
     def pack(self, message: m.Message) -> list[Buffer]:
         """The frames of a message to a runner."""
-        return self.pack_noting(message)[0]
-
-    def pack_noting(self, message: m.Message) -> tuple[list[Buffer], bool]:
-        """The frames of a message to a runner, and whether nothing had to be pickled for them."""
         # the only way in for the caller's own objects; nothing is ever unpickled here
-        pickler = _Noting(pickles.framed)
-        return m.pack(message, pickler=pickler, limits=self._limits), pickler.plain
+        return m.pack(message, pickler=pickles.framed, limits=self.limits)
 
     def send(self, operation: str, requests: Sequence[tuple[int, m.Message]]) -> int:
         """Send one message to each of some runners, in one request; returns its id."""
@@ -174,8 +170,9 @@ class JailHandle:
         return RunnersDiedError(living, deaths)
 
     def _unpack(self, frames: Sequence[Buffer]) -> m.Message:
-        own = self.heard.take(self.watched.take(frames))
-        return m.unpack(own, limits=self._limits, tensors=to_tensor, things=Described)
+        if len(frames) > 1:  # with one frame there is nothing in front
+            frames = self.warnings.take(self.watched.take(frames))
+        return m.unpack(frames, limits=self.limits, tensors=to_tensor, things=Described)
 
     def exchange(
         self, operation: str, requests: Sequence[tuple[int, m.Message]], deadline: Deadline
@@ -256,20 +253,8 @@ def _cut(payload: list[Buffer], counts: Sequence[int]) -> list[list[Buffer]]:
     return [list(islice(frames, count)) for count in counts]
 
 
-class _Noting:
-    """Pickles, and notes that it has."""
-
-    def __init__(self, pickler: Callable[[object], bytes | memoryview]) -> None:
-        self._pickler = pickler
-        self.plain = True
-
-    def __call__(self, value: object) -> bytes | memoryview:
-        self.plain = False
-        return self._pickler(value)
-
-
 def _nothing() -> None:
-    """Nobody follows what it prints."""
+    """What it prints is not followed."""
 
 
 def open_jail(

@@ -1,8 +1,8 @@
 """The way of an environment's requests to its runners: one interface, and the way over the server.
 
 There are two: ``RelayLane``, below, and ``SharedMemoryLane``. Which of them an environment has is
-decided once, when it is built (``session/jails/placement``); whoever asks for something does not
-know.
+decided once, when it is built (``session/jails/placement``); a request
+does not depend on it.
 """
 
 from __future__ import annotations
@@ -15,11 +15,50 @@ from envhub_sandbox.errors import EnvHubError, WorkerError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError
 from envhub_sandbox.transport.pace import Pace
-from envhub_sandbox.transport.replies import check, typed
-from envhub_sandbox.transport.request import Frames, Request
+from envhub_sandbox.transport.replies import all_of
 from envhub_sandbox.transport.results import Results, StepResult
+from envhub_sandbox.transport.values import pickles
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.spaces import batches
+
+Frames = list[Buffer]
+
+
+class Request:
+    """What each shard is sent: made and encoded once, for the lane, the history and a recovery.
+
+    Args:
+        operation: What the user called.
+        messages: One for each shard.
+        frames: Those of each message.
+        bounds: The slices of the sub-environments, one for each shard.
+        plain: Whether there is nothing in them that only pickle could carry.
+    """
+
+    __slots__ = ("_kept", "bounds", "frames", "messages", "operation", "plain")
+
+    def __init__(
+        self,
+        operation: str,
+        messages: Sequence[m.Message],
+        frames: Sequence[Frames],
+        bounds: list[tuple[int, int]],
+        *,
+        plain: bool,
+    ) -> None:
+        self.operation = operation
+        self.messages = messages
+        self.frames = frames
+        self.bounds = bounds
+        self.plain = plain
+        self._kept: list[list[bytes]] | None = None
+
+    def kept(self) -> list[list[bytes]]:
+        """The frames, copied: large values are sent from where they lie, and may change."""
+        if self._kept is None:
+            self._kept = [list(map(bytes, frames)) for frames in self.frames]
+        return self._kept
 
 
 class Lane(Protocol):
@@ -99,7 +138,7 @@ class Lane(Protocol):
         """Take what is owed and drop it; raises as ``wait`` does.
 
         Raises:
-            WorkerError: The sending was interrupted: nobody knows what was sent.
+            WorkerError: The sending was interrupted: what was sent is not known.
         """
 
     def renew(self, dead: Sequence[int], fresh: Sequence[int], deadline: Deadline) -> None:
@@ -165,20 +204,17 @@ class RelayLane:
         """See ``Lane``. Trust: input from the worker."""
         # not kept: a large batch that its owner has dropped is memory for the next
         answers, self._answers = self._answers, []
-        for reply in answers:
-            check(reply)
         try:
-            return self._results.step([typed(reply, m.StepDone) for reply in answers], infos)
+            return self._results.step(all_of(answers, m.StepDone), infos)
         except batches.Misfit:
             self._answers = answers  # to be joined once more, with other infos
             raise
 
     def request(self, operation: str, messages: Sequence[m.Message]) -> Request:
         """See ``Lane``."""
-        packed = [self.jail.pack_noting(message) for message in messages]
-        plain = all(plain for _, plain in packed)
-        frames = [frames for frames, _ in packed]
-        return Request(operation, messages, frames, self._results.bounds, plain=plain)
+        pickler, limits = _NotingPickler(), self.jail.limits
+        frames = [m.pack(message, pickler=pickler, limits=limits) for message in messages]
+        return Request(operation, messages, frames, self._results.bounds, plain=pickler.plain)
 
     def send(self, request: Request) -> None:
         """See ``Lane``."""
@@ -224,7 +260,7 @@ class RelayLane:
             self.runners[index] = runner
 
     def pace(self) -> Pace | None:
-        """None: what a shard takes itself is not known over the server."""
+        """None: only shared memory measures it."""
         return None
 
     def traffic(self) -> tuple[int, int, int]:
@@ -234,3 +270,14 @@ class RelayLane:
 
     def close(self) -> None:
         """There is nothing but the jail."""
+
+
+class _NotingPickler:
+    """Pickles the caller's own objects, and notes that it has. Nothing is ever unpickled here."""
+
+    def __init__(self) -> None:
+        self.plain = True
+
+    def __call__(self, value: object) -> bytes | memoryview:
+        self.plain = False
+        return pickles.framed(value)

@@ -7,7 +7,8 @@ fixed tables, with texts that are cut and made printable.
 from __future__ import annotations
 
 import re
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, cast
 
 from envhub_sandbox.errors import (
     DependencyError,
@@ -74,17 +75,34 @@ def check(reply: m.Message) -> None:
         raise RemoteProtocolError(f"a runner sent {type(reply).__name__}")
 
 
-def typed(reply: m.Message, kind: type[m.M]) -> m.M:
-    """The reply, if it is of the kind that the request asks for.
+def typed(reply: m.Message, kind: type[m.M] | tuple[type[m.M], ...]) -> m.M:
+    """The reply, if it is of the kind, or of one of the kinds, that the request asks for.
 
     Raises:
         RemoteProtocolError: It is another message.
     """
     if not isinstance(reply, kind):
+        kinds = kind if isinstance(kind, tuple) else (kind,)
+        wanted = " or ".join(one.__name__ for one in kinds)
         raise RemoteProtocolError(
-            f"the worker answered with {type(reply).__name__} where {kind.__name__} belongs"
+            f"the worker answered with {type(reply).__name__} where {wanted} belongs"
         )
     return reply
+
+
+def all_of(replies: Sequence[m.Message], kind: type[m.M] | tuple[type[m.M], ...]) -> list[m.M]:
+    """The runners' replies, all of the kind, or of one of the kinds, that was asked for.
+
+    Raises:
+        EnvHubError: What the repository raised; that comes before a wrong message of another shard.
+        RemoteProtocolError: A message is another one.
+    """
+    others = [reply for reply in replies if type(reply) is not kind]
+    for reply in others:
+        check(reply)
+    for reply in others:
+        typed(reply, kind)
+    return cast("list[m.M]", replies)
 
 
 # --- what a server says ---------------------------------------------------------------------

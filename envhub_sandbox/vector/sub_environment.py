@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import gymnasium as gym
 
 from envhub_sandbox.errors import RemoteProtocolError
+from envhub_sandbox.session.requests import OneMessageFor
 from envhub_sandbox.transport.replies import typed
 from envhub_sandbox.transport.values import generators
 from envhub_sandbox.vector.tracebacks import short_traceback
@@ -22,8 +23,6 @@ from envhub_worker.protocol.manifest.names import is_servable
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
-MessageFor = Callable[[int, "int | None"], m.Message]
-"""Makes a message of the environment's number and the place in the slice, None elsewhere."""
 _OUTERMOST = 0
 _SEARCHED = -1
 """In place of a depth: whichever wrapper has it."""
@@ -67,7 +66,7 @@ class SubEnvironment(gym.Env[Any, Any]):
     def __init__(
         self,
         vector: Vector,
-        ask: Callable[[str, int, MessageFor], m.Message],
+        ask: Callable[[str, int, OneMessageFor], m.Message],
         index: int,
         depth: int | None = _OUTERMOST,
     ) -> None:
@@ -242,8 +241,6 @@ class SubEnvironment(gym.Env[Any, Any]):
         )
         if isinstance(reply, m.Value):
             return reply.value
-        if not isinstance(reply, m.Method):
-            raise RemoteProtocolError(f"the worker answered GetOne with {type(reply).__name__}")
 
         @short_traceback
         def method(*args: Any, **kwargs: Any) -> Any:

@@ -16,16 +16,14 @@ import numpy as np
 from gymnasium.error import Error
 from gymnasium.vector import VectorEnv
 
-from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
+from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.session.env_session import EnvSession
-from envhub_sandbox.session.exchange import MessageFor
+from envhub_sandbox.session.requests import Bounds, MessageFor, OneMessageFor
 from envhub_sandbox.transport.replies import typed
 from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.transport.values import generators
 from envhub_sandbox.vector import from_manifest
-from envhub_sandbox.vector.asking import Asking
 from envhub_sandbox.vector.html_repr import environment_html
-from envhub_sandbox.vector.sub_environment import MessageFor as OneMessageFor
 from envhub_sandbox.vector.sub_environment import SubEnvironment
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_worker.protocol import messages as m
@@ -34,7 +32,6 @@ from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _NOT_CALLED = frozenset({"reset", "step", "close"})
 """What ``AsyncVectorEnv.call`` refuses: it would take one sub-environment from under the others."""
-Bounds = tuple[int, int]
 
 
 class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
@@ -54,11 +51,10 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     def __init__(self, session: EnvSession) -> None:
         manifest = session.manifest
         self._session = session
-        self._exchange = session.exchange
+        self._requests = session.requests
+        self._requests.face = type(self).__name__
         self._manifest = manifest
         self._timeouts = session.repository.timeouts
-        self._unshown = session.repository.heard.unshown
-        self._asking = Asking(session.exchange, session.repository, type(self).__name__)
         self._read_actions = from_manifest.action_reader(manifest)
         self.num_envs = manifest.num_envs
         self.single_observation_space = manifest.single_observation_space
@@ -79,7 +75,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     @property
     def closed(self) -> bool:  # type: ignore[override]  # there is nothing to set
         """Whether ``close`` has been called."""
-        return self._asking.closed
+        return self._requests.closed
 
     @short_traceback
     def prewarm(self) -> None:
@@ -90,8 +86,8 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         evaluation can prewarm the next task while it plays one. What fails is raised by the
         first request.
         """
-        self._asking.refuse_if_closed()
-        self._session.head_start.prewarm()
+        self._requests.refuse_if_closed()
+        self._session.prewarm.start_in_background()
 
     # --- reset and step ------------------------------------------------------------------------
 
@@ -116,8 +112,9 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             WorkerDiedError: The worker process ended.
             RemoteEnvError: The environment raised; it is still usable.
         """
-        # not by the two halves: an interrupt between them would leave a wait that nobody ends
-        self._asking.refuse_if_busy("reset_async")
+        # Not by reset_async and reset_wait: an interrupt between them would leave `waiting` set,
+        # and the next request refused, although no reset_wait can follow.
+        self._requests.refuse_if_busy("reset_async")
         self._send_reset(seed, options)
         return self._end_reset(self._timeouts.reset_s)
 
@@ -128,9 +125,9 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         options: dict[str, Any] | None = None,
     ) -> None:
         """Send the reset; ``reset_wait`` returns its results."""
-        self._asking.refuse_if_busy("reset_async")
+        self._requests.refuse_if_busy("reset_async")
         self._send_reset(seed, options)
-        self._asking.waiting = "reset"
+        self._requests.waiting = "reset"
 
     def _send_reset(self, seed: Any, options: dict[str, Any] | None) -> None:
         mask = None
@@ -139,7 +136,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             mask = options.pop("reset_mask")
             from_manifest.check_mask(mask, self.num_envs)
         seeds = self._seeds(seed)
-        self._asking.guarded(self._session.recover)
+        self._recover()
         sliced = self._manifest.shardable and seeds is not None
 
         def message(number: int, bounds: Bounds) -> m.Message:  # kept: it must not hold us
@@ -147,17 +144,25 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             some = seeds[start:stop] if sliced else seeds
             return m.Reset(number, some, options, None if mask is None else mask[start:stop])
 
-        self._asking.submit("reset", message)
+        self._requests.submit("reset", message)
+
+    def _recover(self) -> None:
+        try:
+            self._session.recover()
+        except BaseException as error:
+            self._requests.explain(error)
+            raise
+        self._requests.show_warnings()
 
     @short_traceback
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
         """The results of ``reset_async``; ``timeout`` in seconds, else ``Timeouts.reset_s``."""
-        self._asking.end_wait("reset")
+        self._requests.end_wait("reset")
         return self._end_reset(self._timeouts.reset_s if timeout is None else timeout)
 
     def _end_reset(self, timeout_s: float | None) -> tuple[Any, dict[Any, Any]]:
-        replies = self._asking.collect(timeout_s, m.ResetDone)
-        return self._exchange.finish_reset(replies, timeout_s)
+        replies = self._requests.collect(timeout_s, m.ResetDone)
+        return self._requests.finish_reset(replies, timeout_s)
 
     def step(self, actions: Any) -> StepResult:
         """Step every sub-environment.
@@ -175,73 +180,64 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             WorkerDiedError: The worker process ended.
             RemoteEnvError: The environment raised; it is still usable.
         """
-        asking, exchange = self._asking, self._exchange
-        if asking.closed or asking.waiting is not None:
-            asking.refuse_if_busy("step_async")
-        # both halves in one, and not guarded: this is the way that is taken most
-        try:
-            exchange.submit_step(self._read_actions(actions))
-            result = exchange.collect_step(self._timeouts.step_s)
-        except BaseException as error:
-            asking.tell_beside_an_error()
-            if isinstance(error, WorkerDiedError):
-                asking.refuse_if_closed()  # close() in another thread ended it under us
+        requests = self._requests
+        if requests.closed or requests.waiting is not None:
+            requests.refuse_if_busy("step_async")
+        try:  # without the decorator and step_async's calls: this is the method that is called most
+            requests.submit_step(self._read_actions(actions))
+            return requests.collect_step(self._timeouts.step_s)
+        except EnvHubError as error:
             if shortened(error):
                 __tracebackhide__ = True  # pytest hides the frame then
                 raise error  # ENVHUB_TRACEBACK=full shows where
             raise
-        if self._unshown:
-            asking.tell()
-        return result
 
     @short_traceback
     def step_async(self, actions: Any) -> None:
         """Send the actions; ``step_wait`` returns the results."""
-        self._asking.refuse_if_busy("step_async")
-        batch = self._read_actions(actions)
-        self._asking.unwarned(self._exchange.submit_step, batch)
-        self._asking.waiting = "step"
+        self._requests.refuse_if_busy("step_async")
+        self._requests.submit_step(self._read_actions(actions))
+        self._requests.waiting = "step"
 
     @short_traceback
     def step_wait(self, timeout: float | None = None) -> StepResult:
         """The results of ``step_async``; ``timeout`` in seconds, else ``Timeouts.step_s``."""
-        self._asking.end_wait("step")
+        self._requests.end_wait("step")
         timeout_s = self._timeouts.step_s if timeout is None else timeout
-        return self._asking.guarded(self._exchange.collect_step, timeout_s)
+        return self._requests.collect_step(timeout_s)
 
     # --- everything else -----------------------------------------------------------------------
 
     @short_traceback
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method, or read an attribute, of every sub-environment: a tuple of results."""
-        self._asking.refuse_if_busy("call_async")
+        self._requests.refuse_if_busy("call_async")
         if not (args or kwargs) and self._manifest.shardable:
             return self._read(name)
         self._send_call(name, args, kwargs)  # as reset
         return self._end_call(self._timeouts.call_s)
 
     def _read(self, name: str) -> tuple[Any, ...]:
-        """``call`` without arguments; what is asked for after each step is watched."""
-        attributes = self._exchange.attributes
-        known = attributes.known(name)
+        """``call`` without arguments; what is read after each step is watched."""
+        attributes = self._requests.attributes
+        known = attributes.get(name)
         if known is not None:
             return known
-        if not attributes.wanted(name):
+        if not attributes.should_watch(name):
             self._send_call(name, (), {})
             return self._end_call(self._timeouts.call_s)
         self._send_call(name, (), {}, lambda number, _: m.Watch(number, name))
-        replies = self._asking.collect(self._timeouts.call_s, m.Watched)
-        with self._exchange.handling():
-            values = self._exchange.results.one_each("call", replies)
-        attributes.learn(name, values, watched=all(reply.watched for reply in replies))
+        replies = self._requests.collect(self._timeouts.call_s, m.Watched)
+        values = self._requests.one_each("call", replies)
+        attributes.put(name, values, watched=all(reply.watched for reply in replies))
         return values
 
     @short_traceback
     def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
         """Send the call; ``call_wait`` returns its results."""
-        self._asking.refuse_if_busy("call_async")
+        self._requests.refuse_if_busy("call_async")
         self._send_call(name, args, kwargs)
-        self._asking.waiting = "call"
+        self._requests.waiting = "call"
 
     def _send_call(
         self,
@@ -255,23 +251,19 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             raise ValueError(
                 f"Trying to call function `{name}` with `call`, use `{name}` directly instead."
             )
-        self._asking.submit("call", lambda number, _: m.Call(number, name, args, kwargs), instead)
+        self._requests.submit("call", lambda number, _: m.Call(number, name, args, kwargs), instead)
 
     @short_traceback
     def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
         """The results of ``call_async``; ``timeout`` in seconds, else ``Timeouts.call_s``."""
-        self._asking.end_wait("call")
+        self._requests.end_wait("call")
         return self._end_call(self._timeouts.call_s if timeout is None else timeout)
 
     def _end_call(self, timeout_s: float | None) -> tuple[Any, ...]:
-        replies = self._asking.collect(timeout_s, m.Value)
+        replies = self._requests.collect(timeout_s, m.Value)
         if not self._manifest.shardable:
             return cast("tuple[Any, ...]", replies[0].value)
-        try:
-            return self._exchange.results.one_each("call", replies)
-        except BaseException:
-            with self._exchange.handling():
-                raise
+        return self._requests.one_each("call", replies)
 
     @short_traceback
     def get_attr(self, name: str) -> tuple[Any, ...]:
@@ -288,7 +280,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
                 "Values must be a list or tuple with length equal to the number of environments. "
                 f"Got `{len(each)}` values for {self.num_envs} environments."
             )
-        self._asking.ask(
+        self._requests.ask(
             "set_attr",
             lambda number, bounds: m.SetAttr(number, name, tuple(each[bounds[0] : bounds[1]])),
         )
@@ -296,21 +288,20 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     @short_traceback
     def render(self) -> tuple[Any, ...] | None:
         """What each sub-environment renders; None where the environment gives None."""
-        replies = self._asking.ask("render", lambda number, _: m.Render(number))
+        replies = self._requests.ask("render", lambda number, _: m.Render(number))
         if not self._manifest.shardable:
             return cast("tuple[Any, ...] | None", replies[0].value)
-        with self._exchange.handling():
-            return self._exchange.results.one_each("render", replies)
+        return self._requests.one_each("render", replies)
 
     @property  # type: ignore[misc]  # there is nothing to set, as in SyncVectorEnv
     @short_traceback
     def np_random(self) -> Any:
         """Copies of the generators: ``SyncVectorEnv`` has one for each sub-environment."""
-        replies = self._asking.ask("np_random", lambda number, _: m.GetRandom(number))
+        replies = self._requests.ask("np_random", lambda number, _: m.GetRandom(number))
         with UNTRUSTED:  # a generator that numpy does not know breaks no rule of the wire
             if type(replies[0].value) is dict:
                 return generators.generator(replies[0].value)
-            states = self._exchange.results.one_each("np_random", replies)
+            states = self._requests.one_each("np_random", replies)
             return tuple(generators.generator(state) for state in states)
 
     @property
@@ -318,12 +309,10 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     def np_random_seed(self) -> Any:
         """Their seeds."""
         name = "np_random_seed"
-        replies = self._asking.ask(name, lambda number, _: m.GetOwn(number, name))
+        replies = self._requests.ask(name, lambda number, _: m.GetOwn(number, name))
         if type(replies[0].value) is not tuple:
             return generators.seeds(replies[0].value)
-        with self._exchange.handling():
-            seeds = self._exchange.results.one_each(name, replies)
-        return generators.seeds(seeds)
+        return generators.seeds(self._requests.one_each(name, replies))
 
     @property
     def envs(self) -> tuple[SubEnvironment, ...]:
@@ -379,16 +368,16 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
     def close(self, **kwargs: Any) -> None:
         """Close the sub-environments and end their processes, in bounded time. Idempotent."""
-        if self._asking.waiting is not None and not self.closed:
+        if self._requests.waiting is not None and not self.closed:
             warnings.warn(
-                f"Calling `close` while waiting for a pending call to `{self._asking.waiting}` "
+                f"Calling `close` while waiting for a pending call to `{self._requests.waiting}` "
                 "to complete.",
                 UserWarning,
                 stacklevel=2,
             )
-        self._asking.closed = True
+        self._requests.closed = True
         self._session.close()
-        self._asking.tell()
+        self._requests.show_warnings()
 
     def close_extras(self, **kwargs: Any) -> None:
         """There is nothing beyond ``close``."""
@@ -402,17 +391,15 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         ours = not is_servable(name) or hasattr(type(self), name)
         if manifest is None or ours or name not in manifest.attributes:
             raise absent(self, name, "get_attr")
-        self._asking.refuse_if_busy(name)
-        reply = self._asking.own("get attribute", m.GetOwn, name)
+        self._requests.refuse_if_busy(name)
+        reply = self._requests.ask_own("get attribute", m.GetOwn, name)
         if isinstance(reply, m.Value):
             return reply.value
-        if not isinstance(reply, m.Method):
-            raise RemoteProtocolError(f"the worker answered GetOwn with {type(reply).__name__}")
 
         @short_traceback
         def method(*args: Any, **kwargs: Any) -> Any:
-            self._asking.refuse_if_busy(name)
-            result = self._asking.own(name, m.CallOwn, name, args, kwargs)
+            self._requests.refuse_if_busy(name)
+            result = self._requests.ask_own(name, m.CallOwn, name, args, kwargs)
             return typed(result, m.Value).value
 
         return method
@@ -433,8 +420,8 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     __html__ = _repr_html_
 
     def _ask_one(self, name: str, index: int, message: OneMessageFor) -> m.Message:
-        # a method of ours: with a copy of a sub-environment, what it asks is another one's
-        return self._asking.one(name, index, message)
+        # a method of ours: a copy of a sub-environment then asks the copy of its vector environment
+        return self._requests.ask_one(name, index, message)
 
     def _seeds(self, seed: Any) -> Any:
         """One seed or None per sub-environment, or None for none at all."""

@@ -120,9 +120,7 @@ class Naive:
         return method
 
     def _ask(self, kind: type[Any], *fields: Any) -> m.Message:
-        exchange = inside.session(self._env).exchange
-        [reply] = exchange.request("ask", lambda number, _: kind(number, *fields), 20.0)
-        return reply
+        return inside.session(self._env).requests.ask_own("ask", kind, *fields)
 
 
 class Forwarding(VectorWrapper):

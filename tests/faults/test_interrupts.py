@@ -80,15 +80,15 @@ def test_ctrl_c_while_what_was_started_ahead_is_given_up(
     make_env(sample("counter"), n_envs=2).close()  # known from here on: it starts later
     with make_env(sample("counter"), n_envs=2) as suites:
         env = suites.env
-        lease, ahead = inside.session(env).lease, inside.session(env).head_start
-        ahead.warm_up()
+        lease, ahead = inside.session(env).lease, inside.session(env).prewarm
+        ahead.start()
         give_back = lease.give_back
         with monkeypatch.context() as patch:
             patch.setattr(lease, "give_back", lambda: interrupted(give_back()))
             if why == "it has died":
                 lease.end()
             with pytest.raises(KeyboardInterrupt):
-                env.reset() if why == "it has died" else ahead.cool_down()
+                env.reset() if why == "it has died" else ahead.cancel()
         with pytest.raises(errors.WorkerDiedError, match="call reset"):
             env.step([0, 0])
         env.reset()
@@ -306,7 +306,7 @@ class Closing(Lifecycle):
 
 def recover(env: Any) -> None:
     """Reset after a step that nobody waits for any more."""
-    inside.session(env).exchange.submit_step(np.zeros(2, np.int64))
+    inside.session(env).requests.submit_step(np.zeros(2, np.int64))
     env.reset()
 
 

@@ -29,15 +29,15 @@ def env(request: pytest.FixtureRequest) -> Iterator[Any]:
 
 def held_between_the_halves(env: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Any]:
     """Have another thread step, and stop it once that was sent; returns what lets it go on."""
-    exchange, stopped, go_on = inside.session(env).exchange, threading.Event(), threading.Event()
-    collect, results = exchange.collect_step, []
+    requests, stopped, go_on = inside.session(env).requests, threading.Event(), threading.Event()
+    collect, results = requests.collect_step, []
 
     def slow(timeout_s: float | None = None) -> Any:
         stopped.set()
         assert go_on.wait(DEADLINE_S)
         return collect(timeout_s)
 
-    monkeypatch.setattr(exchange, "collect_step", slow)
+    monkeypatch.setattr(requests, "collect_step", slow)
     thread = threading.Thread(target=lambda: results.append(env.step(ACTIONS)), name="rollout")
     thread.start()
     assert stopped.wait(DEADLINE_S)
@@ -68,7 +68,7 @@ def test_what_nobody_waits_for_is_late(env: Any, monkeypatch: pytest.MonkeyPatch
     def interrupted(timeout_s: float | None = None) -> Any:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(inside.session(env).exchange, "collect_step", interrupted)
+    monkeypatch.setattr(inside.session(env).requests, "collect_step", interrupted)
     with pytest.raises(KeyboardInterrupt):
         env.step(ACTIONS)
     monkeypatch.undo()

@@ -107,15 +107,15 @@ def test_an_operation_has_one_deadline(
     Or else runners that answer at the last moment would make a step last as long as they please.
     """
     made: list[float | None] = []
-    initialize, again = Deadline.__init__, StepDeadline.again
+    initialize, running = Deadline.__init__, vars(StepDeadline)["running"]
 
     def counted(self: Deadline, timeout_s: float | None) -> None:
         made.append(timeout_s)
         initialize(self, timeout_s)
 
-    def counted_again(self: StepDeadline) -> None:
-        made.append(self.timeout_s)
-        again(self)
+    def begin(self: StepDeadline, value: bool) -> None:
+        made.extend([] if value else [self.timeout_s])
+        running.__set__(self, value)
 
     timeouts = {"step_s": 1001.0, "reset_s": 1002.0, "call_s": 1003.0}
     options = {"lane": lane, "num_workers": 4, "policy": {"restart": restart}}
@@ -123,7 +123,7 @@ def test_an_operation_has_one_deadline(
         env = suites.env
         env.reset()
         monkeypatch.setattr(Deadline, "__init__", counted)
-        monkeypatch.setattr(StepDeadline, "again", counted_again)
+        monkeypatch.setattr(StepDeadline, "running", property(running.__get__, begin))
         for act, timeout_s in (
             (lambda: env.step([1, 1, 1, 1]), 1001.0),
             (lambda: env.reset(options={"large": True}), 1002.0),

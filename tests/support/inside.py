@@ -85,7 +85,7 @@ def clean_up(env: Any) -> None:
 def live_by(env: Any, lifecycle: Lifecycle) -> None:
     """Have another table of its states."""
     found = session(env)
-    for owner in (found, found.lease, found.head_start, found.exchange):
+    for owner in (found, found.lease, found.prewarm, found.requests):
         owner.lifecycle = lifecycle
 
 
@@ -108,11 +108,11 @@ def repository(env: Any) -> Repository:
 def hurried(env: Any, **timeouts: float) -> Iterator[None]:
     """What is asked of it meanwhile has these ``Timeouts``; it was made, and goes on, without."""
     found, before = repository(env), repository(env).timeouts
-    env._timeouts = env._asking._timeouts = found.timeouts = replace(before, **timeouts)
+    env._timeouts = env._requests._timeouts = found.timeouts = replace(before, **timeouts)
     try:
         yield
     finally:
-        env._timeouts = env._asking._timeouts = found.timeouts = before
+        env._timeouts = env._requests._timeouts = found.timeouts = before
 
 
 def launcher(env: Any) -> Launcher:

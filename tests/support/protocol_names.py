@@ -53,7 +53,7 @@ KNOWN = frozenset(
         *("__pydantic_validator__", "__get_pydantic_core_schema__", "__attrs_attrs__", "__json__"),
         # Gymnasium's, and ours
         *("np_random", "_np_random", "_np_random_seed", "envs", "env_fns", "env", "unwrapped"),
-        *("_session", "_exchange", "_asking", "_manifest", "_timeouts", "_read_actions"),
+        *("_session", "_requests", "_manifest", "_timeouts", "_read_actions"),
         *("reset", "step", "close", "render", "spec", "metadata", "fileno", "keys", "mro"),
     }
 )

@@ -9,8 +9,7 @@ from unittest.mock import Mock
 import msgpack
 
 from envhub_sandbox.transport.jail import JailHandle
-from envhub_sandbox.transport.lane import RelayLane
-from envhub_sandbox.transport.request import Request
+from envhub_sandbox.transport.lane import RelayLane, Request
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS

@@ -124,7 +124,7 @@ class Launcher:
             wanted.close()
             raise
         try:  # and nothing is called before it, where a Ctrl-C could come
-            jail.heard = self.repository.heard
+            jail.warnings = self.repository.warnings
             WORKER.debug("%s: jail %x opened", self.repository.label, jail.number)
             if wanted.sinks:
                 follower = OutputFollower(lambda: self._connected(server), jail.number, wanted)

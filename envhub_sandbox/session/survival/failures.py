@@ -1,4 +1,4 @@
-"""What is told of a request that failed, and what is written down of it."""
+"""Failures of requests: the error for the caller, the crash bundle, the lifecycle's move."""
 
 from __future__ import annotations
 
@@ -14,13 +14,17 @@ from envhub_worker.protocol.lifecycle import Event
 
 
 class Failures:
-    """Makes the errors of one environment out of what went wrong; it moves where they belong.
+    """The failures of one environment's requests.
 
     Args:
         lease: Its jail.
         results: Its manifest and slices.
         counters: Of deaths and late replies.
         history: What was asked, for a crash bundle.
+
+    Attributes:
+        interruption: The request whose wait was interrupted, so that its reply is late; None where
+            the last late reply has another reason.
     """
 
     def __init__(
@@ -31,9 +35,34 @@ class Failures:
         self._shards = len(results.bounds)
         self._counters = counters
         self._history = history
+        self.interruption: str | None = None
+
+    def timed_out(self, operation: str, deadline: Deadline) -> WorkerTimeoutError:
+        """The deadline of a request came first: the environment is LATE."""
+        self._counters.timeouts += 1
+        self.interruption = None
+        self._lease.lifecycle.moved(Event.TIMEOUT)
+        return self.late(operation, deadline)
+
+    def interrupted(self, error: BaseException) -> None:
+        """Ctrl-C, or another exception of a signal handler, ended a wait.
+
+        The reply may still come, so the environment is LATE, and not READY.
+
+        Raises:
+            WorkerDiedError: A ``close`` within the wait took away what was waited for.
+        """
+        if self._lease.lifecycle.closed and isinstance(error, Exception):
+            raise self.dead(WorkerDiedError("")) from error
+        self.note_interruption()
+
+    def note_interruption(self) -> None:
+        """The reply to the pending request is late, for that reason."""
+        self.interruption = self._lease.lifecycle.request or "request"
+        self._lease.lifecycle.moved(Event.INTERRUPT)
 
     def late(self, operation: str, deadline: Deadline) -> WorkerTimeoutError:
-        """The deadline came first."""
+        """The error for a reply that did not come in time."""
         timeout_s, states = deadline.timeout_s, self._lease.states()
         WORKER.info("%s: no answer to %s after %s s", self._label, operation, timeout_s)
         busy = f" (its processes: {', '.join(states)})" if states else ""
@@ -47,17 +76,20 @@ class Failures:
         return error
 
     def expired(self, operation: str, why: str) -> WorkerDiedError:
-        """The server has ended it, because nobody used it."""
+        """The server has ended the jail because it was idle."""
         lifecycle = self._lease.lifecycle
         lifecycle.moved(Event.EXPIRY)
         lifecycle.request = None
         return expiry(operation, why)
 
     def dead(self, error: EnvHubError) -> EnvHubError:
-        """A death, or a lie; what closed an environment under its user is told as such.
+        """The jail has died, or broke a rule of the protocol: the environment is DEAD.
 
-        Whoever has not died, or has a jail that goes on without him, lives still, and cannot be
-        trusted to do what he says: the jail is ended.
+        A jail that still lives is ended: after a broken rule, and where it goes on without the
+        runner that has died.
+
+        Returns:
+            The error for the caller; after a ``close`` it says that the environment was closed.
         """
         lifecycle, lease = self._lease.lifecycle, self._lease
         operation = lifecycle.request or "a request"
@@ -73,7 +105,7 @@ class Failures:
             if lease.loaded is not None and (lease.loaded.jail.kept or not died):
                 lease.end()
         if isinstance(error, WorkerDiedError):
-            self._write_crash(error)  # asked once: a server that says nothing takes its time
+            self._write_crash(error)  # denials are asked for once: a silent server costs 10 s
         return error
 
     def keep_crash(self, error: WorkerDiedError | WorkerTimeoutError) -> None:

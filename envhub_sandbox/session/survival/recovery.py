@@ -1,16 +1,18 @@
-"""What becomes of a request when processes die under it: it fails, or they are brought back.
+"""``restart="transparent"``: a request goes on although runners have died.
 
-With ``restart="transparent"`` a death is survived: the dead shards come back in fresh runners, and
-the others go on. Otherwise it is told. What the fresh are seeded with is in ``seeds``.
+The dead shards come back in fresh runners, seeded anew, with the attributes that were set; the
+others go on. Without it there is no ``Recovery``, and a death is an error.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
-from envhub_sandbox.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
+from envhub_sandbox.crash.history import History
+from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
 from envhub_sandbox.log import WORKER
+from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.survival.failures import Failures
 from envhub_sandbox.session.survival.restart_policy import Restarts
@@ -18,102 +20,66 @@ from envhub_sandbox.session.survival.revived_rows import marked, truncated
 from envhub_sandbox.session.survival.seeds import SeedBook, Settings, resets
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.jail import RunnersDiedError
-from envhub_sandbox.transport.lane import Lane
-from envhub_sandbox.transport.replies import typed
-from envhub_sandbox.transport.request import Request
+from envhub_sandbox.transport.lane import Lane, Request
+from envhub_sandbox.transport.replies import check, typed
 from envhub_sandbox.transport.results import Results
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.lifecycle import Event
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
-Requests = Callable[[Lane, int], list[m.Message]]
-"""What a shard's fresh runner is asked, one after the other."""
+MessagesFor = Callable[[Lane, int], list[m.Message]]
+"""Makes what a shard's fresh runner is asked, one after the other."""
+RowsOf = Callable[[m.Message, int], m.Message]
+"""Makes the reply for a dead shard of a fresh runner's last answer and the number of rows."""
 
 
-class Recovery(Protocol):
-    """Learns what is asked of an environment, and stands in for those who died of it."""
-
-    def started(self) -> None:
-        """There is a fresh jail: whatever was asked of another is of no concern."""
-
-    def sent(self, request: Request) -> None:
-        """A request has gone out."""
-
-    def answered(self) -> None:
-        """Every shard has answered it, and none has raised."""
-
-    def survivable(self, error: WorkerError) -> RunnersDiedError | None:
-        """The deaths, where the end of a jail can be survived."""
-
-    def steps(self, deaths: RunnersDiedError) -> dict[int, m.StepDone]:
-        """The rows of the dead shards in the step that they died of, from fresh runners.
-
-        Raises:
-            WorkerError: They died again, took too long, or have died too often.
-            RemoteEnvError: The repository raised this time.
-        """
-
-    def resets(self, deaths: RunnersDiedError) -> dict[int, m.ResetDone]:
-        """The same for a reset."""
-
-
-class Fail:
-    """A death is told. Whoever resets afterwards may get a fresh jail: see ``Restarts``."""
-
-    def started(self) -> None:
-        """Nothing is remembered."""
-
-    def sent(self, request: Request) -> None:
-        """Nothing is remembered."""
-
-    def answered(self) -> None:
-        """Nothing is remembered."""
-
-    def survivable(self, error: WorkerError) -> RunnersDiedError | None:
-        """None is."""
-        return None
-
-    def steps(self, deaths: RunnersDiedError) -> dict[int, m.StepDone]:
-        """There are no others: a jail ends with any of its runners."""
-        raise deaths.first
-
-    def resets(self, deaths: RunnersDiedError) -> dict[int, m.ResetDone]:
-        """As ``steps``."""
-        raise deaths.first
-
-
-class Revive:
-    """The dead come back in fresh runners, seeded anew, with the attributes that were set.
+class Recovery:
+    """Brings back the dead shards of one environment.
 
     Args:
         lease: The environment's jail.
         results: Its manifest and slices.
         restarts: How often it may be done, and how soon.
         failures: Make the errors.
+        counters: Of deaths.
+        history: Learns what came back.
     """
 
     def __init__(
-        self, lease: Lease, results: Results, restarts: Restarts, failures: Failures
+        self,
+        lease: Lease,
+        results: Results,
+        restarts: Restarts,
+        failures: Failures,
+        counters: Counters,
+        history: History,
     ) -> None:
         manifest = results.manifest
         self._lease = lease
+        self._lifecycle = lease.lifecycle
         self._num_envs = manifest.num_envs
         self._bounds = results.bounds
         self._restarts = restarts
         self._failures = failures
+        self._counters = counters
+        self._history = history
         self._seeds = SeedBook(manifest.num_envs, manifest.shardable)
         self._settings = Settings()
         self._setting: tuple[str, list[list[bytes]]] | None = None  # what is being set
         self._asked: Sequence[m.Message] = ()
+        self._fresh: tuple[int, ...] = ()  # shards that came back in the last request
+
+    # --- what is asked -------------------------------------------------------------------------
 
     def started(self) -> None:
-        """See ``Recovery``."""
+        """There is a fresh jail, in which no attribute was set."""
         self._settings.clear()
 
     def sent(self, request: Request) -> None:
-        """See ``Recovery``."""
+        """Remember the seeds and attributes of a request that has gone out."""
         self._asked = messages = request.messages
-        self._setting = None
+        self._setting, self._fresh = None, ()
         for message, (start, _) in zip(messages, self._bounds, strict=True):
             if isinstance(message, m.Reset):
                 self._seeds.remember(message, start)
@@ -121,49 +87,106 @@ class Revive:
             self._setting = messages[0].name, request.kept()
 
     def answered(self) -> None:
-        """See ``Recovery``."""
+        """Every shard has answered it, and none has raised."""
         if self._setting is not None:
             self._settings.remember(*self._setting)
             self._setting = None
 
-    def survivable(self, error: WorkerError) -> RunnersDiedError | None:
-        """All shards have died with the jail."""
-        if not isinstance(error, WorkerDiedError):  # a sibling has given the jail up
+    # --- deaths --------------------------------------------------------------------------------
+
+    def deaths_of_all(self, error: WorkerError) -> RunnersDiedError:
+        """The end of the jail, as the death of all shards."""
+        if not isinstance(error, WorkerDiedError):  # another environment there has given it up
             error = WorkerDiedError(str(error), reason="killed")
         shards = range(len(self._bounds))
-        nobody: list[m.Message | None] = [None for _ in shards]
-        return RunnersDiedError(nobody, dict.fromkeys(shards, error), jail_gone=True)
+        replies: list[m.Message | None] = [None for _ in shards]
+        return RunnersDiedError(replies, dict.fromkeys(shards, error), jail_gone=True)
 
-    def steps(self, deaths: RunnersDiedError) -> dict[int, m.StepDone]:
-        """See ``Recovery``. Trust: input from the worker."""
-        fresh = self._bring_back(deaths, "step", self._revivals)
-        with UNTRUSTED:
-            return {
-                index: truncated(typed(reply, m.StepDone), self._size(index))
-                for index, reply in fresh.items()
-            }
+    def survive_request(self, deaths: RunnersDiedError) -> list[m.Message]:
+        """The replies to a reset, which fresh runners repeat; another request is not repeated.
 
-    def resets(self, deaths: RunnersDiedError) -> dict[int, m.ResetDone]:
-        """See ``Recovery``. Trust: input from the worker."""
-        fresh = self._bring_back(deaths, "reset", self._resets)
-        done = {index: typed(reply, m.ResetDone) for index, reply in fresh.items()}
-        with UNTRUSTED:
-            return {
-                index: m.replace(one, info=marked(one.info, self._size(index)))
-                for index, one in done.items()
-            }
+        Raises:
+            WorkerDiedError: It was another one; the next step or reset brings the dead back.
+        """
+        replies = self._of_survivors(deaths)
+        if self._lifecycle.request != "reset":
+            self._lifecycle.answered()
+            raise deaths.first
+        fresh = self._revive(deaths, "reset", self._resets, _reset_rows)
+        merged = [fresh.get(index, reply) for index, reply in enumerate(replies)]
+        return [reply for reply in merged if reply is not None]
+
+    def survive_step(self, deaths: RunnersDiedError) -> list[m.StepDone]:
+        """The replies to a step, with truncated rows in the place of the dead."""
+        replies = self._of_survivors(deaths)
+        fresh = self._revive(deaths, "step", self._revivals, _step_rows)
+        merged = [fresh.get(index, reply) for index, reply in enumerate(replies)]
+        return [typed(reply, m.StepDone) for reply in merged if reply is not None]
+
+    def mark(self, infos: dict[Any, Any]) -> dict[Any, Any]:
+        """All infos of the last request, of which those of the fresh shards say that they are."""
+        if not self._fresh:
+            return infos
+        return marked(infos, self._num_envs, [self._bounds[index] for index in self._fresh])
+
+    def _of_survivors(self, deaths: RunnersDiedError) -> list[m.Message | None]:
+        """What the others answered; None in the place of the dead.
+
+        Raises:
+            RemoteEnvError: One of them raised. The next request meets the deaths.
+        """
+        try:
+            for reply in deaths.replies:
+                if reply is not None:
+                    check(reply)
+        except EnvHubError:
+            self._lifecycle.answered()
+            raise
+        return deaths.replies
+
+    def _revive(
+        self, deaths: RunnersDiedError, operation: str, messages_for: MessagesFor, rows_of: RowsOf
+    ) -> dict[int, m.Message]:
+        """Have the dead shards brought back, and move on to the state that it leads to."""
+        lifecycle, failures = self._lifecycle, self._failures
+        lifecycle.moved(Event.LOSS)
+        failures.keep_crash(deaths.first)
+        try:
+            replies = self._bring_back(deaths, operation, messages_for)
+            with UNTRUSTED:
+                fresh = {index: rows_of(one, self._size(index)) for index, one in replies.items()}
+        except WorkerTimeoutError as error:
+            if lifecycle.closed:
+                raise failures.dead(error) from error
+            lifecycle.request = None  # how far it came is not known: a reset starts afresh
+            failures.interruption = None
+            lifecycle.moved(Event.TIMEOUT)
+            raise
+        except EnvHubError as error:
+            cause = error.__cause__ or deaths.first
+            raise failures.dead(error) from (None if cause is error else cause)
+        except BaseException as error:
+            failures.interrupted(error)
+            lifecycle.request = None
+            raise
+        lifecycle.request = None
+        self._fresh = tuple(fresh)
+        self._counters.deaths += len(fresh)
+        self._history.revived()
+        lifecycle.moved(Event.REVIVAL)
+        return fresh
 
     def _bring_back(
-        self, deaths: RunnersDiedError, operation: str, requests: Requests
+        self, deaths: RunnersDiedError, operation: str, messages_for: MessagesFor
     ) -> dict[int, m.Message]:
         """What the fresh runners answer to the last of their requests."""
         if any(death.reason == "protocol" for death in deaths.deaths.values()):
-            raise deaths.first  # whoever breaks the rules is given no second chance
+            raise deaths.first  # after a broken rule there is no second chance
         try:
             self._restarts.spend(operation)
         except WorkerDiedError as spent:
             raise deaths.first from spent
-        self._tell(deaths)
+        self._log(deaths)
         dead = sorted(deaths.deaths)
         timeouts = self._lease.repository.timeouts
         deadline = StartupDeadline(timeouts.startup_s)
@@ -175,11 +198,11 @@ class Revive:
         assert lane is not None
         try:
             self._set_again(lane, dead, deadline_of_reset)
-            return _ask_anew(lane, dead, requests, deadline_of_reset)
+            return _ask_anew(lane, dead, messages_for, deadline_of_reset)
         except WorkerTimeoutError as error:
             raise self._failures.late("reset", deadline_of_reset) from error
 
-    def _tell(self, deaths: RunnersDiedError) -> None:
+    def _log(self, deaths: RunnersDiedError) -> None:
         """Log a death that the caller sees in the infos only."""
         rows = [row for index in sorted(deaths.deaths) for row in range(*self._bounds[index])]
         why, label = str(deaths.first).partition("\n")[0], self._lease.repository.label
@@ -215,11 +238,22 @@ class Revive:
         return stop - start
 
 
+def _step_rows(reply: m.Message, size: int) -> m.Message:
+    """Trust: input from the worker."""
+    return truncated(typed(reply, m.StepDone), size)
+
+
+def _reset_rows(reply: m.Message, size: int) -> m.Message:
+    """Trust: input from the worker."""
+    done = typed(reply, m.ResetDone)
+    return m.replace(done, info=marked(done.info, size))
+
+
 def _ask_anew(
-    lane: Lane, dead: Sequence[int], requests: Requests, deadline: Deadline
+    lane: Lane, dead: Sequence[int], messages_for: MessagesFor, deadline: Deadline
 ) -> dict[int, m.Message]:
     replies: list[m.Message] = []
-    for messages in zip(*(requests(lane, index) for index in dead), strict=True):
+    for messages in zip(*(messages_for(lane, index) for index in dead), strict=True):
         asked = [(lane.runners[i], message) for i, message in zip(dead, messages, strict=True)]
         replies = lane.jail.exchange("reset", asked, deadline)
     return dict(zip(dead, replies, strict=True))

@@ -7,14 +7,13 @@ import socket
 from collections.abc import Sequence
 from time import monotonic, sleep
 
-from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
+from envhub_sandbox.errors import WorkerDiedError
 from envhub_sandbox.transport.connection import SESSION
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.shared_memory.doorbell import Watch
+from envhub_sandbox.transport.shared_memory.doorbell import Watch, sleep_for
 from envhub_sandbox.transport.shared_memory.shard import LaneShard
 from envhub_worker.protocol import messages as m
 
-_RECHECK_MS = 2
 _ANSWER_S = 20.0
 _LEAST_S = 0.1
 """How long a server may take at most to take descriptors, and at least, so late as it is."""
@@ -81,30 +80,6 @@ class Attachment:
         for index, pidfd in list(self._pidfds.items()):
             del self._pidfds[index]  # and nothing is called in between, where a Ctrl-C could come
             os.close(pidfd)
-
-
-def sleep_for(watch: Watch, shard: LaneShard, deadline: Deadline) -> bool:
-    """Sleep until a shard answers, or somebody dies; whether it has answered.
-
-    Raises:
-        WorkerTimeoutError: The deadline came first.
-    """
-    shard.park(1)
-    try:
-        # a ring may cross with our going to sleep: look again soon, once
-        timeout: int | None = _RECHECK_MS
-        while not shard.answered():
-            died = watch.wait(timeout)
-            if shard.answered():
-                return True
-            if died:
-                return False
-            if deadline.passed:
-                raise WorkerTimeoutError("the worker did not answer in time")
-            timeout = deadline.left_ms()
-        return True
-    finally:
-        shard.park(0)
 
 
 def _wait_s(deadline: Deadline) -> float:

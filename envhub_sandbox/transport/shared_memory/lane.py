@@ -14,18 +14,18 @@ from typing import Any
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RunnersDiedError
-from envhub_sandbox.transport.lane import RelayLane
+from envhub_sandbox.transport.lane import Frames, RelayLane, Request
 from envhub_sandbox.transport.pace import Pace
 from envhub_sandbox.transport.replies import typed
-from envhub_sandbox.transport.request import Request
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.affinity import CPUS, Cores
-from envhub_sandbox.transport.shared_memory.attachment import Attachment, sleep_for
+from envhub_sandbox.transport.shared_memory.attachment import Attachment
+from envhub_sandbox.transport.shared_memory.doorbell import sleep_for
 from envhub_sandbox.transport.shared_memory.observations import RING, ObservationSlab
 from envhub_sandbox.transport.shared_memory.pacing import Pacing
 from envhub_sandbox.transport.shared_memory.shard import LaneShard, Outcome
 from envhub_sandbox.transport.shared_memory.sharding import awake_shards
-from envhub_sandbox.transport.shared_memory.sizes import fits, step_bytes
+from envhub_sandbox.transport.shared_memory.sizes import step_bytes
 from envhub_sandbox.transport.shared_memory.spin import SpinChooser
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
@@ -43,6 +43,9 @@ _BY_SERVER = ""
 """In place of an operation's name, where it is the relay that is owed the answer."""
 _BULKY = frozenset({"render"})
 """What hardly ever fits the slabs."""
+_FRAME_BYTES = 8
+_ROOM = slabs.INFO_BYTES - 64
+"""For the frames of a message, less what is put around them."""
 _NOTHING: list[Outcome] = []
 
 
@@ -245,7 +248,7 @@ class SharedMemoryLane:
         """See ``Lane``."""
         operation = request.operation
         # what may have to be repeated in a fresh runner goes by the server, who knows the dead
-        if self.jail.kept or operation in _BULKY or not all(map(fits, request.frames)):
+        if self.jail.kept or operation in _BULKY or not all(map(_fits, request.frames)):
             self._owed = _BY_SERVER
             if operation == "reset":
                 self.observations.leave()
@@ -407,6 +410,11 @@ class SharedMemoryLane:
             shard.close()
         self._attachment.close()
         self.observations.close()
+
+
+def _fits(frames: Frames) -> bool:
+    """Whether the frames of a message fit a slab."""
+    return sum(memoryview(frame).nbytes + _FRAME_BYTES for frame in frames) < _ROOM
 
 
 def infos_of(shard: LaneShard, outcome: Outcome, results: Results) -> dict[Any, Any]:

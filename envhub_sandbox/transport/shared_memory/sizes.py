@@ -1,23 +1,11 @@
-"""How much goes by the fast lane: what fits its slabs, and what a step moves through them."""
+"""The size in bytes of a step by the fast lane."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.shared_memory import slabs
-
-_FRAME_BYTES = 8
-_ROOM = slabs.INFO_BYTES - 64
-"""For the frames of a message, less what is put around them."""
-
-
-def fits(frames: Sequence[Buffer]) -> bool:
-    """Whether the frames of a message fit a slab."""
-    return sum(memoryview(frame).nbytes + _FRAME_BYTES for frame in frames) < _ROOM
 
 
 def step_bytes(manifest: EnvManifest) -> tuple[int, int]:

@@ -266,5 +266,5 @@ def test_the_proxys_own_names_are_never_served() -> None:
     """Its methods and properties are found in the class, and its fields mean nothing outside."""
     public = [name for name in vars(SandboxVectorEnv) if not name.startswith("_")]
     assert {"prewarm", "stats", "sandbox_report"} <= set(public)
-    for name in ("_session", "_exchange", "_manifest", "_asking", "_timeouts", "_read_actions"):
+    for name in ("_session", "_requests", "_manifest", "_timeouts", "_read_actions"):
         assert not is_servable(name)

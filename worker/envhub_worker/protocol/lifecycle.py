@@ -78,8 +78,8 @@ class Lifecycle:
     """A state and its legal moves.
 
     Attributes:
-        request: What was asked and is not answered yet. None in ``LATE``: nobody knows how far it
-            came.
+        request: What was asked and is not answered yet. None in ``LATE``: how far it came is
+            not known.
     """
 
     request: str | None = None
@@ -91,6 +91,11 @@ class Lifecycle:
     def closed(self) -> bool:
         """Whether it is over."""
         return self.state is State.CLOSED
+
+    def answered(self) -> None:
+        """No reply is owed any more."""
+        self.request = None
+        self.moved(Event.REPLY)
 
     def moved(self, event: Event) -> None:
         """``on``, unless it was closed meanwhile: by another thread, or a signal handler."""

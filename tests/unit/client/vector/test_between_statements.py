@@ -2,66 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from types import SimpleNamespace
-from typing import Any, cast
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 from gymnasium import spaces
 
-from envhub_sandbox.session.env_session import EnvSession
-from envhub_sandbox.transport.remote_warnings import RemoteWarnings
+from envhub_sandbox.session import requests
 from envhub_sandbox.transport.shared_memory import shard
 from envhub_sandbox.transport.shared_memory.shard import LaneShard
 from envhub_sandbox.vector import vector_env
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
-from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
-from tests.attacks.lying_server import env_manifest
 from tests.support import inside
+from tests.support.fake_lane import FakeLane, session_over
 from tests.support.interrupts import before_line
-
-
-class _Session:
-    """The life of an environment that answers at once, as far as its face knows of it."""
-
-    def __init__(self) -> None:
-        self.manifest = env_manifest()
-        timeouts = SimpleNamespace(reset_s=1.0, step_s=1.0, call_s=1.0)
-        said = {"timeouts": timeouts, "heard": RemoteWarnings(), "label": "a/b", "copy": True}
-        self.repository = SimpleNamespace(**said)
-        self.results = SimpleNamespace(one_each=lambda what, replies: replies[0].value)
-        self.attributes = SimpleNamespace(known=lambda _: None, wanted=lambda _: False)
-        self.exchange = self
-        self.pending = ""
-
-    def submit(self, operation: str, message_for: object, instead: object = None) -> None:
-        """Owe an answer."""
-        assert not self.pending
-        self.pending = operation
-
-    def collect(self, timeout_s: float | None) -> list[m.Message]:
-        """The answer that is owed."""
-        operation, self.pending = self.pending, ""
-        return [m.ResetDone(0, {}) if operation == "reset" else m.Value((None,))]
-
-    def finish_reset(self, replies: list[m.ResetDone], timeout_s: float | None) -> Any:
-        """The whole of it."""
-        return replies[0].observation, {}
-
-    def recover(self) -> None:
-        """Drop what is owed."""
-        self.pending = ""
-
-    def close(self) -> None:
-        """Nothing is left."""
-
-    @contextmanager
-    def handling(self) -> Iterator[None]:
-        """As it is."""
-        yield
 
 
 @pytest.mark.parametrize(
@@ -71,18 +28,21 @@ class _Session:
         lambda env: env.render(),
         lambda env: env.call("here"),
         lambda env: env.set_attr("here", 1),
+        lambda env: env.step(env.action_space.sample()),
     ],
-    ids=["reset", "render", "call", "set_attr"],
+    ids=["reset", "render", "call", "set_attr", "step"],
 )
+@pytest.mark.parametrize("module", [vector_env, requests])
 def test_an_interrupted_request_leaves_no_wait_that_nobody_can_end(
-    act: Callable[[Any], object],
+    module: ModuleType, act: Callable[[Any], object]
 ) -> None:
-    """A reset brings the environment back, wherever it was."""
+    """A reset brings the environment back, wherever it was, and takes no other's answer."""
     line = 0
     while True:
-        env = SandboxVectorEnv(cast("EnvSession", _Session()))
-        came = before_line(vector_env.__file__, line, lambda env=env: act(env))  # type: ignore[misc]
-        assert env.reset() == (0, {})
+        env = SandboxVectorEnv(session_over(FakeLane()))
+        came = before_line(module.__file__, line, lambda env=env: act(env))  # type: ignore[misc]
+        observations, infos = env.reset()
+        assert (observations.shape[0], infos) == (env.num_envs, {})
         env.close()
         if not came:
             break

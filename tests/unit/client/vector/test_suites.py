@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -73,3 +74,21 @@ def test_a_suite_that_there_is_not_names_those_there_are() -> None:
         found["c"]
     assert found.get("c") is None
     assert "c" not in found
+
+
+def test_closing_a_suite_closes_all_of_it() -> None:
+    """Whatever one of them raises; and it is raised in the end."""
+    closed = []
+
+    def env(name: str) -> Any:
+        def close() -> None:
+            closed.append(name)
+            if name == "a":
+                raise RuntimeError("its close")
+
+        return SimpleNamespace(close=close)
+
+    suites = EnvSuites({"s": {0: env("a"), 1: env("b")}}, dict, lambda: closed.append("last"))
+    with pytest.raises(RuntimeError, match="its close"):
+        suites.close()
+    assert closed == ["a", "b", "last"]

@@ -1,0 +1,294 @@
+"""The start of an environment's processes: for its first request, or ahead of that.
+
+An evaluation plays task after task. The next task takes time before its first ``reset`` returns: a
+process, imports, the construction of its simulators. That can be done in the background while one
+plays. Results do not depend on it: what fails, or dies, before its first request is started again
+by that request.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import weakref
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import chain
+
+from envhub_sandbox.crash.history import History
+from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.log import WORKER
+from envhub_sandbox.session.counters import Counters
+from envhub_sandbox.session.jails.loaded import LoadedJail
+from envhub_sandbox.session.lease import Lease
+from envhub_sandbox.session.refusals import closed_during
+from envhub_sandbox.session.survival.recovery import Recovery
+from envhub_sandbox.session.turns import Turns
+from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
+from envhub_worker.protocol.lifecycle import Event, State
+
+LOOK_S = 10.0
+"""How long a look at a jail that may have died may take."""
+INTERRUPT_S = 10.0
+"""How long ``close`` waits at most for another thread to notice that the jail has gone: no longer
+than it waits for the environment's own ``close``."""
+_GOING_S = 30.0
+"""How long a jail that is given up may take to go: its ``close``, and its processes' ends."""
+
+
+class Prewarm:
+    """Starts one environment, and cancels a start ahead that no request has used.
+
+    Args:
+        lease: Its hold on a jail.
+        turns: Whose turn it is.
+        counters: Say whether anything was asked of it.
+        history: Learns that it has started.
+        recovery: Learns that it has started, if there is one.
+
+    Attributes:
+        unused: Whether it was started ahead, and no reset came yet.
+        first_use: Called at the first request; None afterwards.
+    """
+
+    def __init__(
+        self,
+        lease: Lease,
+        turns: Turns,
+        counters: Counters,
+        history: History,
+        recovery: Recovery | None,
+    ) -> None:
+        self.lifecycle = lease.lifecycle
+        self.unused = False
+        self.first_use: Callable[[], None] | None = None
+        self._lease = lease
+        self._turns = turns
+        self._counters = counters
+        self._history = history
+        self._recovery = recovery
+        self._timeouts = lease.repository.timeouts
+        self._starting: StartupDeadline | None = None  # of a start ahead that is under way
+
+    @property
+    def closed(self) -> bool:
+        """Whether the environment is closed for good."""
+        return self.lifecycle.closed
+
+    # --- for a request -------------------------------------------------------------------------
+
+    def start_on_demand(self) -> None:
+        """Take a jail, and build the environment in it; raises as ``Lease.acquire`` does."""
+        self._start(StartupDeadline(self._timeouts.startup_s))
+
+    def adopt(self, loaded: LoadedJail) -> None:
+        """Use a jail that is already loaded, instead of opening one later."""
+        with self._turns.take("make_env"):
+            self._lease.adopt(loaded, Deadline(self._timeouts.startup_s))
+            self._started()
+
+    def _start(self, deadline: StartupDeadline) -> None:
+        try:
+            self._lease.acquire(deadline)
+        except EnvHubError:
+            if self.lifecycle.closed:
+                raise closed_during("make_env") from None
+            raise
+        self._started()
+
+    def _started(self) -> None:
+        self._history.started()
+        if self._recovery is not None:
+            self._recovery.started()
+        self.lifecycle.on(Event.START)
+
+    # --- ahead of it ---------------------------------------------------------------------------
+
+    def start_in_background(self) -> None:
+        """Start its processes in a thread of their own, unless they are there."""
+        if self.lifecycle.state is State.IDLE:
+            threading.Thread(target=self.start, name="envhub-prewarm", daemon=True).start()
+
+    def start(self) -> None:
+        """Start its processes, unless they are there, before any request needs them."""
+        deadline = StartupDeadline(self._timeouts.startup_s, unasked=True)
+        # whatever fails here fails again in the first request, which raises it
+        with contextlib.suppress(Exception), self._turns.take("make_env"):
+            if self.lifecycle.state is State.IDLE:
+                self._starting = deadline
+                try:
+                    self._start(deadline)
+                    self.unused = True
+                finally:
+                    self._starting = None
+
+    def cancel(self) -> bool:
+        """Give up what was started ahead, unless it was used since; whether there was any."""
+        starting = self._starting
+        if starting is not None:
+            starting.give_up()
+        lock = self._turns.lock
+        if not lock.acquire(timeout=0 if starting is None else INTERRUPT_S):
+            return False  # it is in use
+        try:
+            unused = self.unused and not self._counters.requests
+            if not unused or self.lifecycle.state is not State.READY:
+                return starting is not None
+            with self._turns.take("make_env"):
+                self.unused = False
+                # The move comes first. An interrupt between here and the end would otherwise leave
+                # an environment that is READY without a jail; this way a reset starts another.
+                self.lifecycle.moved(Event.EXPIRY)
+                self._lease.close_politely()
+                self._lease.give_back()
+                self.lifecycle.moved(Event.FORGET)
+            return True
+        finally:
+            lock.release()
+
+    def look_whether_it_lives(self) -> None:
+        """Before a reset: what was started ahead and died unused counts as expired."""
+        if not self.unused:
+            return
+        self.unused = False
+        if self.lifecycle.state is not State.READY:
+            return
+        try:
+            self._lease.look("make_env", Deadline(LOOK_S))
+        except EnvHubError:
+            self.lifecycle.moved(Event.EXPIRY)  # as in cancel
+
+    # --- the first use -------------------------------------------------------------------------
+
+    def on_first_use(self, first_use: Callable[[], None], make_room: Callable[[], bool]) -> None:
+        """What to call at the first request, and where a server has no place left for it."""
+        self.first_use, self._lease.make_room = first_use, make_room
+
+    def note_use(self) -> None:
+        """A request is made."""
+        if self.first_use is not None:
+            first_use, self.first_use = self.first_use, None
+            first_use()
+
+    def note_if_awaited(self) -> None:
+        """A reset waits for a start ahead: that is its first use, so the next one may start."""
+        if self._starting is not None:
+            self.note_use()
+
+
+class SuitePrewarm:
+    """Starts the tasks after the one that was used last, and cancels those that were passed over.
+
+    Thread-safe. Each task is started in a thread of its own, so that where starting takes longer
+    than playing, the next start begins while a request waits for the one before it.
+
+    Args:
+        suites: The tasks of each suite, in order.
+        count: How many tasks after the last one are started ahead, and so how many unused jails
+            there are at most. None: one, once tasks are seen to be closed before the next is used;
+            so a use of just one task, or of all at once, starts nothing ahead.
+    """
+
+    def __init__(self, suites: Sequence[Sequence[Prewarm]], count: int | None) -> None:
+        self._count = count
+        # weak: an environment without an owner is closed
+        self._suites = [[weakref.ref(task) for task in suite] for suite in suites]
+        for ref in chain.from_iterable(self._suites):
+            hash(ref)  # computed now and kept: it cannot be once the task has gone
+        self._lock = threading.Lock()
+        self._cancelled = threading.Condition(self._lock)
+        self._wanted: list[weakref.ref[Prewarm]] = []
+        self._tried: set[weakref.ref[Prewarm]] = set()
+        self._ahead: list[weakref.ref[Prewarm]] = []  # started here and not used yet
+        self._cancelling = 0
+        for suite in suites:
+            for task in suite:
+                task.on_first_use(partial(self._used, weakref.ref(task)), self.make_room)
+
+    def make_room(self) -> bool:
+        """Cancel all unused starts, since a server has no place left; whether there were any."""
+        with self._lock:
+            self._wanted = []
+            ahead, self._ahead = self._ahead, []
+            going = self._cancelling > 0
+        cancelled = [_cancel(task) for task in ahead]
+        with self._lock:  # what other threads cancel makes room, too, once it has gone
+            self._cancelled.wait_for(lambda: not self._cancelling, _GOING_S)
+        return going or any(cancelled)
+
+    def _used(self, used: weakref.ref[Prewarm]) -> None:
+        """A task has its first request."""
+        with self._lock:
+            self._tried.add(used)
+            self._ahead = [one for one in self._ahead if one != used]
+            self._wanted = list(self._following(used))
+            self._start_threads()
+
+    def _start_threads(self) -> None:
+        """One for each task that is to be cancelled or started. The lock is held.
+
+        Where the system has no thread left, the request for another task does not fail for it.
+        """
+        while (todo := self._next()) is not None:
+            thread = threading.Thread(
+                target=self._run, args=todo, name="envhub-prewarm", daemon=True
+            )
+            try:
+                thread.start()
+            except RuntimeError as error:
+                WORKER.info("nothing is started ahead: %s", error)
+                self._cancelling -= not todo[1]
+                self._cancelled.notify_all()
+                return
+
+    def _following(self, used: weakref.ref[Prewarm]) -> Iterator[weakref.ref[Prewarm]]:
+        suite = next(suite for suite in self._suites if used in suite)
+        index = suite.index(used)
+        count = self._count
+        if count is None:
+            count = 1 if index and _is_closed(suite[index - 1]) else 0
+        left = [one for one in suite[index + 1 :] if one in self._ahead or one not in self._tried]
+        yield from [one for one in left if not _is_closed(one)][:count]
+
+    def _run(self, task: Prewarm, start: bool) -> None:
+        try:
+            with contextlib.suppress(Exception):  # a request for it meets the same failure
+                task.start() if start else task.cancel()
+        finally:
+            if not start:
+                with self._lock:
+                    self._cancelling -= 1
+                    self._start_threads()
+                    self._cancelled.notify_all()
+
+    def _next(self) -> tuple[Prewarm, bool] | None:
+        """What to cancel (False) or start (True).
+
+        All that are passed over come first, and nothing starts before they have gone: so there are
+        never more unused jails than the count.
+        """
+        for ref in [one for one in self._ahead if one not in self._wanted]:
+            self._ahead.remove(ref)
+            self._tried.discard(ref)
+            task = ref()
+            if task is not None:
+                self._cancelling += 1
+                return task, False
+        untried = [one for one in self._wanted if one not in self._tried]
+        for ref in [] if self._cancelling else untried:
+            task = ref()
+            self._tried.add(ref)
+            if task is not None:
+                self._ahead.append(ref)
+                return task, True
+        return None
+
+
+def _is_closed(ref: weakref.ref[Prewarm]) -> bool:
+    task = ref()
+    return task is None or task.closed
+
+
+def _cancel(ref: weakref.ref[Prewarm]) -> bool:
+    task = ref()
+    return task is not None and task.cancel()

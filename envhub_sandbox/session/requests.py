@@ -1,0 +1,480 @@
+"""The requests of one environment: one at a time, none after ``close``, and their answers.
+
+The caller's rules and errors are those of ``gymnasium.vector.AsyncVectorEnv``. ``Lifecycle`` says
+which requests are legal, the lane takes each to the shards, and a ``Recovery``, if there is one,
+repeats what dead shards did not finish.
+
+A Ctrl-C can come between any two statements, and ``close`` from any thread or signal handler. The
+rule for both: the lifecycle moves *before* a message goes out and *after* its replies are in. So an
+interrupt in between finds a pending request whose reply may come (LATE; ``reset`` waits for it),
+and never READY with a reply still owed, which the next request would take for its own. Only where
+the lane says that nothing was sent, by an error of this project, the move is taken back.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from typing import Any, NoReturn, TypeVar
+
+from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
+
+from envhub_sandbox.crash.history import History
+from envhub_sandbox.errors import (
+    EnvHubError,
+    LocalProtocolError,
+    RemoteEnvWarning,
+    WorkerDiedError,
+    WorkerError,
+    WorkerTimeoutError,
+)
+from envhub_sandbox.session.attribute_cache import AttributeCache
+from envhub_sandbox.session.counters import Counters
+from envhub_sandbox.session.lease import Lease
+from envhub_sandbox.session.prewarm import Prewarm
+from envhub_sandbox.session.refusals import refusal
+from envhub_sandbox.session.survival.failures import Failures
+from envhub_sandbox.session.survival.recovery import Recovery
+from envhub_sandbox.session.turns import Turns, collision
+from envhub_sandbox.transport.deadline import Deadline, StepDeadline
+from envhub_sandbox.transport.jail import RunnersDiedError
+from envhub_sandbox.transport.lane import Lane, Request
+from envhub_sandbox.transport.replies import all_of
+from envhub_sandbox.transport.results import Results, StepResult
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.lifecycle import Event, State
+from envhub_worker.protocol.spaces import batches
+
+Bounds = tuple[int, int]
+MessageFor = Callable[[int, Bounds], m.Message]
+"""Makes the message for a shard out of the environment's number and the shard's bounds."""
+OneMessageFor = Callable[[int, "int | None"], m.Message]
+"""Makes it of the number and the sub-environment's place in the shard; None in other shards."""
+_SHOWN = 64
+"""Characters of an attribute's name in the name of a request."""
+T = TypeVar("T")
+
+
+class Requests:
+    """The requests of one environment, whose jail is opened by the first of them.
+
+    Args:
+        lease: Its jail, and the lane there.
+        turns: Whose turn it is.
+        prewarm: Starts it.
+        results: What it is expected to be, and its slices.
+        counters: Of requests, steps and what went wrong.
+        history: Of what was asked.
+        failures: Make the errors.
+        recovery: Repeats what the dead did not finish; None where a death is an error.
+
+    Attributes:
+        results: Makes of replies what Gymnasium returns.
+        attributes: Those that need no request.
+        closed: Whether the caller has called ``close``.
+        waiting: The request of an ``*_async`` whose ``*_wait`` has not come yet.
+        face: What the environment is called in the error after ``close``.
+    """
+
+    def __init__(
+        self,
+        lease: Lease,
+        turns: Turns,
+        prewarm: Prewarm,
+        results: Results,
+        counters: Counters,
+        history: History,
+        failures: Failures,
+        recovery: Recovery | None,
+    ) -> None:
+        self.results = results
+        self.attributes = AttributeCache(lease, counters)
+        self.lifecycle = lease.lifecycle
+        self.closed = False
+        self.waiting: str | None = None
+        self.face = "VectorEnv"
+        self._lease = lease
+        self._turns = turns
+        self._prewarm = prewarm
+        self._counters = counters
+        self._history = history
+        self._failures = failures
+        self._recovery = recovery
+        self._repository = lease.repository
+        self._unshown = lease.repository.warnings.unshown
+        self._timeouts = lease.repository.timeouts
+        self._step_deadline = StepDeadline(self._timeouts.step_s)
+
+    # --- the caller's order --------------------------------------------------------------------
+
+    def refuse_if_busy(self, name: str) -> None:
+        """Refuse a request while another waits for its ``*_wait``.
+
+        Raises:
+            ClosedEnvironmentError: It is closed.
+            AlreadyPendingCallError: There is one.
+        """
+        self.refuse_if_closed()
+        if self.waiting is not None:
+            raise AlreadyPendingCallError(
+                f"Calling `{name}` while waiting for a pending call to `{self.waiting}` to "
+                "complete.",
+                self.waiting,
+            )
+
+    def refuse_if_closed(self) -> None:
+        """Refuse every request after ``close``.
+
+        Raises:
+            ClosedEnvironmentError: It is closed.
+        """
+        if self.closed:
+            raise ClosedEnvironmentError(
+                f"Trying to operate on `{self.face}`, after a call to `close()`."
+            )
+
+    def end_wait(self, operation: str) -> None:
+        """The ``*_wait`` of a request has come.
+
+        Raises:
+            NoAsyncCallError: There was no ``*_async`` before it.
+        """
+        self.refuse_if_closed()
+        if self.waiting != operation:
+            raise NoAsyncCallError(
+                f"Calling `{operation}_wait` without any prior call to `{operation}_async`.",
+                operation,
+            )
+        self.waiting = None
+
+    # --- requests ------------------------------------------------------------------------------
+
+    def ask(self, operation: str, message_for: MessageFor) -> list[m.Value]:
+        """One request, and the values of all shards."""
+        self.refuse_if_busy(operation)
+        self.submit(operation, message_for)
+        return self.collect(self._timeouts.call_s, m.Value)
+
+    def ask_own(self, operation: str, kind: Callable[..., m.Message], *fields: object) -> m.Message:
+        """Ask about what the repository's vector environment has of its own: one shard has it."""
+        self.submit(operation, lambda number, _: kind(number, *fields))
+        [reply] = self.collect(self._timeouts.call_s, (m.Value, m.Method))
+        return reply
+
+    def ask_one(self, name: str, index: int, message: OneMessageFor) -> m.Message:
+        """Ask about one sub-environment; the other shards' replies are empty."""
+        operation = f"envs[{index}].{name[:_SHOWN]}"  # which is no reset or step of all
+        self.refuse_if_busy(operation)
+
+        def message_for(number: int, bounds: Bounds) -> m.Message:
+            start, stop = bounds
+            return message(number, index - start if start <= index < stop else None)
+
+        self.submit(operation, message_for)
+        timeouts = {"reset": self._timeouts.reset_s, "step": self._timeouts.step_s}
+        replies = self.collect(timeouts.get(name, self._timeouts.call_s), (m.Value, m.Method))
+        holds = (start <= index < stop for start, stop in self.results.bounds)
+        return next(reply for reply, here in zip(replies, holds, strict=True) if here)
+
+    def submit(
+        self, operation: str, message_for: MessageFor, instead: MessageFor | None = None
+    ) -> None:
+        """Send a request to every shard, opening the jail if there is none.
+
+        Args:
+            operation: What it is called.
+            message_for: Makes what is asked, as the history keeps it.
+            instead: Makes what is sent in its place, if the answer is to say more.
+
+        Raises:
+            LocalProtocolError: It cannot be sent; nothing was.
+            WorkerError: The environment is not in a state to take it.
+        """
+        try:
+            with self._turns.lock:
+                try:
+                    self._submit(operation, message_for, instead)
+                except BaseException:
+                    with self._turns.take(operation):  # on failure only: it costs some us
+                        raise
+                if self.lifecycle.state is State.CLOSED:
+                    self._lease.let_go()
+        except WorkerDiedError:
+            self.refuse_if_closed()  # a close() in another thread ended it
+            raise
+
+    def _submit(self, operation: str, message_for: MessageFor, instead: MessageFor | None) -> None:
+        if self.lifecycle.state is not State.READY:
+            self._make_ready(operation)
+        lane = self._lane()
+        try:
+            request = self._request(lane, operation, message_for)
+            sent = request if instead is None else self._request(lane, operation, instead)
+        except LocalProtocolError:
+            self._refuse_whole(operation, message_for)
+            raise
+        self._send(operation, lambda: lane.send(sent))
+        if self._recovery is not None:
+            self._recovery.sent(request)
+        self._history.requested(request)
+        if self._prewarm.first_use is not None:
+            self._prewarm.note_use()
+
+    def _request(self, lane: Lane, operation: str, message_for: MessageFor) -> Request:
+        bounds = self.results.bounds
+        return lane.request(operation, [message_for(lane.number, each) for each in bounds])
+
+    def _refuse_whole(self, operation: str, message_for: MessageFor) -> None:
+        """Raise what cannot be sent as it is called in the caller's arguments, not in a shard's."""
+        if len(self.results.bounds) > 1:
+            lane = self._lane()
+            lane.request(operation, [message_for(lane.number, (0, self.results.manifest.num_envs))])
+
+    def collect(
+        self, timeout_s: float | None, kind: type[m.M] | tuple[type[m.M], ...]
+    ) -> list[m.M]:
+        """The shards' replies to the last ``submit``; the environment is usable afterwards.
+
+        Args:
+            timeout_s: How long they may take.
+            kind: The message that a reply must be, or several.
+
+        Raises:
+            WorkerTimeoutError: The environment is then LATE: ``reset`` brings it back.
+            WorkerDiedError: The environment is then DEAD; with ``restart="transparent"`` READY.
+            RemoteEnvError: The repository's code raised; the environment is still usable.
+            ClosedEnvironmentError: A ``close`` in another thread came first.
+        """
+        try:
+            with self._turns.lock:
+                try:
+                    replies = self._collect(timeout_s, kind)
+                except BaseException:
+                    with self._turns.judging("a request"):
+                        raise
+                if self.lifecycle.state is State.CLOSED:
+                    self._lease.let_go()
+        except BaseException as error:
+            self.explain(error)
+            raise
+        self.show_warnings()
+        return replies
+
+    def _collect(
+        self, timeout_s: float | None, kind: type[m.M] | tuple[type[m.M], ...]
+    ) -> list[m.M]:
+        try:
+            replies = self._finish(self._pending_lane().replies, Deadline(timeout_s))
+        except RunnersDiedError as deaths:
+            if self._recovery is None:
+                raise self._failures.dead(deaths.first) from None
+            replies = self._recovery.survive_request(deaths)
+        answers = all_of(replies, kind)
+        if self._recovery is not None:
+            self._recovery.answered()
+        return answers
+
+    def one_each(self, what: str, replies: list[m.Value] | list[m.Watched]) -> tuple[Any, ...]:
+        """One value for each sub-environment, out of the shards' replies."""
+        try:
+            return self.results.one_each(what, replies)
+        except BaseException:
+            with self._turns.judging("a request"):
+                raise
+
+    def finish_reset(
+        self, replies: list[m.ResetDone], timeout_s: float | None
+    ) -> tuple[Any, dict[Any, Any]]:
+        """What ``VectorEnv.reset`` returns, of the replies to one; raises as ``collect`` does."""
+        try:
+            return self.results.reset(replies)
+        except batches.Misfit:
+            with self._turns.judging("a request"):
+                infos = self._infos_apart(Deadline(timeout_s))
+                if self._recovery is not None:
+                    infos = self._recovery.mark(infos)
+                return self.results.reset(replies, infos)
+        except BaseException:
+            with self._turns.judging("a request"):
+                raise
+
+    # --- steps ---------------------------------------------------------------------------------
+
+    def submit_step(self, actions: Any) -> None:
+        """Send a validated batch of actions; raises as ``submit`` does."""
+        try:
+            with self._turns.lock:
+                lifecycle = self.lifecycle
+                if lifecycle.state is not State.READY:
+                    with self._turns.take("step"):
+                        self._make_ready("step")
+                try:
+                    lane = self._lease.lane
+                    assert lane is not None
+                    # The move comes first: an interrupt from here on leaves a reply that may come.
+                    lifecycle.request = "step"
+                    lifecycle.on(Event.SUBMIT)
+                    lane.send_step(actions)
+                except BaseException as error:
+                    with self._turns.take("step"):
+                        self._nothing_was_sent(error)
+                        raise
+                self._counters.requests += 1
+                self._history.step(actions)  # while the jail is at it
+        except WorkerDiedError:
+            self.refuse_if_closed()  # a close() in another thread ended it
+            raise
+
+    def collect_step(self, timeout_s: float | None) -> StepResult:
+        """What ``VectorEnv.step`` returns; raises as ``collect`` does."""
+        deadline: Deadline = self._step_deadline
+        if timeout_s is deadline.timeout_s:
+            self._step_deadline.running = False
+        else:
+            deadline = Deadline(timeout_s)
+        try:
+            with self._turns.lock:
+                try:
+                    lane = self._pending_lane()
+                    self._finish(lane.wait, deadline)
+                    self._counters.stepped(lane.elapsed_ns)
+                    result = lane.result()
+                except BaseException as error:
+                    with self._turns.judging("step"):
+                        result = self._mended(error, deadline)
+        except BaseException as error:
+            self.explain(error)
+            raise
+        if self._unshown:
+            self.show_warnings()
+        return result
+
+    def _mended(self, error: BaseException, deadline: Deadline) -> StepResult:
+        """The step's results, where infos do not fit together or a ``Recovery`` helps."""
+        if isinstance(error, batches.Misfit):
+            return self._lane().result(self._infos_apart(deadline))
+        if not isinstance(error, RunnersDiedError):
+            raise error
+        if self._recovery is None:
+            raise self._failures.dead(error.first) from None
+        done = self._recovery.survive_step(error)
+        try:
+            return self.results.step(done)
+        except batches.Misfit:
+            infos = self._infos_apart(Deadline(self._timeouts.reset_s))
+            return self.results.step(done, self._recovery.mark(infos))
+
+    def _infos_apart(self, deadline: Deadline) -> dict[Any, Any]:
+        """The last infos once more, of shards whose infos do not fit together."""
+        lane = self._lane()
+        self._send("step", lane.send_for_infos)
+        try:
+            replies = self._finish(lane.replies, deadline)
+        except RunnersDiedError as deaths:
+            self.lifecycle.answered()  # the next request meets the deaths
+            raise deaths.first from None
+        return self.results.apart(all_of(replies, m.Value))
+
+    # --- out and back --------------------------------------------------------------------------
+
+    def _make_ready(self, operation: str) -> None:
+        state, restart = self.lifecycle.state, self._repository.policy.restart
+        # a request that is still pending here was interrupted before its wait began
+        pending = state is State.PENDING
+        interrupted = self.lifecycle.request if pending else self._failures.interruption
+        refused = refusal(state, operation, restart, interrupted)
+        if refused is not None:
+            self.refuse_others(operation)
+            raise refused
+        self._prewarm.note_use()  # already: the next one starts beside this
+        self._prewarm.start_on_demand()
+
+    def refuse_others(self, operation: str) -> None:
+        """A request that another thread waits for is not late: it is in use.
+
+        Raises:
+            AlreadyPendingCallError: It is.
+        """
+        if self.lifecycle.state is State.PENDING:
+            found = collision(self, operation)
+            if found is not None:
+                raise found
+
+    def _send(self, operation: str, send: Callable[[], None]) -> None:
+        self.lifecycle.request = operation
+        self.lifecycle.on(Event.SUBMIT)  # first, as for a step
+        try:
+            send()
+        except EnvHubError as error:
+            self._nothing_was_sent(error)
+            raise
+        self._counters.requests += 1
+
+    def _nothing_was_sent(self, error: BaseException) -> None:
+        """Go back to where we were, if the lane says so: by an error of this project."""
+        if isinstance(error, EnvHubError) and self.lifecycle.state is State.PENDING:
+            self.lifecycle.answered()
+
+    def _lane(self) -> Lane:
+        lane = self._lease.lane
+        assert lane is not None
+        return lane
+
+    def _pending_lane(self) -> Lane:
+        lane = self._lease.lane
+        if lane is None or self.lifecycle.state is not State.PENDING:
+            state = self.lifecycle.state.value
+            raise WorkerError(f"there is no request to wait for: the environment is {state}")
+        return lane
+
+    def _finish(self, receive: Callable[[Deadline], T], deadline: Deadline) -> T:
+        """Wait for the pending reply, and move on to the state that it leads to."""
+        try:
+            received = receive(deadline)
+        except RunnersDiedError:
+            raise
+        except EnvHubError as error:
+            self._lease.forget_watched()
+            self._failed(error, deadline)
+        except BaseException as error:  # Ctrl-C, or what another signal handler raises
+            self._lease.forget_watched()
+            self._failures.interrupted(error)
+            raise
+        self.lifecycle.answered()
+        return received
+
+    def _failed(self, error: EnvHubError, deadline: Deadline) -> NoReturn:
+        """Raise what a wait has ended in, and move on to the state that it leads to."""
+        failures, operation = self._failures, self.lifecycle.request or "a request"
+        if isinstance(error, WorkerTimeoutError):
+            raise failures.timed_out(operation, deadline) from error
+        if isinstance(error, WorkerDiedError) and error.reason == "idle":
+            raise failures.expired(operation, error.detail) from None
+        if isinstance(error, WorkerError) and self._recovery and not self.lifecycle.closed:
+            raise self._recovery.deaths_of_all(error) from error.__cause__
+        raise failures.dead(error) from error.__cause__
+
+    # --- at the end of each --------------------------------------------------------------------
+
+    def explain(self, error: BaseException) -> None:
+        """Before an error goes to the caller.
+
+        The repository's warnings come with it; a filter that makes an error of one must not hide a
+        Ctrl-C.
+
+        Raises:
+            ClosedEnvironmentError: A ``close`` in another thread is the reason.
+        """
+        with contextlib.suppress(RemoteEnvWarning):
+            self.show_warnings()
+        if isinstance(error, WorkerDiedError):
+            self.refuse_if_closed()
+
+    def show_warnings(self) -> None:
+        """Show the repository's new warnings.
+
+        Only once the replies are in and handled: what the caller's filters raise is not the
+        worker's fault, and must leave no reply owed.
+        """
+        if self._unshown:
+            self._repository.show_warnings()

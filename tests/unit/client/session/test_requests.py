@@ -1,0 +1,188 @@
+"""The requests of one environment: their order, their errors, and what is shown beside them."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
+
+from envhub_sandbox.errors import (
+    LocalProtocolError,
+    RemoteEnvError,
+    RemoteEnvWarning,
+    RemoteProtocolError,
+    WorkerDiedError,
+    WorkerTimeoutError,
+)
+from envhub_sandbox.session.env_session import EnvSession
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.lifecycle import State
+from tests.support.fake_lane import FakeLane, session_over
+
+ACTIONS = np.zeros(2, np.int64)
+
+
+@pytest.fixture
+def lane() -> FakeLane:
+    """A lane that answers."""
+    return FakeLane()
+
+
+@pytest.fixture
+def session(lane: FakeLane) -> EnvSession:
+    """An environment that is up."""
+    return session_over(lane)
+
+
+def render(number: int, bounds: tuple[int, int]) -> m.Message:
+    """Ask for it."""
+    return m.Render(number)
+
+
+def warned(session: EnvSession, text: str) -> None:
+    """Have the repository warn."""
+    session.repository.warnings.unshown.append(("Warning", text))
+
+
+def test_a_request_is_sent_counted_and_kept(session: EnvSession, lane: FakeLane) -> None:
+    """And the environment is usable afterwards."""
+    [reply] = session.requests.ask("render", render)
+    assert reply == lane.answer
+    assert lane.sent == [m.Render(lane.number)]
+    assert session.counters.requests == 1
+    [kept] = session.history.recording().requests
+    assert getattr(kept, "operation", None) == "render"
+    assert session.lifecycle.state is State.READY
+
+
+def test_what_is_sent_instead_is_not_what_is_kept(session: EnvSession, lane: FakeLane) -> None:
+    """The history repeats the caller's request."""
+    session.requests.submit("call", render, lambda number, _: m.Watch(number, "name"))
+    assert lane.sent == [m.Watch(lane.number, "name")]
+    [kept] = session.history.recording().requests
+    assert getattr(kept, "operation", None) == "render"
+
+
+def test_another_message_than_was_asked_for_gives_the_worker_up(
+    session: EnvSession, lane: FakeLane
+) -> None:
+    """It breaks a rule, and is not asked again."""
+    lane.answer = m.ResetDone(0, {})
+    with pytest.raises(RemoteProtocolError, match="ResetDone where Value belongs"):
+        session.requests.ask("render", render)
+    assert session.lifecycle.state is State.DEAD
+    with pytest.raises(WorkerDiedError, match="cannot render"):
+        session.requests.ask("render", render)
+
+
+def test_of_two_kinds_either_is_taken(session: EnvSession, lane: FakeLane) -> None:
+    """An attribute is a value or a method; a third kind is named."""
+    for lane.answer in (m.Value(1), m.Method()):
+        assert session.requests.ask_own("name", m.GetOwn, "name") == lane.answer
+    lane.answer = m.Watched((), False)
+    with pytest.raises(RemoteProtocolError, match="Watched where Value or Method belongs"):
+        session.requests.ask_own("name", m.GetOwn, "name")
+
+
+def test_what_the_repository_raises_leaves_the_environment_usable(
+    session: EnvSession, lane: FakeLane
+) -> None:
+    """It is the repository's error, by its name."""
+    lane.answer = m.Raised("ValueError", "a.Oops", "no", "trace", "run")
+    with pytest.raises(RemoteEnvError, match="no"):
+        session.requests.ask("render", render)
+    assert session.lifecycle.state is State.READY
+
+
+def test_a_late_reply_is_refused_until_a_reset(session: EnvSession, lane: FakeLane) -> None:
+    """Which drops it."""
+    lane.fails = WorkerTimeoutError("late")
+    with pytest.raises(WorkerTimeoutError, match="render has not finished after"):
+        session.requests.ask("render", render)
+    assert (session.lifecycle.state, session.counters.timeouts) == (State.LATE, 1)
+    with pytest.raises(WorkerTimeoutError, match="the reply to the last request is late"):
+        session.requests.submit_step(ACTIONS)
+    session.recover()
+    assert session.lifecycle.state is State.READY
+
+
+def test_ctrl_c_in_a_wait_says_so_next_time(session: EnvSession, lane: FakeLane) -> None:
+    """Whoever is asked next does not answer for the interrupted one."""
+    lane.fails = KeyboardInterrupt()
+    session.requests.submit_step(ACTIONS)
+    with pytest.raises(KeyboardInterrupt):
+        session.requests.collect_step(1.0)
+    with pytest.raises(WorkerTimeoutError, match="the last step was interrupted"):
+        session.requests.ask("render", render)
+
+
+def test_what_cannot_be_sent_was_not_sent(session: EnvSession, lane: FakeLane) -> None:
+    """The next request goes out."""
+
+    def unsendable(request: object) -> None:
+        raise LocalProtocolError("too large")
+
+    send, lane.send = lane.send, unsendable  # type: ignore[method-assign]
+    with pytest.raises(LocalProtocolError):
+        session.requests.submit("render", render)
+    lane.send = send  # type: ignore[method-assign]
+    assert session.counters.requests == 0
+    session.requests.ask("render", render)
+
+
+def test_the_order_is_gymnasiums(session: EnvSession) -> None:
+    """A wait without its request, a request before its wait, and anything after close."""
+    requests = session.requests
+    with pytest.raises(NoAsyncCallError, match="`step_wait` without any prior"):
+        requests.end_wait("step")
+    requests.waiting = "reset"
+    with pytest.raises(AlreadyPendingCallError, match="pending call to `reset`"):
+        requests.ask("render", render)
+    requests.end_wait("reset")
+    requests.closed, requests.face = True, "Env"
+    with pytest.raises(ClosedEnvironmentError, match="`Env`, after a call to `close"):
+        requests.ask("render", render)
+
+
+def test_a_close_from_a_signal_handler_in_a_wait_says_closed(
+    session: EnvSession, lane: FakeLane
+) -> None:
+    """Whatever the wait ended in; and nothing of the environment is left."""
+
+    def closing(deadline: object) -> Any:
+        session.requests.closed = True
+        session.close()
+        raise OSError("the socket is gone")
+
+    lane.replies = closing  # type: ignore[method-assign]
+    with pytest.raises(ClosedEnvironmentError):
+        session.requests.ask("render", render)
+    assert lane.closed
+
+
+# --- warnings ----------------------------------------------------------------------------------
+
+
+def test_what_only_sends_is_not_stopped_by_a_filter(session: EnvSession, lane: FakeLane) -> None:
+    """The reply would be owed, and the next request refused."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warned(session, "sent")
+        session.requests.submit("render", render)
+        with pytest.raises(RemoteEnvWarning, match="sent"):
+            session.requests.collect(1.0, m.Value)
+    assert lane.owed is None
+    session.requests.ask("render", render)
+
+
+def test_a_filter_does_not_hide_a_ctrl_c(session: EnvSession, lane: FakeLane) -> None:
+    """A program that catches warnings as errors would go on."""
+    lane.fails = KeyboardInterrupt()
+    warned(session, "one")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(KeyboardInterrupt):
+            session.requests.ask("render", render)
