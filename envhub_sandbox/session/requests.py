@@ -263,8 +263,10 @@ class Requests:
     def _collect(
         self, timeout_s: float | None, kind: type[m.M] | tuple[type[m.M], ...]
     ) -> list[m.M]:
+        if self.lifecycle.state is not State.PENDING:
+            raise self._nothing_pending()
         try:
-            replies = self._finish(self._pending_lane().replies, Deadline(timeout_s))
+            replies = self._finish(self._lane().replies, Deadline(timeout_s))
         except RunnersDiedError as deaths:
             if self._recovery is None:
                 raise self._failures.dead(deaths.first) from None
@@ -335,7 +337,9 @@ class Requests:
         try:
             with self._turns.lock:
                 try:
-                    lane = self._pending_lane()
+                    lane = self._lease.lane
+                    if lane is None or self.lifecycle.state is not State.PENDING:
+                        raise self._nothing_pending()
                     self._finish(lane.wait, deadline)
                     self._counters.stepped(lane.elapsed_ns)
                     result = lane.result()
@@ -420,12 +424,9 @@ class Requests:
         assert lane is not None
         return lane
 
-    def _pending_lane(self) -> Lane:
-        lane = self._lease.lane
-        if lane is None or self.lifecycle.state is not State.PENDING:
-            state = self.lifecycle.state.value
-            raise WorkerError(f"there is no request to wait for: the environment is {state}")
-        return lane
+    def _nothing_pending(self) -> WorkerError:
+        state = self.lifecycle.state.value
+        return WorkerError(f"there is no request to wait for: the environment is {state}")
 
     def _finish(self, receive: Callable[[Deadline], T], deadline: Deadline) -> T:
         """Wait for the pending reply, and move on to the state that it leads to."""

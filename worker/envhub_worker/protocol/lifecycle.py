@@ -95,7 +95,8 @@ class Lifecycle:
     def answered(self) -> None:
         """No reply is owed any more."""
         self.request = None
-        self.moved(Event.REPLY)
+        if self.state is not State.CLOSED:  # as moved, which a step need not call
+            self.on(Event.REPLY)
 
     def moved(self, event: Event) -> None:
         """``on``, unless it was closed meanwhile: by another thread, or a signal handler."""
