@@ -1,8 +1,8 @@
-"""Leads whoever wrote an environment to his line: a worker's traceback, with the names he knows.
+"""The author's own line in a worker's traceback.
 
-A worker tells the files of its repository by their names in it. They get the place here that their
-author knows: the path in his folder, or the name in his repository at that commit; never the copy
-in the store. Which names these are, the verified snapshot says and no worker.
+A worker names the files of its repository relative to it. Here they get the name that their author
+knows: the path in the local folder, or the name in the repository at that commit; never the copy
+in the store. The verified snapshot decides which names these are, and not the worker.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def point_out(error: EnvHubError, snapshot: Snapshot) -> None:
 
 
 def _place(found: re.Match[str], snapshot: Snapshot) -> str | None:
-    name = found["file"].removeprefix(f"{snapshot.root}/")  # older workers tell the whole path
+    name = found["file"].removeprefix(f"{snapshot.root}/")  # older workers give the whole path
     return snapshot.known_as(name)
 
 
@@ -54,8 +54,8 @@ def _line(found: re.Match[str], snapshot: Snapshot) -> str:
     place = printable(str(_place(found, snapshot)))
     function = found["function"]
     inside = f", in {one_line(function, _FUNCTION_CHARS)}" if function else ""
-    told = [f"  File {place}, line {found['line']}{inside}", *_source(found)]
-    return "\n    ".join(told)
+    lines = [f"  File {place}, line {found['line']}{inside}", *_source(found)]
+    return "\n    ".join(lines)
 
 
 def _source(found: re.Match[str]) -> list[str]:

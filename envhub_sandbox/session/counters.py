@@ -1,7 +1,7 @@
-"""Counters of the environments: cheap to keep, put in order only when somebody asks.
+"""Counters of the environments: cheap to keep, and summed up only when they are read.
 
-``LEDGER`` knows those of all environments of this process, so that whoever watches it
-(``envhub_sandbox.metrics``) sees counts that only grow, also when environments go.
+``LEDGER`` has those of all environments of this process, so that ``envhub_sandbox.metrics`` sees
+counts that only grow, also when environments are closed.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Counters:
         self._total_ns += elapsed_ns
 
     def connected(self, connection: Connection | None) -> None:
-        """From now on this serves the environment, or nothing does."""
+        """From now on this connection serves the environment; None: no connection does."""
         if connection is not self._connection:
             self._before, self._connection = self._traffic(), connection
 
@@ -99,14 +99,14 @@ class Counters:
 
 
 class Labels(NamedTuple):
-    """Whose numbers they are."""
+    """What identifies a row of numbers."""
 
     repository: str
     suite: str
     task: str
 
 
-class Counted(Protocol):
+class CountedEnv(Protocol):
     """An environment."""
 
     counters: Counters
@@ -115,8 +115,8 @@ class Counted(Protocol):
         """Its numbers."""
 
 
-class Restarted(Protocol):
-    """Whoever counts the restarts."""
+class RestartCounter(Protocol):
+    """Counts the restarts of an environment."""
 
     count: int
 
@@ -125,7 +125,7 @@ class Row(NamedTuple):
     """The numbers of all environments with the same labels.
 
     Attributes:
-        labels: Whose they are.
+        labels: Of these environments.
         numbers: ``Counters.numbers`` and ``restarts``, of the living and of those that are gone.
         states: How many of the living are in each state.
         latencies_s: The last step latencies of the living.
@@ -144,13 +144,15 @@ class Ledger:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew: in a fork, whose environments are its parent's."""
+        """Drop all: in a fork, the environments are those of its parent."""
         self._lock = threading.RLock()  # the garbage collector may come while it is held
-        self._living: dict[int, tuple[Labels, weakref.ref[Counted], Counters, Restarted]] = {}
+        self._living: dict[
+            int, tuple[Labels, weakref.ref[CountedEnv], Counters, RestartCounter]
+        ] = {}
         self._gone: dict[Labels, dict[str, float]] = {}
 
-    def add(self, env: Counted, labels: Labels, restarts: Restarted) -> None:
-        """An environment has come; when it goes, its counts stay."""
+    def add(self, env: CountedEnv, labels: Labels, restarts: RestartCounter) -> None:
+        """Add an environment. Its counts stay when it goes."""
         key = id(env)
         with self._lock:
             self._living[key] = (labels, weakref.ref(env), env.counters, restarts)
@@ -181,7 +183,7 @@ class Ledger:
         ]
 
 
-def _numbers(counters: Counters, restarts: Restarted) -> dict[str, float]:
+def _numbers(counters: Counters, restarts: RestartCounter) -> dict[str, float]:
     return {**counters.numbers(), "restarts": restarts.count}
 
 

@@ -96,14 +96,14 @@ class EnvSession:
         return self.lease.report()
 
     def usage(self) -> dict[str, int]:
-        """What its jail holds, as its server counts it; empty where nobody says."""
-        told = self.lease.status()
-        found = {name: told.get(name) for name in ("processes", "threads", "memory_bytes")}
+        """What its jail holds, as its server counts it; empty if it does not say."""
+        status = self.lease.status()
+        found = {name: status.get(name) for name in ("processes", "threads", "memory_bytes")}
         counts = {name: one for name, one in found.items() if type(one) is int and 0 <= one < _MOST}
         return counts if len(counts) == len(found) else {}
 
     def denials(self) -> tuple[str, ...] | None:
-        """What its jail was denied, as its server says; None where nobody records it."""
+        """What its jail was denied, as its server says; None where it is not recorded."""
         return self.lease.denials()
 
     def stats(self) -> dict[str, Any]:
@@ -190,6 +190,9 @@ class EnvSession:
         if not self.turns.lock.acquire(blocking=False):
             self._interrupt()
             return
+        # CLOSED comes first: from then on no other thread starts anything. Then the repository's
+        # own close may run, and whatever becomes of that, the jail is given back and the lock
+        # released. An interrupt leaves the rest for the next call, which finds it closed.
         try:
             state = self.lifecycle.state
             self._end_life()
@@ -203,7 +206,7 @@ class EnvSession:
                 self.turns.lock.release()
 
     def _finish(self) -> None:
-        if self.turns.lock.acquire(blocking=False):  # else somebody is still at it
+        if self.turns.lock.acquire(blocking=False):  # else another thread is closing it
             try:
                 self.lease.let_go()
             finally:
@@ -214,14 +217,16 @@ class EnvSession:
         self._restarts.give_up()
 
     def _interrupt(self) -> None:
-        """Another thread waits for a reply: end the jail under it, then clean up after it.
+        """Another thread waits for a reply: end its jail, then clean up after it.
 
-        If it does not let go in time it cleans up itself, once it sees that this was closed: no
-        process is left for it to end.
+        If that thread does not release the lock in time, it cleans up itself once it sees that
+        this was closed; the jail's processes have ended by then.
         """
         if not self.lease.interrupt(self._end_life):
-            self.lease.depart()  # who has the turn may be past seeing that it is closed
-            return  # whoever brings a jail sees it
+            # No jail to end. The thread that has the turn sees the closed lifecycle where it takes
+            # a jail; it may be past that, so the server is released here.
+            self.lease.depart()
+            return
         close_s = self.repository.timeouts.close_s
         patience_s = INTERRUPT_S if close_s is None else min(close_s, INTERRUPT_S)
         if self.turns.lock.acquire(timeout=patience_s):
@@ -232,7 +237,7 @@ class EnvSession:
                 self.turns.lock.release()
 
     def abandon(self) -> None:
-        """In a fork of the process that made it: touch nothing, and refuse from now on."""
+        """In a fork of the process that made it: touch nothing, and refuse all requests."""
         self.turns.abandon()
         self.lifecycle.moved(Event.FORK)
         self.lifecycle.request = None

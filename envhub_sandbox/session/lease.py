@@ -1,6 +1,6 @@
 """An environment's hold on a jail: taken, built in, given up for another, and given back.
 
-Nothing here knows what is asked of the environment, nor why a jail has to be left.
+It does not know the requests to the environment, nor why a jail is given up.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ _SUCCESSOR_S = 60.0
 class Lease:
     """The jail of one environment, of which it has one at a time, or none, and the lane there.
 
-    Whoever has the environment's turn uses it. Only ``interrupt`` and ``abandon`` come from
-    elsewhere: another thread that closes, and a fork.
+    It is used by the thread that has the environment's turn, but for ``interrupt``, which a closing
+    thread calls, and ``abandon``, which a fork calls.
 
     Args:
         jails: Gives and takes back the jail.
         results: What the environment is expected to be, and its slices.
-        lifecycle: Where the environment is in its life; who closes it, closes it there first.
-        counters: Told which lane serves it.
+        lifecycle: Where the environment is in its life; ``close`` moves it first.
+        counters: Learn which lane serves it.
         paces: Takes note of what its steps took.
 
     Attributes:
@@ -103,7 +103,7 @@ class Lease:
         return {} if self.loaded is None else self._launcher.status(self.loaded)
 
     def denials(self) -> tuple[str, ...] | None:
-        """What its jail was denied, also where that is dead; None where nobody records it."""
+        """What its jail was denied, also where that is dead; None where it is not recorded."""
         loaded = self.loaded  # another thread may give it back
         if loaded is None:
             return None
@@ -125,7 +125,7 @@ class Lease:
             self.loaded.jail.output(operation, deadline)
 
     def forget_watched(self) -> None:
-        """A reply is lost that may have said what has changed, of others in the jail, too."""
+        """A reply is lost that may have named changed attributes, of any environment there."""
         loaded = self.loaded  # another thread may give it back
         if loaded is not None:
             loaded.jail.watched.forget()
@@ -137,7 +137,7 @@ class Lease:
 
         Raises:
             LoadError: The repository failed to load, or returned something else than before.
-            WorkerError: The jail did not come up, died, took too long, or nobody wants it any more.
+            WorkerError: The jail did not come up, died, took too long, or was given up.
         """
         self.give_back()  # of an attempt that was interrupted when all was built
         self._start(deadline, lambda: self._move_in(lambda: self._take(deadline), deadline))
@@ -202,7 +202,7 @@ class Lease:
 
         Python looks for signals where something is called. So nothing is, neither between the
         taking and the ``try``, nor between the building and the noting. Python 3.10 looks anywhere:
-        there a jail that nobody has noted is given back by its own end.
+        there a jail that was not noted is given back by its finalizer.
         """
         loaded = take()
         try:
@@ -216,7 +216,7 @@ class Lease:
             raise
         self._was_loaded = True
         self._counters.connected(lane)
-        if self.lifecycle.closed:  # only now: who closes from here on sees the jail
+        if self.lifecycle.closed:  # only now: a close from here on sees the jail
             raise closed_during("make_env")
 
     # --- moving out ----------------------------------------------------------------------------
@@ -242,7 +242,7 @@ class Lease:
             try:
                 if loaded is not None:
                     self._jails.give_back(loaded, wait=wait)
-                self.loaded = None  # only now: whoever interrupts this can have it done again
+                self.loaded = None  # only now: after an interrupt, the next call does it again
             except Exception:
                 self.loaded = None
                 raise
@@ -279,10 +279,10 @@ class Lease:
         self._departs()
 
     def interrupt(self, close: Callable[[], None]) -> bool:
-        """In another thread: ``close`` the environment, and end the jail under who waits for it.
+        """In another thread: ``close`` the environment, and end the jail that a request waits for.
 
         Returns:
-            Whether there was one; otherwise whoever brings one sees that it is closed.
+            Whether there was one; otherwise a thread that takes one sees that it is closed.
         """
         with self._ending:
             close()

@@ -51,7 +51,7 @@ class Recipe:
         return self.make_env(cfg, **options)
 
     def make_one(self, suite: str, task: int | str) -> Any:
-        """One fresh environment of them; the others are made by nobody."""
+        """One fresh environment of them."""
         return self.make()[suite][task]
 
 

@@ -9,13 +9,13 @@ from envhub_worker.protocol.lifecycle import State
 
 
 def closed_during(operation: str) -> WorkerDiedError:
-    """What is told to whoever waits for an environment that somebody closes."""
+    """The error of a request during which the environment was closed."""
     text = f"the environment was closed during {operation}"
     return WorkerDiedError(text, reason="killed", request=operation)
 
 
 def expiry(operation: str, why: str) -> WorkerDiedError:
-    """What is told of an environment that nobody used for too long."""
+    """The error of an environment that was idle for too long."""
     text = f"cannot {operation}: {why}, so its processes were ended; call reset() first"
     return WorkerDiedError(text, reason="idle", request=operation, detail=why)
 
@@ -28,8 +28,8 @@ def refusal(
     Args:
         state: Where it is in its life.
         operation: What is asked.
-        restart: What the policy says of an environment that has died.
-        interrupted: The request whose reply nobody waited for any more.
+        restart: The policy's ``restart``.
+        interrupted: The request whose wait was interrupted.
     """
     if state in (State.IDLE, State.READY):
         return None

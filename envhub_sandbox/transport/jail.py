@@ -37,7 +37,7 @@ _UNSEEN_S = 5.0
 class RunnersDiedError(WorkerDiedError):
     """Runners of a kept jail have died; the others have answered.
 
-    Never seen by a user: he is told ``first``, or nothing.
+    Never seen by a user, who gets ``first``, or nothing.
 
     Attributes:
         replies: In the order of the request; None where a runner has died.
@@ -162,7 +162,7 @@ class JailHandle:
             return [self._unpack(part) for part in parts]
 
     def _died(self, dead: Sequence[int], parts: list[list[Buffer]]) -> RunnersDiedError:
-        """Who has died is the server's word, which no runner can say."""
+        """The server says which runners have died; a runner cannot."""
         if not dead or not set(dead) <= set(range(len(parts))):
             raise RemoteProtocolError("the worker names dead runners that were not asked")
         deaths = {index: death(typed(self._unpack(parts[index]), m.Died)) for index in dead}
@@ -276,7 +276,7 @@ def open_jail(
         return JailHandle(client, opened.jail, runners, report, limits)
     except EnvHubError:
         raise
-    except BaseException:  # Ctrl-C: it is open, or will be, and nobody else knows its number
+    except BaseException:  # Ctrl-C: it is open, or will be, and its number is known here only
         _end_unseen(client, sent)
         raise
 

@@ -187,7 +187,7 @@ _LOADING = {
     "return": "its make_env returned something unusable",
 }
 _LOADERS_OWN = (".EntryError", ".ArgumentsError")
-"""What our own loader raises, which has a traceback of nobody's interest."""
+"""What our own loader raises; its traceback is of no use."""
 
 
 def raised(reply: m.Raised) -> EnvHubError:

@@ -24,7 +24,7 @@ from envhub_worker.protocol.untrusted import UNTRUSTED
 _PLAIN = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
 
 
-class Closing(Protocol):
+class Closable(Protocol):
     """What ends with the environment."""
 
     def close(self) -> None:
@@ -48,7 +48,7 @@ class SingleEnv(gym.Env[Any, Any]):
         ValueError: ``vector`` has another number of sub-environments.
     """
 
-    def __init__(self, vector: VectorEnv[Any, Any, Any], owner: Closing | None = None) -> None:
+    def __init__(self, vector: VectorEnv[Any, Any, Any], owner: Closable | None = None) -> None:
         if vector.num_envs != 1:
             raise ValueError(
                 f"a gymnasium.Env is one environment, and {vector!r} has {vector.num_envs}: make "
@@ -108,7 +108,7 @@ class SingleEnv(gym.Env[Any, Any]):
                 __tracebackhide__ = True  # pytest hides the frame then
                 raise error  # ENVHUB_TRACEBACK=full shows where
             raise
-        with UNTRUSTED:  # of a repository's own class, nobody has declared what its results are
+        with UNTRUSTED:  # the results of a repository's own class are not declared
             return self._of_one(*result)
 
     def _of_one(

@@ -1,8 +1,8 @@
 """One sub-environment: ``env.envs[0]``, as an ``Env`` that lives in the jail.
 
-Followed: ``gymnasium.vector.SyncVectorEnv.envs``, which holds the environments themselves. So what
-is done to one of them is done behind the vector environment's back: it keeps the observation and
-the end of an episode that its own last step has seen.
+Followed: ``gymnasium.vector.SyncVectorEnv.envs``, which holds the environments themselves. A
+step or a reset of one of them does not change what the vector environment knows: it keeps the
+observation and the end of an episode of its own last step.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _OUTERMOST = 0
 _SEARCHED = -1
 """In place of a depth: whichever wrapper has it."""
 _MOST_WRAPPERS = 1000
-"""Around one environment: whoever looks for the innermost would never come to an end. As many as
-calls of Python in one another, which a step through them is."""
+"""Around one environment; otherwise a search for the innermost might never end. As many as Python's
+nested calls, which a step through the wrappers makes."""
 _OURS = frozenset({"_vector", "_ask", "_index", "_depth"})
 
 
@@ -187,7 +187,7 @@ class SubEnvironment(gym.Env[Any, Any]):
     def has_wrapper_attr(self, name: str) -> bool:
         """Whether it has an attribute, or a wrapper of it."""
         found = self._call("has_wrapper_attr", (name,), {})
-        with UNTRUSTED:  # of an array, nobody can say
+        with UNTRUSTED:  # an array has no truth value
             return bool(found)
 
     @short_traceback

@@ -1,4 +1,4 @@
-"""What ``make_env`` returns: ``{suite: {task_id: VectorEnv}}``, with an end and an origin."""
+"""What ``make_env`` returns: ``{suite: {task_id: VectorEnv}}``, with ``close``, ``provenance``."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
         return SingleEnv(self.choose(suite, task), self)
 
     def keep(self, suite: str | None = None, task: int | str | None = None) -> None:
-        """Close and drop all but this suite and this task, which is told by its text, too.
+        """Close and drop all but this suite and this task; a task is also found by its text.
 
         Raises:
             ValueError: Nothing would be left; the text names what there is.
@@ -132,7 +132,7 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
 
     def close(self) -> None:
         """Close every environment and end its processes. Idempotent."""
-        with contextlib.ExitStack() as all_of_them:  # what one raises keeps no other open
+        with contextlib.ExitStack() as all_of_them:  # all are closed, also where one raises
             all_of_them.callback(self._on_close)
             for env in list(self.envs())[::-1]:
                 all_of_them.callback(env.close)

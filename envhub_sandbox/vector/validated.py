@@ -1,7 +1,7 @@
-"""Every action and observation held against its space: for whoever tests an environment.
+"""Every action and observation checked against its space, to test an environment.
 
-Costs a look at each value. Shapes, dtypes and structures are checked in any case; values are not,
-because many environments leave their own bounds and train all the same.
+It looks at each value, which takes time. Shapes, dtypes and structures are checked in any case;
+values are not, because many environments leave their own bounds and train all the same.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _SHOWN = 200
 
 
 class ValidatedVectorEnv(SandboxVectorEnv):
-    """A ``SandboxVectorEnv`` that refuses what its spaces do not hold.
+    """A ``SandboxVectorEnv`` that refuses what is outside of its spaces.
 
     Raises:
         ActionError: An action is outside of its space; nothing was sent.
@@ -37,7 +37,7 @@ class ValidatedVectorEnv(SandboxVectorEnv):
     def __init__(self, session: EnvSession) -> None:
         super().__init__(session)
         spaces_of_actions = self.single_action_space, self.action_space
-        # not a method of ours: who holds himself is not closed when nobody else holds him
+        # not a bound method: an environment that refers to itself is not closed with its last owner
         self._read_actions = partial(_read_and_check, self._read_actions, *spaces_of_actions)
 
     def _end_reset(self, timeout_s: float | None) -> tuple[Any, dict[Any, Any]]:
@@ -89,7 +89,7 @@ class ValidatedVectorEnv(SandboxVectorEnv):
 def holds(space: gym.Space[Any], member: Any) -> bool:
     """Whether a value is in a space; numbers of another dtype count as what they are worth."""
     if isinstance(space, OpaqueSpace):
-        return True  # nobody here knows
+        return True  # its members are not known here
     if isinstance(space, spaces.Dict):
         if not isinstance(member, dict) or member.keys() != space.spaces.keys():
             return False

@@ -64,12 +64,12 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         self.metadata = from_manifest.metadata(manifest)
         self.render_mode = manifest.render_mode
         self.spec = from_manifest.spec(manifest, session.repository.label)
-        if manifest.shardable:  # another one's are its own, if it has them
+        if manifest.shardable:  # a repository's own class has others, or none
             self.autoreset_mode = self.metadata.get("autoreset_mode")
             self.copy = session.repository.copy
             self.env_fns = from_manifest.env_fns(manifest, session.repository.label)
             self.observation_mode = "same"
-        # a proxy that nobody holds any more must not keep processes alive
+        # processes end with the last reference to the proxy
         weakref.finalize(self, session.close).atexit = False
 
     @property
@@ -139,7 +139,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         self._recover()
         sliced = self._manifest.shardable and seeds is not None
 
-        def message(number: int, bounds: Bounds) -> m.Message:  # kept: it must not hold us
+        def message(number: int, bounds: Bounds) -> m.Message:  # is kept: it must not refer to self
             start, stop = bounds
             some = seeds[start:stop] if sliced else seeds
             return m.Reset(number, some, options, None if mask is None else mask[start:stop])
@@ -386,8 +386,8 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     def __getattr__(self, name: str) -> Any:
         """An attribute that the repository's vector environment has beyond Gymnasium's."""
         manifest = self.__dict__.get("_manifest")
-        # Judged once more, whatever the manifest went through: what has a name of ours would be
-        # asked for when a property of that name fails.
+        # Checked here once more, although the manifest was: where a property of ours raises
+        # AttributeError, Python calls this method with its name.
         ours = not is_servable(name) or hasattr(type(self), name)
         if manifest is None or ours or name not in manifest.attributes:
             raise absent(self, name, "get_attr")
@@ -405,7 +405,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         return method
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # For copy and deepcopy, too: two environments cannot share processes that either may end.
+        # Also for copy and deepcopy: a copy has processes of its own, since either may be closed.
         recipe = self._session.repository.recipe
         if recipe is None:
             raise TypeError(f"{self!r} does not know how it was made, so it cannot be pickled")

@@ -28,11 +28,11 @@ class Restarts:
 
     @property
     def permitted(self) -> bool:
-        """Whether the policy knows of any."""
+        """Whether the policy permits any."""
         return self._policy.restart != "never"
 
     def give_up(self) -> None:
-        """Nobody needs another one: end a wait in another thread, soon."""
+        """No more restarts are needed: a wait in another thread ends soon."""
         # no Event: a signal handler in the midst of its wait could not set it
         self._given_up = True
 

@@ -15,9 +15,10 @@ RESTARTED = "worker_restarted"
 
 
 def truncated(reply: m.StepDone, count: int) -> m.StepDone:
-    """A fresh runner's rows of the step in which another died. Trust: its flags are not asked.
+    """A fresh runner's rows of the step in which another died. Trust: its flags are not used.
 
-    Nor is anything but an array for a shape, which it has paid for: that of a space is only told.
+    Of the rewards the shape is used where they are an array: then it was paid for in bytes. A
+    described space also has a ``shape``, of any size, for a few.
     """
     rewards: Any = reply.rewards
     return m.StepDone(
