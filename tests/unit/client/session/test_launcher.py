@@ -1,0 +1,171 @@
+"""How a jail ends, once, whatever interrupts it; and what is taken of its server's words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from envhub_sandbox.errors import WorkerDiedError, WorkerStartupError
+from envhub_sandbox.sandboxes.base import Sandbox
+from envhub_sandbox.session.jails import launcher as launcher_module
+from envhub_sandbox.session.jails.launcher import Launcher
+from envhub_sandbox.session.jails.loaded import LoadedJail
+from envhub_worker.protocol import messages as m
+from tests.support.fake_lane import FakeLane, session_over
+
+
+class _Client:
+    """Every connection to the server, as one."""
+
+    def __init__(self) -> None:
+        self.torn = False
+        self.asked: list[m.Message] = []
+        self.status: Any = ()
+        self.refuses: BaseException | None = None
+
+    def hello(self, deadline: object) -> None:
+        """It answers, or not."""
+        if self.refuses is not None:
+            raise self.refuses
+
+    def request(self, message: m.Message, deadline: object) -> tuple[m.Message, list[Any]]:
+        """An answer to it."""
+        self.asked.append(message)
+        return m.Status(self.status) if isinstance(message, m.GetStatus) else m.Done(), []
+
+    def close(self) -> None:
+        """Nothing is left."""
+
+
+class _Place(Sandbox):
+    """A place whose server is there already."""
+
+    name = "fake"
+
+    def __init__(self) -> None:
+        self.released = 0
+        self.fails = False
+
+    def acquire(self, store: Any, runtime: Any = None, idle_s: float | None = 0.0) -> Any:
+        """A use of it."""
+        if self.fails:
+            raise WorkerStartupError("it did not come up")
+        server = SimpleNamespace(endpoint="", process_fd=0)
+        return SimpleNamespace(shared=server, live=False, release=self.release)
+
+    def release(self) -> None:
+        """One use less."""
+        self.released += 1
+
+
+@pytest.fixture
+def client(monkeypatch: pytest.MonkeyPatch) -> _Client:
+    """What the launcher speaks by."""
+    made = _Client()
+    monkeypatch.setattr(launcher_module, "WorkerClient", lambda *_: made)
+    return made
+
+
+@pytest.fixture
+def place() -> _Place:
+    """Where the worker runs."""
+    return _Place()
+
+
+@pytest.fixture
+def launcher(client: _Client, place: _Place) -> Launcher:
+    """Of a repository whose denials are recorded."""
+    repository = session_over(FakeLane()).repository
+    repository.policy = type(repository.policy)(record_denials=True)
+    repository.runtime = cast("Any", SimpleNamespace(python="", packages=""))
+    return Launcher(repository, place, Path())
+
+
+def opened(launcher: Launcher, client: _Client, place: _Place) -> Any:
+    """A jail with the number 7."""
+    waits: list[object] = []
+    jail = SimpleNamespace(
+        number=7,
+        client=client,
+        waits=waits,
+        ask_to_close=lambda: waits.append,
+        before_end=lambda: None,
+        drop=lambda: None,
+    )
+    use = place.acquire(None)
+    return LoadedJail(cast("Any", jail), cast("Any", None), {}, set(), use, launcher.close)
+
+
+def test_a_jail_is_closed_once(launcher: Launcher, client: _Client, place: _Place) -> None:
+    """And its server is given back once."""
+    loaded = opened(launcher, client, place)
+    for _ in range(2):
+        launcher.close(loaded)
+    assert loaded.closed
+    assert (len(loaded.jail.waits), place.released) == (1, 1)
+
+
+def test_an_interrupted_close_goes_on_over_another_connection(
+    launcher: Launcher, client: _Client, place: _Place
+) -> None:
+    """What was said on its own before the interrupt is not known."""
+    loaded = opened(launcher, client, place)
+
+    def interrupted() -> Any:
+        raise KeyboardInterrupt
+
+    loaded.jail.ask_to_close = interrupted
+    with pytest.raises(KeyboardInterrupt):
+        launcher.close(loaded)
+    assert (loaded.closed, place.released) == (False, 0)
+    launcher.close(loaded)
+    assert client.asked == [m.CloseJail(7)]
+    assert (loaded.closed, place.released) == (True, 1)
+
+
+@pytest.mark.parametrize(
+    ("status", "states"),
+    [
+        (({"jail": 7, "states": ("steps", "waits")},), ("steps", "waits")),
+        (({"jail": 8, "states": ("another's",)},), ()),
+        (({"jail": 7, "states": ("steps", 5, None)},), ("steps",)),
+        (({"jail": 7, "states": "text"}, 3, None), ()),
+    ],
+)
+def test_only_words_are_taken_of_a_status(
+    launcher: Launcher, client: _Client, place: _Place, status: Any, states: tuple[str, ...]
+) -> None:
+    """A server on another host may say anything."""
+    client.status = status
+    assert launcher.states(opened(launcher, client, place)) == states
+
+
+def test_a_silent_server_has_no_status(launcher: Launcher, client: _Client, place: _Place) -> None:
+    """Which is no error: it is for a text."""
+    client.refuses = WorkerDiedError("gone")
+    assert launcher.status(opened(launcher, client, place)) == {}
+
+
+@pytest.mark.parametrize(("reason", "asked"), [("exit", 1), ("server", 0), ("connection", 0)])
+def test_denials_are_asked_for_where_the_server_can_know(
+    launcher: Launcher, client: _Client, reason: Any, asked: int
+) -> None:
+    """Once for each error, and not of a server that has gone itself."""
+    client.status = ({"jail": 7, "denied": ("ptrace",)},)
+    error = WorkerDiedError("it died", reason=reason)
+    for _ in range(2):
+        launcher.note_denied(error, cast("Any", SimpleNamespace(endpoint="", process_fd=0)), 7)
+    launcher.note_denied(KeyboardInterrupt(), cast("Any", None), 7)
+    assert len(client.asked) == asked
+    assert error.denied == (("ptrace",) if asked else None)
+
+
+def test_no_server_no_use(launcher: Launcher, place: _Place) -> None:
+    """Nothing is left to be released."""
+    place.fails = True
+    with pytest.raises(WorkerStartupError):
+        launcher.hold()
+    assert place.released == 0

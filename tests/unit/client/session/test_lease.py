@@ -1,0 +1,153 @@
+"""An environment's hold on a jail: whatever interrupts it, the jail is given back, once."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from envhub_sandbox.errors import ServerBusyError, WorkerDiedError
+from envhub_sandbox.session import lease as lease_module
+from envhub_sandbox.session.lease import Lease
+from envhub_sandbox.transport.deadline import StartupDeadline
+from envhub_worker.protocol.lifecycle import Event, State
+from tests.support.fake_lane import FakeLane, session_over
+
+
+class _Jails:
+    """Where jails come from, and what was done with them, in order."""
+
+    def __init__(self, launcher: Any) -> None:
+        self.done: list[str] = []
+        self.fails: dict[str, list[BaseException]] = {}
+        self.launcher = launcher
+        launcher.settle = lambda: False
+        launcher.note_denied = lambda *_: None
+        launcher.hold = lambda: lambda: self.done.append("server released")
+        self.launcher.retry_s = 0.0
+        self.built = 0
+
+    def do(self, what: str) -> None:
+        """Note it, and fail where it is to fail."""
+        self.done.append(what)
+        if self.fails.get(what):
+            raise self.fails[what].pop()
+
+    def take(self, deadline: object) -> Any:
+        """A jail."""
+        self.do("take")
+        return SimpleNamespace(jail=SimpleNamespace(number=1, report=[]), server=None)
+
+    def end(self, loaded: object) -> None:
+        """End it."""
+        self.do("end")
+
+    def give_back(self, loaded: object, *, wait: bool = True) -> None:
+        """Give it back."""
+        self.do("give back")
+
+
+@pytest.fixture
+def taken(monkeypatch: pytest.MonkeyPatch) -> tuple[Lease, _Jails]:
+    """The lease of an environment that has no jail yet, and where it gets one."""
+    lane = FakeLane()
+    session = session_over(lane)
+    jails = _Jails(SimpleNamespace(repository=session.repository, stay=lambda: lambda: None))
+    building = SimpleNamespace(build=lambda *_: jails.do("build") or lane)
+    monkeypatch.setattr(lease_module, "Builder", lambda *_: building)
+    session.lifecycle.state = State.IDLE
+    lease = Lease(
+        cast("Any", jails),
+        session.requests.results,
+        session.lifecycle,
+        session.counters,
+        cast("Any", None),
+    )
+    return lease, jails
+
+
+def acquire(lease: Lease) -> None:
+    """With time enough."""
+    lease.acquire(StartupDeadline(60))
+
+
+def test_a_jail_is_taken_built_in_and_given_back_once(taken: tuple[Lease, _Jails]) -> None:
+    """And its lane is closed."""
+    lease, jails = taken
+    acquire(lease)
+    assert lease.lane is not None
+    for _ in range(2):
+        lease.let_go()
+    assert jails.done == ["take", "build", "give back"]
+    assert (lease.loaded, lease.lane) == (None, None)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), WorkerDiedError("it died")])
+def test_what_cannot_be_built_is_given_back(
+    taken: tuple[Lease, _Jails], error: BaseException
+) -> None:
+    """Nothing of it is kept, and the next attempt takes another."""
+    lease, jails = taken
+    jails.fails["build"] = [error]
+    with pytest.raises(type(error)):
+        acquire(lease)
+    assert jails.done == ["take", "build", "give back"]
+    assert lease.loaded is None
+    acquire(lease)
+    assert lease.loaded is not None
+
+
+def test_an_interrupted_return_is_done_again(taken: tuple[Lease, _Jails]) -> None:
+    """The jail is noted until it has been given back."""
+    lease, jails = taken
+    acquire(lease)
+    jails.fails["give back"] = [KeyboardInterrupt()]
+    with pytest.raises(KeyboardInterrupt):
+        lease.let_go()
+    assert lease.loaded is not None
+    lease.let_go()
+    assert jails.done[2:] == ["give back", "give back"]
+    assert lease.loaded is None
+
+
+def test_a_server_is_held_until_the_next_jail_is_there(taken: tuple[Lease, _Jails]) -> None:
+    """Or else it would end with the one that is given up."""
+    lease, jails = taken
+    acquire(lease)
+    jails.done.clear()
+    lease.leave()
+    acquire(lease)
+    assert jails.done == ["end", "give back", "take", "build", "server released"]
+
+
+def test_a_full_server_is_asked_again_once_there_is_room(taken: tuple[Lease, _Jails]) -> None:
+    """Where nothing can be given up, its refusal is the answer."""
+    lease, jails = taken
+    full = ServerBusyError("full", quota="jails", used=1, limit=1, retry_s=0.1)
+    jails.fails["take"] = [full]
+    with pytest.raises(ServerBusyError):
+        acquire(lease)
+    jails.fails["take"] = [full]
+    lease.make_room = lambda: True
+    acquire(lease)
+    assert lease.loaded is not None
+
+
+def test_a_jail_that_comes_after_close_is_refused(taken: tuple[Lease, _Jails]) -> None:
+    """The thread that brought it sees that, and gives it back."""
+    lease, jails = taken
+    lease.lifecycle.on(Event.CLOSE)
+    with pytest.raises(WorkerDiedError, match="closed during make_env"):
+        acquire(lease)
+    lease.let_go()
+    assert jails.done == ["take", "build", "give back"]
+
+
+def test_a_fork_gives_nothing_back(taken: tuple[Lease, _Jails]) -> None:
+    """The jail is its parent's."""
+    lease, jails = taken
+    acquire(lease)
+    lease.abandon()
+    assert jails.done == ["take", "build"]
+    assert lease.lane is None
