@@ -11,9 +11,10 @@ import numpy as np
 from envhub_sandbox.errors import WorkerTimeoutError
 from envhub_sandbox.policy import Policy, Timeouts
 from envhub_sandbox.session.env_session import EnvSession
-from envhub_sandbox.session.repository import LoadArguments, Repository
+from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.lane import Request
+from envhub_sandbox.transport.remote_warnings import RemoteWarnings
 from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.transport.watched_values import WatchedValues
 from envhub_worker.protocol import messages as m
@@ -99,22 +100,25 @@ class FakeLane:
         self.closed = True
 
 
+class FakeRepository(Repository):
+    """A repository without files, of which no crash is kept."""
+
+    def __init__(self) -> None:
+        self.snapshot = cast("Any", SimpleNamespace(label="a/b", path=None))
+        self.policy, self.timeouts = Policy(crash_history=8), Timeouts()
+        self.warnings, self.recipe, self.copy = RemoteWarnings(), None, True
+
+    def keep_crash(self, *_: object, **__: object) -> None:
+        """There is none."""
+
+
 def _observation() -> Any:
     return np.zeros((NUM_ENVS, *OBSERVATION.shape), OBSERVATION.dtype)
 
 
 def session_over(lane: FakeLane) -> EnvSession:
     """A session that is READY, with its environment behind this lane."""
-    snapshot = SimpleNamespace(label="a/b", path=None)
-    repository = Repository(
-        cast("Any", snapshot),
-        LoadArguments(),
-        Policy(crash_history=8),
-        Timeouts(),
-        cast("Any", None),
-        "auto",
-        True,
-    )
+    repository = FakeRepository()
     launcher = SimpleNamespace(repository=repository, stay=lambda: lambda: None)
     jails = SimpleNamespace(launcher=launcher)
     paces = SimpleNamespace(note=lambda *_: None)
