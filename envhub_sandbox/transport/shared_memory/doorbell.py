@@ -117,7 +117,7 @@ class Watch:
         self._epoll.close()
 
 
-class Answering(Protocol):
+class AnswerSource(Protocol):
     """A shard, as far as its answer is waited for."""
 
     def answered(self) -> bool:
@@ -127,7 +127,7 @@ class Answering(Protocol):
         """Whether we sleep, for its runner to read."""
 
 
-def sleep_for(watch: Watch, shard: Answering, deadline: Deadline) -> bool:
+def sleep_for(watch: Watch, shard: AnswerSource, deadline: Deadline) -> bool:
     """Sleep until a shard answers, or a process dies; whether it has answered.
 
     Raises:
