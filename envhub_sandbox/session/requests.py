@@ -329,13 +329,13 @@ class Requests:
 
     def collect_step(self, timeout_s: float | None) -> StepResult:
         """What ``VectorEnv.step`` returns; raises as ``collect`` does."""
-        deadline: Deadline = self._step_deadline
-        if timeout_s is deadline.timeout_s:
-            self._step_deadline.running = False
-        else:
-            deadline = Deadline(timeout_s)
         try:
             with self._turns.lock:
+                deadline: Deadline = self._step_deadline
+                if timeout_s is deadline.timeout_s:
+                    self._step_deadline.running = False
+                else:
+                    deadline = Deadline(timeout_s)
                 try:
                     lane = self._lease.lane
                     if lane is None or self.lifecycle.state is not State.PENDING:
