@@ -260,7 +260,7 @@ class RelayLane:
             self.runners[index] = runner
 
     def pace(self) -> Pace | None:
-        """None: only shared memory measures it."""
+        """None: what a shard takes itself is not known over the server."""
         return None
 
     def traffic(self) -> tuple[int, int, int]:
