@@ -24,6 +24,7 @@ CLIENTS_OWN = {
         "packaging",
         "platformdirs",
         "psutil",
+        "pyproject_hooks",
         "rich",
         "tomli",
         "tomllib",
@@ -64,8 +65,8 @@ MAY_IMPORT = {
     },
     "envhub_sandbox.api": {"making", "policy", "sandboxes", "vector"},
     "envhub_sandbox.making": {
-        *("dependencies", "hub", "locks", "policy", "sandboxes", "session", "std_streams"),
-        *("transport", "vector"),
+        *("dependencies", "hub", "locks", "parent", "policy", "sandboxes", "session"),
+        *("std_streams", "transport", "vector"),
     },
     "envhub_sandbox.check": {
         *("", "api", "dependencies", "hub", "locks", "parent", "policy", "rollouts", "session"),

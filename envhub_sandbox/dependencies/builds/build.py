@@ -1,0 +1,245 @@
+"""From sources to wheels: fetched, unpacked, built in a jail, checked, kept."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import replace
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+from envhub_sandbox.dependencies import environments, interpreters
+from envhub_sandbox.dependencies.builds import (
+    download,
+    git,
+    jail,
+    missing,
+    project,
+    trees,
+    wheel_store,
+    wheels,
+)
+from envhub_sandbox.dependencies.declared import Wanted, parse_requirement
+from envhub_sandbox.dependencies.interpreters import Interpreter
+from envhub_sandbox.dependencies.request import PackageRequest
+from envhub_sandbox.dependencies.resolve import Lock, Target, resolve
+from envhub_sandbox.dependencies.sources import Source
+from envhub_sandbox.errors import DependencyError, RequirementError, ResolutionError
+from envhub_sandbox.hub.logins import without_login
+from envhub_worker.protocol.runtime import OWN
+
+Tell = Callable[[str], None]
+_DEEPEST = 8
+_ROUNDS = 3
+"""Backends may say what they need besides; once they have it, they may say more."""
+_UNDER_WAY: ContextVar[tuple[str, ...]] = ContextVar("sources that are being built", default=())
+
+
+def build_wheels(
+    sources: Sequence[Source], interpreter: Interpreter, tell: Tell = lambda line: None
+) -> list[Path]:
+    """A wheel of each: kept from before, or built in a jail without network.
+
+    Args:
+        sources: What there is no wheel of.
+        interpreter: What they are for.
+        tell: Gets a line for each thing that happens.
+
+    Raises:
+        ResolutionError: One cannot be built; the text says why, and what is missing here.
+        DependencyError: As with downloads, and where sources or a wheel are refused.
+        SandboxUnavailableError: This host has no jail to build in.
+    """
+    return [_wheel(source, interpreter, tell) for source in sources]
+
+
+def _wheel(source: Source, interpreter: Interpreter, tell: Tell) -> Path:
+    if source.commit:
+        source = replace(source, commit=git.resolve(source.url, source.commit))
+    known = wheel_store.recall(identity(source), interpreter)
+    if known is not None:
+        return known
+    with _under_way(source), tempfile.TemporaryDirectory(prefix="envhub-build-") as place:
+        Path(place).chmod(0o755)  # a jail's user is another one
+        tree = _fetched(source, Path(place), tell)
+        return _Build(source, tree, Path(place), interpreter, tell).wheel()
+
+
+def identity(source: Source) -> str:
+    """What names its content: the hash of a file, or a full commit."""
+    if not source.commit:
+        return f"sha256:{source.sha256}"
+    below = f"#subdirectory={source.subdirectory}" if source.subdirectory else ""
+    return f"git+{source.url}@{source.commit}{below}"
+
+
+@contextmanager
+def _under_way(source: Source) -> Iterator[None]:
+    """Refuse a source that is needed to build itself."""
+    above = _UNDER_WAY.get()
+    chain = (*above, source.name)
+    if source.name in above or len(chain) > _DEEPEST:
+        raise ResolutionError(
+            f"{source.name} cannot be built: there are no wheels of what it is built with, which "
+            f"is built with it in turn ({' <- '.join(chain)})"
+        )
+    token = _UNDER_WAY.set(chain)
+    try:
+        yield
+    finally:
+        _UNDER_WAY.reset(token)
+
+
+def _fetched(source: Source, place: Path, tell: Tell) -> Path:
+    """The folder of its files."""
+    tree = place / "source"
+    tree.mkdir()
+    tell(f"fetching the source of {_title(source)}")
+    if source.commit:
+        git.check_out(source.url, source.commit, tree, tell)
+        return _below(tree, source)
+    archive = place / Path(unquote(urlsplit(source.url).path)).name
+    download.download(source.url, source.sha256, archive)
+    top = trees.unpack(archive, tree, _title(source))
+    archive.unlink()
+    return top
+
+
+def _below(tree: Path, source: Source) -> Path:
+    found = tree
+    for step in filter(None, source.subdirectory.split("/")):
+        if step in (".", "..") or not (found / step).is_dir():
+            raise RequirementError(
+                f"{_title(source)} has no folder {source.subdirectory[:200]!r}. {source.where}"
+            )
+        found = found / step
+    return found
+
+
+def _title(source: Source) -> str:
+    if source.commit:
+        return f"{source.name} ({without_login(source.url)}@{source.commit[:12]})"
+    return f"{source.name} {source.version}"
+
+
+class _Build:
+    """One source, unpacked."""
+
+    def __init__(
+        self, source: Source, tree: Path, place: Path, interpreter: Interpreter, tell: Tell
+    ) -> None:
+        self._source = source
+        self._tree = tree
+        self._place = place
+        self._interpreter = interpreter
+        self._tell = tell
+        self._project = project.read(tree, _title(source))
+
+    def wheel(self) -> Path:
+        """Built, checked and kept.
+
+        Raises:
+            ResolutionError: It cannot be built; the text is of the last try.
+        """
+        further: tuple[str, ...] = ()
+        while True:
+            try:
+                return self._tried(further)
+            except jail.BuildFailedError as failed:
+                more = self._remedy(str(failed), further)
+                if not more:
+                    raise self._failed(failed) from failed
+                further = (*further, *more)
+
+    def _remedy(self, log: str, tried: tuple[str, ...]) -> tuple[str, ...]:
+        """Requirements with which it may be built after all; empty where there are none.
+
+        A program that it lacks may come as a wheel. And sources of years ago may not be read by
+        the setuptools of today: then one of theirs is tried.
+        """
+        program = missing.wheel_for(log)
+        if program and program not in tried:
+            return (program,)
+        old = _old_tools(self._interpreter)
+        if not self._project.uses_setuptools or missing.advice(log) or old[0] in tried:
+            return ()
+        return old
+
+    def _tried(self, further: tuple[str, ...]) -> Path:
+        known: tuple[str, ...] = ()
+        for number in range(_ROUNDS):
+            packages, lock = self._environment((*further, *known))
+            self._tell(f"building {_title(self._source)} in a jail")
+            folder = Path(tempfile.mkdtemp(prefix=f"try-{number}-", dir=self._place))
+            folder.chmod(0o755)
+            found = jail.build(self._order(packages, known), folder)
+            if isinstance(found, Path):
+                return self._kept(found, lock)
+            known = (*known, *found)
+        raise jail.BuildFailedError("its backend never has all that it needs")
+
+    def _environment(self, further: Iterable[str]) -> tuple[Path, str]:
+        """The folder of what it is built with, and the hash of that one's lock."""
+        where = f"what {_title(self._source)} is built with"
+        wanted = [*self._project.requires, *(parse_requirement(text, where) for text in further)]
+        if not wanted:
+            (self._place / "nothing").mkdir(exist_ok=True)
+            return self._place / "nothing", Lock("").digest
+        lock = _lock(tuple(wanted), where, self._interpreter, self._tell)
+        return environments.provide(lock, self._interpreter, self._tell).packages, lock.digest
+
+    def _order(self, packages: Path, known: tuple[str, ...]) -> jail.Order:
+        return jail.Order(
+            *(self._tree, self._project, packages, self._interpreter),
+            runtime=_runtime(self._interpreter, self._tell),
+            known=(*(str(one.requirement) for one in self._project.requires), *known),
+            environment=self._variables(),
+        )
+
+    def _variables(self) -> dict[str, str]:
+        """Without ``.git`` nothing else says a version to those that ask git for it."""
+        if not self._source.commit:
+            return {}
+        return {"SETUPTOOLS_SCM_PRETEND_VERSION": f"0+g{self._source.commit[:12]}"}
+
+    def _kept(self, wheel: Path, lock: str) -> Path:
+        source = self._source
+        wheels.check(wheel, source.name, source.version, self._interpreter)
+        url = without_login(source.url)
+        facts = identity(source), url, lock
+        return wheel_store.keep(wheel, *facts, self._interpreter)
+
+    def _failed(self, failed: DependencyError) -> ResolutionError:
+        source, log = self._source, str(failed)
+        said = missing.advice(log)
+        needed_by = f" ({source.where})" if source.where else ""
+        return ResolutionError(
+            f"{_title(source)}{needed_by} has no wheel for Python {self._interpreter.version}, and "
+            f"building its source in a jail failed. {said + '. ' if said else ''}The build says:\n"
+            f"{log}"
+        )
+
+
+def _old_tools(interpreter: Interpreter) -> tuple[str, ...]:
+    """What reads projects that are older than its checks, and brings ``pkg_resources``.
+
+    Before 66.1 no setuptools runs in Python 3.12.
+    """
+    old = tuple(map(int, interpreter.version.split(".")[:2])) < (3, 12)
+    return ("setuptools<66" if old else "setuptools<81", "wheel<0.40")
+
+
+def _lock(wanted: tuple[Wanted, ...], what: str, interpreter: Interpreter, tell: Tell) -> Lock:
+    request = PackageRequest(what, wanted)
+    return resolve(request, Target(python=interpreter.path), tell=tell)
+
+
+def _runtime(interpreter: Interpreter, tell: Tell) -> tuple[str, str]:
+    """What runs the jail's own code: here this interpreter's packages, else ones that are made."""
+    if interpreter == interpreters.own():
+        return OWN
+    lock = _lock((), "the jail of a build", interpreter, tell)
+    environment = environments.provide(lock, interpreter, tell)
+    return environment.python, str(environment.packages)

@@ -1,0 +1,122 @@
+"""Downloads one file of a known hash, as data.
+
+The index, its logins, certificates and proxies are those of the user's settings for uv and pip.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import http.client
+import netrc
+import os
+import re
+import ssl
+import urllib.error
+import urllib.request
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO
+from urllib.parse import unquote, urlsplit
+
+from envhub_sandbox.dependencies import index
+from envhub_sandbox.errors import (
+    IndexUnavailableError,
+    PackageIntegrityError,
+    PackagesTooLargeError,
+)
+from envhub_sandbox.hub.logins import authorization, login_of, without_login
+from envhub_worker.protocol.text import size_text
+
+MAX_BYTES = 512 * 2**20
+_TIMEOUT_S = 60.0
+_BLOCK = 1 << 20
+_USER_AGENT = "envhub-sandbox"
+_INDEXES = ("UV_DEFAULT_INDEX", "UV_INDEX", "UV_INDEX_URL", "UV_EXTRA_INDEX_URL")
+
+
+def download(url: str, sha256: str, target: Path) -> None:
+    """Write the file of a URL.
+
+    Raises:
+        IndexUnavailableError: It cannot be had.
+        PackagesTooLargeError: It is too large.
+        PackageIntegrityError: It has another hash.
+    """
+    shown = without_login(url)
+    try:
+        with _opened(url) as source, target.open("wb") as file:
+            found = _copy(source, file, shown)
+    except (OSError, http.client.HTTPException, ValueError) as error:
+        raise IndexUnavailableError(f"{shown} cannot be downloaded: {error}") from error
+    if found != sha256:
+        raise PackageIntegrityError(
+            f"{shown} has the SHA-256 {found}, and the index or the lock says {sha256}: it was "
+            "replaced. Nothing of it was kept"
+        )
+
+
+def _copy(source: IO[bytes], file: IO[bytes], shown: str) -> str:
+    digest = hashlib.sha256()
+    size = 0
+    while block := source.read(_BLOCK):
+        size += len(block)
+        if size > MAX_BYTES:
+            raise PackagesTooLargeError(f"{shown} has more than {size_text(MAX_BYTES)}")
+        digest.update(block)
+        file.write(block)
+    return digest.hexdigest()
+
+
+def _opened(url: str) -> IO[bytes]:
+    parts = urlsplit(url)
+    if parts.scheme == "file" or not parts.scheme:
+        return Path(unquote(parts.path)).open("rb")  # of a folder that the user has named
+    if parts.scheme not in ("https", "http"):
+        raise ValueError(f"{parts.scheme} is neither https nor http")
+    settings = index.environment()
+    request = urllib.request.Request(without_login(url), headers={"User-Agent": _USER_AGENT})
+    if login := login_for(url):
+        # not to where it is redirected
+        request.add_unredirected_header("Authorization", authorization(login))
+    context = ssl.create_default_context(cafile=settings.get("SSL_CERT_FILE"))
+    opener = urllib.request.OpenerDirector()
+    for handler in (
+        urllib.request.ProxyHandler(_proxies(settings)),
+        urllib.request.HTTPHandler(),
+        urllib.request.HTTPSHandler(context=context),
+        urllib.request.HTTPRedirectHandler(),
+        urllib.request.HTTPDefaultErrorHandler(),
+        urllib.request.HTTPErrorProcessor(),
+    ):
+        opener.add_handler(handler)
+    opened: IO[bytes] = opener.open(request, timeout=_TIMEOUT_S)
+    return opened
+
+
+def _proxies(settings: Mapping[str, str]) -> dict[str, str]:
+    lower = {name.lower(): value for name, value in settings.items()}
+    return {
+        scheme: proxy
+        for scheme in ("http", "https")
+        if (proxy := lower.get(f"{scheme}_proxy") or lower.get("all_proxy"))
+    }
+
+
+def login_for(url: str) -> tuple[str, str] | None:
+    """That of the URL, of an index on the same host, or of ``.netrc``."""
+    settings = index.environment()
+    host = _host(url)
+    named = " ".join(settings.get(name, "") for name in _INDEXES).split()
+    for place in (url, *(re.sub(r"^[\w-]+=", "", one) for one in named)):
+        if _host(place) == host and (login := login_of(place)):
+            return login
+    with contextlib.suppress(OSError, netrc.NetrcParseError):
+        file = settings.get("NETRC") or os.path.expanduser("~/.netrc")
+        if found := netrc.netrc(file).hosts.get(host.partition(":")[0]):
+            return found[0], found[2] or ""
+    return None
+
+
+def _host(url: str) -> str:
+    return urlsplit(url).netloc.rpartition("@")[2]

@@ -1,0 +1,121 @@
+"""Has a jail build a wheel: by a program of ours, since packages know nothing of sandboxes."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from envhub_sandbox import errors, parent
+from envhub_sandbox.dependencies.builds.project import Project
+from envhub_sandbox.dependencies.builds.wheels import MAX_BYTES
+from envhub_sandbox.dependencies.interpreters import Interpreter
+from envhub_sandbox.errors import DependencyError
+from envhub_worker.protocol.text import printable
+
+PROFILE_VARIABLE = "ENVHUB_BUILD_PROFILE"
+WALL_S = 1800.0
+LIMITS = {"memory_bytes": "8G", "disk_bytes": "6G", "disk_files": 400_000, "cpu_s": 7200}
+_PROGRAM = "envhub_sandbox.making.builder"
+_SHOWN = 6000
+_AROUND_S = 900.0
+_MOST_REQUIRED = 200
+
+
+class BuildFailedError(DependencyError):
+    """The build backend failed, or was ended; the text is what it printed last."""
+
+
+@dataclass(frozen=True)
+class Order:
+    """What is built, and with what.
+
+    Attributes:
+        source: The folder of the sources.
+        project: How they say that they are built.
+        packages: The folder of the packages for that.
+        interpreter: What the wheel is for.
+        runtime: What runs the jail's own code: an interpreter and a folder of packages.
+        known: What the backend is known to need besides what the sources say.
+        environment: Further variables for the build.
+    """
+
+    source: Path
+    project: Project
+    packages: Path
+    interpreter: Interpreter
+    runtime: tuple[str, str]
+    known: tuple[str, ...]
+    environment: Mapping[str, str]
+
+
+def build(order: Order, folder: Path) -> Path | tuple[str, ...]:
+    """A wheel below an empty folder, or what the build backend needs besides.
+
+    Nothing of either has been looked at: they are a stranger's.
+
+    Raises:
+        BuildFailedError: It failed.
+        SandboxUnavailableError: There is no jail on this host.
+    """
+    said = _run(order, folder)
+    further, name = said.get("requires"), said.get("wheel")
+    if isinstance(further, list) and 0 < len(further) <= _MOST_REQUIRED:
+        return tuple(text for text in further if isinstance(text, str))
+    if not isinstance(name, str):
+        raise BuildFailedError("its backend gave no wheel")
+    return folder / "wheel" / os.path.basename(name)
+
+
+def _run(order: Order, folder: Path) -> dict[str, Any]:
+    told = {
+        "source": str(order.source),
+        "packages": str(order.packages),
+        "readable": [str(order.source), str(order.packages), str(folder / "tools")],
+        "python": order.interpreter.path,
+        "runtime": order.runtime,
+        "backend": order.project.backend,
+        "backend_path": order.project.backend_path,
+        "known": order.known,
+        "environment": dict(order.environment),
+        "limits": LIMITS,
+        "wall_s": WALL_S,
+        "max_bytes": MAX_BYTES,
+        "profile": os.environ.get(PROFILE_VARIABLE) or "strict",
+    }
+    (folder / "order.json").write_text(json.dumps(told))
+    with parent.pidfd() as ourselves:
+        done = subprocess.run(
+            [sys.executable, "-I", "-m", _PROGRAM, str(folder), str(ourselves)],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            pass_fds=(ourselves,),
+            start_new_session=True,
+            timeout=WALL_S + _AROUND_S,
+        )
+    try:
+        said = json.loads(done.stdout)
+    except ValueError as error:
+        shown = printable(done.stderr.decode("utf-8", "replace")[-_SHOWN:])
+        raise DependencyError(f"the program that builds failed:\n{shown}") from error
+    return _heard(said)
+
+
+def _heard(said: dict[str, Any]) -> dict[str, Any]:
+    if "error" in said:
+        kind = getattr(errors, str(said["error"]), DependencyError)
+        text = str(said["said"])
+        if issubclass(kind, errors.SandboxUnavailableError):
+            raise kind(
+                f"sources are built in a jail, and there is none here: {text}. A weaker profile "
+                f"for builds is chosen by {PROFILE_VARIABLE}, as in {PROFILE_VARIABLE}=no-userns"
+            )
+        raise DependencyError(text)
+    if "failed" in said:
+        raise BuildFailedError(printable(str(said["failed"])[-_SHOWN:], _SHOWN))
+    return said

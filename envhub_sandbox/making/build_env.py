@@ -1,0 +1,123 @@
+"""The entry file of the jail that sources are built in; it is copied there, and imported nowhere.
+
+It calls the build backend, which is a stranger's, in a child process, and gives the wheel back in
+pieces. Nothing of what it answers is believed: ``dependencies/builds`` checks the wheel.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+TAIL = 16_000
+_SINCE = "315532800"
+"""The time of all files in a wheel, as SOURCE_DATE_EPOCH: the first that a zip can have."""
+
+
+class Build(gym.Env[Any, Any]):
+    """An environment in name; ``build`` is what it is for."""
+
+    observation_space = gym.spaces.Discrete(1)
+    action_space = gym.spaces.Discrete(1)
+    _wheel: Path
+
+    def build(self, order: Mapping[str, Any]) -> dict[str, Any]:
+        """Build a wheel, or say what its backend needs besides.
+
+        Args:
+            order: ``source``, ``packages``, ``tools``: folders; ``python``: the interpreter;
+                ``backend``, ``backend_path``; ``known``: what the backend is known to need;
+                ``environment``: further variables.
+        """
+        sys.path.insert(0, order["tools"])
+        from pyproject_hooks import BuildBackendHookCaller, HookMissing
+
+        place = Path(tempfile.gettempdir(), "build")
+        shutil.copytree(order["source"], place / "source", copy_function=_copied)
+        (place / "wheel").mkdir()
+        hooks = BuildBackendHookCaller(
+            *(str(place / "source"), order["backend"], order["backend_path"] or None),
+            runner=_Runner(place / "log", order),
+            python_executable=order["python"],
+        )
+        try:
+            needed = [str(one) for one in hooks.get_requires_for_build_wheel()]
+            if further := [one for one in needed if one not in order["known"]]:
+                return {"requires": further}
+            name = hooks.build_wheel(str(place / "wheel"))
+        except subprocess.CalledProcessError:
+            return {"failed": _tail(place / "log")}
+        except HookMissing as error:
+            return {"failed": repr(error)}
+        except Exception as error:  # what the backend raised, or a backend that is not there
+            return {"failed": f"{_tail(place / 'log')}\n{type(error).__name__}: {error}"}
+        self._wheel = place / "wheel" / Path(name).name
+        return {"wheel": self._wheel.name, "size": self._wheel.stat().st_size}
+
+    def read(self, start: int, size: int) -> bytes:
+        """A piece of the wheel."""
+        with self._wheel.open("rb") as file:
+            file.seek(start)
+            return file.read(size)
+
+
+class _Runner:
+    """Runs the hooks' program in the build environment alone, and keeps what it prints."""
+
+    def __init__(self, log: Path, order: Mapping[str, Any]) -> None:
+        self._log = log
+        self._python = order["python"]
+        packages = order["packages"]
+        self._environment = {
+            **os.environ,
+            "PYTHONPATH": packages,
+            "PATH": f"{packages}/bin:{os.environ.get('PATH', '')}",
+            "SOURCE_DATE_EPOCH": _SINCE,
+            "PYTHONHASHSEED": "0",
+            **order["environment"],
+        }
+
+    def __call__(
+        self,
+        cmd: Sequence[str],
+        cwd: str | None = None,
+        extra_environ: Mapping[str, str] | None = None,
+    ) -> None:
+        """As ``pyproject_hooks`` calls it."""
+        with self._log.open("ab") as log:
+            subprocess.run(
+                [self._python, "-S", *cmd[1:]],  # without the packages of the interpreter
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                cwd=cwd,
+                env={**self._environment, **(extra_environ or {})},
+                check=True,
+            )
+
+
+def _copied(source: str, target: str) -> str:
+    """One file with its mode: as old as in every other build."""
+    shutil.copyfile(source, target)
+    shutil.copymode(source, target)
+    os.utime(target, (int(_SINCE), int(_SINCE)))
+    return target
+
+
+def _tail(log: Path) -> str:
+    if not log.exists():
+        return ""
+    return log.read_bytes()[-TAIL:].decode("utf-8", "replace")
+
+
+def make_env(n_envs: int = 1, use_async_envs: bool = False) -> gym.vector.VectorEnv[Any, Any, Any]:
+    """One of them."""
+    return gym.vector.SyncVectorEnv([Build])

@@ -1,0 +1,111 @@
+"""The program that has a jail build a wheel: ``python -I -m envhub_sandbox.making.builder FOLDER``.
+
+``dependencies`` starts it, since it knows no sandboxes. In the folder lies ``order.json``, and the
+sources; what came of it is printed as one object of JSON: ``wheel``, its name, which lies in
+``wheel/`` then; ``requires``, what the backend needs besides; or ``failed``, what the build said.
+It ends with the process that started it.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import shutil
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from envhub_sandbox import parent
+from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerTimeoutError
+from envhub_sandbox.hub import store
+from envhub_sandbox.hub.snapshot import local
+from envhub_sandbox.making import build_env
+from envhub_sandbox.making.proxies import Proxies
+from envhub_sandbox.policy import Limits, Policy, Timeouts
+from envhub_sandbox.sandboxes.process import PROCESS
+from envhub_sandbox.session.jails.launcher import Launcher
+from envhub_sandbox.session.repository import LoadArguments, Repository
+from envhub_sandbox.vector.vector_env import SandboxVectorEnv
+from envhub_worker.protocol.runtime import Runtime
+
+_PIECE = 16 * 2**20
+
+
+def main(folder: Path, ended: int) -> int:
+    """Carry out the order that lies in a folder."""
+    parent.end_with(ended, 10.0)
+    order = json.loads((folder / "order.json").read_text())
+    os.environ[store.CACHE_VARIABLE] = str(folder / "cache")  # it goes with the folder
+    try:
+        said = _built(folder, order)
+    except WorkerTimeoutError:
+        said = {"failed": f"it was not done after {order['wall_s']:.0f} s, and was ended"}
+    except WorkerDiedError as error:
+        said = {"failed": f"it was ended: {error}"}
+    except EnvHubError as error:
+        said = {"error": type(error).__name__, "said": str(error)}
+    print(json.dumps(said))
+    return 0
+
+
+def _built(folder: Path, order: Mapping[str, Any]) -> dict[str, Any]:
+    tools = _tools(folder / "tools")
+    repository = _repository(folder, order)
+    launcher = Launcher(repository, PROCESS, store.cache_root() / "snapshots")
+    with Proxies(launcher, 1, 0, SandboxVectorEnv, lambda manifest: None).make() as suites:
+        env = suites.env
+        names = ("packages", "python", "backend", "backend_path", "known", "environment")
+        asked = {name: order[name] for name in names}
+        [said] = env.call("build", {**asked, "source": order["source"], "tools": str(tools)})
+        if not isinstance(said, dict):
+            return {"failed": f"it answered {type(said).__name__}"}
+        if "wheel" not in said:
+            return {name: said[name] for name in ("failed", "requires") if name in said}
+        return _received(env, said, folder / "wheel", int(order["max_bytes"]))
+
+
+def _received(env: Any, said: Mapping[str, Any], target: Path, most: int) -> dict[str, Any]:
+    """The wheel, piece by piece. Trust: input from the worker."""
+    name, size = said["wheel"], said["size"]
+    if type(name) is not str or type(size) is not int or not 0 < size <= most:
+        return {"failed": f"the wheel has not 1 to {most} bytes"}
+    if "/" in name or not name.endswith(".whl") or not name.isprintable() or len(name) > 200:
+        return {"failed": f"the wheel is called {name[:200]!r}"}
+    target.mkdir()
+    with (target / name).open("xb") as file:
+        while (got := file.tell()) < size:
+            [piece] = env.call("read", got, min(_PIECE, size - got))
+            if type(piece) is not bytes or not 0 < len(piece) <= size - got:
+                return {"failed": "the wheel broke off"}
+            file.write(piece)
+    return {"wheel": name}
+
+
+def _repository(folder: Path, order: Mapping[str, Any]) -> Repository:
+    entry = folder / "repository"
+    entry.mkdir()
+    shutil.copyfile(build_env.__file__, entry / "env.py")
+    limits = Limits(**order["limits"])
+    wall_s = float(order["wall_s"])
+    policy = Policy(
+        profile=order["profile"], readable=tuple(order["readable"]), limits=limits, crash_history=0
+    )
+    timeouts = Timeouts(call_s=wall_s, server_idle_s=0)
+    runtime = Runtime(*order["runtime"])
+    snapshot = local(str(entry))
+    return Repository(snapshot, LoadArguments(), policy, timeouts, runtime, "frames", True)
+
+
+def _tools(target: Path) -> Path:
+    """A folder with ``pyproject_hooks``, for the path of an interpreter."""
+    found = importlib.util.find_spec("pyproject_hooks")
+    assert found is not None
+    assert found.origin is not None
+    shutil.copytree(Path(found.origin).parent, target / "pyproject_hooks")
+    return target
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1]), int(sys.argv[2])))

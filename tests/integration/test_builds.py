@@ -1,0 +1,116 @@
+"""Sources become wheels in a jail, with what they are built with and nothing else; once."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox.dependencies import interpreters
+from envhub_sandbox.dependencies.builds import build, git, wheel_store
+from envhub_sandbox.dependencies.sources import Source
+from envhub_sandbox.errors import DependencyError, ResolutionError
+from tests.support.git_server import git_served, make_repository
+from tests.support.sdists import backend, make_sdist
+from tests.support.wheels import Index, make_wheel
+
+OWN = interpreters.own()
+IMPORTS = """
+import {name}
+def further():
+    import sys, {name}
+    return {{"seen.txt": repr(({name}.VERSION, [path for path in sys.path if "site-" in path]))}}
+"""
+ASKS = """
+def get_requires_for_build_wheel(config_settings=None):
+    return ["tool"]
+def further():
+    import tool
+    return {"seen.txt": tool.VERSION}
+"""
+SETUP = "from setuptools import setup\nimport pkg_resources\nsetup(name='old', version='1.0')\n"
+
+
+@pytest.fixture
+def packages(real_index: Index) -> Index:
+    """An index with a package that others are built with."""
+    make_wheel(real_index.folder, "tool", "1.0")
+    return real_index
+
+
+def seen(wheel: Path) -> str:
+    """What a build has found, as it wrote it into its wheel."""
+    with zipfile.ZipFile(wheel) as archive:
+        return archive.read("seen.txt").decode()
+
+
+def test_it_is_built_with_what_it_asks_for_and_once(packages: Index, tmp_path: Path) -> None:
+    """The packages of no interpreter are among it; a second use needs no build and no index."""
+    files = backend("x", needs=["tool<2"], further=IMPORTS.format(name="tool"))
+    source = make_sdist(tmp_path, "x", files=files)
+    said: list[str] = []
+    [wheel] = build.build_wheels([source], OWN, said.append)
+    assert seen(wheel) == "('1.0', [])"
+    assert "building x 1.0 in a jail" in said
+    built = wheel_store.describe(wheel)
+    assert built is not None
+    assert built.source == f"sha256:{source.sha256}"
+    (tmp_path / "x-1.0.tar.gz").unlink()
+    said.clear()
+    packages.broken = 503
+    try:
+        assert build.build_wheels([source], OWN, said.append) == [wheel]
+    finally:
+        packages.broken = 0
+    assert said == []
+
+
+def test_a_wheel_that_was_changed_is_built_again(packages: Index, tmp_path: Path) -> None:
+    """What lies in the cache is held against its hash."""
+    source = make_sdist(tmp_path, "changed")
+    [wheel] = build.build_wheels([source], OWN)
+    whole = wheel.read_bytes()
+    wheel.write_bytes(whole + b"x")
+    assert build.build_wheels([source], OWN)[0].read_bytes() == whole
+
+
+def test_what_the_backend_asks_for_besides(packages: Index, tmp_path: Path) -> None:
+    """It says so when it is asked, in a jail."""
+    source = make_sdist(tmp_path, "asks", files=backend("asks", further=ASKS))
+    [wheel] = build.build_wheels([source], OWN)
+    assert seen(wheel) == "1.0"
+
+
+def test_a_build_that_fails(packages: Index, tmp_path: Path) -> None:
+    """The error names the package, where it is asked for, what is missing, and what was printed."""
+    log = "error: command 'gcc' failed: No such file or directory"
+    further = f"def further():\n    print('noise')\n    raise SystemExit({log!r})\n"
+    source = make_sdist(tmp_path, "fails", files=backend("fails", further=further))
+    with pytest.raises(ResolutionError) as caught:
+        build.build_wheels([source], OWN)
+    for words in ("fails 1.0 (line 1 of x.txt)", "apt-get install gcc", "noise"):
+        assert words in str(caught.value)
+
+
+def test_a_commit_of_git(packages: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a branch, from a folder of it; the wheel says which commit it was."""
+    monkeypatch.setattr(git, "PROTOCOLS", ("http",))
+    served = tmp_path / "served" / "repo"
+    files = {f"python/{name}": text for name, text in backend("x", "3.0").items()}
+    commit = make_repository(served, files)
+    with git_served(served.parent) as address:
+        source = Source("x", "", f"{address}/repo", commit="main", subdirectory="python")
+        [wheel] = build.build_wheels([source], OWN)
+    assert wheel.name == "x-3.0-py3-none-any.whl"
+    built = wheel_store.describe(wheel)
+    assert built is not None
+    assert built.source == f"git+{address}/repo@{commit}#subdirectory=python"
+
+
+def test_no_jail_no_build(packages: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is built where nothing confines it; the error says what else may be chosen."""
+    monkeypatch.setenv("ENVHUB_BUILD_PROFILE", "none-such")
+    with pytest.raises(DependencyError, match="none-such"):
+        build.build_wheels([make_sdist(tmp_path, "unbuilt")], OWN)
+    assert not list(wheel_store.root().glob("*/*/unbuilt*"))

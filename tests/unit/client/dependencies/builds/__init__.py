@@ -1,0 +1,1 @@
+"""Tests of what builds wheels out of sources."""

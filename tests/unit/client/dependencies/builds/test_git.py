@@ -1,0 +1,150 @@
+"""A commit of git is fetched as data: no hook, filter, submodule, login or other protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox.dependencies.builds import git
+from envhub_sandbox.errors import (
+    IndexUnavailableError,
+    PackageIntegrityError,
+    PackagesTooLargeError,
+    RequirementError,
+)
+from tests.support.git_server import commit, git_served, make_repository
+from tests.support.git_server import git as run_git
+
+
+@pytest.fixture
+def repository(tmp_path: Path) -> Path:
+    """One with two commits, of which the first is tagged."""
+    folder = tmp_path / "served" / "org" / "repo"
+    folder.mkdir(parents=True)
+    make_repository(folder, {"setup.py": "1", "a/b.py": "2"})
+    run_git(folder, "tag", "-a", "v1", "-m", "x")
+    (folder / "setup.py").write_text("3")
+    commit(folder)
+    return folder
+
+
+@pytest.fixture
+def url(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Its address; http is permitted here alone."""
+    monkeypatch.setattr(git, "PROTOCOLS", ("http",))
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    with git_served(tmp_path / "served") as address:
+        yield f"{address}/org/repo"
+
+
+@pytest.fixture
+def target(tmp_path: Path) -> Path:
+    """An empty folder."""
+    folder = tmp_path / "target"
+    folder.mkdir()
+    return folder
+
+
+def test_the_files_of_a_commit(url: str, repository: Path, target: Path) -> None:
+    """By a tag, which means its commit; not those of the newest."""
+    found = git.resolve(url, "v1")
+    assert found == run_git(repository, "rev-parse", "v1^{commit}")
+    git.check_out(url, found, target, print)
+    files = {str(f.relative_to(target)): f.read_text() for f in target.rglob("*") if f.is_file()}
+    assert files == {"setup.py": "1", "a/b.py": "2"}
+    assert git.resolve(url, "main") == run_git(repository, "rev-parse", "main")
+
+
+def test_a_full_commit_is_not_asked_for() -> None:
+    """It means itself."""
+    assert git.resolve("https://nowhere.invalid/x", "a" * 40) == "a" * 40
+
+
+@pytest.mark.parametrize("revision", ["v2", "1234567", "main~1"])
+def test_what_is_not_there(url: str, revision: str) -> None:
+    """The error says what to write."""
+    with pytest.raises((IndexUnavailableError, RequirementError), match=r"40 digits|no commit"):
+        git.resolve(url, revision)
+
+
+@pytest.mark.parametrize("revision", ["--upload-pack=x", "a b", "", "a..b", "a@{0}", "-x"])
+def test_a_name_that_is_an_option(url: str, revision: str) -> None:
+    """Git would take it for one, or for an expression."""
+    with pytest.raises(RequirementError):
+        git.resolve(url, revision)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        *(
+            "ssh://git@h/x",
+            "file:///etc",
+            "http://h/x",
+            "git://h/x",
+            "ext::sh -c x",
+            "https://-x/y",
+        ),
+        *("https://u:p@h/x", "/etc", "https://h/x y", "https://h/x?a=b", "https://h"),
+    ],
+)
+def test_only_https_without_a_login(url: str, target: Path) -> None:
+    """Nothing else reaches git."""
+    with pytest.raises(RequirementError, match="no address"):
+        git.check_out(url, "a" * 40, target, print)
+
+
+def test_links_and_submodules_are_left_out(url: str, repository: Path, target: Path) -> None:
+    """They are said; nothing is fetched for them."""
+    (repository / "link").symlink_to("/etc/passwd")
+    inner = "0" * 39 + "1"
+    run_git(repository, "update-index", "--add", "--cacheinfo", f"160000,{inner},module")
+    run_git(repository, "add", "link")
+    run_git(repository, "commit", "--quiet", "--message=x")
+    said: list[str] = []
+    git.check_out(url, run_git(repository, "rev-parse", "HEAD"), target, said.append)
+    assert sorted(path.name for path in target.iterdir()) == ["a", "setup.py"]
+    assert len(said) == 2
+    assert "link is a link or a submodule" in "".join(said)
+
+
+def test_filters_and_attributes_do_nothing(url: str, repository: Path, target: Path) -> None:
+    """The bytes are those of the commit, whatever its attributes ask for."""
+    (repository / ".gitattributes").write_text("* export-ignore\n*.py filter=x text eol=crlf\n")
+    (repository / "setup.py").write_bytes(b"$Format:%H$\n")
+    git.check_out(url, commit(repository), target, print)
+    assert (target / "setup.py").read_bytes() == b"$Format:%H$\n"
+
+
+def test_settings_of_the_user_do_nothing(
+    url: str, repository: Path, target: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """His logins are not sent to a host that a stranger names, and no template brings hooks."""
+    ran = tmp_path / "ran"
+    settings = tmp_path / "config"
+    settings.write_text(f'[credential]\nhelper = "!touch {ran};"\n[url "file:///"]\ninsteadOf = h')
+    monkeypatch.setenv("GIT_CONFIG_GLOBAL", str(settings))
+    git.check_out(url, run_git(repository, "rev-parse", "HEAD"), target, print)
+    assert (target / "setup.py").read_text() == "3"
+    assert not ran.exists()
+
+
+def test_a_name_that_leads_out(url: str, repository: Path, target: Path) -> None:
+    """Git itself makes no such commit, but others can."""
+    blob = run_git(repository, "hash-object", "-w", "setup.py")
+    (repository / "tree").write_bytes(b"100644 a\\b\0" + bytes.fromhex(blob))
+    tree = run_git(repository, "hash-object", "-w", "-t", "tree", "--literally", "tree")
+    bad = run_git(repository, "commit-tree", tree, "-m", "x")
+    run_git(repository, "branch", "bad", bad)
+    with pytest.raises(PackageIntegrityError, match="backslash"):
+        git.check_out(url, bad, target, print)
+    assert not list(target.iterdir())
+
+
+def test_bounds(url: str, repository: Path, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their number before they are read."""
+    monkeypatch.setattr(git, "MAX_FILES", 1)
+    with pytest.raises(PackagesTooLargeError, match="2 files"):
+        git.check_out(url, run_git(repository, "rev-parse", "HEAD"), target, print)

@@ -1,0 +1,142 @@
+"""Source archives are unpacked as data: within bounds, without links, and nowhere else."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import os
+import stat
+import tarfile
+import zipfile
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox.dependencies.builds import trees
+from envhub_sandbox.errors import DependencyError, PackageIntegrityError, PackagesTooLargeError
+from tests.support.sdists import add, make_sdist
+
+
+def packed(tmp_path: Path, *members: tuple[str, bytes, bytes]) -> Path:
+    """An archive of these: name, content and kind."""
+    path = tmp_path / "x-1.0.tar.gz"
+    with tarfile.open(path, "w:gz") as archive:
+        for name, data, kind in members:
+            add(archive, name, data, kind)
+    return path
+
+
+def unpacked(archive: Path) -> Path:
+    """Its one folder, in a folder beside it."""
+    folder = archive.parent / "tree"
+    folder.mkdir()
+    return trees.unpack(archive, folder, "x 1.0")
+
+
+def test_the_files_of_a_source_distribution(tmp_path: Path) -> None:
+    """All of them, as regular files below its one folder."""
+    make_sdist(tmp_path, "x", files={"a/b.py": "1", "setup.py": "2"})
+    top = unpacked(tmp_path / "x-1.0.tar.gz")
+    assert top.name == "x-1.0"
+    assert (top / "a/b.py").read_text() == "1"
+    assert stat.S_IMODE((top / "setup.py").stat().st_mode) == 0o644
+
+
+def test_a_zip_and_what_may_be_executed(tmp_path: Path) -> None:
+    """The mode of a file is kept as far as it says that it may be executed."""
+    path = tmp_path / "x-1.0.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        member = zipfile.ZipInfo("x-1.0/configure")
+        member.external_attr = 0o104755 << 16
+        archive.writestr(member, "#!/bin/sh")
+    assert os.access(unpacked(path) / "configure", os.X_OK)
+    assert not (unpacked_mode := (tmp_path / "tree/x-1.0/configure").stat().st_mode) & 0o4000
+    assert stat.S_ISREG(unpacked_mode)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("x/../../out", b"0"),
+        ("/tmp/out", b"0"),
+        ("x/a\\b", b"0"),
+        ("x/" + "d/" * 70 + "f", b"0"),
+        ("x/link", tarfile.SYMTYPE),
+        ("x/hard", tarfile.LNKTYPE),
+        ("x/device", tarfile.CHRTYPE),
+        ("x/pipe", tarfile.FIFOTYPE),
+    ],
+)
+def test_what_could_lead_out_is_refused(tmp_path: Path, name: str, kind: bytes) -> None:
+    """Nothing of such an archive is written."""
+    archive = packed(tmp_path, ("x/fine", b"1", b"0"), (name, b"", kind))
+    with pytest.raises(PackageIntegrityError):
+        unpacked(archive)
+    assert not list((tmp_path / "tree").iterdir())
+
+
+def test_the_same_name_twice(tmp_path: Path) -> None:
+    """Two programs could read two different files."""
+    with pytest.raises(PackageIntegrityError, match="twice"):
+        unpacked(packed(tmp_path, ("x/a", b"1", b"0"), ("x/a", b"2", b"0")))
+
+
+def test_a_link_in_a_zip(tmp_path: Path) -> None:
+    """As in a tar."""
+    path = tmp_path / "x-1.0.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        member = zipfile.ZipInfo("x-1.0/link")
+        member.external_attr = (stat.S_IFLNK | 0o777) << 16
+        archive.writestr(member, "/etc/passwd")
+    with pytest.raises(PackageIntegrityError, match="link"):
+        unpacked(path)
+
+
+def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of all files together, of their number, and of what a header says of itself."""
+    archive = packed(tmp_path, ("x/a", b"1" * 100, b"0"), ("x/b", b"1" * 100, b"0"))
+    monkeypatch.setattr(trees, "MAX_BYTES", 150)
+    with pytest.raises(PackagesTooLargeError):
+        unpacked(archive)
+    monkeypatch.setattr(trees, "MAX_BYTES", 1000)
+    monkeypatch.setattr(trees, "MAX_FILES", 1)
+    with pytest.raises(PackagesTooLargeError):
+        trees.unpack(archive, tmp_path / "tree", "x")
+
+
+def test_a_header_that_is_a_bomb(tmp_path: Path) -> None:
+    """An extended header has any length, and tarfile reads it at once."""
+    member = tarfile.TarInfo("x/a")
+    member.type, member.size = tarfile.XHDTYPE, 1 << 32
+    path = tmp_path / "x-1.0.tar.gz"
+    path.write_bytes(gzip.compress(member.tobuf() + bytes(1024)))
+    with pytest.raises(PackagesTooLargeError):
+        unpacked(path)
+
+
+def test_a_file_that_is_not_as_long_as_it_says(tmp_path: Path) -> None:
+    """It is read no farther than it says, and refused."""
+    for data in (b"12", b"1234"):
+        member = trees.Member(f"{len(data)}", 3, False, partial(io.BytesIO, data))
+        with pytest.raises(PackageIntegrityError, match="size"):
+            trees.lay_out([member], tmp_path, "x")
+
+
+@pytest.mark.parametrize("data", [b"", b"no archive", gzip.compress(b"neither")])
+def test_what_is_no_archive(tmp_path: Path, data: bytes) -> None:
+    """A clear error, and nothing else."""
+    path = tmp_path / "x-1.0.tar.gz"
+    path.write_bytes(data)
+    with pytest.raises(DependencyError):
+        unpacked(path)
+    path = tmp_path / "x-1.0.rar"
+    path.write_bytes(data)
+    with pytest.raises(PackageIntegrityError, match=r"\.tar\.gz, \.tar\.bz2 and \.zip are read"):
+        trees.unpack(path, tmp_path, "x")
+
+
+def test_more_than_one_top(tmp_path: Path) -> None:
+    """Nobody could say which of them is the source."""
+    with pytest.raises(PackageIntegrityError, match="2 entries"):
+        unpacked(packed(tmp_path, ("x/a", b"", b"0"), ("y/a", b"", b"0")))

@@ -1,0 +1,136 @@
+"""A wheel out of a jail is a stranger's: it is what was asked for, or it is refused."""
+
+from __future__ import annotations
+
+import stat
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox.dependencies import interpreters
+from envhub_sandbox.dependencies.builds import trees, wheels
+from envhub_sandbox.errors import PackageIntegrityError
+from tests.support.wheels import make_wheel
+
+OWN = interpreters.own()
+
+
+def check(wheel: Path, name: str = "some-name", version: str = "1.0") -> None:
+    """For this interpreter."""
+    wheels.check(wheel, name, version, OWN)
+
+
+def test_what_was_asked_for_is_taken(tmp_path: Path) -> None:
+    """Names and versions are compared in their normal form."""
+    check(make_wheel(tmp_path, "Some.Name"), version="1")
+    minor = "".join(OWN.version.split(".")[:2])
+    tag = f"cp{minor}-cp{minor}-linux_{OWN.machine}"
+    wheel = make_wheel(tmp_path, "some-name", tag=tag)
+    with zipfile.ZipFile(wheel, "a") as archive:
+        archive.writestr("some_name/", "")
+    check(wheel, version="")
+
+
+@pytest.mark.parametrize(
+    ("name", "version", "tag", "said"),
+    [
+        ("another", "1.0", "py3-none-any", "it is another 1.0, and not some-name 1.0"),
+        ("some-name", "2.0", "py3-none-any", "it is some-name 2.0"),
+        ("some-name", "1.0", "cp27-cp27m-linux_x86_64", "does not fit Python"),
+        ("some-name", "1.0", "py3-none-win32", "does not fit Python"),
+    ],
+)
+def test_another_package_is_refused(
+    tmp_path: Path, name: str, version: str, tag: str, said: str
+) -> None:
+    """By its file's name already."""
+    with pytest.raises(PackageIntegrityError, match=said):
+        check(make_wheel(tmp_path, name, version, tag=tag))
+
+
+def test_metadata_of_another(tmp_path: Path) -> None:
+    """The file's name says one thing, and what uv would install another."""
+    wheel = make_wheel(tmp_path, "another")
+    renamed = wheel.rename(tmp_path / "some_name-1.0-py3-none-any.whl")
+    with pytest.raises(PackageIntegrityError, match=r"its metadata are those of 'another-1\.0"):
+        check(renamed)
+
+
+def add(name: str, mode: int = 0o100644) -> Callable[[zipfile.ZipFile], None]:
+    """What adds a file to an archive."""
+
+    def change(archive: zipfile.ZipFile) -> None:
+        member = zipfile.ZipInfo(name)
+        member.external_attr = mode << 16
+        archive.writestr(member, "x")
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (add("../out"), "'..' step"),
+        (add("../out/", stat.S_IFDIR | 0o755), "'..' step"),
+        (add("/etc/out"), "absolute name"),
+        (add("link", stat.S_IFLNK | 0o777), "link or a device"),
+        (add("unrecorded.py"), "names other files"),
+        (add("another-1.0.dist-info/METADATA"), "2 folders .dist-info"),
+        (add("some_name/__init__.py"), "listed twice"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_what_no_wheel_has_is_refused(
+    tmp_path: Path, change: Callable[[zipfile.ZipFile], None], said: str
+) -> None:
+    """Links, ways out of the folder, files that RECORD does not know."""
+    wheel = make_wheel(tmp_path, "some-name")
+    with zipfile.ZipFile(wheel, "a") as archive:
+        change(archive)
+    with pytest.raises(PackageIntegrityError, match=said):
+        check(wheel)
+
+
+def test_a_file_that_is_not_what_record_says(tmp_path: Path) -> None:
+    """The hashes are held against the bytes."""
+    wheel = make_wheel(tmp_path, "some-name")
+    data = wheel.read_bytes()
+    other = tmp_path / "other"
+    other.mkdir()
+    with zipfile.ZipFile(wheel) as old, zipfile.ZipFile(other / wheel.name, "w") as new:
+        for member in old.infolist():
+            changed = b"# changed\n" if member.filename.endswith("__init__.py") else None
+            new.writestr(member.filename, changed or old.read(member))
+    with pytest.raises(PackageIntegrityError, match="not the file that its RECORD says"):
+        check(other / wheel.name)
+    assert data == wheel.read_bytes()
+
+
+@pytest.mark.parametrize("bound", ["MAX_BYTES", "MAX_UNPACKED", "MAX_FILES", "MAX_TABLE"])
+def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bound: str) -> None:
+    """Each of them holds."""
+    wheel = make_wheel(tmp_path, "some-name")
+    check(wheel)
+    monkeypatch.setattr(wheels, bound, 1)
+    with pytest.raises(PackageIntegrityError):
+        check(wheel)
+
+
+def test_a_table_of_contents_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is read at once, and its length is the archive's own word."""
+    wheel = make_wheel(tmp_path, "some-name", files={f"some_name/{n}": "" for n in range(300)})
+    check(wheel)
+    monkeypatch.setattr(trees, "AT_ONCE", 4096)
+    with pytest.raises(PackageIntegrityError, match="too large"):
+        check(wheel)
+
+
+@pytest.mark.parametrize("data", [b"", b"PK\5\6" + bytes(18), b"no zip"])
+def test_what_is_no_wheel(tmp_path: Path, data: bytes) -> None:
+    """A clear error."""
+    wheel = tmp_path / "some_name-1.0-py3-none-any.whl"
+    wheel.write_bytes(data)
+    with pytest.raises(PackageIntegrityError, match="is not taken"):
+        check(wheel)
