@@ -32,10 +32,23 @@ if TYPE_CHECKING:
     from envhub_sandbox.dependencies.interpreters import Interpreter
     from envhub_sandbox.dependencies.resolutions import Resolution
     from envhub_sandbox.dependencies.resolve import Lock
-    from envhub_sandbox.dependencies.sources import Builder
+    from envhub_sandbox.dependencies.sources import Builder, Source
 
 Tell = Callable[[str], None]
-BUILDER: Builder | None = None
+
+
+def lock_for(request: PackageRequest, interpreter: Interpreter, tell: Tell) -> Lock:
+    """Versions for one interpreter; what has no wheel is built."""
+    return _Attempt(request, BUILDER).lock(request, interpreter, False, tell)
+
+
+def _build(sources: Sequence[Source], interpreter: Interpreter, tell: Tell) -> list[Path]:
+    from envhub_sandbox.dependencies.builds.build import build_wheels
+
+    return build_wheels(sources, interpreter, tell, lock_for)
+
+
+BUILDER: Builder | None = _build
 """Makes wheels of packages that have none."""
 
 

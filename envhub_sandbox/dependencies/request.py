@@ -34,6 +34,7 @@ class PackageRequest:
         override: Requirements that hold instead of all others of the same package.
         fetch_python: Whether uv may download an interpreter that this machine lacks.
         gpu: Whether its jails are given one.
+        runs_worker: Whether the worker runs with them, so that they hold what it needs, too.
     """
 
     source: str
@@ -48,6 +49,7 @@ class PackageRequest:
     override: tuple[Wanted, ...] = ()
     fetch_python: bool = False
     gpu: bool = False
+    runs_worker: bool = True
 
     def plus(self, guesses: tuple[Guess, ...]) -> PackageRequest:
         """The same with these as requirements, and no guesses."""

@@ -124,8 +124,9 @@ def _compiled(
     settings: Mapping[str, str] = {},
 ) -> str:
     """What ``uv pip compile`` prints; raises as ``resolve``."""
-    ours = (parse_requirement(text, "the worker of envhub-sandbox") for text in WORKERS)
-    every = [*request.wanted, *ours]
+    ours = WORKERS if request.runs_worker else ()
+    where = "the worker of envhub-sandbox"
+    every = [*request.wanted, *(parse_requirement(text, where) for text in ours)]
     files = {
         "--constraints": _lines(request.constraints),
         "--overrides": _lines(request.override),

@@ -6,11 +6,15 @@ pieces. Nothing of what it answers is believed: ``dependencies/builds`` checks t
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
+import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -60,6 +64,7 @@ class Build(gym.Env[Any, Any]):
         except Exception as error:  # what the backend raised, or a backend that is not there
             return {"failed": f"{_tail(place / 'log')}\n{type(error).__name__}: {error}"}
         self._wheel = place / "wheel" / Path(name).name
+        mend(self._wheel)
         return {"wheel": self._wheel.name, "size": self._wheel.stat().st_size}
 
     def read(self, start: int, size: int) -> bytes:
@@ -67,6 +72,33 @@ class Build(gym.Env[Any, Any]):
         with self._wheel.open("rb") as file:
             file.seek(start)
             return file.read(size)
+
+
+def mend(wheel: Path) -> None:
+    """Write requirements of old metadata such as ``x (>=3.)`` as they are read today."""
+    with zipfile.ZipFile(wheel) as archive:
+        files = {one: archive.read(one) for one in archive.infolist()}
+    [about] = [one for one in files if one.filename.endswith(".dist-info/METADATA")]
+    old = files[about]
+    new = b"\n".join(map(_mended, old.split(b"\n")))
+    if new == old:
+        return
+    files[about] = new
+    [record] = [one for one in files if one.filename.endswith(".dist-info/RECORD")]
+    rows = files[record].replace(_row(about, old), _row(about, new))
+    with zipfile.ZipFile(wheel, "w", zipfile.ZIP_DEFLATED) as archive:
+        for one, data in {**files, record: rows}.items():
+            archive.writestr(one, data)
+
+
+def _mended(line: bytes) -> bytes:
+    dangling = line.startswith(b"Requires-Dist:")
+    return re.sub(rb"(?<=\d)\.(?=\s*[,;)]|\s*$)", b"", line) if dangling else line
+
+
+def _row(member: zipfile.ZipInfo, data: bytes) -> bytes:
+    digest = base64.urlsafe_b64encode(hashlib.sha256(data).digest()).rstrip(b"=").decode()
+    return f"{member.filename},sha256={digest},{len(data)}".encode()
 
 
 class _Runner:

@@ -26,6 +26,7 @@ from envhub_sandbox.making.proxies import Proxies
 from envhub_sandbox.policy import Limits, Policy, Timeouts
 from envhub_sandbox.sandboxes.process import PROCESS
 from envhub_sandbox.session.jails.launcher import Launcher
+from envhub_sandbox.session.recipe import Recipe, pinned
 from envhub_sandbox.session.repository import LoadArguments, Repository
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.runtime import Runtime
@@ -95,7 +96,12 @@ def _repository(folder: Path, order: Mapping[str, Any]) -> Repository:
     timeouts = Timeouts(call_s=wall_s, server_idle_s=0)
     runtime = Runtime(*order["runtime"])
     snapshot = local(str(entry))
-    return Repository(snapshot, LoadArguments(), policy, timeouts, runtime, "frames", True)
+    return Repository(
+        *(snapshot, LoadArguments(), policy, timeouts, runtime, "frames", True),
+        recipe=Recipe(make_env=_built, reference=pinned(snapshot), config=None),
+        installed=None,
+        advice=lambda text: "",
+    )
 
 
 def _tools(target: Path) -> Path:

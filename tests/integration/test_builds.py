@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from envhub_sandbox.dependencies import interpreters
-from envhub_sandbox.dependencies.builds import build, git, wheel_store
+from envhub_sandbox.dependencies.builds import git, wheel_store
+from envhub_sandbox.dependencies.builds.build import build_wheels
+from envhub_sandbox.dependencies.pipeline import lock_for
 from envhub_sandbox.dependencies.sources import Source
 from envhub_sandbox.errors import DependencyError, ResolutionError
 from tests.support.git_server import git_served, make_repository
@@ -33,10 +36,15 @@ SETUP = "from setuptools import setup\nimport pkg_resources\nsetup(name='old', v
 
 
 @pytest.fixture
-def packages(real_index: Index) -> Index:
+def packages(index: Index) -> Index:
     """An index with a package that others are built with."""
-    make_wheel(real_index.folder, "tool", "1.0")
-    return real_index
+    make_wheel(index.folder, "tool", "1.0")
+    return index
+
+
+def built(sources: list[Source], tell: Callable[[str], None] = lambda line: None) -> list[Path]:
+    """A wheel of each, for this interpreter."""
+    return build_wheels(sources, OWN, tell, lock_for)
 
 
 def seen(wheel: Path) -> str:
@@ -50,17 +58,17 @@ def test_it_is_built_with_what_it_asks_for_and_once(packages: Index, tmp_path: P
     files = backend("x", needs=["tool<2"], further=IMPORTS.format(name="tool"))
     source = make_sdist(tmp_path, "x", files=files)
     said: list[str] = []
-    [wheel] = build.build_wheels([source], OWN, said.append)
+    [wheel] = built([source], said.append)
     assert seen(wheel) == "('1.0', [])"
     assert "building x 1.0 in a jail" in said
-    built = wheel_store.describe(wheel)
-    assert built is not None
-    assert built.source == f"sha256:{source.sha256}"
+    known = wheel_store.describe(wheel)
+    assert known is not None
+    assert known.source == f"sha256:{source.sha256}"
     (tmp_path / "x-1.0.tar.gz").unlink()
     said.clear()
     packages.broken = 503
     try:
-        assert build.build_wheels([source], OWN, said.append) == [wheel]
+        assert built([source], said.append) == [wheel]
     finally:
         packages.broken = 0
     assert said == []
@@ -69,16 +77,16 @@ def test_it_is_built_with_what_it_asks_for_and_once(packages: Index, tmp_path: P
 def test_a_wheel_that_was_changed_is_built_again(packages: Index, tmp_path: Path) -> None:
     """What lies in the cache is held against its hash."""
     source = make_sdist(tmp_path, "changed")
-    [wheel] = build.build_wheels([source], OWN)
+    [wheel] = built([source])
     whole = wheel.read_bytes()
     wheel.write_bytes(whole + b"x")
-    assert build.build_wheels([source], OWN)[0].read_bytes() == whole
+    assert built([source])[0].read_bytes() == whole
 
 
 def test_what_the_backend_asks_for_besides(packages: Index, tmp_path: Path) -> None:
     """It says so when it is asked, in a jail."""
     source = make_sdist(tmp_path, "asks", files=backend("asks", further=ASKS))
-    [wheel] = build.build_wheels([source], OWN)
+    [wheel] = built([source])
     assert seen(wheel) == "1.0"
 
 
@@ -88,7 +96,7 @@ def test_a_build_that_fails(packages: Index, tmp_path: Path) -> None:
     further = f"def further():\n    print('noise')\n    raise SystemExit({log!r})\n"
     source = make_sdist(tmp_path, "fails", files=backend("fails", further=further))
     with pytest.raises(ResolutionError) as caught:
-        build.build_wheels([source], OWN)
+        built([source])
     for words in ("fails 1.0 (line 1 of x.txt)", "apt-get install gcc", "noise"):
         assert words in str(caught.value)
 
@@ -101,16 +109,16 @@ def test_a_commit_of_git(packages: Index, tmp_path: Path, monkeypatch: pytest.Mo
     commit = make_repository(served, files)
     with git_served(served.parent) as address:
         source = Source("x", "", f"{address}/repo", commit="main", subdirectory="python")
-        [wheel] = build.build_wheels([source], OWN)
+        [wheel] = built([source])
     assert wheel.name == "x-3.0-py3-none-any.whl"
-    built = wheel_store.describe(wheel)
-    assert built is not None
-    assert built.source == f"git+{address}/repo@{commit}#subdirectory=python"
+    known = wheel_store.describe(wheel)
+    assert known is not None
+    assert known.source == f"git+{address}/repo@{commit}#subdirectory=python"
 
 
 def test_no_jail_no_build(packages: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is built where nothing confines it; the error says what else may be chosen."""
     monkeypatch.setenv("ENVHUB_BUILD_PROFILE", "none-such")
     with pytest.raises(DependencyError, match="none-such"):
-        build.build_wheels([make_sdist(tmp_path, "unbuilt")], OWN)
+        built([make_sdist(tmp_path, "unbuilt")])
     assert not list(wheel_store.root().glob("*/*/unbuilt*"))

@@ -28,10 +28,11 @@ def build_wheel(wheel_directory, config_settings=None, metadata_directory=None):
     wheel = f"{{NAME}}-{{VERSION}}-py3-none-any.whl"
     with zipfile.ZipFile(f"{{wheel_directory}}/{{wheel}}", "w") as archive:
         for path, text in files.items():
-            archive.writestr(path, text)
+            archive.writestr(zipfile.ZipInfo(path), text)
             digest = base64.urlsafe_b64encode(hashlib.sha256(text.encode()).digest())
             rows.append(f"{{path}},sha256={{digest.decode().rstrip('=')}},{{len(text)}}")
-        archive.writestr(f"{{info}}/RECORD", "\\n".join([*rows, f"{{info}}/RECORD,,", ""]))
+        record = f"{{info}}/RECORD"
+        archive.writestr(zipfile.ZipInfo(record), "\\n".join([*rows, f"{{record}},,", ""]))
     return wheel
 
 def further():

@@ -21,16 +21,17 @@ from envhub_sandbox.dependencies.builds import (
     wheel_store,
     wheels,
 )
-from envhub_sandbox.dependencies.declared import Wanted, parse_requirement
+from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.request import PackageRequest
-from envhub_sandbox.dependencies.resolve import Lock, Target, resolve
+from envhub_sandbox.dependencies.resolve import Lock
 from envhub_sandbox.dependencies.sources import Source
 from envhub_sandbox.errors import DependencyError, RequirementError, ResolutionError
 from envhub_sandbox.hub.logins import without_login
 from envhub_worker.protocol.runtime import OWN
 
 Tell = Callable[[str], None]
+Choose = Callable[[PackageRequest, Interpreter, Tell], Lock]
 _DEEPEST = 8
 _ROUNDS = 3
 """Backends may say what they need besides; once they have it, they may say more."""
@@ -38,7 +39,7 @@ _UNDER_WAY: ContextVar[tuple[str, ...]] = ContextVar("sources that are being bui
 
 
 def build_wheels(
-    sources: Sequence[Source], interpreter: Interpreter, tell: Tell = lambda line: None
+    sources: Sequence[Source], interpreter: Interpreter, tell: Tell, choose: Choose
 ) -> list[Path]:
     """A wheel of each: kept from before, or built in a jail without network.
 
@@ -46,16 +47,17 @@ def build_wheels(
         sources: What there is no wheel of.
         interpreter: What they are for.
         tell: Gets a line for each thing that happens.
+        choose: Gives versions of what they are built with.
 
     Raises:
         ResolutionError: One cannot be built; the text says why, and what is missing here.
         DependencyError: As with downloads, and where sources or a wheel are refused.
         SandboxUnavailableError: This host has no jail to build in.
     """
-    return [_wheel(source, interpreter, tell) for source in sources]
+    return [_wheel(source, interpreter, tell, choose) for source in sources]
 
 
-def _wheel(source: Source, interpreter: Interpreter, tell: Tell) -> Path:
+def _wheel(source: Source, interpreter: Interpreter, tell: Tell, choose: Choose) -> Path:
     if source.commit:
         source = replace(source, commit=git.resolve(source.url, source.commit))
     known = wheel_store.recall(identity(source), interpreter)
@@ -64,7 +66,7 @@ def _wheel(source: Source, interpreter: Interpreter, tell: Tell) -> Path:
     with _under_way(source), tempfile.TemporaryDirectory(prefix="envhub-build-") as place:
         Path(place).chmod(0o755)  # a jail's user is another one
         tree = _fetched(source, Path(place), tell)
-        return _Build(source, tree, Path(place), interpreter, tell).wheel()
+        return _Build(source, tree, Path(place), interpreter, tell, choose).wheel()
 
 
 def identity(source: Source) -> str:
@@ -128,13 +130,20 @@ class _Build:
     """One source, unpacked."""
 
     def __init__(
-        self, source: Source, tree: Path, place: Path, interpreter: Interpreter, tell: Tell
+        self,
+        source: Source,
+        tree: Path,
+        place: Path,
+        interpreter: Interpreter,
+        tell: Tell,
+        choose: Choose,
     ) -> None:
         self._source = source
         self._tree = tree
         self._place = place
         self._interpreter = interpreter
         self._tell = tell
+        self._choose = choose
         self._project = project.read(tree, _title(source))
 
     def wheel(self) -> Path:
@@ -187,16 +196,27 @@ class _Build:
         if not wanted:
             (self._place / "nothing").mkdir(exist_ok=True)
             return self._place / "nothing", Lock("").digest
-        lock = _lock(tuple(wanted), where, self._interpreter, self._tell)
+        request = PackageRequest(where, tuple(wanted), runs_worker=False)
+        lock = self._choose(request, self._interpreter, self._tell)
         return environments.provide(lock, self._interpreter, self._tell).packages, lock.digest
 
     def _order(self, packages: Path, known: tuple[str, ...]) -> jail.Order:
         return jail.Order(
             *(self._tree, self._project, packages, self._interpreter),
-            runtime=_runtime(self._interpreter, self._tell),
+            runtime=self._runtime(),
             known=(*(str(one.requirement) for one in self._project.requires), *known),
             environment=self._variables(),
         )
+
+    def _runtime(self) -> tuple[str, str]:
+        """What runs the jail's own code: here our own packages, else ones that are made."""
+        if self._interpreter == interpreters.own():
+            return OWN
+        lock = self._choose(
+            PackageRequest("the jail of a build", ()), self._interpreter, self._tell
+        )
+        environment = environments.provide(lock, self._interpreter, self._tell)
+        return environment.python, str(environment.packages)
 
     def _variables(self) -> dict[str, str]:
         """Without ``.git`` nothing else says a version to those that ask git for it."""
@@ -229,17 +249,3 @@ def _old_tools(interpreter: Interpreter) -> tuple[str, ...]:
     """
     old = tuple(map(int, interpreter.version.split(".")[:2])) < (3, 12)
     return ("setuptools<66" if old else "setuptools<81", "wheel<0.40")
-
-
-def _lock(wanted: tuple[Wanted, ...], what: str, interpreter: Interpreter, tell: Tell) -> Lock:
-    request = PackageRequest(what, wanted)
-    return resolve(request, Target(python=interpreter.path), tell=tell)
-
-
-def _runtime(interpreter: Interpreter, tell: Tell) -> tuple[str, str]:
-    """What runs the jail's own code: here this interpreter's packages, else ones that are made."""
-    if interpreter == interpreters.own():
-        return OWN
-    lock = _lock((), "the jail of a build", interpreter, tell)
-    environment = environments.provide(lock, interpreter, tell)
-    return environment.python, str(environment.packages)
