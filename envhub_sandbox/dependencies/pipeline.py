@@ -42,13 +42,14 @@ def lock_for(request: PackageRequest, interpreter: Interpreter, tell: Tell) -> L
     return _Attempt(request, BUILDER).lock(request, interpreter, False, tell)
 
 
-def _build(sources: Sequence[Source], interpreter: Interpreter, tell: Tell) -> list[Path]:
+def build(sources: Sequence[Source], interpreter: Interpreter, tell: Tell) -> list[Path]:
+    """A wheel of each source, in the same order: kept from before, or built in a jail."""
     from envhub_sandbox.dependencies.builds.build import build_wheels
 
     return build_wheels(sources, interpreter, tell, lock_for)
 
 
-BUILDER: Builder | None = _build
+BUILDER: Builder | None = build
 """Makes wheels of packages that have none."""
 
 

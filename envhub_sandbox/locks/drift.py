@@ -110,6 +110,9 @@ def _of_package(then: Package, now: Package) -> Iterator[str]:
     if then.version != now.version:
         yield f"package {then.name}: {then.version} was locked, this is {now.version}"
         return
+    before, after = (one.origin.identity if one.origin else "" for one in (then, now))
+    if before != after:
+        yield f"package {then.name}: built of {before or 'no source'}, this of {after or 'none'}"
     there = {wheel.sha256 for wheel in now.wheels}
     for wheel in then.wheels:
         if wheel.sha256 not in there:

@@ -74,10 +74,13 @@ def relisted(lock: LockFile) -> LockFile:
     Raises:
         DependencyError: The index does not answer, or lacks one.
     """
-    pins = [f"{package.name}=={package.version}" for package in lock.packages]
+    built = [one for one in lock.packages if one.origin is not None]
+    pins = [f"{one.name}=={one.version}" for one in lock.packages if one.origin is None]
     interpreter = lockfile.runner_here(lock)
     options = pylock.pins(lock.packages).options
-    return replace(lock, packages=pylock.listed(pins, interpreter.path, options, refresh=True))
+    found = pylock.listed(pins, interpreter.path, options, refresh=True)
+    packages = tuple(sorted((*built, *found), key=lambda one: one.name))
+    return replace(lock, packages=packages)
 
 
 def with_spaces(

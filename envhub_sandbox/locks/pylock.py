@@ -19,6 +19,8 @@ from envhub_sandbox.dependencies.resolve import Lock, Target
 from envhub_sandbox.errors import LockError, PackageIntegrityError
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.locks import toml
+from envhub_sandbox.locks.built import Origin, origins
+from envhub_sandbox.locks.built import read as read_origin
 
 MAX_PACKAGES = 2000
 MAX_WHEELS = 200
@@ -51,11 +53,14 @@ class Package:
     name: str
     version: str
     wheels: tuple[Wheel, ...]
+    origin: Origin | None = None
+    """What it is built of, where it has no wheels."""
 
     @property
     def pin(self) -> str:
         """As pip's ``--require-hashes`` reads it."""
-        hashes = (f"    --hash=sha256:{wheel.sha256}" for wheel in self.wheels)
+        known = [self.origin.wheel] if self.origin else [one.sha256 for one in self.wheels]
+        hashes = (f"    --hash=sha256:{one}" for one in known)
         return " \\\n".join([f"{self.name}=={self.version}", *hashes]) + "\n"
 
 
@@ -75,8 +80,13 @@ def described(lock: Lock, python: str) -> tuple[Package, ...]:
     versions = [line.partition(" ")[0] for line in lock.text.splitlines()]
     found = listed(versions, python, lock.options)
     permitted = set(re.findall(r"--hash=sha256:([0-9a-f]{64})", lock.text))
+    built = origins(lock)
     kept = []
     for package in found:
+        origin = next((built[one.sha256] for one in package.wheels if one.sha256 in built), None)
+        if origin is not None:
+            kept.append(Package(package.name, package.version, (), origin))
+            continue
         wheels = tuple(wheel for wheel in package.wheels if wheel.sha256 in permitted)
         if not wheels:
             raise PackageIntegrityError(
@@ -144,6 +154,8 @@ def _package(given: object, where: str) -> Package:
         Version(version)
     except InvalidVersion as error:
         raise LockError(f"{name} in {where} has no version: {str(version)[:80]!r}") from error
+    if origin := read_origin(given, name, version, where):
+        return Package(name, version, (), origin)
     if others := sorted({"vcs", "directory", "archive", "marker"} & given.keys()):
         raise LockError(
             f"{name} in {where} has {', '.join(others)}; only wheels of an index are installed"
@@ -170,7 +182,11 @@ def written(packages: Sequence[Package]) -> str:
     lines = []
     for package in packages:
         lines += ["", "[[packages]]", f"name = {quoted(package.name)}"]
-        lines += [f"version = {quoted(package.version)}", "wheels = ["]
+        lines += [f"version = {quoted(package.version)}"]
+        if package.origin is not None:
+            lines += package.origin.table
+            continue
+        lines += ["wheels = ["]
         for wheel in package.wheels:
             size = "" if wheel.size is None else f"size = {wheel.size}, "
             hashes = f"hashes = {{ sha256 = {quoted(wheel.sha256)} }}"

@@ -50,13 +50,16 @@ def provided(snapshot: Snapshot, lock: LockFile) -> PackageSet:
     from envhub_sandbox.dependencies import environments, progress
     from envhub_sandbox.dependencies.pipeline import PackageSet
     from envhub_sandbox.locks import drift, lockfile, pylock
+    from envhub_sandbox.locks.built import with_wheels
 
     drift.refuse(drift.files_and_commit(lock, snapshot), snapshot.label)
     try:
         interpreter = lockfile.runner_here(lock)
         drift.refuse(drift.runner(lock, lockfile.Runner.of(interpreter)), snapshot.label)
         with progress.shown("packages") as tell:
-            made = environments.provide(pylock.pins(lock.packages), interpreter, tell)
+            locked = [one.origin for one in lock.packages if one.origin is not None]
+            pins = with_wheels(pylock.pins(lock.packages), locked, interpreter, tell)
+            made = environments.provide(pins, interpreter, tell)
             return PackageSet.of(made)
     except (DependencyError, LockError) as error:
         name_source(error, snapshot.label)

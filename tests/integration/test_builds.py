@@ -8,13 +8,20 @@ from pathlib import Path
 
 import pytest
 
+from envhub_sandbox import make_env
 from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.builds import git, wheel_store
 from envhub_sandbox.dependencies.builds.build import build_wheels
+from envhub_sandbox.dependencies.choice import Choice
 from envhub_sandbox.dependencies.pipeline import lock_for
 from envhub_sandbox.dependencies.sources import Source
-from envhub_sandbox.errors import DependencyError, ResolutionError
+from envhub_sandbox.errors import DependencyError, PackageIntegrityError, ResolutionError
+from envhub_sandbox.hub.snapshot import local
+from envhub_sandbox.hub.store import cache_root, remove_tree
+from envhub_sandbox.locks import lockfile
+from envhub_sandbox.locks.making import locked
 from tests.support.git_server import git_served, make_repository
+from tests.support.repositories import write_repository
 from tests.support.sdists import backend, make_sdist
 from tests.support.wheels import Index, make_wheel
 
@@ -32,7 +39,10 @@ def further():
     import tool
     return {"seen.txt": tool.VERSION}
 """
-SETUP = "from setuptools import setup\nimport pkg_resources\nsetup(name='old', version='1.0')\n"
+NAMED = """
+def further():
+    return {"builder/__init__.py": "VERSION = '1.0'\\n"}
+"""
 
 
 @pytest.fixture
@@ -114,6 +124,57 @@ def test_a_commit_of_git(packages: Index, tmp_path: Path, monkeypatch: pytest.Mo
     known = wheel_store.describe(wheel)
     assert known is not None
     assert known.source == f"git+{address}/repo@{commit}#subdirectory=python"
+
+
+ENV = """
+import gymnasium as gym
+import sourced
+
+class Told(gym.Wrapper):
+    def origin(self):
+        return sourced.FROM
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([lambda: Told(gym.make("CartPole-v1"))] * n_envs)
+"""
+
+
+def test_a_repository_whose_package_has_no_wheel(real_index: Index, tmp_path: Path) -> None:
+    """By its reference alone; what its package needs once it is installed has no wheel either."""
+    shelf = real_index.folder
+    make_sdist(shelf, "sourced", files=backend("sourced", requires=["further"]))
+    further = backend("further", needs=["builder"], further=IMPORTS.format(name="builder"))
+    make_sdist(shelf, "further", files=further)
+    make_sdist(shelf, "builder", files=backend("builder", further=NAMED))
+    folder = write_repository(tmp_path / "repo", ENV, requirements__txt="sourced\n")
+    at_once = {"server_idle_s": 0.0}  # no server keeps what is removed below
+    with make_env(folder, timeouts=at_once) as suites:
+        assert suites.env.call("origin") == ("a source",)
+        assert {"sourced==1.0", "further==1.0"} < set(suites.provenance["installed"]["packages"])
+    snapshot = local(folder)
+    lock = locked(snapshot, Choice("own"))
+    path = tmp_path / "pylock.x.toml"
+    lockfile.write(lock, path)
+    assert lockfile.read(path) == lock
+    [origin] = [one.origin for one in lock.packages if one.name == "sourced"]
+    assert origin is not None
+    for name in ("wheels", "environments", "resolutions"):
+        remove_tree(cache_root() / name)
+    with make_env(folder, lock=path, timeouts=at_once) as suites:
+        assert suites.env.call("origin") == ("a source",)
+    remove_tree(cache_root() / "wheels")
+    remove_tree(cache_root() / "environments")
+    real_index.replaced["sourced-1.0.tar.gz"] = b"another"
+    with pytest.raises(PackageIntegrityError, match="it was replaced"):
+        make_env(folder, lock=path)
+
+
+def test_what_is_needed_to_build_itself(index: Index, tmp_path: Path) -> None:
+    """It ends with an error that shows the circle."""
+    make_sdist(index.folder, "one", files=backend("one", needs=["two"]))
+    source = make_sdist(index.folder, "two", files=backend("two", needs=["one"]))
+    with pytest.raises(ResolutionError, match="two <- one <- two"):
+        built([source])
 
 
 def test_no_jail_no_build(packages: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,8 +51,8 @@ def build_wheels(
 
     Raises:
         ResolutionError: One cannot be built; the text says why, and what is missing here.
-        DependencyError: As with downloads, and where sources or a wheel are refused.
-        SandboxUnavailableError: This host has no jail to build in.
+        DependencyError: As with downloads; and where sources or a wheel are refused, or this host
+            has no jail to build in.
     """
     return [_wheel(source, interpreter, tell, choose) for source in sources]
 

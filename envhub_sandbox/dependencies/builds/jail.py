@@ -61,7 +61,7 @@ def build(order: Order, folder: Path) -> Path | tuple[str, ...]:
 
     Raises:
         BuildFailedError: It failed.
-        SandboxUnavailableError: There is no jail on this host.
+        DependencyError: There is no jail on this host.
     """
     said = _run(order, folder)
     further, name = said.get("requires"), said.get("wheel")
@@ -111,7 +111,7 @@ def _heard(said: dict[str, Any]) -> dict[str, Any]:
         kind = getattr(errors, str(said["error"]), DependencyError)
         text = str(said["said"])
         if issubclass(kind, errors.SandboxUnavailableError):
-            raise kind(
+            raise DependencyError(
                 f"sources are built in a jail, and there is none here: {text}. A weaker profile "
                 f"for builds is chosen by {PROFILE_VARIABLE}, as in {PROFILE_VARIABLE}=no-userns"
             )
