@@ -235,7 +235,7 @@ def test_what_would_be_built_is_not(
     traces: Path,
     kind: Callable[[Index, Path, Path], tuple[str, Callable[[], object]]],
 ) -> None:
-    """A build runs what the package says: that of an index's source in a jail, others not at all."""
+    """A build runs what the package says: an index's source in a jail, and others not at all."""
     line, control = kind(real_index, tmp_path, traces)
     control()
     assert sprung(traces), "the control builds nothing"

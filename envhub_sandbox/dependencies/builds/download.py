@@ -71,7 +71,10 @@ def _copy(source: IO[bytes], file: IO[bytes], shown: str) -> str:
 def _opened(url: str) -> IO[bytes]:
     parts = urlsplit(url)
     if parts.scheme == "file" or not parts.scheme:
-        return Path(unquote(parts.path)).open("rb")  # of a folder that the user has named
+        path = Path(unquote(parts.path))  # of a folder that the user has named
+        if not path.is_file():
+            raise ValueError("it is no file")
+        return path.open("rb")
     if parts.scheme not in ("https", "http"):
         raise ValueError(f"{parts.scheme} is neither https nor http")
     settings = index.environment()

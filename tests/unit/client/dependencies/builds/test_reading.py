@@ -108,7 +108,7 @@ def test_downloads_are_bounded_and_verified(
         monkeypatch.setattr(download, "MAX_BYTES", 3)
         with pytest.raises(PackagesTooLargeError):
             download.download(url, known, target)
-    for other in ("ftp://127.0.0.1/x", "http://127.0.0.1:1/x", "gopher:x"):
+    for other in ("ftp://127.0.0.1/x", "http://127.0.0.1:1/x", "file:///dev/zero"):
         with pytest.raises(IndexUnavailableError):
             download.download(other, known, target)
 
