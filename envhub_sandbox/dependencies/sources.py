@@ -14,7 +14,7 @@ from envhub_sandbox.dependencies.interpreters import Interpreter
 
 _GIT = re.compile(
     r"git\+(?P<url>https://[A-Za-z0-9.-]+(:\d{1,5})?/[A-Za-z0-9._~/-]+?)"
-    r"@(?P<revision>[A-Za-z0-9._/-]{1,200})(#subdirectory=(?P<folder>[A-Za-z0-9._/-]{1,200}))?"
+    r"(?:@(?P<revision>[A-Za-z0-9._/-]{1,200}))?(#subdirectory=(?P<folder>[A-Za-z0-9._/-]{1,200}))?"
 )
 
 
@@ -27,7 +27,7 @@ class Source:
         version: Empty for a repository of git.
         url: Of the source distribution, or of the repository.
         sha256: Of the source distribution; empty for git.
-        commit: What a requirement names in a repository: a commit, a tag or a branch.
+        commit: What a requirement names in a repository: a commit, a tag or a branch; or ``HEAD``.
         subdirectory: Where the project lies in there.
         where: The line that asks for it, for errors.
     """
@@ -54,7 +54,7 @@ def of_git(requirement: Requirement, where: str) -> Source | None:
     return Source(
         canonicalize_name(requirement.name),
         url=found["url"],
-        commit=found["revision"],
+        commit=found["revision"] or "HEAD",
         subdirectory=found["folder"] or "",
         where=where,
     )

@@ -55,6 +55,7 @@ def resolve(url: str, revision: str) -> str:
     if not _NAME.fullmatch(revision):
         raise RequirementError(f"{revision[:200]!r} is no commit, tag or branch of {url[:200]!r}")
     names = [f"refs/tags/{revision}^{{}}", f"refs/tags/{revision}", f"refs/heads/{revision}"]
+    names = ["HEAD"] if revision == "HEAD" else names
     with tempfile.TemporaryDirectory(prefix="envhub-git-") as nowhere:
         said = _git(Path(nowhere), "ls-remote", "--quiet", _checked(url), *names).decode()
     found = {name: commit for commit, _, name in (x.partition("\t") for x in said.splitlines())}

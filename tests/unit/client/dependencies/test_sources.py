@@ -124,15 +124,15 @@ def test_a_repository_becomes_the_version_of_its_wheel(index: Index, built: list
 @pytest.mark.parametrize(
     "url",
     [
-        *("git+ssh://git.example/a@b", "git+https://git.example/a", "git+file:///a@b"),
+        *("git+ssh://git.example/a@b", "git+https://git.example/a@", "git+file:///a@b"),
         *("git+https://user:secret@git.example/a@b", "git+https://git.example/a@b --x"),
         *("git+https://git.example/a@../b", "git+https://git.example/a@b#egg=x"),
         "https://git.example/a.tar.gz",
     ],
 )
 def test_nothing_else_is_a_repository(url: str) -> None:
-    """No other protocol, no login, no option, and always a revision."""
+    """No other protocol, no login, no option, and no empty revision."""
     with pytest.raises(RequirementError):
         parse_requirement(f"a @ {url}", "line 1")
-    good = parse_requirement("a @ git+https://git.example/a@main", "line 1")
+    good = parse_requirement("a @ git+https://git.example/a", "line 1")
     assert of_git(good.requirement, "line 1") is not None

@@ -54,7 +54,8 @@ def test_the_files_of_a_commit(url: str, repository: Path, target: Path) -> None
     git.check_out(url, found, target, print)
     files = {str(f.relative_to(target)): f.read_text() for f in target.rglob("*") if f.is_file()}
     assert files == {"setup.py": "1", "a/b.py": "2"}
-    assert git.resolve(url, "main") == run_git(repository, "rev-parse", "main")
+    newest = run_git(repository, "rev-parse", "main")
+    assert git.resolve(url, "main") == git.resolve(url, "HEAD") == newest
 
 
 def test_a_full_commit_is_not_asked_for() -> None:
