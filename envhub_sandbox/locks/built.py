@@ -137,7 +137,7 @@ def with_wheels(
     if not locked or environments.ready(environments.key_of(lock, interpreter)) is not None:
         return lock
     wheels = build([one.source for one in locked], interpreter, tell)
-    text, options = lock.text, []
+    text, options = lock.text, list(lock.options)
     for origin, wheel in zip(locked, wheels, strict=True):
         built = wheel_store.describe(wheel)
         assert built is not None
