@@ -24,12 +24,19 @@ def base_interpreter() -> str:
     return str(Path(getattr(sys, "_base_executable", sys.executable)).resolve())
 
 
-def install(folder: Path, *requirements: str) -> Runtime:
-    """``requirements``, and what the worker needs, as wheels for this interpreter."""
+def install(folder: Path, *requirements: str, built: str | None = None) -> Runtime:
+    """``requirements``, and what the worker needs, as wheels for this interpreter.
+
+    Args:
+        folder: Where to.
+        requirements: As pip takes them.
+        built: The one package that has no wheels, and is built of its source.
+    """
     if sys.version_info >= (3, 13) and "numpy==1.26.4" in requirements:
         pytest.skip("numpy 1.26 has wheels up to Python 3.12")
     python = base_interpreter()
-    command = [uv.find_uv_bin(), "pip", "install", "--quiet", "--no-config", "--no-build"]
+    command = [uv.find_uv_bin(), "pip", "install", "--quiet", "--no-config"]
+    command += ["--only-binary", ":all:", *(["--no-binary", built] if built else [])]
     command += ["--compile-bytecode", "--python", python, "--target", str(folder)]
     # from where the user's own settings say, those for pip included
     where = index.environment()

@@ -13,7 +13,7 @@ What they lack is added here, so that nobody else asks for a version:
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -63,7 +63,8 @@ def _as_they_are(info: Any) -> Any:
     return info
 
 
-def _renamed(info: Any) -> Any:
+def renamed(info: Any) -> Any:
+    """The infos of a vector environment of old, under the names of today."""
     if not isinstance(info, dict):
         return info
     found: dict[Any, Any] = {}
@@ -91,7 +92,7 @@ def _entry(key: Any, values: Any, mask: Any) -> dict[Any, Any]:
     return {key: values, f"_{key}": mask}
 
 
-joined_infos: Callable[[Any], Any] = _renamed if _BEFORE_1_0 else _as_they_are
+joined_infos: Callable[[Any], Any] = renamed if _BEFORE_1_0 else _as_they_are
 """The infos of a vector environment with a ``step`` of its own, under the names of today."""
 
 
@@ -126,7 +127,7 @@ class _OldSyncVectorEnv(_WithMode):
                 f"Got `{len(values)}` values for {self.num_envs} environments."
             )
         for env, value in zip(self.envs, values, strict=True):
-            setattr(_owner(env, name), name, value)
+            setattr(owner(env, name), name, value)
 
     @property
     def np_random(self) -> Any:
@@ -141,15 +142,25 @@ class _OldSyncVectorEnv(_WithMode):
         return tuple(one.bit_generator.seed_seq.entropy for one in self.np_random)
 
 
-def _owner(env: Any, name: str) -> Any:
+def owner(env: Any, name: str) -> Any:
     """The wrapper, or what is wrapped, that has this attribute itself; else the outermost."""
-    layer = env
-    while True:
+    for layer in layers(env):
         if name in vars(layer) or hasattr(type(layer), name):
             return layer
-        if not isinstance(layer, gym.Wrapper):
-            return env
-        layer = layer.env
+    return env
+
+
+def layers(env: Any) -> Iterator[Any]:
+    """The wrappers from the outermost on, and what is wrapped; ``gym``'s wrappers count as well."""
+    while isinstance(env, gym.Wrapper) or descends_from(env, "gym.core", "Wrapper"):
+        yield env
+        env = env.env
+    yield env
+
+
+def descends_from(value: object, module: str, name: str) -> bool:
+    """Whether its class has an ancestor of this name, which need not be imported here."""
+    return any((cls.__module__, cls.__qualname__) == (module, name) for cls in type(value).__mro__)
 
 
 SyncBase: Any = SyncVectorEnv

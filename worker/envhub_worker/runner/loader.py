@@ -18,6 +18,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from envhub_worker.protocol.messages import Load, LoadTask
+from envhub_worker.runner.signatures import Parameters, parameters_of, takes
 
 PACKAGE = "hub_env"
 
@@ -73,10 +74,10 @@ def call_make_env(make_env: Callable[..., Any], request: Load | LoadTask) -> Any
     if request.cfg is not None:
         values = {key: _readable(value) for key, value in request.cfg.items()}
         offered["cfg"] = types.SimpleNamespace(**values)
-    parameters = _parameters(make_env)
+    parameters = parameters_of(make_env)
     if parameters is None:
         return make_env(**offered, **request.env_kwargs)
-    taken = {name: value for name, value in offered.items() if _takes(parameters, name)}
+    taken = {name: value for name, value in offered.items() if takes(parameters, name)}
     _check_arguments(parameters, taken, request.env_kwargs)
     return make_env(**(taken | request.env_kwargs))
 
@@ -124,24 +125,8 @@ def _make_importable(root: Path, folder: Path, scratch: str, package_path: Path)
     importlib.invalidate_caches()
 
 
-def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter] | None:
-    try:
-        return dict(inspect.signature(function).parameters)
-    except (TypeError, ValueError):
-        return None
-
-
-def _takes(parameters: dict[str, inspect.Parameter], name: str) -> bool:
-    parameter = parameters.get(name)
-    if parameter is not None and parameter.kind is not inspect.Parameter.POSITIONAL_ONLY:
-        return True
-    return any(item.kind is inspect.Parameter.VAR_KEYWORD for item in parameters.values())
-
-
-def _check_arguments(
-    parameters: dict[str, inspect.Parameter], taken: dict[str, Any], given: dict[str, Any]
-) -> None:
-    unknown = [name for name in given if not _takes(parameters, name)]
+def _check_arguments(parameters: Parameters, taken: dict[str, Any], given: dict[str, Any]) -> None:
+    unknown = [name for name in given if not takes(parameters, name)]
     if unknown:
         raise ArgumentsError(
             f"make_env takes no {', '.join(unknown)}; it takes {', '.join(parameters) or 'nothing'}"

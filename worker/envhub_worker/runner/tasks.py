@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -15,6 +16,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 
 from envhub_worker.protocol.manifest.manifest import TaskId
+from envhub_worker.runner import old_gym
 from envhub_worker.runner.deferred import Recording, recording
 from envhub_worker.runner.sync_envs import SubEnvs
 
@@ -47,7 +49,7 @@ class Task:
         """A vector environment of the sub-environments ``start`` to ``stop``."""
         if self.recording is None:
             return self.vector
-        env_fns = list(self.recording.env_fns[start:stop])
+        env_fns: list[EnvFn] = [partial(self._one, index) for index in range(start, stop)]
         if start == 0 and self.probe is not None:
             first, self.probe = self.probe, None
             env_fns[0] = lambda: first
@@ -59,8 +61,13 @@ class Task:
         if self.recording is None:
             return self.vector
         if self.probe is None:
-            self.probe = self.recording.env_fns[0]()
+            self.probe = self._one(0)
         return self.probe
+
+    def _one(self, index: int) -> Any:
+        """A new sub-environment, as one of Gymnasium's."""
+        made = self.recording
+        return None if made is None else old_gym.adapted(made.env_fns[index]())
 
     def forget_probe(self) -> None:
         """Close the sub-environment that was built for its spaces."""
@@ -134,8 +141,11 @@ class _Maker:
         if isinstance(env, VectorEnv) or _is_duck(env) or _has_single_spaces(env):
             made = recording(env)
             return Task(suite, task, recording=made, vector=None if made else env)
+        if old_gym.is_vector(env):
+            return Task(suite, task, vector=old_gym.adapted_vector(env))
         if isinstance(env, gym.Env):
             _refuse_batched(env.unwrapped)
+        if isinstance(env, gym.Env) or old_gym.is_env(env):
             return Task(suite, task, recording=self._multiplied(env, pick))
         raise ResultError(
             f"make_env must return a gymnasium VectorEnv, an Env, or a mapping "
@@ -165,7 +175,9 @@ class _Maker:
 
 
 def _is_duck(env: Any) -> bool:
-    return not isinstance(env, (gym.Env, type)) and all(hasattr(env, name) for name in _DUCK)
+    if isinstance(env, (gym.Env, type)) or old_gym.is_env(env):
+        return False
+    return all(hasattr(env, name) for name in _DUCK)
 
 
 def _has_single_spaces(env: Any) -> bool:
@@ -193,7 +205,8 @@ def _refuse_batched(env: Any) -> None:
 
 
 def _suite_name(env: Any) -> str:
-    spec = getattr(env, "spec", None) if isinstance(env, (gym.Env, VectorEnv)) else None
+    known = isinstance(env, (gym.Env, VectorEnv)) or old_gym.is_env(env)
+    spec = getattr(env, "spec", None) if known else None
     return str(getattr(spec, "id", None) or "hub_env")
 
 

@@ -1,0 +1,300 @@
+"""Environments of ``gym``, Gymnasium's predecessor, as environments of Gymnasium.
+
+``gym`` is maintained no more, and much of what was published needs it. From 0.21 to 0.26 it changed
+what an environment is, and authors of one release run on another, so that nothing here asks for a
+version. It looks at what an environment takes and gives:
+
+- ``reset`` with ``seed`` where the environment and all its wrappers take one, else ``seed()``
+  before it; with an info or without.
+- ``step`` with one ``done``, of which ``TimeLimit`` says in the info whether it is a truncation, or
+  with two.
+- ``render(mode=...)``, or a ``render_mode`` that was given when it was made.
+- Spaces of its own classes, which Gymnasium does not know.
+
+Followed: ``gymnasium.wrappers.compatibility.EnvCompatibility`` (0.26 to 0.29, gone since) and
+Shimmy's ``GymV21CompatibilityV0`` and ``GymV26CompatibilityV0``.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.step_api_compatibility import convert_to_terminated_truncated_step_api
+from gymnasium.vector.utils import batch_space, iterate
+
+from envhub_worker.runner import gymnasium_compat as compat
+from envhub_worker.runner.described import facts_of
+from envhub_worker.runner.infos import join
+from envhub_worker.runner.signatures import names, parameters_of, takes
+
+_OPTIONAL = ("seed", "options", "return_info")
+_MODES = ("rgb_array", "ansi")
+"""What ``render`` is asked for where it has to be asked, the first that it can do: no window."""
+
+
+class OldSpaceError(TypeError):
+    """A space of ``gym`` that has no counterpart here."""
+
+
+def is_env(value: object) -> bool:
+    """Whether it is an environment of ``gym``, and not one of Gymnasium."""
+    return not isinstance(value, gym.Env) and compat.descends_from(value, "gym.core", "Env")
+
+
+def is_vector(value: object) -> bool:
+    """Whether it is a vector environment of ``gym``, each of which is an ``Env`` there."""
+    return is_env(value) and compat.descends_from(value, "gym.vector.vector_env", "VectorEnv")
+
+
+def adapted(env: Any) -> Any:
+    """An environment of ``gym`` as one of Gymnasium; anything else as it is."""
+    return _told(OldEnv, env) if is_env(env) else env
+
+
+def adapted_vector(env: Any) -> Any:
+    """A vector environment of ``gym`` as one of Gymnasium; anything else as it is."""
+    return _told(OldVectorEnv, env) if is_vector(env) else env
+
+
+def _told(adapter: Callable[[Any], Any], env: Any) -> Any:
+    if not hasattr(np, "bool8"):  # numpy 2 has taken away what gym's own checks of a step use
+        np.bool8 = np.bool_  # type: ignore[attr-defined]
+    release = getattr(sys.modules.get("gym"), "__version__", "of an unknown release")
+    warnings.warn(
+        f"make_env returns environments of gym {release}, which is not maintained. They run as "
+        "Gymnasium's, through a compatibility wrapper of the sandbox: a time limit becomes a "
+        "truncation. To run without it, its author should move to gymnasium",
+        stacklevel=1,
+    )
+    return adapter(env)
+
+
+class _Reset:
+    """How an environment is reset: by what it takes, with every wrapper that it goes through."""
+
+    def __init__(self, env: Any) -> None:
+        self._env = env
+        self._takes = frozenset(name for name in _OPTIONAL if _passes(env, name))
+        self._seeds = hasattr(env, "seed") and "seed" not in self._takes
+
+    def __call__(self, seed: Any, options: Any) -> tuple[Any, Any]:
+        """The observation, and the info where it gives one."""
+        if seed is not None and self._seeds:
+            self._env.seed(seed)
+        offered = {"seed": seed, "options": options, "return_info": True}
+        given = {name: offered[name] for name in self._takes if offered[name] is not None}
+        result = self._env.reset(**given)
+        return result if self._has_info(result) else (result, {})
+
+    def _has_info(self, result: Any) -> bool:
+        if not isinstance(result, tuple) or len(result) != 2 or not isinstance(result[1], dict):
+            return False
+        space = self._env.observation_space
+        return not (hasattr(space, "spaces") and space.contains(result))
+
+
+def _passes(env: Any, name: str) -> bool:
+    """Whether ``reset`` of the environment names an argument, and its wrappers pass it on."""
+    *wrappers, innermost = [layer.reset for layer in compat.layers(env)]
+    named = names(parameters_of(innermost) or {}, name)
+    return named and all(_takes(wrapper, name) for wrapper in wrappers)
+
+
+def _takes(method: Any, name: str) -> bool:
+    return takes(parameters_of(method) or {}, name)
+
+
+class OldEnv(gym.Env[Any, Any]):
+    """An environment of ``gym``. What Gymnasium's do not have is looked up, and set, in it.
+
+    Args:
+        env: The environment, with its wrappers.
+    """
+
+    def __init__(self, env: Any) -> None:
+        asked = getattr(env, "render_mode", None) is None and all(
+            _takes(layer.render, "mode") for layer in compat.layers(env)
+        )
+        metadata = _metadata_of(env)
+        mode = next((mode for mode in _MODES if mode in metadata["render_modes"]), None)
+        self.__dict__.update(
+            env=env,
+            observation_space=space_of(env.observation_space),
+            action_space=space_of(env.action_space),
+            metadata=metadata,
+            render_mode=mode if asked else getattr(env, "render_mode", None),
+            spec=_spec_of(env),
+            _mode={"mode": mode} if asked and mode else {},
+            _reset=_Reset(env),
+        )
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
+        """As Gymnasium's, whichever way the environment is seeded."""
+        return self._reset(seed, options)  # type: ignore[no-any-return]
+
+    def step(self, action: Any) -> Any:
+        """As Gymnasium's."""
+        return convert_to_terminated_truncated_step_api(self.env.step(action))
+
+    def render(self) -> Any:
+        """In the mode of ``render_mode``."""
+        return self.env.render(**self._mode)
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
+
+    @property
+    def unwrapped(self) -> Any:
+        """The environment without any wrapper."""
+        return self.env.unwrapped
+
+    @property
+    def np_random(self) -> Any:
+        """Its generator; before 0.22 a ``RandomState``."""
+        return self.env.np_random
+
+    @np_random.setter
+    def np_random(self, value: Any) -> None:
+        compat.owner(self.env, "np_random").np_random = value
+
+    @property
+    def np_random_seed(self) -> int:
+        """-1, as Gymnasium says of a generator whose seed is not known."""
+        return -1
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "env":  # not there yet, in a copy that is being made
+            raise AttributeError(name)
+        return getattr(self.env, name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in self.__dict__ or isinstance(getattr(type(self), name, None), property):
+            super().__setattr__(name, value)
+        else:
+            setattr(compat.owner(self.env, name), name, value)
+
+
+class OldVectorEnv:
+    """A vector environment of ``gym``, driven as it is: it resets in the step that ends an episode.
+
+    Args:
+        env: The vector environment.
+    """
+
+    def __init__(self, env: Any) -> None:
+        self.env = env
+        self.num_envs = int(env.num_envs)
+        self.single_observation_space = space_of(env.single_observation_space)
+        self.single_action_space = space_of(env.single_action_space)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        # before 0.22 it takes one action after the other, whatever the space is
+        self._in_turn = type(space_of(env.action_space)) is not type(self.action_space)
+        self.metadata = _metadata_of(env) | {"autoreset_mode": "SameStep"}
+        self._reset = _Reset(env)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, Any]:
+        """The observations and infos, as Gymnasium has them."""
+        observation, infos = self._reset(seed, options)
+        return observation, self._joined(infos)
+
+    def step(self, actions: Any) -> Any:
+        """Five results, as Gymnasium has them."""
+        if self._in_turn:
+            actions = tuple(iterate(self.action_space, actions))
+        *results, infos = self.env.step(actions)
+        infos = list(infos) if isinstance(infos, tuple) else infos
+        if len(results) == 3 and isinstance(infos, dict):
+            infos.pop("_TimeLimit.truncated", None)
+        made = convert_to_terminated_truncated_step_api((*results, infos), is_vector_env=True)
+        observation, rewards, terminated, truncated, infos = made
+        flags = (np.asarray(terminated, np.bool_), np.asarray(truncated, np.bool_))
+        return observation, rewards, *flags, self._joined(infos)
+
+    def _joined(self, infos: Any) -> Any:
+        """Before 0.24 there is a list of them, one of each sub-environment."""
+        if isinstance(infos, Mapping):
+            return compat.renamed(infos)
+        return join([(index, info) for index, info in enumerate(infos) if info], self.num_envs)
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "env":
+            raise AttributeError(name)
+        return getattr(self.env, name)
+
+
+def _metadata_of(env: Any) -> dict[str, Any]:
+    """With the names that Gymnasium gives to what 0.21 calls otherwise."""
+    metadata = dict(getattr(env, "metadata", None) or {})
+    modes: Any = metadata.get("render_modes", metadata.get("render.modes"))
+    metadata["render_modes"] = list(modes or ())
+    if "video.frames_per_second" in metadata:
+        metadata.setdefault("render_fps", metadata["video.frames_per_second"])
+    return metadata
+
+
+def _spec_of(env: Any) -> EnvSpec | None:
+    spec = getattr(env, "spec", None)
+    if getattr(spec, "id", None) is None:
+        return None
+    return EnvSpec(entry_point="", **facts_of(spec))
+
+
+def space_of(space: Any) -> Any:
+    """The same space, of Gymnasium's class; a subclass becomes what it is derived from.
+
+    Raises:
+        OldSpaceError: It is of none of the classes that are known.
+    """
+    if isinstance(space, gym.Space):
+        return space
+    for cls in type(space).__mro__:
+        if cls.__module__.startswith("gym.spaces.") and cls.__name__ in _SPACES:
+            return _SPACES[cls.__name__](space)
+    raise OldSpaceError(
+        f"a space of gym is a {type(space).__module__}.{type(space).__qualname__}, which Gymnasium "
+        f"has not; what can be taken over is {', '.join(_SPACES)}"
+    )
+
+
+def _box(space: Any) -> Any:
+    return spaces.Box(space.low, space.high, space.shape, space.dtype)
+
+
+def _discrete(space: Any) -> Any:
+    return spaces.Discrete(int(space.n), start=int(getattr(space, "start", 0)))
+
+
+def _multi_discrete(space: Any) -> Any:
+    return spaces.MultiDiscrete(space.nvec, dtype=space.dtype)
+
+
+def _multi_binary(space: Any) -> Any:
+    return spaces.MultiBinary(space.n)
+
+
+def _tuple(space: Any) -> Any:
+    return spaces.Tuple([space_of(one) for one in space.spaces])
+
+
+def _dict(space: Any) -> Any:
+    return spaces.Dict(OrderedDict((key, space_of(one)) for key, one in space.spaces.items()))
+
+
+_SPACES: dict[str, Callable[[Any], Any]] = {
+    "Box": _box,
+    "Discrete": _discrete,
+    "MultiDiscrete": _multi_discrete,
+    "MultiBinary": _multi_binary,
+    "Tuple": _tuple,
+    "Dict": _dict,
+}
