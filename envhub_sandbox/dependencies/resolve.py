@@ -23,7 +23,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-WORKERS = ("cloudpickle>=3", "gymnasium>=0.29", "msgpack>=1.0.5", "numpy>=1.26")
+WORKERS = ("cloudpickle>=3", "gymnasium>=0.26", "msgpack>=1.0.5", "numpy>=1.26")
 """What the worker's jails import besides: the repository's versions must be among these.
 Gymnasium may be older in a jail than outside."""
 _RESOLVE_S = 600.0

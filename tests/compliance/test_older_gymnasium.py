@@ -26,6 +26,7 @@ from tests.support.compare import assert_same
 from tests.support.environments import install, running_on
 from tests.support.samples import reference, sample
 
+OLDEST = ("gymnasium==0.26.3", "numpy==1.26.4")
 OLD = ("gymnasium==0.29.1", "numpy==1.26.4")
 FIRST = ("gymnasium==1.0.0", "numpy==1.26.4")
 NEW = ("gymnasium>=1.1", "numpy>=2")
@@ -95,7 +96,7 @@ class TestOlderCounter(test_parity.TestCounter):
     """The whole suite, with the worker's own loop, sliced and not."""
 
     cases = [  # noqa: RUF012
-        OlderCase(),
+        OlderCase(requirements=OLDEST),
         OlderCase(use_async_envs=True, num_workers=2),
         OlderCase(requirements=FIRST, mode="NextStep"),
     ]

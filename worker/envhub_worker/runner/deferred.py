@@ -8,7 +8,7 @@ wrapper, the repository itself) makes it build itself after all, and it is drive
 Its end is no look: what was never built has nothing to close. Gymnasium's ``__del__`` asks for
 attributes, and would build all processes of every task that nobody used, only to end them.
 
-Followed: ``gymnasium.vector.SyncVectorEnv.__init__`` and ``AsyncVectorEnv.__init__`` (0.29 to 1.4).
+Followed: ``gymnasium.vector.SyncVectorEnv.__init__`` and ``AsyncVectorEnv.__init__`` (0.26 to 1.4).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Older releases of Gymnasium in a jail, as the client's own would have it: 0.29 and 1.0.
+"""Older releases of Gymnasium in a jail, as the client's own would have it: 0.26 to 1.0.
 
 What they lack is added here, so that nobody else asks for a version:
 
@@ -7,6 +7,8 @@ What they lack is added here, so that nobody else asks for a version:
   ``final_observation``. Vector environments of 0.29 are described as ``SameStep``, and their last
   observations and infos are called ``final_obs`` and ``final_info``, with a dict of arrays for the
   latter.
+- **Attributes.** Before 0.29, wrappers pass on whatever they are asked for, and have no method that
+  does so; a ``MultiDiscrete`` starts at zero, and a ``Sequence`` is not stacked.
 - **Vector environments.** Those of 0.29 have no ``render``, one random generator for all, and look
   attributes up in the outermost wrapper only.
 """
@@ -34,6 +36,16 @@ OWN_NAMES = frozenset(
 )
 """Names of any vector environment; older classes set some of them only when they are made."""
 _EXPERIMENTAL = "gymnasium.experimental.vector"
+
+
+def _add_what_came_with_0_29(env: Any, spaces: Any) -> None:
+    env.get_wrapper_attr = lambda self, name: getattr(self, name)
+    spaces.MultiDiscrete.start = property(lambda space: np.zeros_like(space.nvec))
+    spaces.Sequence.stack = False
+
+
+if not hasattr(gym.Env, "get_wrapper_attr"):
+    _add_what_came_with_0_29(gym.Env, gym.spaces)
 
 
 def mode_named(mode: Any) -> str:

@@ -1,6 +1,6 @@
 """Gymnasium spaces as plain values, and back with every claim checked.
 
-Works with Gymnasium 0.29 to 1.4, which may differ between the two ends.
+Works with Gymnasium 0.26 to 1.4, which may differ between the two ends.
 """
 
 from __future__ import annotations
