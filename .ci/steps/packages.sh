@@ -1,6 +1,6 @@
-# Repositories around real packages, in an environment that has none of these: cold, warm, and without
-# a network. Proves that make_env brings what a repository declares. More of them by hand:
-# python -m benchmarks.packages
+# Repositories around real packages and in different styles, in an environment that has none of these:
+# cold, warm, and without a network; and equal to the same repository in an ordinary environment. All of
+# them by hand: python -m benchmarks.reach
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../lib.sh"
 built=$(wheel)
@@ -8,4 +8,5 @@ python=$(find_python 3.11 || command -v python3)
 [ "$(id -u)" != 0 ] || [ ! -x /usr/bin/python3 ] || python=/usr/bin/python3
 make_venv "$python" "$CI_WORK/packages"
 "$CI_WORK/packages/bin/uv" pip install --quiet --python "$CI_WORK/packages/bin/python" "$built"
-"$CI_WORK/packages/bin/python" -m benchmarks.packages minigrid gym-pusht highway-env
+"$CI_WORK/packages/bin/python" -m benchmarks.reach --quick --client "$CI_WORK/packages/bin/python" \
+  --results "$CI_WORK/reach.json"

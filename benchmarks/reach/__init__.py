@@ -1,0 +1,1 @@
+"""What was written for no sandbox: how much of it runs in ours, by its reference alone."""

@@ -1,0 +1,3 @@
+from walks import make_env
+
+__all__ = ["make_env"]
