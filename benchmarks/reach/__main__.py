@@ -14,7 +14,8 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -36,17 +37,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         table.write(known)
         return 0
     chosen = _chosen(options)
-    folder = Path(tempfile.mkdtemp(prefix="envhub-reach-"))
-    folder.chmod(0o755)
-    try:
-        client = options.client or _client(folder)
+    missing = {
+        name
+        for name, case in chosen.items()
+        if options.again or name not in known or known[name].digest != case.digest
+    }
+    with _client(options.client, bool(missing)) as client:
         for name, case in chosen.items():
-            if options.again or name not in known or known[name].digest != case.digest:
+            if name in missing:
                 known[name] = measured(case, client, options.deadline)
                 _write(options.results, known)
             print(table.row(name, known[name]), flush=True)
-    finally:
-        removed(folder)
     found = {name: known[name] for name in chosen}
     print("\n" + table.sums(found))
     return 0 if all(_is_as_it_should(chosen[name], one) for name, one in found.items()) else 1
@@ -77,16 +78,24 @@ def _chosen(options: argparse.Namespace) -> dict[str, Case]:
     return {name: case for name, case in every.items() if case.quick or not options.quick}
 
 
-def _client(folder: Path) -> str:
-    """An environment with this checkout, which has none of what the cases need beyond Gymnasium."""
-    python = str(folder / "client/bin/python")
-    program = uv.find_uv_bin()
-    for words in (
-        [program, "venv", "--quiet", "--python", sys.executable, str(folder / "client")],
-        [program, "pip", "install", "--quiet", "--python", python, str(HERE.parents[1])],
-    ):
-        subprocess.run(words, check=True, env=index.environment())
-    return python
+@contextmanager
+def _client(given: str | None, needed: bool) -> Iterator[str]:
+    """An interpreter with this checkout, and with nothing that the cases need beyond Gymnasium."""
+    if given or not needed:
+        yield given or ""
+        return
+    folder = Path(tempfile.mkdtemp(prefix="envhub-reach-"))
+    folder.chmod(0o755)
+    python, program = str(folder / "bin/python"), uv.find_uv_bin()
+    try:
+        for words in (
+            [program, "venv", "--quiet", "--python", sys.executable, "--clear", str(folder)],
+            [program, "pip", "install", "--quiet", "--python", python, str(HERE.parents[1])],
+        ):
+            subprocess.run(words, check=True, env=index.environment())
+        yield python
+    finally:
+        removed(folder)
 
 
 def _read(path: Path) -> dict[str, Outcome]:

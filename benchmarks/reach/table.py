@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -24,17 +25,18 @@ def row(name: str, outcome: Outcome) -> str:
     alone = _first(outcome.alone) if outcome.alone else "yes"
     argument = ""
     if outcome.argument:
-        argument = f"`{outcome.argument}`" + (
-            f": {_first(outcome.helped)}" if outcome.helped else ""
-        )
+        given = json.loads(outcome.argument).items()
+        words = ", ".join(f"{key}={json.dumps(value)}" for key, value in given)
+        argument = f"`{words}`: {_first(outcome.helped) or 'yes'}"
     seconds = ", ".join(f"{one:.0f}" for one in outcome.seconds)
     cells = [about, alone, argument, seconds, str(outcome.mib or ""), _first(outcome.control)]
     return f"| {' | '.join(cells)} |"
 
 
 def _first(text: str) -> str:
-    """The first sentence, which says what; the others say what to do."""
-    return text.partition(". ")[0].replace("|", "\\|").replace("<", "&lt;").replace("\n", " ")
+    """The first sentence, or uv's, which says what; the others say what to do."""
+    says = text.partition("(cause: ")[2].partition(" and it is required")[0] or text
+    return says.partition(". ")[0].replace("|", "\\|").replace("<", "&lt;").replace("\n", " ")
 
 
 def sums(outcomes: Mapping[str, Outcome]) -> str:
