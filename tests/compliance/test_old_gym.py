@@ -25,8 +25,8 @@ from tests.support.samples import SAMPLES
 
 REPOSITORY = SAMPLES / "old_gym"
 STEPS = 60
-NEWEST = ("gym==0.26.2", "gymnasium", "numpy<2")
-OLDER = ("gym==0.23.1", "gymnasium", "numpy<2")
+NEWEST = ("gym==0.26.2", "gymnasium", "numpy==1.26.4")
+OLDER = ("gym==0.23.1", "gymnasium", "numpy==1.26.4")
 WITHOUT_BOOL8 = ("gym==0.26.2", "gymnasium", "numpy>=2")
 CASES = [(OLDER, "walk"), (OLDER, "wrapped"), (NEWEST, "walk"), (NEWEST, "cartpole")]
 BY_HAND = """
