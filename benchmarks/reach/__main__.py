@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import subprocess
 import sys
 import tempfile
@@ -37,6 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         table.write(known)
         return 0
     chosen = _chosen(options)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # what is temporary goes, too
     missing = {
         name
         for name, case in chosen.items()

@@ -133,7 +133,11 @@ class Trial:
 
     def _environment(self) -> dict[str, Any]:
         command = [self._client, "-I", "-m", "envhub_sandbox", "cache", "list", "--json"]
-        made = json.loads(self.run(command, {**os.environ, **self._own}, _ROOT))["environments"]
+        try:
+            listed = self.run(command, {**os.environ, **self._own}, _ROOT)
+        except Failed:  # at the deadline
+            return {}
+        made = json.loads(listed)["environments"]
         return made[0] if made else {}
 
     def _control(self) -> str:
@@ -190,7 +194,7 @@ class Trial:
         Raises:
             Failed: It did, or was late.
         """
-        with tempfile.TemporaryFile("w+") as said, tempfile.TemporaryFile("w+") as failed:
+        with _output() as said, _output() as failed:
             process = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -211,6 +215,10 @@ class Trial:
             if code:
                 raise Failed(_reason(failed.read(), code))
             return said.read()
+
+
+def _output() -> Any:
+    return tempfile.TemporaryFile("w+", errors="replace")
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
