@@ -214,7 +214,8 @@ class Trial:
             failed.seek(0)
             if code:
                 raise Failed(_reason(failed.read(), code))
-            return said.read()
+            printed: str = said.read()
+            return printed
 
 
 def _output() -> Any:
