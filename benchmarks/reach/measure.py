@@ -213,7 +213,7 @@ class Trial:
             said.seek(0)
             failed.seek(0)
             if code:
-                raise Failed(_reason(failed.read(), code))
+                raise Failed(_reason(failed.read().replace(f"{self._folder}/", ""), code))
             printed: str = said.read()
             return printed
 
