@@ -24,7 +24,7 @@ import uv
 
 from benchmarks.reach import table
 from benchmarks.reach.cases import HERE, Case, cases, removed
-from benchmarks.reach.measure import Outcome, measured
+from benchmarks.reach.measure import EQUAL, UNSEEDED, Outcome, measured
 from envhub_sandbox.dependencies import index
 
 _RESULTS = HERE / "results.json"
@@ -52,11 +52,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(table.row(name, known[name]), flush=True)
     found = {name: known[name] for name in chosen}
     print("\n" + table.sums(found))
-    return 0 if all(_is_as_it_should(chosen[name], one) for name, one in found.items()) else 1
-
-
-def _is_as_it_should(case: Case, outcome: Outcome) -> bool:
-    return not outcome.alone and (outcome.control == "equal" or case.random)
+    return (
+        0
+        if all(not one.alone and one.control in (EQUAL, UNSEEDED) for one in found.values())
+        else 1
+    )
 
 
 def _parser() -> argparse.ArgumentParser:

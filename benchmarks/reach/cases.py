@@ -41,7 +41,6 @@ class Case:
         python: Of the control, where our run has chosen none: a release as ``"3.10"``.
         control: What the control installs where our run has installed nothing; empty for
             ``requirements.txt``.
-        random: Whether it draws from generators that nobody seeds, so that no two runs are equal.
         entry: Its entry file.
         path: Folders of it that the control finds modules in, beside its root.
         quick: Whether it is one of those that CI tries.
@@ -54,7 +53,6 @@ class Case:
     argument: Mapping[str, Any] = field(default_factory=dict)
     python: str = ""
     control: tuple[str, ...] = ()
-    random: bool = False
     entry: str = "env.py"
     path: tuple[str, ...] = ()
     quick: bool = False

@@ -21,6 +21,8 @@ from envhub_sandbox.dependencies import index, interpreters
 
 _ROOT = HERE.parents[1]
 _NOWHERE = dict.fromkeys(("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY"), "http://127.0.0.1:9")
+EQUAL = "equal"
+UNSEEDED = "differs from itself: no seed reaches its generators"
 _MOST = 240
 """Characters of a reason."""
 
@@ -144,14 +146,16 @@ class Trial:
         """How the results compare with those of an ordinary process."""
         ours = self._folder / "results.txt"
         try:
-            python, requirements = self._ordinary(ours.exists())
-            self._step_by_hand(python, requirements)
+            python = self._installed(*self._ordinary(ours.exists()))
+            theirs = self._step_by_hand(python)
+            if not ours.exists():
+                return "runs"
+            verdict = _compared(ours.read_text().splitlines(), theirs)
+            return verdict if verdict == EQUAL or self._step_by_hand(python) == theirs else UNSEEDED
         except Failed as error:
             return f"fails without a sandbox, too: {error}"
         except Exception as error:
             return f"no control: {error}"[:_MOST]
-        theirs = (self._folder / "control.txt").read_text().splitlines()
-        return _compared(ours.read_text().splitlines(), theirs) if ours.exists() else "runs"
 
     def _ordinary(self, ran: bool) -> tuple[str, list[str]]:
         """An interpreter, and what is installed: what our run had, or what its author would."""
@@ -167,26 +171,30 @@ class Trial:
             return self._client, [f"{name}=={version}" for name, version in found]
         return interpreters.find(release).path, ["--no-deps", *installed["packages"]]
 
-    def _step_by_hand(self, python: str, requirements: Sequence[str]) -> None:
-        venv = self._folder / "control"
-        variables = {**index.environment(), **self._own, "UV_PYTHON_DOWNLOADS": "never"}
+    def _installed(self, python: str, requirements: Sequence[str]) -> str:
+        """The interpreter of an environment with these; the client's own, if that was used."""
         if python == self._client:
-            own = python
-        else:
-            own = str(venv / "bin/python")
-            uv_program = uv.find_uv_bin()
-            for words in (
-                [uv_program, "venv", "--quiet", "--python", python, str(venv)],
-                [uv_program, "pip", "install", "--quiet", "--python", own, *requirements],
-            ):
-                self.run(words, variables, self._folder)
+            return python
+        venv, program = self._folder / "control", uv.find_uv_bin()
+        own = str(venv / "bin/python")
+        variables = {**index.environment(), **self._own, "UV_PYTHON_DOWNLOADS": "never"}
+        for words in (
+            [program, "venv", "--quiet", "--python", python, str(venv)],
+            [program, "pip", "install", "--quiet", "--python", own, *requirements],
+        ):
+            self.run(words, variables, self._folder)
+        return own
+
+    def _step_by_hand(self, python: str) -> list[str]:
+        """What the control gives, in a copy of the repository that it may write to."""
         copied = self._folder / "by-hand"
         self._case.write(copied)
         program, results = str(HERE / "control.py"), str(self._folder / "control.txt")
         actions = str(self._folder / "actions.json")
-        command = [own, program, str(copied), self._case.entry, actions, results]
+        command = [python, program, str(copied), self._case.entry, actions, results]
         beside = os.pathsep.join(str(copied / one) for one in self._case.path)
         self.run(command, {**os.environ, "PYTHONPATH": beside}, copied)
+        return Path(results).read_text().splitlines()
 
     def run(self, command: Sequence[str], variables: Mapping[str, str], where: Path) -> str:
         """What it printed; it and all that it started end with the deadline.
@@ -253,7 +261,7 @@ def _compared(ours: list[str], theirs: list[str]) -> str:
     for number, (one, other) in enumerate(zip(ours, theirs, strict=False)):
         if one != other:
             return "differs from the reset on" if number == 0 else f"differs from step {number} on"
-    return "equal" if len(ours) == len(theirs) else "is shorter"
+    return EQUAL if len(ours) == len(theirs) else "is shorter"
 
 
 def measured(case: Case, client: str, deadline_s: float) -> Outcome:
@@ -261,9 +269,6 @@ def measured(case: Case, client: str, deadline_s: float) -> Outcome:
     folder = Path(tempfile.mkdtemp(prefix="envhub-reach-"))
     folder.chmod(0o755)  # a jail of root is another user
     try:
-        outcome = Trial(case, client, folder, monotonic() + deadline_s).outcome()
+        return Trial(case, client, folder, monotonic() + deadline_s).outcome()
     finally:
         removed(folder)
-    if case.random and outcome.control.startswith("differs"):
-        return Outcome(**{**vars(outcome), "control": "draws from generators that no seed reaches"})
-    return outcome

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
-from benchmarks.reach.measure import Outcome
+from benchmarks.reach.measure import EQUAL, Outcome
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "dependencies.md"
 BEGIN = "<!-- python -m benchmarks.reach --write -->\n"
@@ -47,7 +47,7 @@ def sums(outcomes: Mapping[str, Outcome]) -> str:
         ordinary = sum(one.runs or one.control == "runs" for one in chosen)
         alone = sum(not one.alone for one in chosen)
         helped = sum(bool(one.alone) and one.runs for one in chosen)
-        equal = sum(one.control == "equal" for one in chosen)
+        equal = sum(one.control == EQUAL for one in chosen)
         lines.append(
             f"Of {len(chosen)} {plural}, {ordinary} run with a sandbox or without; {alone} run by "
             f"reference alone, {helped} more with one argument, {equal} of these bit for bit as "
