@@ -106,6 +106,14 @@ class Between(Env):
         return kwargs.get("mode")
 
 
+class Deaf(Bare):
+    """Somebody's, whose ``seed`` takes nothing."""
+
+    def seed(self) -> None:  # type: ignore[override]
+        """Fails for whoever gives it one."""
+        raise AssertionError
+
+
 class Last(Env):
     """As 0.26."""
 
@@ -134,6 +142,7 @@ class Blind(Wrapper):
     [
         (Bare(), ("seed", 3, "reset"), {}),
         (Wrapper(Bare()), ("seed", 3, "reset"), {}),
+        (Wrapper(Deaf()), ("reset",), {}),
         (Wrapper(Between()), ("reset", 3, {"a": 1}), {"n": 1}),
         (Wrapper(Last()), ("reset", 3, {"a": 1}), {"n": 1}),
         (Wrapper(Blind(Between())), ("seed", 3, "reset", None, None), {}),

@@ -83,7 +83,7 @@ class _Reset:
     def __init__(self, env: Any) -> None:
         self._env = env
         self._takes = frozenset(name for name in _OPTIONAL if _passes(env, name))
-        self._seeds = hasattr(env, "seed") and "seed" not in self._takes
+        self._seeds = "seed" not in self._takes and _is_seeded(env)
 
     def __call__(self, seed: Any, options: Any) -> tuple[Any, Any]:
         """The observation, and the info where it gives one."""
@@ -99,6 +99,12 @@ class _Reset:
             return False
         space = self._env.observation_space
         return not (hasattr(space, "spaces") and space.contains(result))
+
+
+def _is_seeded(env: Any) -> bool:
+    """Whether it has a ``seed`` that takes one; some have one that takes nothing."""
+    *_, innermost = compat.layers(env)
+    return bool(parameters_of(getattr(innermost, "seed", None) or (lambda: None)))
 
 
 def _passes(env: Any, name: str) -> bool:
