@@ -13,10 +13,10 @@ from envhub_sandbox.check.table import CHECKS, CURES, Check, Severity
 from envhub_sandbox.check.walls import Walls
 from envhub_worker.protocol.text import counted, duration_text, printable
 
-_LONGEST = 1_000
+_LONGEST = 1_500
 _MOST = 500
 """Findings: a repository of ten thousand files is no reason for as many lines."""
-_SHOWN = 40
+_SHOWN = 60
 _OF_EACH = 20
 """Of one check, which are kept whatever there is of others: no flood of notes hides an error."""
 

@@ -6,10 +6,9 @@ our own comparison found nothing, never because the repository says so.
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -18,12 +17,11 @@ from gymnasium.error import CustomSpaceError
 
 from envhub_sandbox import __version__
 from envhub_sandbox.api import make_env
-from envhub_sandbox.check import denials, frames, leaks, traces
+from envhub_sandbox.check import denials
 from envhub_sandbox.check.findings import Report
-from envhub_sandbox.check.plays import Play, facts_of, film
 from envhub_sandbox.check.survey import survey
 from envhub_sandbox.check.table import CHECKS
-from envhub_sandbox.check.traces import Trace
+from envhub_sandbox.check.task import Asked, TaskJudge
 from envhub_sandbox.check.undeclared import undeclared
 from envhub_sandbox.check.walls import walls
 from envhub_sandbox.dependencies.choice import chosen
@@ -51,43 +49,15 @@ from envhub_sandbox.sources import imports, parsing
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol.text import size_text
 
-_PICTURED = 12
-"""Tasks of which a page has pictures: a suite may have hundreds."""
-_MODES = ("NextStep", "SameStep", "Disabled")
 _ITS_FAULT = (LoadError, DependencyError, RemoteProtocolError, WorkerDiedError, WorkerTimeoutError)
 """Where it does not load: what the repository is to blame for."""
 
 
+__all__ = ["Asked", "judge"]
+
+
 class _StoppedError(Exception):
     """Nothing more can be asked of this task, or of the repository."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Asked:
-    """What is judged, and how.
-
-    Attributes:
-        reference: The repository.
-        arguments: Of ``make_env``, beyond the reference.
-        seed, steps: Of each play.
-        resets: In a row, four times: what they leave behind is counted. 0 asks nothing.
-        slow_step_s: What half of the steps may take.
-        tasks: Chooses ``(suite, task)`` pairs of the environments.
-        tell: Is told what is done next.
-        pictures: Also gather what only a page shows: frames, and memory over time.
-    """
-
-    reference: str
-    arguments: Mapping[str, Any]
-    seed: int = 0
-    steps: int = 200
-    resets: int = 8
-    slow_step_s: float = 1.0
-    tasks: Callable[[EnvSuites], list[tuple[str, Any]]] = field(
-        default=lambda suites: [(suite, task) for suite in suites for task in suites[suite]]
-    )
-    tell: Callable[[str], None] = lambda what: None
-    pictures: bool = False
 
 
 def judge(asked: Asked, report: Report | None = None) -> Report:
@@ -200,7 +170,7 @@ class _Judge:
             self._report.judged("imports", [])
 
     @property
-    def takes_render_mode(self) -> bool:
+    def _takes_render_mode(self) -> bool:
         """Whether its make_env names such an argument, as far as its text says."""
         entry = self._files.get(self._snapshot.path)
         return entry is not None and any("render_mode" in text for text, _ in entry.entries)
@@ -243,13 +213,18 @@ class _Judge:
         self._report.waiting = [f"{suite} / {task}" for suite, task in tasks]
         for suite, task in tasks:
             self._asked.tell(f"{suite} / {task}")
-            asking = _Task(self, suites, suite, task)
+            asking = self._task(suites, suite, task)
             with self._stopping(f"{suite} / {task}", asking):
                 asking.ask()
-            asking.denied()
+            self.denied(asking.denied(), f"{suite} / {task}")
             asking.film()
             suites[suite][task].close()
             self._report.waiting.pop(0)
+
+    def _task(self, suites: EnvSuites, suite: str, task: Any) -> TaskJudge:
+        env, takes = suites[suite][task], self._takes_render_mode
+        asked, report = self._asked, self._report
+        return TaskJudge(asked, report, self.make, env, (suite, task), takes_render_mode=takes)
 
     def _note_walls(self, provenance: Mapping[str, Any] | None) -> None:
         policy = policy_from(self._asked.arguments.get("policy"), None)
@@ -287,7 +262,7 @@ class _Judge:
         return self.make(num_workers=1, validate=True)
 
     @contextmanager
-    def _stopping(self, task: str, asking: _Task) -> Iterator[None]:
+    def _stopping(self, task: str, asking: TaskJudge) -> Iterator[None]:
         try:
             with asking.ending():
                 yield
@@ -309,136 +284,3 @@ class _Judge:
 
     def _found(self, check: str) -> bool:
         return any(finding.id == check for finding in self._report.findings)
-
-
-class _Task:
-    """The questions to one environment."""
-
-    def __init__(self, judge: _Judge, suites: EnvSuites, suite: str, task: Any) -> None:
-        self._judge, self._report = judge, judge._report
-        self._asked = judge._asked
-        self._env = suites[suite][task]
-        self._suite, self._task = suite, task
-        self._name = f"{suite} / {task}"
-        self._play = self._report.plays[self._name] = Play(facts_of(self._env))
-        self._denied: tuple[str, ...] | None = None
-        self._pictured = self._asked.pictures and len(self._report.plays) <= _PICTURED
-
-    def ask(self) -> None:
-        mode = getattr(self._env.metadata.get("autoreset_mode"), "value", None)
-        stated = mode in _MODES
-        self._say("autoreset-stated", [] if stated else ["the metadata does not say"])
-        usage, seen = getattr(self._env, "jail_usage", None), {}
-        if usage is not None and self._pictured:
-            seen = {"observe": self._play.sampling(usage, self._asked.steps)}
-        first = traces.play(self._env, mode, seed=self._asked.seed, steps=self._asked.steps, **seen)
-        self._play.episodes = first.counted
-        self._say("rewards", first.bad_rewards)
-        self._say("infos", first.infos)
-        if stated:
-            self._say("autoreset", first.autoreset)
-        self._say("render", list(self._renders()))
-        self._say("observation-dtype", list(self._uncast()))
-        self._compare(first, mode)
-        self._leaks()
-
-    @contextmanager
-    def ending(self) -> Iterator[None]:
-        """Keep what its jail was refused, where that ends: nobody knows it afterwards."""
-        try:
-            yield
-        except EnvHubError as error:
-            self._denied = error.denied
-            raise
-
-    def denied(self) -> None:
-        """What was refused so far: also where it ended in an error."""
-        told = getattr(self._env, "jail_denials", None)
-        denied = None if told is None else told()
-        self._judge.denied(self._denied if denied is None else denied, self._name)
-
-    def film(self) -> None:
-        """Last of all, so that no verdict depends on whether somebody looks."""
-        if self._pictured and self._is_alive and self._env.render_mode == "rgb_array":
-            self._play.film = film(self._env, seed=self._asked.seed)
-
-    @property
-    def _is_alive(self) -> bool:
-        return not any(
-            one.task == self._name and one.id == "survives" for one in self._report.findings
-        )
-
-    def _leaks(self) -> None:
-        usage = getattr(self._env, "jail_usage", None)
-        if usage is None or not self._asked.resets:
-            return
-        seen = leaks.watch(
-            lambda: self._env.reset(seed=self._asked.seed),
-            self._play.counting(usage),
-            self._asked.resets,
-        )
-        if not seen:
-            return  # a server on another host that does not count
-        self._report.figures[self._name] |= {name: float(n) for name, n in seen[-1].items()}
-        found = dict(leaks.grown(seen, self._asked.resets))
-        for check in leaks.checks():
-            self._say(check, [found[check]] if check in found else [])
-
-    def _say(self, check: str, found: list[str]) -> None:
-        self._report.judged(check, found, self._name)
-
-    def _again(self, mode: str | None, **changes: Any) -> Trace:
-        """The same play in fresh processes."""
-        with self._judge.make(**changes) as suites:
-            env = suites[self._suite][self._task]
-            return traces.play(env, mode, seed=self._asked.seed, steps=self._asked.steps)
-
-    def _compare(self, first: Trace, mode: str | None) -> None:
-        second = self._again(mode, num_workers=1)
-        self._report.figures[self._name] = {
-            "steps": len(second.steps) - 1,
-            "episodes": second.episodes,
-            **second.times,
-        }
-        self._play.step_s = second.spent
-        half, most = second.times.get("step_median_s", 0.0), self._asked.slow_step_s
-        slow = f"half of the steps take {half:.2f} s or more, where {most:g} s are set"
-        self._say("slow-steps", [slow] if half > most else [])
-        at = first.differs_from(second)
-        self._say("seeding", [] if at is None else [_first_difference(at, "in two processes")])
-        if at is None and self._env.num_envs > 1:
-            spread = first.differs_from(self._again(mode, num_workers=2))
-            here = _first_difference(spread or 0, "with one worker and with two")
-            self._say("workers", [] if spread is None else [here])
-
-    def _renders(self) -> Iterator[str]:
-        """In its own mode; in the others that it declares, where its make_env takes one."""
-        yield from frames.wrong(self._env)
-        given = self._asked.arguments.get("env_kwargs") or {}
-        for mode in frames.others(self._env) if self._judge.takes_render_mode else ():
-            asked = {**given, "render_mode": mode}
-            with self._judge.make(env_kwargs=asked, num_workers=1) as suites:
-                env = suites[self._suite][self._task]
-                env.reset(seed=self._asked.seed)
-                if env.render_mode != mode:
-                    yield f"{mode}: it is declared and asked for, and is {env.render_mode!r}"
-                yield from frames.wrong(env)
-
-    def _uncast(self) -> Iterator[str]:
-        """What one sub-environment gives before Gymnasium writes it into a batch."""
-        handles = getattr(self._env, "envs", None)
-        if not handles:
-            return
-        space = self._env.single_observation_space
-        try:
-            observation = handles[0].reset(seed=self._asked.seed)[0]
-        except (AttributeError, TypeError, ValueError, NotImplementedError):
-            return  # it has no sub-environments of its own that can be reset
-        with contextlib.suppress(CustomSpaceError):  # whose code is not here to be asked
-            if space.contains(observation):
-                return
-            yield f"sub-environment 0 gave {frames.kind(observation)}, which is not in {space}"
-
-
-def _first_difference(at: int, where: str) -> str:
-    return f"{'the reset' if at == 0 else f'step {at}'} differs {where}"

@@ -1,4 +1,4 @@
-"""What resets leave behind: processes, threads and memory, counted by the server from outside."""
+"""What resets leave behind: processes, threads, files and memory, counted from outside."""
 
 from __future__ import annotations
 
@@ -9,27 +9,35 @@ from typing import Any
 from envhub_worker.protocol.text import size_text
 
 _ROUNDS = 3
-_LEAST = {"processes": 2, "threads": 2, "memory_bytes": 1 << 20}
+_LEAST = {"processes": 2, "threads": 2, "files": 2, "memory_bytes": 1 << 20}
 """What a round has to add. Pools that are filled once, and the allocator, add less or once."""
 _CHECKS = {
     "processes": "leaks-processes",
     "threads": "leaks-threads",
+    "files": "leaks-files",
     "memory_bytes": "leaks-memory",
 }
 
 Usage = dict[str, int]
 
 
-def watch(reset: Callable[[], Any], usage: Callable[[], Usage], resets: int) -> list[Usage]:
-    """What is held after each round of resets; a first round warms up. Empty if nobody counts.
+def watch(
+    reset: Callable[[], Any],
+    usage: Callable[[], Usage],
+    resets: int,
+    tell: Callable[[str], None] = lambda what: None,
+) -> list[Usage]:
+    """What is held after each round of resets; a first round warms up. Empty if nothing counts.
 
     Args:
         reset: Resets all sub-environments.
         usage: What its jail holds.
         resets: Of each round.
+        tell: Is called with the name of each round.
     """
     seen = []
-    for _ in range(_ROUNDS + 1):
+    for number in range(_ROUNDS + 1):
+        tell(f"{resets} resets, round {number + 1} of {_ROUNDS + 1}")
         for _ in range(resets):
             reset()
         seen.append(usage())
@@ -39,8 +47,8 @@ def watch(reset: Callable[[], Any], usage: Callable[[], Usage], resets: int) -> 
 def grown(seen: Sequence[Usage], resets: int) -> Iterator[tuple[str, str]]:
     """The check of each thing that grew in every round, and in what words.
 
-    A process that was left has threads and memory of its own, and a thread has a stack: what is
-    told is the first of the three alone.
+    A process that was left has threads and memory of its own, and pipes to it; a thread has a
+    stack: only the first of them is reported.
     """
     told = False
     for what, check in _CHECKS.items():

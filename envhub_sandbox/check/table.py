@@ -94,6 +94,25 @@ CHECKS: dict[str, Check] = {
             "Return what observation_space says: for a float32 Box, np.asarray(..., np.float32).",
         ),
         Check(
+            "observation-finite",
+            _E,
+            "Observations have no NaN and no infinity, also where a space without bounds has them.",
+            "Bound what they are computed from; give what is missing a value of its own.",
+        ),
+        Check(
+            "step-types",
+            _E,
+            "A step of one sub-environment gives a number, two bools and a dict, which Gymnasium "
+            "casts into a batch, and so hides.",
+            "Return float(reward), bool(terminated), bool(truncated) and a dict.",
+        ),
+        Check(
+            "num-envs",
+            _W,
+            "make_env returns as many sub-environments as n_envs says.",
+            "Make n_envs of them: gym.vector.SyncVectorEnv([make] * n_envs).",
+        ),
+        Check(
             "deadline",
             _E,
             "All of it was judged within --deadline.",
@@ -102,7 +121,7 @@ CHECKS: dict[str, Check] = {
         ),
         Check(
             "rewards",
-            _W,
+            _E,
             "Rewards are finite numbers.",
             "Bound what the reward is computed from.",
         ),
@@ -113,10 +132,48 @@ CHECKS: dict[str, Check] = {
             "Let Gymnasium's vector environments gather them; '_name' are booleans, one for each.",
         ),
         Check(
+            "large-infos",
+            _W,
+            "Half of the steps have less than 512 KiB of info for each sub-environment.",
+            "Put arrays into the observation, or give them by a method that is called for them.",
+        ),
+        Check(
             "seeding",
             _E,
             "The same seed and the same actions give the same results in another process.",
             "Draw from self.np_random alone, after super().reset(seed=seed).",
+        ),
+        Check(
+            "seed-ignored",
+            _E,
+            "In one process the same seed and the same actions give the same results again. "
+            "Gymnasium's check_env refuses what does not.",
+            "Let reset begin anew: super().reset(seed=seed), draw from self.np_random alone, and "
+            "keep nothing of past episodes (running statistics, curricula).",
+        ),
+        Check(
+            "seed-constant",
+            _N,
+            "Another seed begins another episode.",
+            "Nothing, where nothing is drawn by lot; else draw from self.np_random.",
+        ),
+        Check(
+            "seed-fixed",
+            _W,
+            "Resets without a seed begin different episodes, where resets with seeds do.",
+            "Seed only where reset is given a seed: super().reset(seed=seed) does it.",
+        ),
+        Check(
+            "actions-ignored",
+            _W,
+            "Other actions give other results.",
+            "Apply the action that step is given.",
+        ),
+        Check(
+            "endless",
+            _W,
+            "Some episode ends within 10,000 steps by lot, as far as 30 seconds suffice for them.",
+            "Terminate or truncate; gymnasium.wrappers.TimeLimit does it.",
         ),
         Check(
             "workers",
@@ -151,6 +208,12 @@ CHECKS: dict[str, Check] = {
             "Compute less in a step, or once in reset; and never wait for a clock.",
         ),
         Check(
+            "slow-resets",
+            _W,
+            "A reset takes no longer than five times what --slow-step says: five seconds.",
+            "Load and compile once, when it is made, and not in each reset.",
+        ),
+        Check(
             "denied-network",
             _W,
             "It tries to reach no network that the policy denies.",
@@ -176,19 +239,25 @@ CHECKS: dict[str, Check] = {
         ),
         Check(
             "leaks-processes",
-            _W,
+            _E,
             "Resets leave no processes behind.",
             "End what an episode started before the next one begins, and wait for it.",
         ),
         Check(
             "leaks-threads",
-            _W,
+            _E,
             "Resets leave no threads behind.",
             "Join what an episode started, or start it once.",
         ),
         Check(
+            "leaks-files",
+            _E,
+            "Resets leave no files, sockets or pipes open.",
+            "Close what an episode opened, or open it once.",
+        ),
+        Check(
             "leaks-memory",
-            _W,
+            _E,
             "Resets leave no memory behind.",
             "Keep nothing of past episodes: no lists that grow, no caches without an end.",
         ),

@@ -14,6 +14,7 @@ from gymnasium.vector import VectorEnv
 from envhub_sandbox.rollouts.episodes import Episode, EpisodeCounter, RolloutError
 
 Env = VectorEnv[Any, Any, Any]
+_LAST = ("final_obs", "final_observation")
 
 
 @dataclass
@@ -22,7 +23,10 @@ class Trace:
 
     Attributes:
         steps: A digest of the reset, and of every step.
+        actions: A digest of the actions of every step.
         bad_rewards: Steps with a reward that is no finite number, the first few.
+        unbounded: Resets and steps with an observation that is not finite, the first few.
+        heavy: Bytes of the infos of each step, for each sub-environment.
         autoreset: What the autoreset mode would not permit, the first few.
         infos: Infos that do not say which sub-environments they are of, the first few.
         episodes: How many ended.
@@ -33,7 +37,10 @@ class Trace:
     """
 
     steps: list[str] = field(default_factory=list)
+    actions: list[str] = field(default_factory=list)
     bad_rewards: list[str] = field(default_factory=list)
+    unbounded: list[str] = field(default_factory=list)
+    heavy: list[float] = field(default_factory=list)
     autoreset: list[str] = field(default_factory=list)
     infos: list[str] = field(default_factory=list)
     episodes: int = 0
@@ -42,8 +49,8 @@ class Trace:
     spent: list[float] = field(default_factory=list)
 
     def differs_from(self, other: Trace) -> int | None:
-        """The first step that differs, 0 for the reset; None if none does."""
-        pairs = enumerate(zip(self.steps, other.steps, strict=True))
+        """The first step of both that differs, 0 for the reset; None if none does."""
+        pairs = enumerate(zip(self.steps, other.steps, strict=False))
         return next((number for number, (one, two) in pairs if one != two), None)
 
 
@@ -53,6 +60,8 @@ def play(
     *,
     seed: int,
     steps: int,
+    actions_seed: int | None = None,
+    like: Trace | None = None,
     observe: Callable[[int], None] = lambda number: None,
 ) -> Trace:
     """Reset and step with seeded random actions.
@@ -60,30 +69,37 @@ def play(
     Args:
         env: Is left open.
         mode: Its autoreset mode, as its metadata says.
-        seed: Of the environment and of the actions.
+        seed: Of the environment, and of the actions unless ``actions_seed`` is given.
         steps: Vector steps.
-        observe: Is told the number of each step that was made; 0 is the reset.
+        actions_seed: Of the actions alone.
+        like: Stop at the first step that differs from this one.
+        observe: Is called with the number of each step that was made; 0 is the reset.
     """
     trace, ended = Trace(), np.zeros(env.num_envs, np.bool_)
     counter: EpisodeCounter | None = EpisodeCounter(env.num_envs, env.num_envs * steps, mode)
-    env.action_space.seed(seed)
+    env.action_space.seed(seed if actions_seed is None else actions_seed)
     began = time.perf_counter()
     first = env.reset(seed=seed)[0]
-    reset_s = time.perf_counter() - began
+    trace.times = {"reset_s": time.perf_counter() - began}
+    _look_at(trace, first, "the reset")
     trace.steps.append(digest(first))
     observe(0)
     for number in range(1, steps + 1):
+        if like is not None and trace.steps[-1] != like.steps[len(trace.steps) - 1]:
+            break
+        resumed = ""
         if mode == "Disabled" and ended.any():
-            trace.steps[-1] += digest(env.reset(options={"reset_mask": ended})[0])
+            resumed = digest(env.reset(options={"reset_mask": ended})[0])
         actions = env.action_space.sample()
+        trace.actions.append(digest(actions))
         begun = time.perf_counter()
         result = env.step(actions)
         trace.spent.append(time.perf_counter() - begun)
-        trace.steps.append(digest(result[:4]))  # infos may hold times
+        trace.steps.append(resumed + digest(result[:4]))  # infos may hold times
         ended = _judge(trace, result, ended, mode, number)
         counter = _count(trace, counter, result)
         observe(number)
-    trace.times = {"reset_s": reset_s, **_times(trace.spent)}
+    trace.times |= _times(trace.spent)
     return trace
 
 
@@ -114,7 +130,9 @@ def _times(spent: list[float]) -> dict[str, float]:
 
 
 def _judge(trace: Trace, result: tuple[Any, ...], ended: Any, mode: str | None, number: int) -> Any:
-    _, rewards, terminations, truncations, infos = result
+    observations, rewards, terminations, truncations, infos = result
+    _look_at(trace, observations, f"step {number}")
+    trace.heavy.append(_bytes_of(infos) / max(len(rewards), 1))
     for text in _masks(infos, len(rewards)):
         _note(trace.infos, f"step {number}: {text}")
     done = np.logical_or(np.asarray(terminations, bool), np.asarray(truncations, bool))
@@ -132,6 +150,44 @@ def _judge(trace: Trace, result: tuple[Any, ...], ended: Any, mode: str | None, 
     if mode == "SameStep" and done.any() and "final_obs" not in infos:
         _note(trace.autoreset, f"step {number}: an episode ended without 'final_obs' (SAME_STEP)")
     return done
+
+
+def _look_at(trace: Trace, observations: Any, where: str) -> None:
+    found = next(_unbounded(observations), None)
+    if found is not None:
+        _note(trace.unbounded, f"{where}: an observation has {found}")
+
+
+def _unbounded(value: Any) -> Iterator[str]:
+    """What is not finite in observations. Trust: input from the worker, already decoded."""
+    if isinstance(value, Mapping):
+        for one in value.values():
+            yield from _unbounded(one)
+    elif isinstance(value, (list, tuple)):
+        for one in value:
+            yield from _unbounded(one)
+    elif hasattr(value, "tolist") and hasattr(value, "cpu"):  # a tensor
+        yield from _unbounded(value.cpu().numpy())
+    elif isinstance(value, np.ndarray) and value.dtype == object:
+        yield from _unbounded(list(value.flat))
+    elif isinstance(value, (float, np.ndarray, np.generic)):
+        array = np.asarray(value)
+        if array.dtype.kind in "fc" and not np.isfinite(array).all():
+            yield "NaN" if np.isnan(array).any() else "infinity"
+
+
+def _bytes_of(value: Any) -> int:
+    """What an info weighs, roughly; without the last observation of an episode.
+
+    Trust: input from the worker, already decoded, and so bounded in depth and size.
+    """
+    if isinstance(value, Mapping):
+        return sum(_bytes_of(value[name]) for name in value if name not in _LAST)
+    if isinstance(value, np.ndarray) and value.dtype != object:
+        return value.nbytes
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return sum(map(_bytes_of, value))
+    return len(value) if isinstance(value, (str, bytes)) else 8
 
 
 def _masks(infos: Mapping[Any, Any], count: int) -> Iterator[str]:

@@ -98,7 +98,7 @@ class EnvSession:
     def usage(self) -> dict[str, int]:
         """What its jail holds, as its server counts it; empty if it does not say."""
         told = self.lease.status()
-        found = {name: told.get(name) for name in ("processes", "threads", "memory_bytes")}
+        found = {name: told.get(name) for name in ("processes", "threads", "files", "memory_bytes")}
         counts = {name: one for name, one in found.items() if type(one) is int and 0 <= one < _MOST}
         return counts if len(counts) == len(found) else {}
 

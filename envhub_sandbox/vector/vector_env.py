@@ -338,8 +338,9 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         """What its jail holds right now, counted from outside of it by the worker server.
 
         Returns:
-            ``processes`` and ``threads`` (beyond one for each process), and ``memory_bytes``: of
-            the processes that run environments, what is theirs alone. Empty unless it runs.
+            ``processes`` and ``threads`` (beyond one for each process); of the processes that run
+            environments ``files``, which they have open, and ``memory_bytes``, what is theirs
+            alone. Empty unless it runs.
         """
         return self._session.usage()
 

@@ -116,7 +116,7 @@ _FAULTS = {
     "observation-dtype": ("self.count], np.float32)", "self.count], np.float64)"),
     "observation-space": ("self.count], np.float32)", "self.count * 30], np.float32)"),
     "seeding": ("self.at = self.np_random.random()", "self.at = np.random.default_rng().random()"),
-    "workers": ("[self.at, self.count]", "[len(gym.shared), self.count]"),
+    "workers": ("[self.at, self.count]", "[self.at + len(gym.shared), self.count]"),
     "autoreset": ("def make_env", _TWO_RESETS + "\ndef first_make_env"),
     "infos": ("def make_env", _THREE_INFOS + "\ndef first_make_env"),
     "rewards": ("1.0, self.count >= 10", "float('nan'), self.count >= 10"),

@@ -15,9 +15,10 @@ DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "checks.md"
 _HEAD = """# Checks
 
 What `envhub check` asks of a repository, written from `envhub_sandbox/check/table.py`. Its files
-are read as data, its packages installed without running any of them, and each task is played up to
-three times with seeded random actions, in the sandbox, each time in fresh processes: with every
-observation held against its space, once more, and spread over two processes.
+are read as data, its packages installed without running any of them, and each task is played with
+seeded random actions in the sandbox: with every observation held against its space, once more in
+fresh processes, again in these, with another seed, with other actions, and spread over two
+processes. A play ends where it differs, if that is what is asked.
 
 Exit code 0: nothing fails. 1: a finding weighs as much as `--fail-on` says (`error` by default),
 and `--allow ID` does not permit it. 2: a wrong option. 10: nothing fails, but `--deadline SECONDS`
@@ -41,11 +42,19 @@ A folder is judged as its commit would be ([snapshots.md](snapshots.md#the-store
 commit something else than what lies there, that fails (`source-uncommitted`). What it ignores is in
 no commit, is not loaded and not pushed: it is named in a note (`source-ignored`).
 
+Same seed, same episode, however often: that is asked twice, of fresh processes (`seeding`) and, if
+these agree, of one process (`seed-ignored`), where Gymnasium's `check_env` asks it. So running
+statistics and curricula that a reset does not reset fail it: leave them to the caller's wrappers.
+An environment in which nothing is drawn by lot passes, with a note (`seed-constant`).
+
 How long resets and steps take, and what the jail holds in the end, are figures of the report, for
-they say as much of the machine; only steps that take a second are a finding (`--slow-step`). What
-resets leave behind is counted by the worker server, from outside of the jail, after each of four
-rounds of `--resets`; what grows from each round to the next is told, processes before threads
-before memory.
+they say as much of the machine; only steps that take a second, and resets that take five, are
+findings (`--slow-step`). What resets leave behind is counted by the worker server, from outside of
+the jail, after each of four rounds of `--resets`; what grows from each round to the next is a
+finding, processes before threads, open files and memory.
+
+A terminal shows what is done and for how long. In a log, whatever takes 10 seconds has a line, and
+again after 20, 40 and so on.
 
 What it tried and was denied is told by the first process of the jail, which the system call filter
 asks instead of refusing by itself (`Policy.record_denials`), with `sandbox="process"` alone. What

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 _PANEL = "What it says"
 _FILE = "FILE"
 _MAY = "What it may do"
+_LONG_S = 10.0
 
 
 def _with_settings(ctx: typer.Context, path: Path | None) -> Path | None:
@@ -49,7 +50,7 @@ def check(
         ),
     ] = None,
     steps: Annotated[
-        int, typer.Option(min=1, help="Vector steps of each play; there are up to three.")
+        int, typer.Option(min=1, help="Vector steps of each play; there are up to six.")
     ] = 200,
     resets: Annotated[
         int,
@@ -58,7 +59,12 @@ def check(
         ),
     ] = 8,
     slow_step: Annotated[
-        float, typer.Option(metavar="SECONDS", min=0.0, help="What half of the steps may take.")
+        float,
+        typer.Option(
+            metavar="SECONDS",
+            min=0.0,
+            help="What half of the steps may take, and a fifth of a reset.",
+        ),
     ] = 1.0,
     seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="Of each play.")] = 0,
     fail_on: Annotated[
@@ -139,8 +145,8 @@ def check(
 ) -> None:
     """Run a repository in a sandbox and say what is wrong with it.
 
-    Its files are read, its packages installed, and each task is played up to three times, in
-    processes of its own each time. docs/checks.md has every check. Exit code 0: nothing fails; 1:
+    Its files are read, its packages installed, and each task is played again and again, in one
+    process and in others. docs/checks.md has every check. Exit code 0: nothing fails; 1:
     something does; others: it could not be judged.
 
     [bold]envhub check org/repo@<commit> --junit report.xml[/bold]
@@ -241,7 +247,7 @@ def _judge(
         arguments["policy"] = settings.merged(settings.policy(policy), arguments["policy"])
 
     report, doing = Report(make.ref), ["starting"]
-    with Bar(quiet=quiet) as bar:
+    with Bar(quiet=quiet, long_s=_LONG_S) as bar:
 
         def tell(what: str) -> None:
             doing.append(what)

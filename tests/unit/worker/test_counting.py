@@ -38,5 +38,6 @@ def test_one_look_does_for_all() -> None:
         assert process.pid in reap.descendants(os.getpid(), children=children)
         assert held["processes"] >= 1
         assert held["memory_bytes"] > 0
+        assert held["files"] >= 3, "its standard streams"
         process.communicate(b"\n")
     assert usage_of(0, [], children) == {}

@@ -12,6 +12,7 @@ from collections.abc import Collection, Iterator, Mapping
 
 from envhub_worker.lockdown.root_plan import TEMPORARY
 from envhub_worker.protocol.confinement import Limits
+from envhub_worker.supervisor.usage import descriptors
 
 _LEFT_BYTES = 1 << 16
 """Below that a scratch is full: it is counted in pages, and for each core."""
@@ -30,7 +31,7 @@ def reached(
     """
     if usage and usage["processes"] + usage["threads"] >= limits.processes:
         yield "PROCESSES"
-    if any(_descriptors(pid) >= limits.open_files - 1 for pid in runners):  # a pipe takes two
+    if any(descriptors(pid) >= limits.open_files - 1 for pid in runners):  # a pipe takes two
         yield "OPEN_FILES"
     for pid in runners if own_root else ():
         with contextlib.suppress(OSError):
@@ -44,10 +45,3 @@ def _used_up(left: os.statvfs_result) -> Iterator[str]:
         yield "DISK_BYTES"
     if left.f_ffree == 0:
         yield "DISK_FILES"
-
-
-def _descriptors(pid: int) -> int:
-    """How many files a process has open; 0 where it has gone, or may not be looked at."""
-    with contextlib.suppress(OSError):
-        return len(os.listdir(f"/proc/{pid}/fd"))
-    return 0

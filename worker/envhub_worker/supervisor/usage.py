@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 from collections.abc import Callable, Collection
 from time import monotonic
 
@@ -45,7 +47,8 @@ def usage_of(init: int, runners: Collection[int], children: reap.Children) -> di
 
     Returns:
         ``processes``: all that live or wait to be reaped, without init. ``threads``: theirs, beyond
-        one each. ``memory_bytes``: of the runners, what is theirs alone and not a file's.
+        one each. ``files``: descriptors that the runners have open. ``memory_bytes``: of the
+        runners, what is theirs alone and not a file's.
     """
     if init <= 0:
         return {}
@@ -53,7 +56,20 @@ def usage_of(init: int, runners: Collection[int], children: reap.Children) -> di
     fields = {pid: _fields(pid) for pid in {*processes, *runners}}
     threads = sum(max(fields[pid].get("Threads", 1), 1) - 1 for pid in processes)
     kib = sum(fields[pid].get(name, 0) for pid in runners for name in ("RssAnon", "VmSwap"))
-    return {"processes": len(processes), "threads": threads, "memory_bytes": _KIB * kib}
+    files = sum(map(descriptors, runners))
+    return {
+        "processes": len(processes),
+        "threads": threads,
+        "files": files,
+        "memory_bytes": _KIB * kib,
+    }
+
+
+def descriptors(pid: int) -> int:
+    """How many files a process has open; 0 where it has gone, or may not be looked at."""
+    with contextlib.suppress(OSError):
+        return len(os.listdir(f"/proc/{pid}/fd"))
+    return 0
 
 
 def _fields(pid: int) -> dict[str, int]:

@@ -157,7 +157,7 @@ def test_severities_are_ordered() -> None:
 def mixed() -> Report:
     """What was found in the order in which it is found: notes first, an error last."""
     made = Report("./walk:env.py")
-    for check in ("card", "rewards", "licence", "leaks-threads", "runs", "seeding"):
+    for check in ("card", "slow-steps", "licence", "denied-files", "runs", "seeding"):
         made.judged(check, [f"about {check}"], "a / 0")
     made.judged("loads", [])
     return made
@@ -167,7 +167,7 @@ def test_the_most_severe_stands_first_in_every_form() -> None:
     """Those of one severity stay in the order in which they were found."""
     made = mixed()
     failures = made.failures(Severity.WARNING, ["runs"])
-    order = ["runs", "seeding", "rewards", "leaks-threads", "card", "licence"]
+    order = ["runs", "seeding", "slow-steps", "denied-files", "card", "licence"]
     told = reports.document(made, failures)
     assert [one["check"] for one in told["findings"]] == order
     assert [one.id for one in reports.read(told)[0].findings] == order
@@ -244,7 +244,7 @@ def test_what_was_not_judged_is_told_in_every_form() -> None:
     assert (first.id, made.failures(Severity.ERROR)[0].id) == ("runs", "runs")
     [ended] = [one for one in made.findings if one.id == "deadline"]
     assert "ended after 15 min 0 s, at: a / 0. Not judged: requirements, " in ended.message
-    assert ended.message.endswith("and 1 more") or "all of b / 1" in ended.message
+    assert ended.message.endswith("all of b / 1")
     told = reports.document(made, [])
     assert told["unjudged"]["tasks"] == ["a / 0", "b / 1"]
     assert not set(told["unjudged"]["checks"]) & {"runs", "card", "loads", "deadline"}

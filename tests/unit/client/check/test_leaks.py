@@ -11,30 +11,43 @@ from envhub_sandbox.check import leaks
 _MIB = 1 << 20
 
 
-def seen(*rows: tuple[int, int, int]) -> list[leaks.Usage]:
+def seen(*rows: tuple[int, int, int, int]) -> list[leaks.Usage]:
     """One count after each round."""
-    return [{"processes": p, "threads": t, "memory_bytes": m} for p, t, m in rows]
+    return [{"processes": p, "threads": t, "files": f, "memory_bytes": m} for p, t, f, m in rows]
 
 
 @pytest.mark.parametrize(
     ("counts", "found"),
     [
-        (seen((1, 0, 0), (1, 0, 0), (1, 0, 0), (1, 0, 0)), []),
-        (seen((1, 0, 0), (9, 8, 90 * _MIB), (9, 8, 90 * _MIB), (9, 8, 90 * _MIB)), []),
-        (seen((1, 0, 0), (2, 1, 1000), (3, 2, 2000), (4, 3, 3000)), []),
-        (seen((1, 0, 0), (9, 0, 0), (17, 0, 0), (25, 0, 0)), ["leaks-processes"]),
-        (seen((1, 0, 0), (1, 8, 0), (1, 16, 0), (1, 24, 0)), ["leaks-threads"]),
+        (seen((1, 0, 9, 0), (1, 0, 9, 0), (1, 0, 9, 0), (1, 0, 9, 0)), []),
+        (seen((1, 0, 9, 0), (9, 8, 9, 90 * _MIB), (9, 8, 9, 90 * _MIB), (9, 8, 9, 90 * _MIB)), []),
+        (seen((1, 0, 9, 0), (2, 1, 9, 1000), (3, 2, 9, 2000), (4, 3, 9, 3000)), []),
+        (seen((1, 0, 9, 0), (9, 0, 9, 0), (17, 0, 9, 0), (25, 0, 9, 0)), ["leaks-processes"]),
+        (seen((1, 0, 9, 0), (1, 8, 9, 0), (1, 16, 9, 0), (1, 24, 9, 0)), ["leaks-threads"]),
+        (seen((1, 0, 3, 0), (1, 0, 9, 0), (1, 0, 15, 0), (1, 0, 21, 0)), ["leaks-files"]),
         (
-            seen((1, 0, 0), (1, 0, 2 * _MIB), (1, 0, 4 * _MIB), (1, 0, 6 * _MIB)),
+            seen((1, 0, 9, 0), (1, 0, 9, 2 * _MIB), (1, 0, 9, 4 * _MIB), (1, 0, 9, 6 * _MIB)),
             ["leaks-memory"],
         ),
         (
-            seen((1, 0, 0), (9, 8, 90 * _MIB), (17, 16, 190 * _MIB), (25, 24, 290 * _MIB)),
+            seen(
+                (1, 0, 9, 0), (9, 8, 9, 90 * _MIB), (17, 16, 9, 190 * _MIB), (25, 24, 9, 290 * _MIB)
+            ),
             ["leaks-processes"],
         ),
         ([], []),
     ],
-    ids=["level", "filled once", "jitter", "processes", "threads", "memory", "all", "uncounted"],
+    ids=[
+        "level",
+        "filled once",
+        "jitter",
+        "processes",
+        "threads",
+        "files",
+        "memory",
+        "all",
+        "uncounted",
+    ],
 )
 def test_what_grows_in_every_round_is_told(counts: list[leaks.Usage], found: list[str]) -> None:
     """And of what comes with it nothing: a process has threads and memory of its own."""

@@ -145,7 +145,8 @@ class GetStatus(Message, kind=14):
 class Status(Message, kind=15):
     """One mapping per jail: ``jail``, ``name``, ``pids``, ``states``, ``busy_s``, ``operation``.
 
-    Of one that lives also ``processes``, ``threads`` and ``memory_bytes``, counted from outside.
+    Of one that lives also ``processes``, ``threads``, ``files`` and ``memory_bytes``, counted from
+    outside.
     Where denials are recorded: ``denied``, a tuple of texts.
     """
 
