@@ -13,7 +13,7 @@ from envhub_sandbox.check.table import CHECKS, CURES, Check, Severity
 from envhub_sandbox.check.walls import Walls
 from envhub_worker.protocol.text import counted, duration_text, printable
 
-_LONGEST = 1_500
+_LONGEST = 1_000
 _MOST = 500
 """Findings: a repository of ten thousand files is no reason for as many lines."""
 _SHOWN = 60

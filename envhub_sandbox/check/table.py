@@ -146,8 +146,8 @@ CHECKS: dict[str, Check] = {
         Check(
             "seed-ignored",
             _E,
-            "In one process the same seed and the same actions give the same results again. "
-            "Gymnasium's check_env refuses what does not.",
+            "In one process the same seed and the same actions give the same results again, and so "
+            "do resets without a seed that follow. Gymnasium's check_env refuses what does not.",
             "Let reset begin anew: super().reset(seed=seed), draw from self.np_random alone, and "
             "keep nothing of past episodes (running statistics, curricula).",
         ),

@@ -199,7 +199,8 @@ class TaskJudge:
         self._tell("the same play in the same process")
         again = self._played(env, mode, like=before)
         at = before.differs_from(again)
-        self._say("seed-ignored", [] if at is None else [_difference(at, "in one process")])
+        begun = self._begun_unseeded(env) if at is None else []
+        self._say("seed-ignored", list(self._ignored(at, begun, env)))
         self._tell("another seed, and other actions")
         other = self._played(env, mode, seed=self._asked.seed + 1, actions_seed=self._asked.seed)
         acted = self._played(env, mode, actions_seed=self._asked.seed + 1, like=before)
@@ -207,13 +208,25 @@ class TaskJudge:
         self._say("actions-ignored", list(self._unmoved(before, acted)))
         resets = [trace.times["reset_s"] for trace in (again, other, acted)]
         self._say("slow-resets", list(self._slow(min(resets))))
-        if at is None and before.differs_from(other) == 0:
-            self._say("seed-fixed", list(self._fixed(env)))
+        if begun and before.differs_from(other) == 0:
+            same = f"{_UNSEEDED} resets without a seed begin the same episode"
+            self._say("seed-fixed", [same] if len(set(begun)) == 1 else [])
         if not any(trace.episodes for trace in (before, again, other, acted)):
             self._tell("on to the end of an episode")
             self._on_to_an_end(env)
         else:
             self._say("endless", [])
+
+    def _begun_unseeded(self, env: Env) -> list[str]:
+        """The episodes that follow a seeded one; its generator goes on in them."""
+        env.reset(seed=self._asked.seed)
+        return [traces.digest(env.reset()[0]) for _ in range(_UNSEEDED)]
+
+    def _ignored(self, at: int | None, begun: list[str], env: Env) -> Iterator[str]:
+        if at is not None:
+            yield _difference(at, "in one process")
+        elif self._begun_unseeded(env) != begun:  # followed: check_reset_seed_determinism
+            yield "the resets without a seed after one with a seed differ in one process"
 
     def _other_seed(self, before: Trace, other: Trace) -> None:
         seeds = f"{self._asked.seed} and {self._asked.seed + 1}"
@@ -231,11 +244,6 @@ class TaskJudge:
         most = _RESET * self._asked.slow_step_s
         if took > most:
             yield f"a reset takes {took:.1f} s, where {most:g} s are set"
-
-    def _fixed(self, env: Env) -> Iterator[str]:
-        begun = {traces.digest(env.reset()[0]) for _ in range(_UNSEEDED)}
-        if len(begun) == 1:
-            yield f"{_UNSEEDED} resets without a seed begin the same episode"
 
     def _on_to_an_end(self, env: Env) -> None:
         """Says nothing where there is no time to find out."""
