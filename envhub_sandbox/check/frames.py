@@ -11,6 +11,8 @@ from gymnasium.vector import VectorEnv
 MODES = ("rgb_array", "rgb_array_list", "ansi")
 """Those that need no display, and of which one knows what they give."""
 
+FILMED = ("rgb_array", "rgb_array_list")
+
 
 def others(env: VectorEnv[Any, Any, Any]) -> list[str]:
     """The modes that it declares and is not in. Trust: input from the worker."""

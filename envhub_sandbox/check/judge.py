@@ -49,7 +49,10 @@ from envhub_sandbox.sources import imports, parsing
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol.text import size_text
 
-_ITS_FAULT = (LoadError, DependencyError, RemoteProtocolError, WorkerDiedError, WorkerTimeoutError)
+_ITS_FAULT = (
+    *(LoadError, DependencyError, RemoteEnvError, RemoteProtocolError),
+    *(WorkerDiedError, WorkerTimeoutError),
+)
 """Where it does not load: what the repository is to blame for."""
 
 

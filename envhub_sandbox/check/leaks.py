@@ -1,4 +1,4 @@
-"""What resets leave behind: processes, threads, files and memory, counted from outside."""
+"""What episodes leave behind: processes, threads, files and memory, counted from outside."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Usage = dict[str, int]
 
 
 def watch(
-    reset: Callable[[], Any],
+    begin: Callable[[], Any],
     usage: Callable[[], Usage],
     resets: int,
     tell: Callable[[str], None] = lambda what: None,
@@ -30,7 +30,7 @@ def watch(
     """What is held after each round of resets; a first round warms up. Empty if nothing counts.
 
     Args:
-        reset: Resets all sub-environments.
+        begin: Resets all sub-environments, and steps them.
         usage: What its jail holds.
         resets: Of each round.
         tell: Is called with the name of each round.
@@ -39,7 +39,7 @@ def watch(
     for number in range(_ROUNDS + 1):
         tell(f"{resets} resets, round {number + 1} of {_ROUNDS + 1}")
         for _ in range(resets):
-            reset()
+            begin()
         seen.append(usage())
     return seen if all(seen) else []
 

@@ -202,6 +202,12 @@ CHECKS: dict[str, Check] = {
             "Return that from render(), or declare the modes that there are.",
         ),
         Check(
+            "render-fps",
+            _W,
+            "Where it renders frames, metadata['render_fps'] says how many make a second.",
+            "Set metadata['render_fps'] to a number; LeRobot and RecordVideo read it.",
+        ),
+        Check(
             "slow-steps",
             _W,
             "Half of the steps take no longer than --slow-step says: a second.",
@@ -240,25 +246,25 @@ CHECKS: dict[str, Check] = {
         Check(
             "leaks-processes",
             _E,
-            "Resets leave no processes behind.",
+            "Resets and steps leave no processes behind.",
             "End what an episode started before the next one begins, and wait for it.",
         ),
         Check(
             "leaks-threads",
             _E,
-            "Resets leave no threads behind.",
+            "Resets and steps leave no threads behind.",
             "Join what an episode started, or start it once.",
         ),
         Check(
             "leaks-files",
             _E,
-            "Resets leave no files, sockets or pipes open.",
+            "Resets and steps leave no files, sockets or pipes open.",
             "Close what an episode opened, or open it once.",
         ),
         Check(
             "leaks-memory",
             _E,
-            "Resets leave no memory behind.",
+            "Resets and steps leave no memory behind.",
             "Keep nothing of past episodes: no lists that grow, no caches without an end.",
         ),
         Check(

@@ -17,9 +17,9 @@ from envhub_sandbox.check import frames, leaks, traces
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.plays import Play, facts_of, film
 from envhub_sandbox.check.traces import Env, Trace
-from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.errors import EnvHubError, RemoteEnvError
 from envhub_sandbox.vector.suites import EnvSuites
-from envhub_worker.protocol.text import size_text
+from envhub_worker.protocol.text import printable, size_text
 
 _PICTURED = 12
 """Tasks of which a page has pictures: a suite may have hundreds."""
@@ -30,8 +30,10 @@ _LARGE_INFO = 512 << 10
 """Bytes of info a step, for each sub-environment: more than a picture of 480 x 360."""
 _UNSEEDED = 8
 """Resets without a seed that must not all begin the same episode."""
-_EPISODE_STEPS, _EPISODE_S = 10_000, 30.0
+_EPISODE_S = 30.0
 """How long is looked for the end of an episode."""
+_BEGUN = 4
+"""Steps after each of the resets after which is counted what is left."""
 _ALONE = 5
 """Steps of one sub-environment by itself."""
 
@@ -46,6 +48,7 @@ class Asked:
         seed, steps: Of each play.
         resets: In a row, four times: what they leave behind is counted. 0 asks nothing.
         slow_step_s: What half of the steps may take; a reset may take five times that.
+        episode_steps: In which some episode has to end, if 30 seconds suffice for them.
         tasks: Chooses ``(suite, task)`` pairs of the environments.
         tell: Is called with what is done next.
         pictures: Also gather what only a page shows: frames, and memory over time.
@@ -57,6 +60,7 @@ class Asked:
     steps: int = 200
     resets: int = 8
     slow_step_s: float = 1.0
+    episode_steps: int = 10_000
     tasks: Callable[[EnvSuites], list[tuple[str, Any]]] = field(
         default=lambda suites: [(suite, task) for suite in suites for task in suites[suite]]
     )
@@ -114,7 +118,7 @@ class TaskJudge:
         if stated:
             self._say("autoreset", first.autoreset)
         self._tell("rendering")
-        self._say("render", list(self._renders()))
+        self._render()
         self._tell("one sub-environment by itself")
         self._alone()
         self._compare(first, mode)
@@ -218,9 +222,12 @@ class TaskJudge:
             self._say("endless", [])
 
     def _begun_unseeded(self, env: Env) -> list[str]:
-        """The episodes that follow a seeded one; its generator goes on in them."""
+        """The episodes that follow a seeded one, in which its generator goes on."""
         env.reset(seed=self._asked.seed)
-        return [traces.digest(env.reset()[0]) for _ in range(_UNSEEDED)]
+        begun: list[str] = []
+        while len(begun) < _UNSEEDED and len(set(begun)) < 2:
+            begun.append(traces.digest(env.reset()[0]))
+        return begun
 
     def _ignored(self, at: int | None, begun: list[str], env: Env) -> Iterator[str]:
         if at is not None:
@@ -249,14 +256,14 @@ class TaskJudge:
         """Says nothing where there is no time to find out."""
         until = time.monotonic() + _EPISODE_S
         env.reset(seed=self._asked.seed)
-        for _ in range(_EPISODE_STEPS):
+        for _ in range(self._asked.episode_steps):
             _, _, terminations, truncations, _ = env.step(env.action_space.sample())
             if np.any(terminations) or np.any(truncations):
                 self._say("endless", [])
                 return
             if time.monotonic() > until:
                 return
-        self._say("endless", [f"no episode ended in {_EPISODE_STEPS:,} steps"])
+        self._say("endless", [f"no episode ended in {self._asked.episode_steps:,} steps"])
 
     # --- in the process that was played first --------------------------------------------------
 
@@ -265,7 +272,7 @@ class TaskJudge:
         if usage is None or not self._asked.resets:
             return
         seen = leaks.watch(
-            lambda: self._env.reset(seed=self._asked.seed),
+            self._begin,
             self._play.counting(usage),
             self._asked.resets,
             self._tell,
@@ -276,6 +283,31 @@ class TaskJudge:
         found = dict(leaks.grown(seen, self._asked.resets))
         for check in leaks.checks():
             self._say(check, [found[check]] if check in found else [])
+
+    def _begin(self) -> None:
+        self._env.reset(seed=self._asked.seed)
+        for _ in range(min(_BEGUN, self._asked.steps)):
+            _, _, terminations, truncations, _ = self._env.step(self._env.action_space.sample())
+            if np.any(terminations) or np.any(truncations):
+                return
+
+    def _render(self) -> None:
+        wrong: list[str] = []
+        cause = ""
+        try:
+            wrong += self._renders()
+        except RemoteEnvError as error:
+            wrong.append(f"{error.type_name}: {error.message}")
+            cause = error.type_name.rpartition(".")[2]
+        self._report.judged("render", wrong, self._name, cause=cause)
+        self._say("render-fps", list(self._unpaced()))
+
+    def _unpaced(self) -> Iterator[str]:
+        """LeRobot's evaluation reads the number, and so does Gymnasium's ``RecordVideo``."""
+        fps = self._env.metadata.get("render_fps")
+        is_rate = isinstance(fps, (int, float)) and not isinstance(fps, bool) and fps > 0
+        if self._env.render_mode in frames.FILMED and not is_rate:
+            yield f"metadata['render_fps'] is {printable(repr(fps), 100)}"
 
     def _renders(self) -> Iterator[str]:
         """In its own mode; in the others that it declares, where its make_env takes one."""
@@ -314,9 +346,18 @@ class TaskJudge:
     def _outside(self, observation: Any) -> Iterator[str]:
         space = self._env.single_observation_space
         with contextlib.suppress(CustomSpaceError):  # whose code is not here to be asked
-            if not space.contains(observation):
+            if _would_be_cast(observation, space) or not space.contains(observation):
                 given = frames.kind(observation)
                 yield f"sub-environment 0 gave {given}, which is not in {space}"
+
+
+def _would_be_cast(value: Any, space: spaces.Space[Any]) -> bool:
+    """Whether a Box would make an array of it to look whether it is a member."""
+    if isinstance(space, spaces.Dict) and isinstance(value, Mapping):
+        return any(_would_be_cast(value[name], space[name]) for name in space if name in value)
+    if isinstance(space, spaces.Tuple) and isinstance(value, tuple):
+        return any(map(_would_be_cast, value, space))
+    return isinstance(space, spaces.Box) and isinstance(value, (list, tuple, int, float))
 
 
 def _untyped(reward: Any, terminated: Any, truncated: Any, info: Any) -> Iterator[str]:

@@ -6,10 +6,14 @@ Write it again with ``python -m tests.support.checks``.
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Iterator
 from pathlib import Path
 
 from envhub_sandbox.check.table import CHECKS
 from envhub_sandbox.cli.check.options import SETTINGS
+from tests.corpus.entries import Entry
+from tests.corpus.faults import FAULTS
+from tests.corpus.honest import HONEST
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "checks.md"
 _HEAD = """# Checks
@@ -108,6 +112,18 @@ changes no verdict.
 | --- | --- | --- | --- |
 """
 
+_CORPUS = """
+## How good it is
+
+`tests/corpus` has repositories that are judged in each test run: honest ones in many styles, in
+which nothing but notes may be found, and others with one fault each, which its check has to find
+and no other check may. Missed is a fault that is not found; false is a finding where there is none.
+`python -m tests.corpus` prints what is found in each.
+
+| Repositories | Number | Right | Missed | False |
+| --- | --- | --- | --- | --- |
+"""
+
 
 def document() -> str:
     """What the file has to hold."""
@@ -117,7 +133,22 @@ def document() -> str:
     ]
     options = ", ".join(f"`{name.replace('_', '-')}`" for name in SETTINGS)
     head = _HEAD.replace("SETTINGS", textwrap.fill(f"{options}.", 100, break_on_hyphens=False))
-    return head + "\n".join(rows) + "\n"
+    return head + "\n".join(rows) + "\n" + _CORPUS + "\n".join(_judged()) + "\n"
+
+
+def _judged() -> Iterator[str]:
+    """A row for each group of the corpus, and one for all of it; its tests judge every entry."""
+    groups: dict[str, list[Entry]] = {}
+    for entry in (*HONEST.values(), *FAULTS.values()):
+        groups.setdefault(entry.group, []).append(entry)
+    for name, entries in {**groups, "all": [*HONEST.values(), *FAULTS.values()]}.items():
+        missed = sum(bool(entry.right - entry.expected) for entry in entries)
+        false = sum(bool(entry.expected - entry.right) for entry in entries)
+        right = sum(entry.expected == entry.right for entry in entries)
+        yield f"| {name} | {len(entries)} | {right} | {missed} | {false} |"
+    for name, entry in {**HONEST, **FAULTS}.items():
+        if entry.expected != entry.right:
+            yield f"\nNot right is “{name}”: {entry.why}"
 
 
 if __name__ == "__main__":

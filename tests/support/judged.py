@@ -193,7 +193,7 @@ def is_told(found: list[Finding], attack: Attack) -> bool:
 
 
 HONEST = (
-    *("async_import", "brittle", "cartpole", "counter", "custom_vector", "duck_typed"),
+    *("async_import", "brittle", "cartpole", "custom_vector", "duck_typed"),
     *("exotic_spaces", "half_cheetah", "lerobot_docs_multitask", "lerobot_docs_single"),
     *("lerobot_pendulum", "loose_suites", "lunar_lander", "many_tasks", "marker", "minigrid"),
     *("mo_gymnasium", "partial_entry", "pendulum", "pusht", "scribbler", "signal_handlers"),
@@ -202,6 +202,7 @@ HONEST = (
 """Samples of which nothing fails."""
 FAILING = {
     "cfg_reader": ("loads", "it wants a config"),
+    "counter": ("seed-ignored", "it counts its resets"),
     "echo": ("survives", "an action of 3 ends it"),
     "exits": ("survives", "it ends in its third step"),
     "faulty": ("imports", "one of its ways to fail is a package that nobody has"),

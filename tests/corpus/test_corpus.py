@@ -1,0 +1,59 @@
+"""``envhub check`` finds the one fault of each repository, and nothing in the honest ones.
+
+What stands with an entry is in the table of ``docs/checks.md``; here each is judged.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox.check.table import CHECKS
+from tests.corpus.entries import Entry
+from tests.corpus.faults import FAULTS
+from tests.corpus.honest import HONEST
+
+_ENTRIES = {**HONEST, **FAULTS}
+_ELSEWHERE = {
+    "card": "test_check.py",
+    "deadline": "test_check_deadline.py",
+    "licence": "test_check.py",
+    "limits-reached": "test_judged.py",
+    "pinned": "test_check_clones.py",
+    "source-ignored": "test_check_checkouts.py",
+    "source-link": "test_check_survey.py",
+    "source-uncommitted": "test_check_checkouts.py",
+}
+"""Checks that need more than a folder, and what tests them."""
+
+
+@pytest.mark.filterwarnings("ignore::envhub_sandbox.errors.RemoteEnvWarning")
+@pytest.mark.parametrize("name", _ENTRIES)
+def test_it_is_judged_as_it_stands(name: str, tmp_path: Path) -> None:
+    """Its check finds something, and no other does."""
+    entry = _ENTRIES[name]
+    found = entry.judged(tmp_path)
+    assert set(found) == entry.expected, found
+
+
+def test_the_corpus_is_large() -> None:
+    """And each check has a fault that it finds."""
+    assert len(HONEST) >= 30
+    assert len(FAULTS) >= 60
+    assert not set(HONEST) & set(FAULTS)
+    found = {entry.told for entry in FAULTS.values() if entry.told in entry.expected}
+    assert found.isdisjoint(_ELSEWHERE)
+    assert found | set(_ELSEWHERE) == set(CHECKS)
+    tests = {path.name for path in Path(__file__).parents[1].rglob("test_*.py")}
+    assert set(_ELSEWHERE.values()) <= tests
+
+
+def test_entries_differ() -> None:
+    """No repository is in it twice."""
+
+    def text(entry: Entry) -> tuple[str, ...]:
+        return entry.source(), *map(repr, sorted(entry.files.items()))
+
+    texts = [text(entry) for entry in _ENTRIES.values()]
+    assert len(set(texts)) == len(texts)
