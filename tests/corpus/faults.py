@@ -278,10 +278,10 @@ _SEEDS = {
         "def move(self, action):\n    self.at += int(action) + time.time() % 1",
     ),
     "an identifier by lot": ("seeding", _REWARD + "uuid.uuid4().int % 1000 / 1000"),
-    "the hash of a text": ("seeding", _REWARD + "float(hash('walk') % 1000)"),
+    "the hash of a text": ("seeding", _REWARD + "float(hash('walk'))"),
     "the order of a set": (
         "seeding",
-        _REWARD + "float('abcdefghijkl'.index(next(iter(set('abcdefghijkl')))))",
+        _REWARD + "sum(7.0**at * ord(one) for at, one in enumerate(set('abcdefghijkl')))",
     ),
     "always the same without a seed": (
         "seed-fixed",
