@@ -8,9 +8,9 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
-from envhub_sandbox.check.plays import Play
-from envhub_sandbox.check.table import CHECKS, CURES, Check, Severity
-from envhub_sandbox.check.walls import Walls
+from envhub_sandbox.check.checks import CHECKS, CURES, Check, Severity
+from envhub_sandbox.check.play.confinement import Walls
+from envhub_sandbox.check.play.plays import Play
 from envhub_worker.protocol.text import counted, duration_text, printable
 
 _LONGEST = 1_000

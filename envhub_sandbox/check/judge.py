@@ -17,13 +17,13 @@ from gymnasium.error import CustomSpaceError
 
 from envhub_sandbox import __version__
 from envhub_sandbox.api import make_env
-from envhub_sandbox.check import denials
+from envhub_sandbox.check.checks import CHECKS
 from envhub_sandbox.check.findings import Report
-from envhub_sandbox.check.survey import survey
-from envhub_sandbox.check.table import CHECKS
-from envhub_sandbox.check.task import Asked, TaskJudge
-from envhub_sandbox.check.undeclared import undeclared
-from envhub_sandbox.check.walls import walls
+from envhub_sandbox.check.play import denials
+from envhub_sandbox.check.play.confinement import walls
+from envhub_sandbox.check.play.task import Asked, TaskJudge
+from envhub_sandbox.check.static.survey import survey
+from envhub_sandbox.check.static.undeclared import undeclared
 from envhub_sandbox.dependencies.choice import chosen
 from envhub_sandbox.dependencies.declared import declared
 from envhub_sandbox.dependencies.pipeline import packages_for

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+from envhub_sandbox.check.checks import CHECKS, Severity
 from envhub_sandbox.check.findings import Finding, Report
-from envhub_sandbox.check.table import CHECKS, Severity
 
 _SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
 _GITHUB = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.NOTE: "notice"}

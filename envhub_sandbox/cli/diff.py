@@ -14,7 +14,7 @@ from envhub_sandbox.cli.shared.progress import Bar
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
-    from envhub_sandbox.check.compare import Change
+    from envhub_sandbox.check.static.compare import Change
     from envhub_sandbox.hub.snapshot import Snapshot
     from envhub_sandbox.locks.fingerprint import Task
 
@@ -50,8 +50,8 @@ def diff(
     hub = {"token": token, "endpoint": endpoint, "hub_cache_dir": hub_cache_dir}
     with reported(debug=debug):
         least = None if fail_on is None else level(fail_on)
-        from envhub_sandbox.check import compare
-        from envhub_sandbox.check.static import static
+        from envhub_sandbox.check.static import compare
+        from envhub_sandbox.check.static.static import static
         from envhub_sandbox.hub.snapshot import named
 
         with Bar(quiet=json) as bar:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.judge import Asked, judge
-from envhub_sandbox.check.table import Severity
 
 _BASE = """
 import gymnasium as gym

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.check.table import CHECKS
+from envhub_sandbox.check.checks import CHECKS
 from tests.corpus.entries import Entry
 from tests.corpus.faults import FAULTS
 from tests.corpus.honest import HONEST

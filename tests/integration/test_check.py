@@ -14,9 +14,9 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.check import judge as judging
+from envhub_sandbox.check.checks import CHECKS, Severity
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.judge import Asked, judge
-from envhub_sandbox.check.table import CHECKS, Severity
 from envhub_sandbox.errors import SandboxUnavailableError, SnapshotError
 from envhub_sandbox.rollouts.pictures import png
 from tests.integration.test_cli_run import envhub

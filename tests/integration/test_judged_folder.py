@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import make_env
+from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.judge import Asked, judge
-from envhub_sandbox.check.table import Severity
 from envhub_sandbox.hub.snapshot import named
 from tests.hub.olah_server import GitRepository, OlahServer
 

@@ -9,7 +9,7 @@ import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
-from envhub_sandbox.check.table import CHECKS
+from envhub_sandbox.check.checks import CHECKS
 from envhub_sandbox.cli.check.options import SETTINGS
 from tests.corpus.entries import Entry
 from tests.corpus.faults import FAULTS
@@ -18,7 +18,7 @@ from tests.corpus.honest import HONEST
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "checks.md"
 _HEAD = """# Checks
 
-What `envhub check` asks of a repository, written from `envhub_sandbox/check/table.py`. Its files
+What `envhub check` asks of a repository, written from `envhub_sandbox/check/checks.py`. Its files
 are read as data, its packages installed without running any of them, and each task is played with
 seeded random actions in the sandbox: with every observation held against its space, once more in
 fresh processes, again in these, with another seed, with other actions, and spread over two

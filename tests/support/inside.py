@@ -19,7 +19,7 @@ from typing import Any
 import zmq
 
 from envhub_sandbox import folders
-from envhub_sandbox.check import denials
+from envhub_sandbox.check.play import denials
 from envhub_sandbox.crash import writer
 from envhub_sandbox.dependencies import environments, guesses, interpreters, resolutions
 from envhub_sandbox.making import making

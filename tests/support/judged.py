@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.findings import Finding
 from envhub_sandbox.check.judge import Asked, judge
-from envhub_sandbox.check.table import Severity
 from tests.support.samples import SAMPLES, sample
 
 HOSTILE = SAMPLES.parent / "attacks" / "hostile"

@@ -9,8 +9,8 @@ import numpy as np
 from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.check.many.lines import Listed
 from envhub_sandbox.check.many.results import Result, Verdict
-from envhub_sandbox.check.plays import Film, Play
-from envhub_sandbox.check.walls import walls
+from envhub_sandbox.check.play.confinement import walls
+from envhub_sandbox.check.play.plays import Film, Play
 from envhub_sandbox.rollouts.episodes import Episode
 from envhub_sandbox.rollouts.pictures import png
 

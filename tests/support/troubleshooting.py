@@ -100,10 +100,10 @@ _CURE = re.compile(
 # What a function or a class of this name is told is no message: help, and checks (docs/checks.md).
 _NO_MESSAGES = {"Option", "Argument", "Typer", "add_argument", "add_parser", "Check", "Template"}
 _NO_FILES = (
-    "envhub_sandbox/check/markup.py",
-    "envhub_sandbox/check/page.py",
-    "envhub_sandbox/check/table.py",
-    "envhub_sandbox/check/survey.py",
+    "envhub_sandbox/check/page/markup.py",
+    "envhub_sandbox/check/page/page.py",
+    "envhub_sandbox/check/checks.py",
+    "envhub_sandbox/check/static/survey.py",
     "envhub_sandbox/cli/init/starter.py",
     "envhub_sandbox/cli/doctor/doctor.py",
     "envhub_sandbox/locks/lockfile.py",

@@ -224,7 +224,7 @@ def _refuse_beside_a_list(**options: object) -> None:
 
 
 def _known(names: Sequence[str]) -> Sequence[str]:
-    from envhub_sandbox.check.table import CHECKS
+    from envhub_sandbox.check.checks import CHECKS
 
     for name in names:
         if name not in CHECKS:
@@ -270,7 +270,8 @@ def _write(
     sarif: Path | None,
     html: Path | None,
 ) -> None:
-    from envhub_sandbox.check import page, reports
+    from envhub_sandbox.check import reports
+    from envhub_sandbox.check.page import page
 
     for path, form in ((junit, reports.junit), (sarif, reports.sarif), (html, page.page)):
         if path is None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from envhub_sandbox.check.checks import CHECKS
 from envhub_sandbox.check.many import index, lines
 from envhub_sandbox.check.many.results import (
     FolderError,
@@ -26,7 +27,6 @@ from envhub_sandbox.check.many.results import (
 from envhub_sandbox.check.many.running import Ended, judgements
 from envhub_sandbox.check.reports import write
 from envhub_sandbox.check.settings import merged, policy
-from envhub_sandbox.check.table import CHECKS
 from envhub_sandbox.cli.check.outside import refuse_the_judged
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import print_json, safe_line, say, show

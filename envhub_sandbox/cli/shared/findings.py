@@ -13,8 +13,8 @@ from envhub_sandbox.cli.shared.console import command, show
 from envhub_sandbox.cli.shared.exits import UsageError
 
 if TYPE_CHECKING:
+    from envhub_sandbox.check.checks import Severity
     from envhub_sandbox.check.findings import Finding
-    from envhub_sandbox.check.table import Severity
 
 STYLES = {"error": "red", "warning": "yellow", "note": "dim"}
 
@@ -44,7 +44,7 @@ def level(name: str) -> Severity:
     Raises:
         UsageError: It says something else.
     """
-    from envhub_sandbox.check.table import Severity
+    from envhub_sandbox.check.checks import Severity
 
     if name not in {one.value for one in Severity}:
         raise UsageError(f"--fail-on is {name!r}; it takes error, warning or note")

@@ -9,10 +9,10 @@ from xml.etree import ElementTree
 import pytest
 
 from envhub_sandbox.check import reports
+from envhub_sandbox.check.checks import CHECKS, Severity
 from envhub_sandbox.check.findings import Finding, Report
-from envhub_sandbox.check.page import page
-from envhub_sandbox.check.table import CHECKS, Severity
-from envhub_sandbox.check.walls import walls
+from envhub_sandbox.check.page.page import page
+from envhub_sandbox.check.play.confinement import walls
 from envhub_worker.protocol.text import printable
 
 _HOSTILE = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from envhub_sandbox.check.denials import sorted_out
+from envhub_sandbox.check.play.denials import sorted_out
 
 
 @pytest.mark.parametrize(

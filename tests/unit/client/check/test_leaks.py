@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from envhub_sandbox.check import leaks
+from envhub_sandbox.check.play import leaks
 
 _MIB = 1 << 20
 

@@ -9,8 +9,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from envhub_sandbox.check import traces
-from envhub_sandbox.check.plays import Play, facts_of, film
+from envhub_sandbox.check.play import traces
+from envhub_sandbox.check.play.plays import Play, facts_of, film
 from envhub_sandbox.errors import RemoteEnvError
 from envhub_sandbox.rollouts import video
 

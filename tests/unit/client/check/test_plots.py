@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from envhub_sandbox.check.plots import bars, course, histogram, number
+from envhub_sandbox.check.page.plots import bars, course, histogram, number
 
 _NUMBERS: dict[str, list[float]] = {
     "one": [3.0],

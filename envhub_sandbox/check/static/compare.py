@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.findings import Finding
-from envhub_sandbox.check.static import Static, of_finding
-from envhub_sandbox.check.table import Severity
+from envhub_sandbox.check.static.static import Static, of_finding
 from envhub_sandbox.hub.hashing import differing
 from envhub_sandbox.hub.listing import FileRecord
 from envhub_sandbox.locks.drift import of_tasks

@@ -12,9 +12,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
-from envhub_sandbox.check import contents
-from envhub_sandbox.check.constructs import constructs, long_lines
 from envhub_sandbox.check.findings import Finding
+from envhub_sandbox.check.static import contents
+from envhub_sandbox.check.static.constructs import constructs, long_lines
 from envhub_sandbox.errors import SnapshotError
 from envhub_sandbox.hub.checkout import Checkout
 from envhub_sandbox.hub.listing import FileRecord, Snapshot

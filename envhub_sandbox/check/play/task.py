@@ -13,10 +13,10 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.error import CustomSpaceError
 
-from envhub_sandbox.check import frames, leaks, traces
 from envhub_sandbox.check.findings import Report
-from envhub_sandbox.check.plays import Play, facts_of, film
-from envhub_sandbox.check.traces import Env, Trace
+from envhub_sandbox.check.play import frames, leaks, traces
+from envhub_sandbox.check.play.plays import Play, facts_of, film
+from envhub_sandbox.check.play.traces import Env, Trace
 from envhub_sandbox.errors import EnvHubError, RemoteEnvError
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol.text import printable, size_text

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from envhub_sandbox.check.checks import CHECKS
 from envhub_sandbox.check.findings import Finding, Report
-from envhub_sandbox.check.markup import data, document, facts, folded, table, text
-from envhub_sandbox.check.plays import Film, Play
-from envhub_sandbox.check.plots import bars, course, finite, histogram, number
-from envhub_sandbox.check.table import CHECKS
+from envhub_sandbox.check.page.markup import data, document, facts, folded, table, text
+from envhub_sandbox.check.page.plots import bars, course, finite, histogram, number
+from envhub_sandbox.check.play.plays import Film, Play
 from envhub_worker.protocol.text import counted, duration_text, size_text
 
 _MOST_PAIRS, _LONGEST_WORD = 1_000, 160

@@ -9,7 +9,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from envhub_sandbox.check.findings import Finding
-from envhub_sandbox.check.survey import File, survey
+from envhub_sandbox.check.static.survey import File, survey
 from envhub_sandbox.dependencies.declared import Declared, declared
 from envhub_sandbox.dependencies.resolve import WORKERS
 from envhub_sandbox.errors import RequirementError

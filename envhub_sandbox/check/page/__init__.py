@@ -1,0 +1,1 @@
+"""The page for people: its parts, and how text gets into it."""

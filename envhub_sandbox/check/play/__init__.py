@@ -1,0 +1,1 @@
+"""How a repository is played, and what is seen from outside meanwhile."""

@@ -1,0 +1,1 @@
+"""What is read of a repository without running any of it."""
