@@ -200,40 +200,46 @@ class TaskJudge:
 
     def _replay(self, env: Env, mode: str | None, before: Trace) -> None:
         """In one process: the same seed, another, none; other actions; and on to an end."""
+        seed = self._asked.seed
         self._tell("the same play in the same process")
         again = self._played(env, mode, like=before)
-        at = before.differs_from(again)
-        begun = self._begun_unseeded(env) if at is None else []
-        self._say("seed-ignored", list(self._ignored(at, begun, env)))
         self._tell("another seed, and other actions")
-        other = self._played(env, mode, seed=self._asked.seed + 1, actions_seed=self._asked.seed)
-        acted = self._played(env, mode, actions_seed=self._asked.seed + 1, like=before)
+        other = self._played(env, mode, seed=seed + 1, actions_seed=seed, like=before)
+        acted = self._played(env, mode, actions_seed=seed + 1, like=before)
         self._other_seed(before, other)
         self._say("actions-ignored", list(self._unmoved(before, acted)))
         resets = [trace.times["reset_s"] for trace in (again, other, acted)]
         self._say("slow-resets", list(self._slow(min(resets))))
-        if begun and before.differs_from(other) == 0:
-            same = f"{_UNSEEDED} resets without a seed begin the same episode"
-            self._say("seed-fixed", [same] if len(set(begun)) == 1 else [])
-        if not any(trace.episodes for trace in (before, again, other, acted)):
+        self._tell("resets without a seed")
+        at, is_drawn = before.differs_from(again), before.differs_from(other) == 0
+        self._seeded(env, at, _UNSEEDED if is_drawn else 2)
+        if any(trace.episodes for trace in (before, again, other, acted)):
+            self._say("endless", [])
+        else:
             self._tell("on to the end of an episode")
             self._on_to_an_end(env)
-        else:
-            self._say("endless", [])
 
-    def _begun_unseeded(self, env: Env) -> list[str]:
-        """The episodes that follow a seeded one, in which its generator goes on."""
+    def _seeded(self, env: Env, at: int | None, most: int) -> None:
+        if at is not None:
+            self._say("seed-ignored", [_difference(at, "in one process")])
+            return
+        begun, again = self._begun(env, most), self._begun(env, most)
+        differ = "the resets without a seed after one with a seed differ in one process"
+        self._say("seed-ignored", [differ] if begun != again else [])
+        is_fixed = len(begun) == _UNSEEDED and len(set(begun)) == 1
+        same = f"{_UNSEEDED} resets without a seed begin the same episode"
+        self._say("seed-fixed", [same] if is_fixed else [])
+
+    def _begun(self, env: Env, most: int) -> list[str]:
+        """The episodes that follow a seeded one, up to one that differs.
+
+        Followed: ``check_reset_seed_determinism`` of Gymnasium's ``check_env``.
+        """
         env.reset(seed=self._asked.seed)
         begun: list[str] = []
-        while len(begun) < _UNSEEDED and len(set(begun)) < 2:
+        while len(begun) < most and len(set(begun)) < 2:
             begun.append(traces.digest(env.reset()[0]))
         return begun
-
-    def _ignored(self, at: int | None, begun: list[str], env: Env) -> Iterator[str]:
-        if at is not None:
-            yield _difference(at, "in one process")
-        elif self._begun_unseeded(env) != begun:  # followed: check_reset_seed_determinism
-            yield "the resets without a seed after one with a seed differ in one process"
 
     def _other_seed(self, before: Trace, other: Trace) -> None:
         seeds = f"{self._asked.seed} and {self._asked.seed + 1}"
