@@ -68,7 +68,8 @@ class Single:
         """The observation in a batch of one."""
         if "seed" in inspect.signature(self._env.unwrapped.reset).parameters:
             return self._batch(self._observation(self._env.reset(seed=seed)))
-        if inspect.signature(self._env.unwrapped.seed).parameters:
+        seeds = getattr(self._env.unwrapped, "seed", None)
+        if seeds is not None and inspect.signature(seeds).parameters:
             self._env.seed(seed)
         return self._batch(self._observation(self._env.reset()))
 
