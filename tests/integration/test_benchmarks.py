@@ -18,7 +18,7 @@ SHORT = {
     "doorbells --rounds 1 --trips 20": "of eventfds",
     "recording --rounds 1 --count 5": "| its own |",
     "remote 0.01 plain": "| plain, n=1 |",
-    "suites light --rounds 1 --tasks 2 --variants envhub-sync": "| envhub-sync |",
+    "suites first --rounds 1 --tasks 2": "| cold make_env and first reset |",
 }
 
 
