@@ -141,7 +141,7 @@ def parse_requirement(text: str, where: str) -> Wanted:
     Raises:
         RequirementError: It is none that can be taken.
     """
-    plain, *hashes = re.split(r"\s+(?=--hash[= ])", text)
+    plain, *hashes = map(str.strip, re.split(r"(?<=\s)(?=--hash[= ])", text))
     if len(plain) > MAX_LINE:
         raise RequirementError(f"{where} has {len(plain)} characters; at most {MAX_LINE} are read")
     found = [_HASH.fullmatch(one.strip()) for one in hashes]
@@ -212,11 +212,18 @@ def _beside(root: Path, file: str, named: str, where: str) -> str:
     """A file of the repository that another one names, relative to the root."""
     path = os.path.normpath(os.path.join(os.path.dirname(file), named))
     inside = not os.path.isabs(path) and path.split(os.sep)[0] != ".." and "://" not in named
-    if not inside or not (root / path).is_file():
+    if not inside or not _is_file(root / path):
         raise RequirementError(
             f"{where} names {named[:200]!r}, which is no file of the repository. {_advice()}"
         )
     return path
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # a name that there cannot be
+        return False
 
 
 def _joined(lines: Sequence[str]) -> Iterator[tuple[int, str]]:

@@ -281,6 +281,7 @@ def _made(
 
 def _publish(building: Path, key: str, facts: dict[str, object]) -> None:
     (building / RECORD).write_text(json.dumps(facts, indent=1))
+    (building / RECORD).chmod(0o600)  # it is locked by those who use this: nobody else may
     building.chmod(folders.SHARED_MODE)
     try:
         os.rename(building, root() / key)

@@ -200,7 +200,8 @@ def _chosen(request: PackageRequest, first: Interpreter, refresh: bool, tell: Te
 
 
 def _attempts(request: PackageRequest) -> Iterator[_Attempt]:
-    wheels_alone = BUILDER is None or not any(one.requirement.url for one in request.wanted)
+    every = (*request.wanted, *(guess.wanted for guess in request.guesses))
+    wheels_alone = BUILDER is None or not any(one.requirement.url for one in every)
     ways = [*([None] if wheels_alone else []), *([BUILDER] if BUILDER else [])]
     less = [replace(request, guesses=())] if request.guesses and request.wanted else []
     for asked in (request, *less):

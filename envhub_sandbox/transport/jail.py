@@ -132,11 +132,17 @@ class JailHandle:
         """Send one message to each of some runners, in one request; returns its id."""
         return self.relay(operation, [(runner, self.pack(message)) for runner, message in requests])
 
-    def relay(self, operation: str, requests: Sequence[tuple[int, list[Buffer]]]) -> int:
-        """``send`` for messages that are packed."""
+    def relay(
+        self,
+        operation: str,
+        requests: Sequence[tuple[int, list[Buffer]]],
+        *,
+        deposited: bool = False,
+    ) -> int:
+        """``send`` for messages that are packed; ``deposited`` as in ``Relay``."""
         parts = tuple((runner, len(frames)) for runner, frames in requests)
         payload = [frame for _, frames in requests for frame in frames]
-        request_id = self.client.send(m.Relay(self.number, operation, parts), payload)
+        request_id = self.client.send(m.Relay(self.number, operation, parts, deposited), payload)
         self._asked[request_id] = len(parts)
         return request_id
 
@@ -175,21 +181,31 @@ class JailHandle:
         return m.unpack(frames, limits=self.limits, tensors=to_tensor, things=Described)
 
     def exchange(
-        self, operation: str, requests: Sequence[tuple[int, m.Message]], deadline: Deadline
+        self,
+        operation: str,
+        requests: Sequence[tuple[int, m.Message]],
+        deadline: Deadline,
+        *,
+        deposited: bool = False,
     ) -> list[m.Message]:
         """``ask`` for messages that are not packed; a runner's exception is raised."""
         packed = [(runner, self.pack(message)) for runner, message in requests]
-        replies = self.ask(operation, packed, deadline)
+        replies = self.ask(operation, packed, deadline, deposited=deposited)
         for reply in replies:
             check(reply)
         return replies
 
     def ask(
-        self, operation: str, requests: Sequence[tuple[int, list[Buffer]]], deadline: Deadline
+        self,
+        operation: str,
+        requests: Sequence[tuple[int, list[Buffer]]],
+        deadline: Deadline,
+        *,
+        deposited: bool = False,
     ) -> list[m.Message]:
         """``relay`` and ``receive``; of deaths, the first is raised."""
         try:
-            return self.receive(self.relay(operation, requests), deadline)
+            return self.receive(self.relay(operation, requests, deposited=deposited), deadline)
         except RunnersDiedError as error:
             raise error.first from None
 

@@ -19,12 +19,17 @@ def test_a_request_in_between_takes_no_descriptors(monkeypatch: pytest.MonkeyPat
     whole, between = JailHandle.exchange, []
 
     def exchange(
-        self: JailHandle, operation: str, requests: Sequence[tuple[int, Any]], deadline: Any
+        self: JailHandle,
+        operation: str,
+        requests: Sequence[tuple[int, Any]],
+        deadline: Any,
+        *,
+        deposited: bool = False,
     ) -> list[m.Message]:
-        if operation == m.ATTACH:
+        if deposited:
             asked = [(runner, m.Watch(attach.env, "metadata")) for runner, attach in requests]
             between.append(whole(self, "call", asked, deadline))
-        return whole(self, operation, requests, deadline)
+        return whole(self, operation, requests, deadline, deposited=deposited)
 
     monkeypatch.setattr(JailHandle, "exchange", exchange)
     with make_env(sample("cartpole"), n_envs=2) as suites:

@@ -189,11 +189,11 @@ def test_a_signal_without_a_name_is_told(talker: Path) -> None:
 
 
 def test_what_a_request_is_called_decides_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Descriptors go with the request that follows them, whatever its label for people says."""
+    """Descriptors go with the request that says so, whatever its label for people says."""
     exchange = JailHandle.exchange
 
-    def renamed(jail: JailHandle, _: str, *rest: Any) -> Any:
-        return exchange(jail, "beginning", *rest)
+    def renamed(jail: JailHandle, _: str, *rest: Any, **options: Any) -> Any:
+        return exchange(jail, "beginning", *rest, **options)
 
     monkeypatch.setattr(JailHandle, "exchange", renamed)
     with make_env(sample("counter"), n_envs=2, num_workers=2) as suites:

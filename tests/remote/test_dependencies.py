@@ -7,6 +7,7 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,7 +16,14 @@ import psutil
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import MissingModuleError, PolicyError, ResolutionError
+from envhub_sandbox.dependencies.builds import git
+from envhub_sandbox.errors import (
+    IndexUnavailableError,
+    MissingModuleError,
+    PolicyError,
+    RequirementError,
+    ResolutionError,
+)
 from envhub_sandbox.sandboxes import server_facts
 from envhub_worker.access import packages as server_side
 from envhub_worker.access.packages import Packages
@@ -95,6 +103,28 @@ def test_what_cannot_be_made_is_told_here(
     assert "repo" in str(caught.value)
     with pytest.raises(PolicyError, match="name a version"):
         make_env(folder, sandbox=permitting.sandbox(), dependencies={"python": sys.executable})
+
+
+def test_nothing_is_built_there(
+    permitting: Listening, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would ask any host that a client names. The control: our own git does."""
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    with socket.create_server(("127.0.0.1", 0)) as host:
+        url = f"https://127.0.0.1:{host.getsockname()[1]}/org/repo"
+        declared = f"wanted @ git+{url}@{'0' * 40}\n"
+        folder = write_repository(tmp_path / "repo", ENV, requirements__txt=declared)
+        with pytest.raises(RequirementError, match="not built here"):
+            make_env(folder, sandbox=permitting.sandbox())
+        host.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            host.accept()
+        host.setblocking(True)
+        asked = threading.Thread(target=lambda: host.accept()[0].close())
+        asked.start()
+        with pytest.raises(IndexUnavailableError):
+            git.check_out(url, "0" * 40, tmp_path, print)
+        asked.join()
 
 
 def test_a_server_that_makes_none_says_so(server: Listening, tmp_path: Path) -> None:

@@ -48,5 +48,6 @@ def install(folder: Path, *requirements: str, built: str | None = None) -> Runti
 def running_on(runtime: Runtime) -> Iterator[None]:
     """While it lasts, ``make_env`` gives its jails this interpreter and these packages."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(*inside.choice_of_packages(), lambda *asked, **options: None)
         patch.setattr(*inside.choice_of_runtime(), lambda python: runtime)
         yield

@@ -13,11 +13,12 @@ from pathlib import Path
 _OURS = {"GIT_CONFIG_GLOBAL": os.devnull, "GIT_CONFIG_NOSYSTEM": "1"}
 
 
-def git(folder: Path, *arguments: str) -> str:
+def git(folder: Path, *arguments: str, given: str | None = None) -> str:
     """Run git in a folder, without this user's settings."""
     who = ("-c", "user.name=a", "-c", "user.email=a@b.example")
     done = subprocess.run(
         ["git", *who, *arguments],
+        input=given,
         cwd=folder,
         env=os.environ | _OURS,
         check=True,

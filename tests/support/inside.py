@@ -71,6 +71,11 @@ def choice_of_runtime() -> Spot:
     return making, "Runtime"
 
 
+def choice_of_packages() -> Spot:
+    """Makes the packages that a repository declares."""
+    return making, "packages_for"
+
+
 def turn_lock(env: Any) -> Spot:
     """What a thread holds while it asks the environment something."""
     return session(env).turns, "lock"

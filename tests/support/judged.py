@@ -61,6 +61,7 @@ _LIMITS = "limits-reached"
 ATTACKS = {
     "answers": Attack(_KERNEL, "tried kcmp", {"calls": {"bpf": [0, 0, 0], "kcmp": [0, 0, 0]}}),
     "change_attribute": Attack(_FILES, "setxattr /home/other/file", _OUTSIDE),
+    "change_tree": Attack(_FILES, "/home/other/", {"place": "/home/other"}),
     "change_mode": Attack(_FILES, "chmod /home/other/file", _OUTSIDE),
     "change_owner": Attack(_FILES, "chown /home/other/file", {**_OUTSIDE, "gid": 0}),
     "change_times": Attack(_FILES, "utimensat /home/other/file", _OUTSIDE),
@@ -116,6 +117,7 @@ ATTACKS = {
     "ptrace_poke": Attack(_KERNEL, "tried ptrace", {**_MEMORY, "word": 1}),
     "raid": Attack(_FILES, "write /home/other/file", {"paths": ["/home/other/file"], **_TEXT}),
     "raw_icmp": Attack(_NETWORK, "tried socket AF_INET", {"host": "127.0.0.1", **_WORD}),
+    "reach_below": Attack(_FILES, "/proc/", {"folder": "/tmp", "name": "x"}),
     "reach_devices": Attack(
         _FILES,
         "write /dev/nvidia0",
@@ -128,6 +130,7 @@ ATTACKS = {
     "read_through_hard_link": Attack(_FILES, "link /home/other", {**_KEY, "folders": ["/tmp"]}),
     "read_through_proc": Attack(_FILES, "read /home/other/.ssh/id_rsa", _KEY),
     "read_through_symlink": Attack(_FILES, "read /home/other/.ssh/id_rsa", _KEY),
+    "redirect": Attack(_FILES, "read /home/other/.ssh/id_rsa", {"folder": "/tmp", **_KEY}),
     "remount_root": Attack(_KERNEL, "tried unshare", _NAMED),
     "rename_file": Attack(_FILES, "rename /home/other/file", _OUTSIDE),
     "sched_setaffinity": Attack(_KERNEL, "sched_setaffinity of", {**_CLIENT, "cpus": [0]}),
@@ -208,6 +211,7 @@ FAILING = {
     "faulty": ("imports", "one of its ways to fail is a package that nobody has"),
     "given": ("loads", "it wants arguments that are pickled"),
     "mortal": ("survives", "an action kills it"),
+    "old_gym": ("imports", "it imports gym, which nothing declares"),
     "noisy": ("loads", "it fails, and paints meanwhile"),
     "prompts": ("loads", "it asks a question that nobody answers"),
     "torch_obs": ("autoreset", "its episodes end in the same step, and without final_obs"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -33,9 +34,11 @@ from envhub_worker.protocol.runtime import OWN
 Tell = Callable[[str], None]
 Choose = Callable[[PackageRequest, Interpreter, Tell], Lock]
 _DEEPEST = 8
+_MOST = 50
 _ROUNDS = 3
 """Backends may say what they need besides; once they have it, they may say more."""
 _UNDER_WAY: ContextVar[tuple[str, ...]] = ContextVar("sources that are being built", default=())
+_BUILDS: ContextVar[Iterator[int]] = ContextVar("how many were built for one request")
 
 
 def build_wheels(
@@ -54,7 +57,13 @@ def build_wheels(
         DependencyError: As with downloads; and where sources or a wheel are refused, or this host
             has no jail to build in.
     """
-    return [_wheel(source, interpreter, tell, choose) for source in sources]
+    if _UNDER_WAY.get():
+        return [_wheel(source, interpreter, tell, choose) for source in sources]
+    token = _BUILDS.set(itertools.count(1))
+    try:
+        return [_wheel(source, interpreter, tell, choose) for source in sources]
+    finally:
+        _BUILDS.reset(token)
 
 
 def _wheel(source: Source, interpreter: Interpreter, tell: Tell, choose: Choose) -> Path:
@@ -62,6 +71,7 @@ def _wheel(source: Source, interpreter: Interpreter, tell: Tell, choose: Choose)
         source = replace(source, commit=git.resolve(source.url, source.commit))
     known = wheel_store.recall(identity(source), interpreter)
     if known is not None:
+        wheels.named(known.name, source.name, source.version)  # one commit, asked for as another
         return known
     with _under_way(source), tempfile.TemporaryDirectory(prefix="envhub-build-") as place:
         Path(place).chmod(0o755)  # a jail's user is another one
@@ -87,6 +97,8 @@ def _under_way(source: Source) -> Iterator[None]:
             f"{source.name} cannot be built: there are no wheels of what it is built with, which "
             f"is built with it in turn ({' <- '.join(chain)})"
         )
+    if next(_BUILDS.get()) > _MOST:
+        raise ResolutionError(f"{chain[0]} needs more than {_MOST} packages to be built")
     token = _UNDER_WAY.set(chain)
     try:
         yield

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import os
 import re
+import resource
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -32,6 +33,8 @@ _COMMIT = re.compile(r"[0-9a-f]{40}")
 _NAME = re.compile(r"(?!.*(?:\.\.|//|@\{))[A-Za-z0-9_][A-Za-z0-9_./+-]{0,200}")
 _URL = re.compile(r"([a-z]+)://([A-Za-z0-9][A-Za-z0-9.-]*(?::\d+)?)(/[A-Za-z0-9_.~/+%-]+)")
 _TIMEOUT_S = 900.0
+_BLOCK = 1 << 20
+_SAID_BYTES = 1000
 _ROW = re.compile(rb"(\d{6}) (\w+) ([0-9a-f]{40}) +(\d+|-)\t(.+)", re.DOTALL)
 _SETTINGS = (
     *("protocol.allow=never", f"core.hooksPath={os.devnull}", "credential.helper="),
@@ -41,6 +44,7 @@ _SETTINGS = (
 _LIMITED = 'ulimit -f "$1" && ulimit -v "$2" && shift 2 && exec "$@"'
 """What ``sh`` does first: git's own children have the same limits."""
 _MEMORY_KIB = 4 * 2**20
+_ALONE = {"GIT_TERMINAL_PROMPT": "0", "GIT_NO_LAZY_FETCH": "1", "GIT_CEILING_DIRECTORIES": "/"}
 
 
 def resolve(url: str, revision: str) -> str:
@@ -82,11 +86,11 @@ def check_out(url: str, commit: str, folder: Path, tell: Callable[[str], None]) 
         _git(store, "init", "--quiet", "--bare", "--template=", ".")
         options = ("--quiet", "--depth=1", "--no-tags", "--no-recurse-submodules", "--no-auto-gc")
         _git(store, "fetch", *options, address, commit)
-        rows = _git(store, "ls-tree", "-r", "-z", "-l", "--full-tree", commit).split(b"\0")[:-1]
         title = f"{url}@{commit[:12]}"
-        if len(rows) > MAX_FILES:
-            raise PackagesTooLargeError(f"{title} has {len(rows)} files; at most {MAX_FILES}")
-        blobs = list(_blobs(rows, title, tell))
+        with (store / "rows").open("w+b") as file:
+            _git(store, "ls-tree", "-r", "-z", "-l", "--full-tree", commit, output=file)
+            file.seek(0)
+            blobs = list(_blobs(_rows(file, title), title, tell))
         with (store / "blobs").open("w+b") as file:
             names = "".join(f"{blob.digest}\n" for blob in blobs)
             _git(store, "cat-file", "--batch", given=names.encode(), output=file)
@@ -100,7 +104,19 @@ class _Blob(NamedTuple):
     executable: bool
 
 
-def _blobs(rows: list[bytes], title: str, tell: Callable[[str], None]) -> Iterator[_Blob]:
+def _rows(file: IO[bytes], title: str) -> Iterator[bytes]:
+    """Each file of a tree. Trees that hold each other make billions of a few bytes."""
+    left = b""
+    count = 0
+    while block := file.read(_BLOCK):
+        *rows, left = (left + block).split(b"\0")
+        count += len(rows)
+        if count > MAX_FILES or len(left) > _BLOCK:
+            raise PackagesTooLargeError(f"{title} has more than {MAX_FILES} files")
+        yield from rows
+
+
+def _blobs(rows: Iterable[bytes], title: str, tell: Callable[[str], None]) -> Iterator[_Blob]:
     for row in rows:
         found = _ROW.fullmatch(row)
         if found is None:
@@ -138,31 +154,40 @@ def _checked(url: str) -> str:
 
 
 def _git(
-    store: Path, *arguments: str, given: bytes = b"", output: IO[bytes] | int = subprocess.PIPE
+    store: Path, *arguments: str, given: bytes = b"", output: IO[bytes] | None = None
 ) -> bytes:
+    """Run git, and return the first of what it prints, where there is no file for that.
+
+    It prints into files, for which it has a limit: a pipe would bring all of it into our memory.
+    """
     program = shutil.which("git")
     if program is None:
         raise DependencyError("sources of a repository of git are needed, and there is no git here")
     settings = [*_SETTINGS, *(f"protocol.{name}.allow=always" for name in PROTOCOLS)]
     command = [program, *(word for one in settings for word in ("-c", one)), *arguments]
-    limits = (str(MAX_BYTES // 512), str(_MEMORY_KIB))  # blocks of 512 bytes, and KiB
-    try:
-        done = subprocess.run(
-            ["/bin/sh", "-c", _LIMITED, "sh", *limits, *command],
-            input=given,
-            stdout=output,
-            stderr=subprocess.PIPE,
-            cwd=store,
-            env=_environment(store),
-            timeout=_TIMEOUT_S,
-            check=True,
-        )
-    except (OSError, subprocess.SubprocessError) as error:
-        said = (getattr(error, "stderr", None) or b"").decode("utf-8", "replace")
-        raise IndexUnavailableError(
-            f"git {arguments[0]} failed: {printable(said[-1000:] or str(error), 1000)}"
-        ) from error
-    return done.stdout or b""
+    _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+    file_bytes = MAX_BYTES if most == resource.RLIM_INFINITY else min(MAX_BYTES, most)
+    limits = (str(file_bytes // 512), str(_MEMORY_KIB))  # blocks of 512 bytes, and KiB
+    with tempfile.TemporaryFile(dir=store) as said, tempfile.TemporaryFile(dir=store) as printed:
+        try:
+            subprocess.run(
+                ["/bin/sh", "-c", _LIMITED, "sh", *limits, *command],
+                input=given,
+                stdout=output or printed,
+                stderr=said,
+                cwd=store,
+                env=_environment(store),
+                timeout=_TIMEOUT_S,
+                check=True,
+            )
+        except (OSError, subprocess.SubprocessError) as error:
+            said.seek(max(0, said.seek(0, os.SEEK_END) - _SAID_BYTES))
+            text = said.read(_SAID_BYTES).decode("utf-8", "replace") or str(error)
+            raise IndexUnavailableError(
+                f"git {arguments[0]} failed: {printable(text, _SAID_BYTES)}"
+            ) from error
+        printed.seek(0)
+        return printed.read(_BLOCK)
 
 
 def _environment(store: Path) -> dict[str, str]:
@@ -176,4 +201,4 @@ def _environment(store: Path) -> dict[str, str]:
     if certificates := given.get("SSL_CERT_FILE"):
         kept["GIT_SSL_CAINFO"] = certificates
     ours = {"GIT_CONFIG_NOSYSTEM": "1", "GIT_CONFIG_GLOBAL": os.devnull, "HOME": str(store)}
-    return {**kept, **ours, "GIT_TERMINAL_PROMPT": "0", "GIT_NO_LAZY_FETCH": "1"}
+    return {**kept, **ours, **_ALONE}

@@ -26,8 +26,13 @@ from envhub_worker.protocol.text import size_text
 MAX_BYTES = 2 * 2**30
 """Of all files of one source, unpacked."""
 MAX_FILES = 50_000
-AT_ONCE = 16 * 2**20
+AT_ONCE = 2**20
 """The most that is read at once: an extended header says its own length."""
+MAX_TABLE = 16 * 2**20
+"""Of a zip's table of contents."""
+_HEADERS = 1000
+PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""How members of a zip may be packed: Python unpacks other ways whole, whatever it is asked for."""
 _FAR = 2 * MAX_BYTES
 _BLOCK = 1 << 20
 _BROKEN = (OSError, EOFError, ValueError, zlib.error, tarfile.TarError, zipfile.BadZipFile)
@@ -121,7 +126,7 @@ def unpack(archive: Path, folder: Path, title: str) -> Path:
 def _members(archive: Path, title: str) -> Iterator[Iterator[Member]]:
     with ExitStack() as stack:
         if archive.suffix == ".zip":
-            stream: Any = Bounded(stack.enter_context(archive.open("rb")), title)
+            stream: Any = Bounded(stack.enter_context(archive.open("rb")), title, MAX_TABLE)
             yield _of_zip(stack.enter_context(zipfile.ZipFile(stream)), title)
         elif opener := _TARS.get(archive.suffix):
             stream = Bounded(stack.enter_context(opener(archive, "rb")), title)
@@ -135,16 +140,17 @@ def _members(archive: Path, title: str) -> Iterator[Iterator[Member]]:
 class Bounded(io.RawIOBase):
     """A stream that refuses to be read far, or much at once: an archive says its own lengths."""
 
-    def __init__(self, stream: IO[bytes], title: str) -> None:
+    def __init__(self, stream: IO[bytes], title: str, at_once: int = AT_ONCE) -> None:
         self._stream = stream
         self._title = title
+        self._at_once = at_once
 
     def read(self, size: int = -1) -> bytes:
         """At most so many bytes; all that are left are few, too."""
-        self._check(0 if size < 0 else size, AT_ONCE)
+        self._check(0 if size < 0 else size, self._at_once)
         self._check(self._stream.tell(), _FAR)
-        found = self._stream.read(AT_ONCE + 1 if size < 0 else size)
-        self._check(len(found), AT_ONCE)
+        found = self._stream.read(self._at_once + 1 if size < 0 else size)
+        self._check(len(found), self._at_once)
         return found
 
     def seek(self, offset: int, whence: int = 0) -> int:
@@ -169,6 +175,11 @@ def _of_tar(archive: tarfile.TarFile, title: str) -> Iterator[Member]:
     for count, member in enumerate(archive):
         if count > 2 * MAX_FILES:
             raise PackagesTooLargeError(f"{title} has more than {MAX_FILES} files")
+        if len(archive.pax_headers) > _HEADERS:
+            raise PackagesTooLargeError(f"{title} has more than {_HEADERS} headers for all files")
+        # each has a copy of all headers: what is kept must not
+        archive.members.clear()  # type: ignore[attr-defined]  # not in the stubs
+        member.pax_headers = {}
         if member.isdir():
             continue
         if not member.isreg():
@@ -190,6 +201,8 @@ def _of_zip(archive: zipfile.ZipFile, title: str) -> Iterator[Member]:
             continue
         if stat.S_IFMT(mode) not in (0, stat.S_IFREG):
             raise _no_file(title, member.filename)
+        if member.compress_type not in PACKINGS:
+            raise PackageIntegrityError(f"{title} is packed in a way that is not read")
 
         def opened(member: zipfile.ZipInfo = member) -> IO[bytes]:
             return archive.open(member)

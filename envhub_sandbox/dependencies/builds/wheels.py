@@ -20,7 +20,7 @@ from packaging import tags
 from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel_filename
 from packaging.version import InvalidVersion, Version
 
-from envhub_sandbox.dependencies.builds.trees import Bounded
+from envhub_sandbox.dependencies.builds.trees import MAX_TABLE, PACKINGS, Bounded
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.errors import DependencyError, PackageIntegrityError, SnapshotError
 from envhub_sandbox.hub.listing import FileRecord, check_names
@@ -29,8 +29,6 @@ from envhub_worker.protocol.text import printable, size_text
 MAX_BYTES = 512 * 2**20
 MAX_UNPACKED = 4 * 2**30
 MAX_FILES = 100_000
-MAX_TABLE = 16 * 2**20
-"""Of the archive's table of contents, METADATA and RECORD, each."""
 _BLOCK = 1 << 20
 _UNREADABLE = (
     *(OSError, EOFError, ValueError, RuntimeError, NotImplementedError, KeyError),
@@ -51,11 +49,11 @@ def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> Non
         PackageIntegrityError: The text says what is wrong.
     """
     try:
-        found = _named(wheel.name, name, version)
+        found = named(wheel.name, name, version)
         _fits(wheel.name, interpreter)
         if wheel.stat().st_size > MAX_BYTES:
             raise PackageIntegrityError(f"it has more than {size_text(MAX_BYTES)}")
-        with wheel.open("rb") as file, zipfile.ZipFile(Bounded(file, "it")) as archive:
+        with wheel.open("rb") as file, zipfile.ZipFile(Bounded(file, "it", MAX_TABLE)) as archive:
             _files(archive)
             info = _info(archive, name, found)
             _record(archive, f"{info}/RECORD")
@@ -67,7 +65,12 @@ def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> Non
         ) from error
 
 
-def _named(file: str, name: str, version: str) -> Version:
+def named(file: str, name: str, version: str) -> Version:
+    """The version of a wheel, by the name of its file.
+
+    Raises:
+        PackageIntegrityError: It is of another package, or of another version.
+    """
     try:
         found, number, _, _ = parse_wheel_filename(file)
         wanted = Version(version) if version else number
@@ -100,6 +103,8 @@ def _files(archive: zipfile.ZipFile) -> None:
     for member in members:
         if stat.S_IFMT(member.external_attr >> 16) not in (0, stat.S_IFREG, stat.S_IFDIR):
             raise PackageIntegrityError(f"{member.filename[:200]!r} in it is a link or a device")
+        if member.compress_type not in PACKINGS:
+            raise PackageIntegrityError(f"{member.filename[:200]!r} in it is packed in another way")
     names = (one.filename + "_" * one.is_dir() for one in members)  # a folder as a file in it
     check_names([FileRecord(name, 0, "") for name in names], "it")
 

@@ -165,7 +165,7 @@ class SharedMemoryLane:
                 raise self.jail.cause_of_death("make_env") from error
             attach = m.Attach(self.number, bounds[index][0], layout.count, layout.slots)
             messages.append((self.runners[index], attach))
-        replies = self.jail.exchange(m.ATTACH, messages, deadline)
+        replies = self.jail.exchange("attach", messages, deadline, deposited=True)
         return all(typed(reply, m.Value).value is True for reply in replies)
 
     # --- steps ---------------------------------------------------------------------------------

@@ -167,8 +167,7 @@ class Jails:
                 pending.lost(index, entry.lost[runner])
                 continue
             link = entry.links[runner]
-            attaches = request.operation == m.ATTACH
-            fds = self._deposits.take(entry.number, runner) if attaches else []
+            fds = self._deposits.take(entry.number, runner) if request.deposited else []
             try:
                 link.send(next(self._packet_ids), frames, (pending, index), fds)
                 if entry.idle is not None and fds:

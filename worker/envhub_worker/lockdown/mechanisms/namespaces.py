@@ -159,10 +159,7 @@ def user_namespace_unavailable(
 
 
 def _diagnosis(error: OSError, read: Callable[[str], str | None]) -> tuple[str, str]:
-    short, _, cure = shortage(error, "here").partition(": ")
-    if short:
-        return short, f"{cure.capitalize()}."
-    if read("/proc/sys/user/max_user_namespaces") == "0":
+    if read("/proc/sys/user/max_user_namespaces") == "0":  # answered by ENOSPC
         return "user.max_user_namespaces is 0", "Run: sudo sysctl user.max_user_namespaces=15000."
     if read("/proc/sys/kernel/unprivileged_userns_clone") == "0":
         return (
@@ -175,6 +172,10 @@ def _diagnosis(error: OSError, read: Callable[[str], str | None]) -> tuple[str, 
             "Install the AppArmor profile that `envhub doctor` prints, or run: "
             "sudo sysctl kernel.apparmor_restrict_unprivileged_userns=0.",
         )
+    # the kernel says ENOSPC of namespaces, too, where there are too many already
+    short, _, cure = shortage(error, "here").partition(": ")
+    if short and error.errno != errno.ENOSPC:
+        return short, f"{cure.capitalize()}."
     answer = errno.errorcode.get(error.errno or 0, "?")
     if read("/.dockerenv") is not None or read("/run/.containerenv") is not None:
         return (

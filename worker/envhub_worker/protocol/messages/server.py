@@ -76,10 +76,6 @@ class StartRunners(Message, kind=6):
     runners: int
 
 
-ATTACH = "attach"
-"""The operation whose runners get the descriptors that wait for them: ``Attach``."""
-
-
 class Relay(Message, kind=7):
     """Hand the frames that follow to runners: ``parts`` is ``((runner, frames), ...)``.
 
@@ -89,6 +85,8 @@ class Relay(Message, kind=7):
     jail: int
     operation: str
     parts: tuple[object, ...]
+    deposited: bool = False
+    """Whether the descriptors of each runner's last ``Deposit`` go with its frames: ``Attach``."""
 
 
 class Relayed(Message, kind=8):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -147,5 +148,25 @@ def test_a_name_that_leads_out(url: str, repository: Path, target: Path) -> None
 def test_bounds(url: str, repository: Path, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Their number before they are read."""
     monkeypatch.setattr(git, "MAX_FILES", 1)
-    with pytest.raises(PackagesTooLargeError, match="2 files"):
+    with pytest.raises(PackagesTooLargeError, match="more than 1 files"):
         git.check_out(url, run_git(repository, "rev-parse", "HEAD"), target, print)
+
+
+def test_trees_that_hold_each_other(url: str, repository: Path, target: Path) -> None:
+    """Seven objects list a million files: what git prints of them never comes into our memory."""
+    kind = f"100644 blob {run_git(repository, 'hash-object', '-w', 'setup.py')}"
+    for _ in range(6):
+        tree = run_git(repository, "mktree", given="".join(f"{kind}\t{n}\n" for n in range(10)))
+        kind = f"040000 tree {tree}"
+    bomb = run_git(repository, "commit-tree", tree, "-m", "x")
+    run_git(repository, "branch", "bomb", bomb)
+    tracemalloc.start()
+    try:
+        with pytest.raises(PackagesTooLargeError, match="files"):
+            git.check_out(url, bomb, target, print)
+        assert tracemalloc.get_traced_memory()[1] < 32 << 20
+        listed = run_git(repository, "ls-tree", "-r", "-l", bomb)
+        assert tracemalloc.get_traced_memory()[1] > 32 << 20, "the control failed: it is no bomb"
+    finally:
+        tracemalloc.stop()
+    assert listed.count("\n") == 10**6 - 1

@@ -7,6 +7,7 @@ import io
 import os
 import stat
 import tarfile
+import tracemalloc
 import zipfile
 from functools import partial
 from pathlib import Path
@@ -112,6 +113,52 @@ def test_a_header_that_is_a_bomb(tmp_path: Path) -> None:
     path = tmp_path / "x-1.0.tar.gz"
     path.write_bytes(gzip.compress(member.tobuf() + bytes(1024)))
     with pytest.raises(PackagesTooLargeError):
+        unpacked(path)
+
+
+@pytest.mark.parametrize("packing", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_a_zip_whose_packing_has_no_bounds(tmp_path: Path, packing: int) -> None:
+    """Of these Python unpacks all that a block holds, whatever is asked for."""
+    path = tmp_path / "x-1.0.zip"
+    with zipfile.ZipFile(path, "w", packing) as archive:
+        archive.writestr("x-1.0/setup.py", bytes(64 << 20))
+    tracemalloc.start()
+    try:
+        with pytest.raises(PackageIntegrityError, match="not read"):
+            unpacked(path)
+        assert tracemalloc.get_traced_memory()[1] < 32 << 20
+        with zipfile.ZipFile(path) as archive, archive.open("x-1.0/setup.py") as file:
+            file.read(1)
+        assert tracemalloc.get_traced_memory()[1] > 32 << 20, "the control failed: it is no bomb"
+    finally:
+        tracemalloc.stop()
+
+
+def test_headers_for_all_files_are_kept_once(tmp_path: Path) -> None:
+    """Each member of a tar copies them; the copies are not kept."""
+    path = tmp_path / "x-1.0.tar.gz"
+    headers = {f"key{number}": "x" * 50 for number in range(900)}
+    with tarfile.open(path, "w:gz", format=tarfile.PAX_FORMAT, pax_headers=headers) as archive:
+        for number in range(1000):
+            add(archive, f"x-1.0/{number}", b"", tarfile.REGTYPE)
+    tracemalloc.start()
+    try:
+        unpacked(path)
+        assert tracemalloc.get_traced_memory()[1] < 16 << 20
+        with tarfile.open(path) as archive:
+            archive.getmembers()
+        assert tracemalloc.get_traced_memory()[1] > 16 << 20, "the control failed: it is no bomb"
+    finally:
+        tracemalloc.stop()
+
+
+def test_more_headers_for_all_files_than_there_may_be(tmp_path: Path) -> None:
+    """A clear error."""
+    path = tmp_path / "x-1.0.tar.gz"
+    headers = {f"key{number}": "x" for number in range(2000)}
+    with tarfile.open(path, "w:gz", format=tarfile.PAX_FORMAT, pax_headers=headers) as archive:
+        add(archive, "x-1.0/a", b"", tarfile.REGTYPE)
+    with pytest.raises(PackagesTooLargeError, match="headers"):
         unpacked(path)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.dependencies import interpreters
-from envhub_sandbox.dependencies.builds import trees, wheels
+from envhub_sandbox.dependencies.builds import wheels
 from envhub_sandbox.errors import PackageIntegrityError
 from tests.support.wheels import make_wheel
 
@@ -122,7 +122,7 @@ def test_a_table_of_contents_is_bounded(tmp_path: Path, monkeypatch: pytest.Monk
     """It is read at once, and its length is the archive's own word."""
     wheel = make_wheel(tmp_path, "some-name", files={f"some_name/{n}": "" for n in range(300)})
     check(wheel)
-    monkeypatch.setattr(trees, "AT_ONCE", 4096)
+    monkeypatch.setattr(wheels, "MAX_TABLE", 4096)
     with pytest.raises(PackageIntegrityError, match="too large"):
         check(wheel)
 
@@ -134,3 +134,16 @@ def test_what_is_no_wheel(tmp_path: Path, data: bytes) -> None:
     wheel.write_bytes(data)
     with pytest.raises(PackageIntegrityError, match="is not taken"):
         check(wheel)
+
+
+@pytest.mark.parametrize("packing", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_a_packing_without_bounds_is_refused(tmp_path: Path, packing: int) -> None:
+    """Of these Python unpacks all that a block holds, whatever is asked for."""
+    wheel = make_wheel(tmp_path, "some-name")
+    other = tmp_path / "other" / wheel.name
+    other.parent.mkdir()
+    with zipfile.ZipFile(wheel) as old, zipfile.ZipFile(other, "w", packing) as new:
+        for member in old.infolist():
+            new.writestr(member.filename, old.read(member))
+    with pytest.raises(PackageIntegrityError, match="packed in another way"):
+        check(other)
