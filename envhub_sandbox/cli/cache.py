@@ -185,15 +185,28 @@ def remove(
                 shutil.rmtree(store.cache_root() / folder, ignore_errors=True)
         else:
             found, made = _chosen(found, made, names or [], unused_for)
-        for one in found:
-            store.remove_tree(one.home)
-        kept = {one.key: why for one in made if (why := environments.remove(one))}
+        kept = {one.commit: why for one in found if (why := _users_of(one))}
+        kept |= {one.key: why for one in made if (why := environments.remove(one))}
         environments.remove_abandoned()
-        say(f"Removed {_told(found, [one for one in made if one.key not in kept])}.")
+        gone = [one for one in found if one.commit not in kept]
+        say(f"Removed {_told(gone, [one for one in made if one.key not in kept])}.")
         if kept and names:
             raise UsageError("; ".join(kept.values()))
         for why in kept.values():
             say(f"Kept: {why}.")
+
+
+def _users_of(one: Stored) -> str:
+    """Remove a snapshot; who uses it, if somebody does: then it stays."""
+    from envhub_sandbox.hub import store
+
+    users = [f"process {pid} ({command})" for pid, command in store.remove(one.home).items()]
+    if not users:
+        return ""
+    return (
+        f"the snapshot {one.repository}@{one.commit[:12]} is in use by {', '.join(users)}. "
+        "Close its environments there, or end it"
+    )
 
 
 def _chosen(

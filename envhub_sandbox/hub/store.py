@@ -34,6 +34,7 @@ from envhub_sandbox.hub.hashing import Mismatch, digest_of
 from envhub_sandbox.hub.listing import FileRecord
 from envhub_sandbox.log import SNAPSHOT
 from envhub_sandbox.system.files import write_whole
+from envhub_sandbox.system.shared_lock import sharers
 
 CACHE_VARIABLE = "ENVHUB_CACHE"
 _FORMAT = 1
@@ -309,13 +310,31 @@ def _begin(slot: Slot) -> Path:
     return building
 
 
+def remove(home: Path) -> dict[int, str]:
+    """Remove a snapshot. Not while others use it, who share a lock of its folder.
+
+    Returns:
+        These, as ``sharers`` does; none where it was removed.
+    """
+    with contextlib.suppress(FileNotFoundError):
+        descriptor = os.open(home, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            remove_tree(home)
+        except BlockingIOError:
+            return sharers(home) or {0: "that is not seen from here"}
+        finally:
+            os.close(descriptor)
+    return {}
+
+
 def remove_unused(folder: Path, days: float) -> None:
     """Remove snapshots that nobody asked for in that many days (see ``mark_used``)."""
     oldest = time.time() - days * 24 * 3600
     for record in folder.glob("*/record.json"):
         with contextlib.suppress(OSError):
             if record.stat().st_mtime < oldest:
-                remove_tree(record.parent)
+                remove(record.parent)
 
 
 def mark_used(slot: Slot) -> None:

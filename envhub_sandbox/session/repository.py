@@ -100,7 +100,8 @@ class Repository:
         self.policy = policy
         self.timeouts = timeouts
         self.runtime = runtime
-        # nobody removes its packages before the last environment is gone that may start a jail
+        # files and packages stay until the last environment is gone that may start a jail
+        self._files_in_use = SharedLock(snapshot.root.parent)
         if os.path.isabs(runtime.packages):  # else they have a name, on another host
             self._in_use = SharedLock(Path(runtime.packages).with_name(RECORD))
         self.lane = lane

@@ -9,6 +9,8 @@ import weakref
 from pathlib import Path
 
 _COMMAND_CHARS = 80
+_LOOKS = 5
+"""The kernel gives the list of locks a page at a time, and skips some where others change it."""
 
 
 class SharedLock:
@@ -37,8 +39,12 @@ def sharers(path: Path) -> dict[int, str]:
     """
     status = path.stat()
     device = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
-    rows = [row.split() for row in Path("/proc/locks").read_text().splitlines()]
-    held = {int(row[4]) for row in rows if row[1] == "FLOCK" and row[5] == device}
+    held: set[int] = set()
+    for _ in range(_LOOKS):
+        rows = [row.split() for row in Path("/proc/locks").read_text().splitlines()]
+        held = {int(row[4]) for row in rows if row[1] == "FLOCK" and row[5] == device}
+        if held:
+            break
     return {pid: _command(pid) for pid in sorted(held) if pid > 0}
 
 

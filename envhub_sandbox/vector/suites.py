@@ -16,6 +16,19 @@ from envhub_sandbox.vector.single_env import SingleEnv
 Envs = Mapping[str, Mapping[int | str, VectorEnv[Any, Any, Any]]]
 
 
+class Tasks(dict[Any, Any]):
+    """The environments of one suite, by task id; one that is not there is named with the others."""
+
+    def __init__(self, suite: str, tasks: Mapping[Any, Any]) -> None:
+        super().__init__(tasks)
+        self._suite = suite
+
+    def __missing__(self, task: object) -> Any:
+        raise KeyError(
+            f"{self._suite!r} has no task {task!r}; there are: {', '.join(map(repr, self))}"
+        )
+
+
 class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
     """A real ``dict`` of suites, each a ``dict`` of vector environments by task id.
 
@@ -35,7 +48,7 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
         on_close: Callable[[], None] = lambda: None,
         recipe: Recipe | None = None,
     ) -> None:
-        super().__init__({suite: dict(tasks) for suite, tasks in envs.items()})
+        super().__init__({suite: Tasks(suite, tasks) for suite, tasks in envs.items()})
         self._provenance = provenance
         self._on_close = on_close
         self._recipe = recipe

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from envhub_sandbox import __version__
+from envhub_sandbox import __version__, make_env
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.cache import stored_snapshots
 from envhub_sandbox.dependencies import environments
@@ -94,6 +94,20 @@ def test_remove_all_forgets_descriptions_too(stored: list[str]) -> None:
     assert RUNNER.invoke(app, ["cache", "remove", "--all"]).exit_code == 0
     assert stored_snapshots() == []
     assert not manifests.exists()
+
+
+def test_a_snapshot_that_is_used_is_kept(stored: list[str], tmp_path: Path) -> None:
+    """It is named with its user, and what its code imports later is still there."""
+    env = "import gymnasium\n\ndef make_env(n_envs=1, use_async_envs=False):\n"
+    env += "    import later\n    return gymnasium.make_vec('CartPole-v1', num_envs=n_envs)\n"
+    folder = write_repository(tmp_path / "used", env, later__py="")
+    with make_env(folder) as suites:
+        done = RUNNER.invoke(app, ["cache", "remove", "--all"])
+        assert done.exit_code == 0
+        assert "Removed 3 snapshots" in done.stderr
+        assert f"process {os.getpid()} (" in done.stderr
+        suites.env.reset(seed=0)
+    assert [one.commit for one in stored_snapshots()] == [suites.provenance["commit"]]
 
 
 def test_remove_of_an_unknown_name_is_usage(stored: list[str]) -> None:
