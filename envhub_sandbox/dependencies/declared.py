@@ -44,6 +44,7 @@ _HASH = re.compile(r"--hash[= ](sha256:[0-9a-f]{64}|sha384:[0-9a-f]{96}|sha512:[
 _QUOTED = re.compile(r"'[^']*'|\"[^\"]*\"")
 _CLOSES = "# ///"
 _INCLUDES = re.compile(r"(-r|--requirement|-c|--constraint)[ =]\s*(\S+)")
+_ITSELF = re.compile(r"(?:(?:-e|--editable)[ =]\s*)?\./?(?:\[([\w.,\s-]{0,200})\])?")
 _BYTE_ORDER_MARKS = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 _NOT_READ = ("environment.yml", "environment.yaml", "setup.py", "setup.cfg", "Pipfile", "uv.lock")
 
@@ -200,12 +201,30 @@ def read(root: Path, name: str) -> tuple[list[Wanted], list[Wanted]]:
                 if row not in seen:
                     seen.add(row)
                     waiting.append(row)
+            elif not constrains and (itself := _ITSELF.fullmatch(line)):
+                wanted += _of_itself(root, itself[1] or "", where)
             else:
                 (constraints if constrains else wanted).append(parse_requirement(line, where))
         _bounded(len(wanted) + len(constraints), name)
         if len(seen) > MAX_FILES:
             raise RequirementError(f"{name} leads to more than {MAX_FILES} files. {_advice()}")
     return wanted, constraints
+
+
+def _of_itself(root: Path, extras: str, where: str) -> Iterator[Wanted]:
+    """What ``-e .`` brings besides the repository, whose modules are there already."""
+    data = _toml(_text(root / PROJECT, PROJECT), PROJECT) if _is_file(root / PROJECT) else {}
+    project = data.get("project")
+    if not isinstance(project, dict):
+        raise RequirementError(
+            f"{where} installs the repository itself, which is there already; what that needs is "
+            f"read in [project] of {PROJECT} alone, and there is none. {_advice()}"
+        )
+    yield from _list(project.get("dependencies", []), f"[project] of {PROJECT}")
+    optional = project.get("optional-dependencies", {})
+    for name in filter(None, map(str.strip, extras.split(","))):
+        rows = optional.get(name, []) if isinstance(optional, dict) else []
+        yield from _list(rows, f"[project.optional-dependencies] of {PROJECT}")
 
 
 def _beside(root: Path, file: str, named: str, where: str) -> str:

@@ -147,6 +147,20 @@ def test_no_file_beyond_the_repository_is_read(tmp_path: Path, named: str) -> No
         repository(tmp_path / "repo", requirements__txt=f"-r {named}\n")
 
 
+def test_the_repository_itself_is_its_project(tmp_path: Path) -> None:
+    """Its modules are there already: what its project needs counts, and extras that are named."""
+    (tmp_path / "pyproject.toml").write_text(
+        '[project]\ndependencies = ["a"]\n[project.optional-dependencies]\nx = ["b"]\ny = ["c"]\n'
+    )
+    for line, names in (("-e .", ["a"]), (".", ["a"]), ("--editable=./[x, y]", ["a", "b", "c"])):
+        (tmp_path / "requirements.txt").write_text(f"{line}\nd\n")
+        wanted, _ = read(tmp_path, "requirements.txt")
+        assert [one.requirement.name for one in wanted] == [*names, "d"]
+    (tmp_path / "pyproject.toml").unlink()
+    with pytest.raises(RequirementError, match="installs the repository itself"):
+        read(tmp_path, "requirements.txt")
+
+
 def test_a_chain_of_files_ends(tmp_path: Path) -> None:
     """Before it has a thousand."""
     for number in range(module.MAX_FILES + 1):
