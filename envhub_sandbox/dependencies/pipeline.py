@@ -260,17 +260,20 @@ class _Attempt:
         links: list[str] = []
         if self.builder is not None:
             request, links = _built_from_git(request, self.builder, interpreter, tell)
-        seen: set[str] = set()
+        built: set[str] = set()
         while True:
             try:
                 lock = resolve(request, target, options=links, refresh=refresh, tell=tell)
                 break
             except ResolutionError as error:
-                names = sorted(set(without_wheels(error)) - seen)
+                names = sorted(set(without_wheels(error)) - built)
                 if self.builder is None or not names or needs_other_python(error):
                     raise
-            seen.update(names)
-            sources = sources_of(request, target, names, links)
+                # what one needs is known once it is built: then others may be chosen
+                sources = sources_of(request, target, names, links)
+                if built.issuperset(one.name for one in sources):
+                    raise
+            built.update(one.name for one in sources)
             links += _links(self.builder(sources, interpreter, tell))
         return torch_cpu.smaller(
             request,

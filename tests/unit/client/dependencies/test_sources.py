@@ -42,7 +42,11 @@ def source_distribution(folder: Path, name: str, version: str, built: Path) -> s
 def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Source]:
     """What a builder was handed, whose wheels need more from the index."""
     seen: list[Source] = []
-    needs = {"only-source": ["deeper-source"], "of-git": ["only-wheel"]}
+    needs = {
+        "only-source": ["deeper-source"],
+        "half-source": ["deeper-source"],
+        "of-git": ["only-wheel"],
+    }
 
     def build(
         sources: Sequence[Source], interpreter: Interpreter, tell: Callable[[str], None]
@@ -79,6 +83,18 @@ def test_a_source_is_chosen_and_built_by_none_but_the_builder(
     again = len(built)
     assert pipeline.HERE.make(request("only-source>1"), lambda line: None) == made
     assert len(built) == again
+
+
+def test_what_is_named_beside_another_is_built_in_its_turn(
+    index: Index, tmp_path: Path, built: list[Source]
+) -> None:
+    """uv names each package that lacks a wheel, also one of which only old releases do."""
+    for name, version in (("half-source", "1.0"), ("half-source", "2.0"), ("deeper-source", "1.5")):
+        source_distribution(index.folder, name, version, tmp_path / "ran")
+    make_wheel(index.folder, "half-source", "2.0", requires=["deeper-source"])
+    found = pipeline.resolution_for(request("half-source")).lock.packages
+    assert {"half-source==2.0", "deeper-source==1.5"} <= set(found)
+    assert "deeper-source" in {one.name for one in built}
 
 
 def test_wheels_are_taken_where_there_are_some(
