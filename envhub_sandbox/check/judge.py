@@ -274,7 +274,8 @@ class _Judge:
         except CustomSpaceError as error:  # of actions
             self._report.judged("runs", [str(error)], task)
         except RemoteEnvError as error:
-            found = [f"{error.type_name}: {error.message}{f' ({error.where})' * bool(error.where)}"]
+            line = error.where.strip().partition("\n")[0]
+            found = [f"{error.type_name}: {error.message}" + (f" ({line})" if line else "")]
             self._report.judged("runs", found, task, cause=_cause(error))
         except (LoadError, DependencyError, RemoteProtocolError) as error:
             found = [f"not as it did at first: {error}"]

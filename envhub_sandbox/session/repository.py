@@ -100,10 +100,8 @@ class Repository:
         self.policy = policy
         self.timeouts = timeouts
         self.runtime = runtime
-        # files and packages stay until the last environment is gone that may start a jail
-        self._files_in_use = SharedLock(snapshot.root.parent)
-        if os.path.isabs(runtime.packages):  # else they have a name, on another host
-            self._in_use = SharedLock(Path(runtime.packages).with_name(RECORD))
+        self._in_use: list[SharedLock] = []
+        self.hold()
         self.lane = lane
         self.copy = copy
         self.warnings = RemoteWarnings()
@@ -122,6 +120,21 @@ class Repository:
     def wire_limits(self) -> WireLimits:
         """Bounds on what a jail may send."""
         return _wire_limits(self.policy.limits.message_bytes)
+
+    def hold(self) -> None:
+        """Nobody removes its files and packages, until ``let_go``."""
+        if self._in_use:
+            return
+        folders = [self.snapshot.root.parent]
+        if os.path.isabs(self.runtime.packages):  # else they have a name, on another host
+            folders.append(Path(self.runtime.packages).with_name(RECORD))
+        self._in_use = [SharedLock(folder) for folder in folders]
+
+    def let_go(self) -> None:
+        """No environment may start a jail any more. Idempotent, also where it was interrupted."""
+        for lock in self._in_use:
+            lock.release()
+        self._in_use = []
 
     @contextmanager
     def named(self) -> Iterator[None]:

@@ -17,18 +17,20 @@ class SharedLock:
     """A file's lock that this process shares until ``release``, or until nobody has this object.
 
     A fork does not hold it. Nothing is held where there is no such file, or another has it alone.
-
-    Attributes:
-        release: Gives it back. Idempotent, and nothing in a fork.
     """
 
     def __init__(self, path: Path) -> None:
-        descriptor = -1
+        self._held: list[int] = []
+        _shared.add(self)
+        # what a Ctrl-C keeps ``release`` from, this does, which is called whatever became of that
+        weakref.finalize(self, _close, self._held).atexit = False
         with contextlib.suppress(OSError):
-            descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
-            _shared.add(descriptor)
-            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        self.release = weakref.finalize(self, _release, descriptor)
+            self._held.append(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC))
+            fcntl.flock(self._held[0], fcntl.LOCK_SH | fcntl.LOCK_NB)
+
+    def release(self) -> None:
+        """Give it back. Idempotent, and nothing in a fork."""
+        _close(self._held)
 
 
 def sharers(path: Path) -> dict[int, str]:
@@ -55,20 +57,17 @@ def _command(pid: int) -> str:
     return ""
 
 
-_shared: set[int] = set()
+_shared: weakref.WeakSet[SharedLock] = weakref.WeakSet()
 
 
-def _release(descriptor: int) -> None:
-    if descriptor in _shared:
-        _shared.discard(descriptor)
-        os.close(descriptor)
+def _close(held: list[int]) -> None:
+    while held:
+        os.close(held.pop())
 
 
 def _forked() -> None:
-    for descriptor in _shared:
-        with contextlib.suppress(OSError):
-            os.close(descriptor)
-    _shared.clear()
+    for lock in _shared:
+        lock.release()
 
 
 os.register_at_fork(after_in_child=_forked)

@@ -75,7 +75,10 @@ def test_a_list_is_judged_and_then_what_has_changed(tmp_path: Path) -> None:
     assert verdicts(out) == {"honest": "passed", "broken": "failed", "empty": "not judged"}
     failed, empty, honest = index(out)
     assert failed["fails"] == ["runs"]
-    assert failed["why"] == ["runs: RuntimeError: it broke"]
+    [why] = failed["why"]
+    assert why.startswith("runs: RuntimeError: it broke (File ")
+    assert "broken/env.py" in why
+    assert "in step)" in why
     assert "no file 'env.py'" in empty["said"]
     suites = ElementTree.parse(junit).getroot()
     assert [suite.attrib["failures"] for suite in suites] == ["1", "0", "0"]

@@ -70,7 +70,7 @@ class Launcher:
             self._sandbox, self.runs_on = own, Runtime(own.interpreter)
         self.retry_s = self._sandbox.retry_s if isinstance(self._sandbox, Crowded) else 0.0
         self._store = store
-        self._hold = ServerHold(self._acquire)
+        self._hold = ServerHold(self._acquire, repository.hold, repository.let_go)
         self._jail_numbers = count(1)
 
     def hold(self) -> Callable[[], None]:

@@ -18,13 +18,22 @@ class ServerHold:
 
     Args:
         acquire: Asks for a use of the server.
+        on_enter: Called when there is one environment more.
+        on_empty: Called when the last one is closed; where that is interrupted, again.
 
     Attributes:
         partings: The ends of jails in it that have not been waited for.
     """
 
-    def __init__(self, acquire: Callable[[], ServerUse]) -> None:
+    def __init__(
+        self,
+        acquire: Callable[[], ServerUse],
+        on_enter: Callable[[], None],
+        on_empty: Callable[[], None],
+    ) -> None:
         self._acquire = acquire
+        self._on_enter = on_enter
+        self._on_empty = on_empty
         self.partings = Partings()
         # reentrant: the garbage collector may close an environment in the midst of this
         self._lock = threading.RLock()
@@ -37,6 +46,7 @@ class ServerHold:
         """There is one environment more; returns what says that it is closed. Idempotent."""
         ticket = object()
         with self._lock:
+            self._on_enter()
             self._open.add(ticket)
         return lambda: self._leave(ticket)
 
@@ -74,6 +84,9 @@ class ServerHold:
                 self.partings.settle()
         finally:
             self._let_go()
+        with self._lock:
+            if not self._open:
+                self._on_empty()
 
     def _let_go(self) -> None:
         for use in list(self._left):

@@ -6,6 +6,7 @@ import os
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -210,7 +211,12 @@ def test_a_fork_has_none_and_ends_none(sharing: Sharing[Server]) -> None:
 
 def hold_of(sharing: Sharing[Server]) -> ServerHold:
     """A suite's hold on the servers of a sharing."""
-    return ServerHold(lambda: sharing.acquire("key", Server))  # type: ignore[arg-type, return-value]
+
+    def nothing() -> None:
+        pass
+
+    acquire = partial(sharing.acquire, "key", Server)
+    return ServerHold(acquire, nothing, nothing)  # type: ignore[arg-type]
 
 
 def keep(hold: ServerHold, use: Use[Server]) -> None:
