@@ -74,10 +74,10 @@ lock = LifeLock(Path(sys.argv[1]), "who")
 sleeper = subprocess.Popen(["sleep", "600"], stdout=subprocess.DEVNULL, close_fds=False)
 if os.fork() == 0:
     lock.release()
-    print("here", flush=True)
+    os.write(1, b"here\\n")  # whole lines: two processes write them
     sys.stdin.read()
     os._exit(0)
-print("holds", sleeper.pid, flush=True)
+os.write(1, b"holds %d\\n" % sleeper.pid)
 signal.pause()
 """
     path = tmp_path / "life"
