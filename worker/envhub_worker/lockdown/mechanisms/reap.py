@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 _ROUNDS_S = 5.0
+_PAUSE_S = 0.001
 
 
 #: The signals that ``child_signals`` sets handlers for.
@@ -112,20 +113,39 @@ def kill_descendants(keep: Collection[int]) -> None:
 
 
 def kill_below(root: int, keep: Collection[int] = ()) -> None:
-    """SIGKILL everything below ``root``.
+    """SIGKILL everything below ``root``, and return when all of it has ended.
 
-    All are stopped first, until none is new: a stopped process cannot fork away. ``root`` must
-    adopt the orphans of its descendants.
+    All are stopped first, until none is new: a stopped process cannot fork away. But one that is
+    inside ``fork`` when it is stopped may finish that, and its child can appear after the last look
+    and live on. So it is looked again, until nothing is left but zombies. ``root`` must adopt the
+    orphans of its descendants.
     """
     deadline = time.monotonic() + _ROUNDS_S
-    stopped: set[int] = set()
-    while time.monotonic() < deadline:
-        new = [pid for pid in descendants(root, keep) if pid not in stopped]
-        if not new:
-            break
-        _signal(new, signal.SIGSTOP)
-        stopped.update(new)
-    _signal(stopped, signal.SIGKILL)
+    while alive := _alive_below(root, keep):
+        stopped: set[int] = set()
+        while alive:
+            _signal(alive, signal.SIGSTOP)
+            stopped.update(alive)
+            alive = [pid for pid in _alive_below(root, keep) if pid not in stopped]
+            if time.monotonic() > deadline:
+                break
+        _signal(stopped, signal.SIGKILL)
+        if time.monotonic() > deadline:
+            return  # what waits in the kernel ends later
+        time.sleep(_PAUSE_S)
+
+
+def _alive_below(root: int, keep: Collection[int]) -> list[int]:
+    return [pid for pid in descendants(root, keep) if not _has_ended(pid)]
+
+
+def _has_ended(pid: int) -> bool:
+    """Whether it is gone, or a zombie: that has no children any more, and can make none."""
+    try:
+        with open(f"/proc/{pid}/stat", "rb") as stat:
+            return stat.read().rpartition(b")")[2].split()[0] in (b"Z", b"X")
+    except OSError:
+        return True
 
 
 def _signal(pids: Collection[int], signum: int) -> None:

@@ -44,7 +44,8 @@ def enter(config: ZygoteConfig) -> Common:
         covered = mounts.proc_to_cover()
     else:
         if config.user is not None:
-            _become(config)
+            # no pid namespace ends its jails with it: it must live long enough to do that
+            _become(config, signal.SIGTERM)
             _check_interpreter()
         covered = ([], [])
     if config.packages:
@@ -131,7 +132,7 @@ def _enter_namespaces(config: ZygoteConfig, plan: root_plan.RootPlan) -> None:
         if config.user is not None:
             unshare(CLONE_NEWNS)
             enter_root()
-            _become(config)
+            _become(config, signal.SIGKILL)
         namespaces.enter_user_namespace(os.getuid(), os.getgid())
         namespaces.unshare_for_zygote(config.network)
         if config.user is None:
@@ -142,10 +143,10 @@ def _enter_namespaces(config: ZygoteConfig, plan: root_plan.RootPlan) -> None:
         raise _mounts_unavailable(error) from error
 
 
-def _become(config: ZygoteConfig) -> None:
+def _become(config: ZygoteConfig, at_parents_death: int) -> None:
     assert config.user is not None
     user.become(config.user)
-    process.die_with_parent(config.parent)
+    process.die_with_parent(config.parent, at_parents_death)
 
 
 def _check_interpreter() -> None:

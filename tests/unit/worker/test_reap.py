@@ -1,0 +1,53 @@
+"""Ending all processes below one."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from envhub_worker.lockdown.mechanisms import reap
+
+TREE = """
+import os, time
+for _ in range(2):
+    if os.fork() == 0:
+        os.setsid()
+        break
+print("up", flush=True)
+time.sleep(600)
+"""
+
+
+def test_a_child_that_appears_after_the_last_look_is_killed_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A fork that had begun when its process was stopped may end after we looked."""
+    with subprocess.Popen([sys.executable, "-c", TREE], stdout=subprocess.PIPE) as root:
+        assert root.stdout is not None
+        for _ in range(3):
+            root.stdout.readline()
+        first, second = reap.descendants(root.pid)
+        looks, look = iter(range(2)), reap.all_children
+
+        def late() -> reap.Children:
+            seen = look()
+            if next(looks, None) is not None:
+                return {
+                    above: [pid for pid in below if pid != second] for above, below in seen.items()
+                }
+            return seen
+
+        monkeypatch.setattr(reap, "all_children", late)
+        reap.kill_below(root.pid)
+        states = [_state(pid) for pid in (root.pid, first, second)]
+        os.kill(root.pid, signal.SIGKILL)
+    assert states == ["S", "Z", "Z"]
+
+
+def _state(pid: int) -> str:
+    with open(f"/proc/{pid}/stat") as stat:
+        return stat.read().rpartition(")")[2].split()[0]
