@@ -279,7 +279,7 @@ def pids_named(alias: str) -> list[int]:
     """The live processes of a name, in any pid namespace below ours."""
     found = []
     for name in os.listdir("/proc"):
-        if name.isdigit() and _comm(name) == alias and _state(name) not in ("Z", "X", ""):
+        if name.isdigit() and _comm(name) == alias and _runs(name):
             found.append(int(name))
     return sorted(found)
 
@@ -296,8 +296,10 @@ def _comm(pid: str) -> str:
     return _read(f"/proc/{pid}/comm").strip()
 
 
-def _state(pid: str) -> str:
-    return _read(f"/proc/{pid}/stat").rpartition(")")[2].strip()[:1]
+def _runs(pid: str) -> bool:
+    """Whether any of its threads does: without its first one a process looks like a zombie."""
+    fields = _read(f"/proc/{pid}/stat").rpartition(")")[2].split()
+    return bool(fields) and (fields[0] not in ("Z", "X") or int(fields[17]) > 1)
 
 
 def _read(path: str) -> str:

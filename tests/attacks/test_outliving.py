@@ -43,6 +43,7 @@ time.sleep(600)
     [
         ("a daemon (double fork)", "daemon", {}),
         ("a process that keeps forking away", "grandchildren", {"seconds": 120}),
+        ("a process without its main thread", "leaderless", {}),
     ],
 )
 def test_nothing_outlives_the_environment(

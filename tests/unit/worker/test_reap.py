@@ -48,6 +48,33 @@ def test_a_child_that_appears_after_the_last_look_is_killed_too(
     assert states == ["S", "Z", "Z"]
 
 
+LEADERLESS = """
+import ctypes, os, threading, time
+if os.fork() == 0:
+    main = ctypes.c_ulong(threading.main_thread().ident)
+    def run_on():
+        ctypes.CDLL(None).pthread_join(main, None)
+        os.write(1, b"up\\n")
+        time.sleep(600)
+    threading.Thread(target=run_on).start()
+    ctypes.CDLL(None).pthread_exit(None)
+time.sleep(600)
+"""
+
+
+def test_a_process_whose_first_thread_has_ended_is_killed_too() -> None:
+    """It looks like a zombie, and runs on."""
+    with subprocess.Popen([sys.executable, "-c", LEADERLESS], stdout=subprocess.PIPE) as root:
+        assert root.stdout is not None
+        assert root.stdout.readline() == b"up\n"
+        (pid,) = reap.descendants(root.pid)
+        assert (_state(pid), len(os.listdir(f"/proc/{pid}/task"))) == ("Z", 2)
+        reap.kill_below(root.pid)
+        threads = os.listdir(f"/proc/{pid}/task")
+        os.kill(root.pid, signal.SIGKILL)
+    assert threads == [str(pid)]
+
+
 def _state(pid: int) -> str:
     with open(f"/proc/{pid}/stat") as stat:
         return stat.read().rpartition(")")[2].split()[0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import select
 import signal
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -115,37 +116,45 @@ def kill_descendants(keep: Collection[int]) -> None:
 def kill_below(root: int, keep: Collection[int] = ()) -> None:
     """SIGKILL everything below ``root``, and return when all of it has ended.
 
-    All are stopped first, until none is new: a stopped process cannot fork away. But one that is
-    inside ``fork`` when it is stopped may finish that, and its child can appear after the last look
-    and live on. So it is looked again, until nothing is left but zombies. ``root`` must adopt the
-    orphans of its descendants.
+    All are stopped before any is killed, until none is new: a stopped process cannot fork away. But
+    one that is inside ``fork`` when it is stopped may finish that, and its child can appear after
+    the last look. So the end is a look that finds only what had ended before it began: whatever
+    lives then has a parent that this look would have found. ``root`` must adopt the orphans of its
+    descendants.
     """
     deadline = time.monotonic() + _ROUNDS_S
-    while alive := _alive_below(root, keep):
-        stopped: set[int] = set()
-        while alive:
-            _signal(alive, signal.SIGSTOP)
-            stopped.update(alive)
-            alive = [pid for pid in _alive_below(root, keep) if pid not in stopped]
-            if time.monotonic() > deadline:
-                break
+    ended: set[int] = set()
+    while not ended.issuperset(descendants(root, keep)):
+        stopped = _stop_below(root, keep, deadline)
         _signal(stopped, signal.SIGKILL)
         if time.monotonic() > deadline:
             return  # what waits in the kernel ends later
         time.sleep(_PAUSE_S)
+        ended = {pid for pid in stopped if _has_ended(pid)}
 
 
-def _alive_below(root: int, keep: Collection[int]) -> list[int]:
-    return [pid for pid in descendants(root, keep) if not _has_ended(pid)]
+def _stop_below(root: int, keep: Collection[int], deadline: float) -> set[int]:
+    stopped: set[int] = set()
+    while new := set(descendants(root, keep)) - stopped:
+        _signal(new, signal.SIGSTOP)
+        stopped |= new
+        if time.monotonic() > deadline:
+            break
+    return stopped
 
 
 def _has_ended(pid: int) -> bool:
-    """Whether it is gone, or a zombie: that has no children any more, and can make none."""
+    """Whether every thread has; ``/proc`` calls it a zombie when the first one has."""
     try:
-        with open(f"/proc/{pid}/stat", "rb") as stat:
-            return stat.read().rpartition(b")")[2].split()[0] in (b"Z", b"X")
-    except OSError:
-        return True
+        pidfd = os.pidfd_open(pid)
+    except OSError as error:
+        return isinstance(error, ProcessLookupError)
+    try:
+        poller = select.poll()
+        poller.register(pidfd, select.POLLIN)
+        return bool(poller.poll(0))
+    finally:
+        os.close(pidfd)
 
 
 def _signal(pids: Collection[int], signum: int) -> None:
