@@ -94,6 +94,7 @@ ATTACKS = {
     "kernel_object": Attack(_KERNEL, "tried bpf", {"kind": "bpf"}),
     "keyring": Attack(_KERNEL, "tried keyctl", {"name": "x"}),
     "large_pipe": Attack(_KERNEL, "tried fcntl", {"size": _MIB}),
+    "leaderless": Attack("leaks-processes", "processes after each", _NAMED, stage="reset"),
     "list_folder": Attack(_FILES, "read /root", {"path": "/root"}),
     "listen": Attack(_NETWORK, "tried socket AF_INET", {"port": 4711, **_WORD}),
     "memory_bomb": Attack("survives", "out of memory", {"kind": "heap", "size": 1 << 31}),
