@@ -18,8 +18,6 @@ class Departures:
 
     Args:
         idle_s: How long the jails of a client that says nothing live on; 0 for ever.
-        uploads: Forgets what they were bringing.
-        events: Is told.
         open_wires: The connections that are there now; None if nobody counts them.
     """
 

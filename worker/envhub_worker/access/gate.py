@@ -37,9 +37,7 @@ class Arrived(NamedTuple):
     """A message as it came.
 
     Attributes:
-        identity: The routing id of its sender.
         key: The key that he has proved; empty where none is needed.
-        frames: The message.
         fd: The descriptor of the connection that it came over; -1 if that is not known.
     """
 
@@ -69,7 +67,6 @@ class Gate(Protocol):
         handlers: The requests that only this gate knows.
         compresses: Whether frames are worth compressing.
         idle_s: How long the jails of a client that says nothing live on; 0 for ever.
-        witness: Is told what becomes of jails.
     """
 
     handlers: Mapping[type[m.Message], Handler]

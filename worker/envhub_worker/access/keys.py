@@ -81,7 +81,6 @@ class AuthorizedClients:
     begin a comment. It is read anew when it changes, so that a client can be taken off it.
 
     Args:
-        path: The file, or None.
         known: Keys that may come in without it.
         most: How many may be on it; None for any number.
     """

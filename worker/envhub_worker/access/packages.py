@@ -66,7 +66,6 @@ class Order:
     """What somebody waits for.
 
     Attributes:
-        plain: For the program.
         owner: Whose session asked first.
         asked: When it was asked for last.
         told: What the program has said last.
@@ -103,8 +102,6 @@ class News:
 
     Attributes:
         owner: Whose session asked first.
-        seconds: How long the program was at it.
-        said: Its last words.
     """
 
     owner: bytes
@@ -117,8 +114,6 @@ class Packages:
 
     Args:
         folder: Where they lie; None where the operator does not permit any.
-        quotas: How much of them each key may have.
-        make_s: For how long an order may be at work.
     """
 
     def __init__(self, folder: Path | None, quotas: Quotas, make_s: float = MAKE_S) -> None:
@@ -140,10 +135,8 @@ class Packages:
         """How far they are; begins, or goes on, to make them.
 
         Args:
-            key: The client's key.
             request: Trust: input from a client.
             in_use: Folders of packages that must stay.
-            owner: The client's session, for the log.
 
         Raises:
             RefusedError: They cannot be made, or not now.

@@ -41,11 +41,9 @@ class Quotas:
     """Of one client key, all its processes together.
 
     Attributes:
-        jails: Open jails.
         runners: Processes of environments in them.
         memory_bytes: The sum of its open jails' memory limits.
         upload_bytes: Files of snapshots that it has brought here; the longest unused go first.
-        upload_files: Files of one snapshot.
         packages_bytes: Environments of its repositories' packages, and what was downloaded for
             them; the longest unused go first.
         inflight_bytes: Requests that its jails have not answered yet.

@@ -52,12 +52,8 @@ class Rules:
 
     Attributes:
         keys: The server's key pair; None only for ``--insecure-loopback``.
-        authorized: Whose keys may come in.
         operators: Keys that see everybody's sessions: the server's own.
-        quotas: What one key may take.
-        permissions: What a policy may ask for.
         idle_s: How long the jails of a client that says nothing live on.
-        max_connections: Of everybody together, strangers included.
         drain_s: How long what runs may go on once nothing new is let in.
         profile: The strongest that jails can have here.
     """

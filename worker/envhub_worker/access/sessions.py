@@ -38,7 +38,6 @@ class Session:
         key: The client's public key, as ZAP gave it; empty where there is none.
         name: The client's own random bytes.
         heard: When it last said anything.
-        since: When it said Hello for the first time.
         held: The jails that it holds, and when it last said so or used them; None before it said
             so for the first time.
     """

@@ -45,10 +45,8 @@ class HttpPort:
     """Listens until it is closed.
 
     Args:
-        host: An address, not a name.
         port: 0 for any that is free.
         answer: The page of a path. What it raises is a 500.
-        failed: Told of that.
 
     Raises:
         OSError: The address is not to be had.

@@ -358,9 +358,7 @@ class Identity:
 
     Attributes:
         keys: The server's pair; None only behind ``--insecure-loopback``.
-        authorized: A file of clients' keys, or None.
         client: The one client that was made, if there is no such file.
-        client_file: Where its secret lies.
         fresh: Whether that was made just now.
         profile: The strongest profile that jails can have here.
     """

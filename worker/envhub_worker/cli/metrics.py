@@ -34,9 +34,7 @@ class Page:
     """What there is to read.
 
     Args:
-        usable: Whether jails can be opened here at all.
         render: Makes text of figures, and says of which kind.
-        clock: Seconds.
     """
 
     def __init__(

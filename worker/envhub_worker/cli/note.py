@@ -24,12 +24,7 @@ class Noted(NamedTuple):
 
 
 class Note:
-    """A server's own note. Another server on the same state folder replaces it.
-
-    Args:
-        state: The state folder.
-        noted: What stands in it.
-    """
+    """A server's own note. Another server on the same state folder replaces it."""
 
     def __init__(self, state: Path, noted: Noted) -> None:
         self._path = state / _NAME

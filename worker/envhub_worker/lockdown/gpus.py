@@ -29,7 +29,6 @@ class Granted:
     """What a jail gets.
 
     Attributes:
-        devices: Device nodes.
         folders: Paths of /sys; links among them are followed.
     """
 

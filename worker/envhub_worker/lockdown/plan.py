@@ -29,8 +29,6 @@ class HostFacts:
     """What decides, of this host.
 
     Attributes:
-        machine: As ``os.uname`` says it.
-        root: Whether the server runs as root.
         landlock_abi: 0 where there is none.
         memory: What caps memory: ``"cgroup-v2"``, ``"cgroup-v1"`` or ``"watchdog"``.
     """
@@ -46,10 +44,8 @@ class Plan:
     """What the stages of lockdown do.
 
     Attributes:
-        namespaced: Enter namespaces and a private root.
         landlock: Restrict files (and TCP, signals, abstract sockets as the ABI allows).
         measured: No control group counts memory; init measures it.
-        layers: All of it in order, for the report.
     """
 
     namespaced: bool

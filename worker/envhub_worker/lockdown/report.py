@@ -10,13 +10,7 @@ from envhub_worker.protocol.records import dataclass
 
 @dataclass(frozen=True)
 class Layer:
-    """One layer that was enforced or deliberately was not.
-
-    Attributes:
-        layer: Its name (``"landlock"``).
-        enforced: Whether it holds for this jail.
-        detail: What exactly, or why not.
-    """
+    """One layer that was enforced or deliberately was not."""
 
     layer: str
     enforced: bool
@@ -31,8 +25,6 @@ class LayerUnavailableError(Exception):
     """A layer that the profile names cannot be had on this host. Nothing may run.
 
     Attributes:
-        layer: Its name.
-        reason: What the host answered.
         fix: What the user can do, by exact command where there is one.
     """
 

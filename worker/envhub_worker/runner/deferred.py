@@ -36,8 +36,6 @@ class Recording:
     """The arguments of a vector environment that has not been built.
 
     Attributes:
-        env_fns: One function per sub-environment.
-        sync: Whether it is a ``SyncVectorEnv``.
         autoreset_mode: ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``.
         arguments: All arguments, for building it after all.
     """

@@ -24,8 +24,6 @@ def raised(error: BaseException, stage: str, root: str = "") -> Raised:
     """The message for an exception: its nearest builtin ancestor, its text, its traceback.
 
     Args:
-        error: What the repository raised.
-        stage: What it was doing.
         root: The repository's folder: its files are told by their names in it.
     """
     # a package that may not be read is imported all the same, as one without a file of its own

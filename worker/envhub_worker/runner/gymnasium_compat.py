@@ -57,7 +57,6 @@ def mode_of(env: Any, stated: Any) -> Any:
     """The autoreset mode of a vector environment with a ``step`` of its own.
 
     Args:
-        env: The environment.
         stated: What its metadata says, or None.
     """
     if stated is not None or _MODES is not None or not _is_gymnasiums(env):

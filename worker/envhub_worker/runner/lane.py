@@ -33,19 +33,14 @@ class Lane:
     """One environment's steps.
 
     Args:
-        env: Its sub-environments.
         attach: Which rows of the batch they are, and how many slots there are.
         fds: Request slab, reply slab, observation slab, our doorbell, the client's. Owned from
             now on.
-        answer: Gives the frames of the answer to a message.
-        pack: Gives the frames of a message.
-        raised: Makes a message of an exception.
         warned: What the repository has warned of, and no reply has taken along: while there is
             something, answers are fetched by the server, with that in front of them.
         watches: What the client has had watched; what has changed of it goes the same way.
 
     Attributes:
-        number: The environment's.
         unsent: The frames of the last answer, if it did not fit.
     """
 

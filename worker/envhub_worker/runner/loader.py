@@ -35,8 +35,6 @@ def import_entry(snapshot: str, entry: str, scratch: str) -> Callable[..., Any]:
     """Import the entry file and give its ``make_env``.
 
     Args:
-        snapshot: The repository's root.
-        entry: Path of the file in it, as in the hub reference.
         scratch: A writable folder that outlives this call.
 
     Raises:

@@ -119,11 +119,7 @@ def _takes(method: Any, name: str) -> bool:
 
 
 class OldEnv(gym.Env[Any, Any]):
-    """An environment of ``gym``. What Gymnasium's do not have is looked up, and set, in it.
-
-    Args:
-        env: The environment, with its wrappers.
-    """
+    """An environment of ``gym``. What Gymnasium's do not have is looked up, and set, in it."""
 
     def __init__(self, env: Any) -> None:
         asked = getattr(env, "render_mode", None) is None and all(
@@ -190,11 +186,7 @@ class OldEnv(gym.Env[Any, Any]):
 
 
 class OldVectorEnv:
-    """A vector environment of ``gym``, driven as it is: it resets in the step that ends an episode.
-
-    Args:
-        env: The vector environment.
-    """
+    """A vector environment of ``gym``, driven as it is: it resets in the step that ends an episode."""
 
     def __init__(self, env: Any) -> None:
         self.env = env

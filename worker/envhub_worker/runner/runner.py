@@ -83,16 +83,7 @@ def _send(stream: socket.socket, request_id: int, frames: list[Any]) -> None:
 
 
 class Runner:
-    """The state of one runner: the repository's tasks and the environments built of them.
-
-    Args:
-        snapshot: The folder of the repository.
-        entry: The entry file in it.
-
-    Attributes:
-        warned: What the repository has warned of.
-        watches: What the client has had watched.
-    """
+    """The state of one runner: the repository's tasks and the environments built of them."""
 
     def __init__(self, snapshot: str, entry: str) -> None:
         self._pack = partial(m.pack, describer=described)

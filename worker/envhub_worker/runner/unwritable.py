@@ -10,12 +10,7 @@ _REFUSALS = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
 def why_unwritable(error: BaseException, root: str) -> str:
-    """A sentence for an error whose file lies among what a jail shares; empty for any other.
-
-    Args:
-        error: What the repository raised.
-        root: The repository's folder.
-    """
+    """A sentence for an error whose file lies among what a jail shares; empty for any other."""
     name = getattr(error, "filename", None)
     if not isinstance(error, OSError) or error.errno not in _REFUSALS or type(name) is not str:
         return ""

@@ -47,9 +47,6 @@ _Reading = tuple[Callable[[str], Any], Any]
 class Watches:
     """What is watched of the environments of one runner.
 
-    Args:
-        alone: Tells whether nobody can change anything between two requests.
-
     Attributes:
         readings: Of each attribute; empty if nothing is watched. Always the same dict.
         changed: What the client is to be told, likewise.

@@ -14,7 +14,6 @@ class ZygoteDied:
 
     Attributes:
         code: Its exit code, or minus the signal that ended it.
-        log: The end of what it printed.
     """
 
     code: int
@@ -42,7 +41,6 @@ class RunnerStarted:
     """A runner is confined, has tested its denials, and now enters ``runner.main``.
 
     Attributes:
-        runner_id: From ``Jail.start_runner``.
         pid: Its pid as this process sees it; 0 or less when it has already ended.
         report: Every layer that holds for it, the jail's own first.
     """
@@ -57,10 +55,6 @@ class RunnerExited:
     """A runner has ended.
 
     Attributes:
-        runner_id: From ``Jail.start_runner``.
-        code: Its exit code, or None.
-        signal: The number of the signal that ended it, or None.
-        reason: Why.
         detail: The numbers, where a limit was the reason.
     """
 

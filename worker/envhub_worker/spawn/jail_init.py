@@ -73,7 +73,6 @@ class _Runner:
     """A runner as its init knows it.
 
     Attributes:
-        number: The server's number for it.
         status: Where it reports, until it is confined.
         ended: (reason, detail) of the end that we gave it.
     """

@@ -51,7 +51,6 @@ def bring_in(folder: str, home: str) -> None:
     what of ``site`` a program may expect. What it starts as ``sys.executable`` has them as well.
 
     Args:
-        folder: The packages.
         home: The jail's own home. All of its runners make the same there.
     """
     environment = f"{home}/.environment"

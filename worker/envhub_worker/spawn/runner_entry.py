@@ -36,8 +36,6 @@ class Order:
     """What init asks a new runner to be.
 
     Attributes:
-        parent: Init's pid.
-        jail: The jail.
         fds: The stream to the server, then whatever the server passes through.
         runners: How many the jail has, this one included.
         joins: Where to join the jail's control group, if it has one.

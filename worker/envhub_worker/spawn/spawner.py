@@ -88,9 +88,6 @@ class Spawner:
 
         Args:
             confinement: What the zygote's jails have in common.
-            runtime_dir: An existing folder of the server's own.
-            readable_roots: Where snapshots lie (the snapshot store).
-            runtime: The interpreter of the jails, and their packages; default: ours.
             target: What a runner runs once it is confined: ``"module:function"``, or
                 ``"/a/file.py:function"``.
             ahead: A process to use, if it is one of this interpreter; else it is ended.

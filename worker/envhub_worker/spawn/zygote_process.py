@@ -31,14 +31,12 @@ class ZygoteProcess:
     Args:
         runtime: Its interpreter, and the packages of its jails. Where it has any, it starts without
             ``site``, and so sees none: not those, and not the interpreter's own.
-        runtime_dir: An existing folder of the server's own.
         ahead: Import before the configuration comes, and so before any confinement: only where that
             is from what the server has imported the same from.
 
     Attributes:
         channel: Its first message is the configuration.
         folder: Goes with ``close`` of whoever uses it.
-        log: Both outputs.
         pid: Of what was started, which may only wait for the zygote.
     """
 

@@ -18,11 +18,7 @@ _WORD = 8
 
 
 class Idleness:
-    """The clock of one jail.
-
-    Args:
-        limit_s: How long is too long.
-    """
+    """The clock of one jail."""
 
     def __init__(self, limit_s: float) -> None:
         self.limit_s = limit_s

@@ -45,11 +45,7 @@ class JailEvents:
     """Writes down what happens, and tells everybody who waits for it.
 
     Args:
-        loop: Calls back when a descriptor is ready.
-        answers: Takes the replies.
         jails: All jails of the server; what has ended long ago is taken out.
-        deposits: Descriptors that wait for runners.
-        witness: Is told what becomes of each.
 
     Attributes:
         deaths: How many jails, and runners of kept jails, have ended unasked, by reason.

@@ -51,14 +51,8 @@ class Jails:
     """All jails of a server.
 
     Args:
-        loop: Calls back when one of their descriptors is ready.
-        answers: Takes the replies.
-        runtime_dir: An existing folder of the server's own.
-        readable_roots: Where snapshots lie.
-        limits: Bounds on what a runner may say.
         fd_path: The socket that takes descriptors.
         ahead: A process for the first zygote.
-        witness: Is told what becomes of each.
     """
 
     def __init__(

@@ -24,9 +24,7 @@ def reached(
     """The names of limits that are used up.
 
     Args:
-        limits: Of the jail.
         usage: What it holds; empty where nobody has counted.
-        runners: Processes of it that run environments.
         own_root: Whether its scratch is a file system of its own.
     """
     if usage and usage["processes"] + usage["threads"] >= limits.processes:

@@ -60,8 +60,6 @@ class JailEntry:
     """A jail and everything that waits for it.
 
     Attributes:
-        opened: Whether it has come up.
-        since: When it was asked for.
         moved: Bytes to and from runners that it has lost.
         denied: What was tried in it and is denied, where it records that.
     """

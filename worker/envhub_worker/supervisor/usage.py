@@ -15,11 +15,7 @@ _A_SECOND = 16
 
 
 class Counting:
-    """How often is counted for whoever asks: each time takes the server's one thread some ms.
-
-    Args:
-        now: The time in seconds.
-    """
+    """How often is counted for whoever asks: each time takes the server's one thread some ms."""
 
     def __init__(self, now: Callable[[], float] = monotonic) -> None:
         self._now = now
@@ -42,8 +38,6 @@ def usage_of(init: int, runners: Collection[int], children: reap.Children) -> di
 
     Args:
         init: The pid of its first process, which adopts whatever is orphaned in it.
-        runners: The pids of its runners.
-        children: Who is below whom on this machine.
 
     Returns:
         ``processes``: all that live or wait to be reaped, without init. ``threads``: theirs, beyond

@@ -25,11 +25,6 @@ class Zygotes:
     """Started when a jail needs one, ended when they are too many.
 
     Args:
-        loop: Calls back when one of them has something to say.
-        runtime_dir: An existing folder of the server's own.
-        readable_roots: Where snapshots lie.
-        jails: All jails of the server.
-        events: Is told of jails and zygotes that have gone.
         ahead: A process for the first of them.
     """
 

@@ -32,9 +32,6 @@ class Doorman:
     """Watches a socket's connections. To be made before it is bound.
 
     Args:
-        router: The socket.
-        loop: Calls back.
-        log: Takes what is refused.
         limit: Connections at once. The backlog may come in besides.
     """
 

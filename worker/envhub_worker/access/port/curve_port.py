@@ -29,8 +29,6 @@ class CurvePort:
 
     Args:
         keys: The server's key pair; None only for ``--insecure-loopback``.
-        admits: Whether a key at an address may come in.
-        log: Takes what is refused.
         max_connections: Of everybody together, strangers included.
     """
 

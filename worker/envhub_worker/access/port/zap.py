@@ -20,7 +20,6 @@ class Zap:
     """Answers libzmq's questions about each handshake.
 
     Args:
-        context: The context of the sockets to be protected.
         admits: Called with the client's public key and address; whether it may come in.
     """
 

@@ -46,9 +46,6 @@ def tree_charge(paths: Iterable[str]) -> int:
 class Store:
     """The files of one key.
 
-    Args:
-        home: Where they lie; what is there is counted once.
-
     Attributes:
         held: Bytes that they are charged.
     """

@@ -61,7 +61,6 @@ class Offer:
     """What a session is about to bring.
 
     Attributes:
-        store: Where to.
         needed: The hashes of all its files: they stay until its tree is laid out.
         missing: Of these, the ones that are not here yet, with their sizes.
         reserved: What it may still be charged.
@@ -74,12 +73,7 @@ class Offer:
 
 
 class Uploads:
-    """The snapshots of all clients.
-
-    Args:
-        folder: Where they lie.
-        quotas: How much of them each client may have.
-    """
+    """The snapshots of all clients."""
 
     def __init__(self, folder: Path, quotas: Quotas) -> None:
         self.folder = folder
@@ -98,9 +92,6 @@ class Uploads:
         """What is missing of a snapshot. Nothing: it lies ready.
 
         Args:
-            owner: The client's session.
-            key: The client's key.
-            request: The listing.
             in_use: Trees that must stay, by path.
 
         Raises:

@@ -21,7 +21,6 @@ class Events:
     """A line an event, under the name that the operator has given the client.
 
     Args:
-        log: Takes them.
         name_of: The name that stands beside a key in the list of clients.
         count_opened: Called with the key whose jail has come up.
     """

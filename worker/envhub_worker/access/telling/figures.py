@@ -71,11 +71,7 @@ class Facts:
     """What does not change while a server runs.
 
     Attributes:
-        profile: The strongest that a jail can have here.
-        permissions: What a policy may ask for.
-        quotas: What one key may take.
         state: A path on the disk that keys and snapshots lie on.
-        max_connections: Of everybody together.
     """
 
     profile: str

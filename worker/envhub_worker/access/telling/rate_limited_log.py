@@ -28,14 +28,7 @@ def _to_stderr(line: str) -> None:
 
 
 class Log:
-    """Writes at most so many lines of an event in ``PERIOD_S`` seconds.
-
-    Args:
-        write: Takes the lines.
-        clock: Seconds, of which only differences count.
-        form: Makes a line of an event.
-        level: What is less important than this is left out.
-    """
+    """Writes at most so many lines of an event in ``PERIOD_S`` seconds."""
 
     def __init__(
         self,

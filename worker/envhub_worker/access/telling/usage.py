@@ -26,9 +26,7 @@ class Process:
     """One look at a process.
 
     Attributes:
-        pid: Its number here.
         started: When it was started, so that the number is not taken for another's.
-        cpu_s: What it has taken by itself.
         memory_bytes: Its share of what it has in memory, or all of that where nobody may ask.
     """
 
@@ -40,9 +38,6 @@ class Process:
 
 class Usage:
     """Memory, and processor time so far, of each client's jails.
-
-    Args:
-        failed: Is told what a look has raised.
 
     Attributes:
         memory_bytes: By client, at the last look; replaced, never changed.

@@ -14,11 +14,7 @@ WHY = "the memory limit around the server (its container's) was reached: the ker
 
 
 class Around:
-    """Tells a process that was killed for that limit from one that somebody killed.
-
-    Args:
-        root: Where the control groups are.
-    """
+    """Tells a process that was killed for that limit from one that somebody killed."""
 
     def __init__(self, root: Path = _ROOT) -> None:
         self._events = -1

@@ -32,7 +32,6 @@ class Guard:
         """A guard for ``jail``.
 
         Args:
-            jail: The jail.
             events: Where its control group counts out-of-memory; -1 to measure instead.
         """
         self._limits = jail.spec.confinement.limits

@@ -20,7 +20,6 @@ def wanted(limits: Limits, processes: int | None) -> dict[int, tuple[int, int]]:
     """Resource number to (soft, hard).
 
     Args:
-        limits: The caps of the jail.
         processes: Cap for ``RLIMIT_NPROC``, or None where it would count strangers.
     """
     file_bytes = limits.disk_bytes if limits.file_bytes is None else limits.file_bytes

@@ -86,7 +86,6 @@ class MemoryWatch:
         """A watch for ``limit`` bytes.
 
         Args:
-            limit: What the jail may use.
             tmpfs: A path in the jail's own, if it has one.
             own_network: Whether all sockets of our network namespace are the jail's, those too
                 that wait in another socket, where no process has them.

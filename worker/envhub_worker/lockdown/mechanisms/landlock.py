@@ -46,13 +46,7 @@ class Rule:
 
 @dataclass(frozen=True)
 class Ruleset:
-    """What the kernel is asked to handle; everything handled is denied but for the rules.
-
-    Attributes:
-        files: Mask of file accesses.
-        tcp: Mask of TCP accesses.
-        scope: Mask of what may not leave the domain.
-    """
+    """What the kernel is asked to handle; everything handled is denied but for the rules."""
 
     files: int
     tcp: int
@@ -63,7 +57,6 @@ def ruleset(abi: int, network: str) -> Ruleset:
     """All that ``abi`` can handle. An unknown bit would be refused, so it is clamped.
 
     Args:
-        abi: From ``version()``.
         network: ``"none"`` denies all TCP; otherwise its own layer decides.
     """
     bits = {1: 13, 2: 14, 3: 15, 4: 15}.get(abi, 16)

@@ -26,11 +26,7 @@ class LockedFolder:
     """A new one. It is private; its owner may let others pass.
 
     Args:
-        prefix: What its name begins with.
         place: Where it lies; by default below the folder for temporary files.
-
-    Attributes:
-        path: Its path.
     """
 
     def __init__(self, prefix: str, place: Path | None = None) -> None:

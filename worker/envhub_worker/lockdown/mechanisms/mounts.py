@@ -69,8 +69,6 @@ def build_root(plan: RootPlan, place: str, copied: Sequence[str], user: int | No
     Needs a mount namespace of our own; nothing propagates out of it.
 
     Args:
-        plan: What is in it.
-        place: An empty folder.
         copied: Folders whose files are to be the jails' own there, so that overlays can copy them.
         user: The user of the jails, where that is not this process's own.
     """
@@ -230,10 +228,7 @@ def mount_jail(
     Args:
         snapshot: Shown at this path; everything else below ``roots`` is hidden.
         packages: Folder of packages of its own, with a skeleton; or empty.
-        roots: Folders that snapshots lie in.
         trees: What the zygote's root shows (``RootPlan.trees``).
-        size: Bytes of the scratch, all of it together.
-        inodes: Files and folders in it.
     """
     hidden = [*roots, TEMPORARY, SHARED_MEMORY, HOME, WORK]
     buried = [path for path in trees if any(within(path, folder) for folder in hidden)]

@@ -42,10 +42,6 @@ _WEAKER = 'Or choose a weaker one by its name: profile "no-userns".'
 def enter_user_namespace(uid: int, gid: int) -> None:
     """Become ``INSIDE_UID`` of a new user namespace, with every capability over it.
 
-    Args:
-        uid: This process's user, as it is seen now.
-        gid: This process's group.
-
     Raises:
         LayerUnavailableError: The host forbids it; the fix is for this host.
     """
@@ -150,7 +146,6 @@ def user_namespace_unavailable(
     """Why this host refused a user namespace, and what to do about it here.
 
     Args:
-        error: What the kernel answered.
         read: Gives the text of a sysctl file, or None where there is none.
     """
     read = read or _read

@@ -16,11 +16,7 @@ HANDLED = (signal.SIGCHLD, signal.SIGTERM)
 
 
 def child_signals(stop: Callable[..., None]) -> int:
-    """A descriptor that becomes readable when a child changes state, or SIGTERM comes.
-
-    Args:
-        stop: The handler of SIGTERM.
-    """
+    """A descriptor that becomes readable when a child changes state, or SIGTERM comes."""
     read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     signal.signal(signal.SIGCHLD, lambda *_: None)
     signal.signal(signal.SIGTERM, stop)
@@ -57,8 +53,6 @@ def descendants(
     """Pids below ``root``, without those in ``keep`` and what is below them.
 
     Args:
-        root: The pid of a process.
-        keep: Pids to leave out.
         children: What ``all_children`` gave a moment ago; looked up by default.
     """
     children = all_children() if children is None else children

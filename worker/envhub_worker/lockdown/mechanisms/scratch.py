@@ -16,8 +16,6 @@ class Scratch:
     """Absolute paths of one jail's writable folders.
 
     Attributes:
-        home: The private home.
-        temporary: For temporary files.
         work: The working directory: shows the snapshot's files, takes new ones.
         shared_memory: Where ``shm_open`` puts its files, or None for nowhere.
     """

@@ -44,7 +44,6 @@ class Request:
     Attributes:
         thread: The calling thread.
         caller: Its process.
-        call: The call's number.
         arguments: The first three, as the C integers that the kernel reads.
         words: All six, as the registers are.
         still_waits: Raises OSError where the caller has gone since.
@@ -81,11 +80,9 @@ def serve(
     """Answer one request that waits at ``listener``; False when nobody is left to ask.
 
     Args:
-        listener: Where calls arrive.
         permitted: Calls that the policy allows whatever their arguments, and that only ask so that
             they are seen: the kernel goes on with them. What is neither one of these nor a signal
             is denied.
-        note: Is told of each.
     """
     buffer = bytearray(_REQUEST.size)
     try:
@@ -152,7 +149,6 @@ def decide(request: Request, inside: _Inside) -> Answer:
     """Send the signal that ``request`` asks for, where that is permitted.
 
     Args:
-        request: The call.
         inside: Gives the pids of the jail's processes, without init.
     """
     first, second, third = request.arguments

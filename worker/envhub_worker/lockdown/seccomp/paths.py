@@ -95,8 +95,6 @@ def asked(
     Args:
         call: Its name, one of ``NAMED``.
         words: Its arguments, as the registers are.
-        thread: Who calls.
-        own: What it may have.
         still_waits: Raises OSError where the caller has gone: its number may be another's now.
     """
     with contextlib.suppress(OSError, ValueError, OverflowError):

@@ -147,7 +147,6 @@ def table(
     Args:
         namespaced: A mount, pid and IPC namespace hold the jail, so that paths, processes and
             IPC objects of the host are out of reach anyway.
-        network: ``"none"``, ``"loopback"`` or ``"host"``.
         brokered: Init sends the jail's signals: see ``notify``.
         measured: No control group counts the jail's memory: see ``watchdog``.
         scoped: Landlock keeps the abstract sockets of the network namespace out of reach.
@@ -176,7 +175,6 @@ def recorded(verdicts: Mapping[str, Verdict], names: Iterable[str]) -> dict[str,
     and so is what names a process, which may be another's.
 
     Args:
-        verdicts: Of ``table``.
         names: Every call that there is.
     """
     denied = {name: _asking(name, verdicts.get(name, EPERM)) for name in names}

@@ -32,8 +32,6 @@ def is_another(call: str, arguments: Sequence[int], caller: int, init: int) -> b
     Args:
         call: Its name, one of ``NAMING``.
         arguments: Its first three, as C integers.
-        caller: The process that calls.
-        init: The first process of the jail.
     """
     if call in _WHICH and arguments[0] != _WHICH[call]:
         return False

@@ -21,8 +21,6 @@ def enter(spec: JailSpec, common: Common, folder: str) -> tuple[Scratch, View]:
     """Confine this init as far as all of its runners are.
 
     Args:
-        spec: The jail.
-        common: What the zygote gives.
         folder: A private folder of the host for a jail without a mount namespace.
 
     Returns:

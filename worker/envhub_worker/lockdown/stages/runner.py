@@ -48,7 +48,6 @@ def enter(
     """Confine this single-threaded process for good, and test that it holds.
 
     Args:
-        jail: The jail that it belongs to.
         descriptors: Every descriptor that may be open.
         give_to_init: Takes the broker's listener, if there is one, before the descriptor is closed.
 
@@ -82,7 +81,6 @@ def rules(jail: JailContext, pid: int) -> list[Rule]:
     """What Landlock permits a runner; everything else it denies.
 
     Args:
-        jail: The jail.
         pid: The runner's own: without a pid namespace it may read only its own ``/proc`` folder.
     """
     common = jail.common
