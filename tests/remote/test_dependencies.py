@@ -27,8 +27,9 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.sandboxes import server_facts
 from envhub_worker.access import packages as server_side
 from envhub_worker.access.packages import Packages
-from envhub_worker.access.quotas import BusyError, Quotas, RefusedError
+from envhub_worker.access.quotas import BusyError, Quotas
 from envhub_worker.protocol import messages as m
+from envhub_worker.supervisor.records import RefusedError
 from tests.remote.listening import Listening, listening
 from tests.support.processes import eventually
 from tests.support.repositories import write_repository

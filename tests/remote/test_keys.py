@@ -20,8 +20,8 @@ from zmq.utils import z85
 from envhub_sandbox import RemoteSandbox, make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
 from envhub_worker.access import keys
+from envhub_worker.access.audit.log import CLIENT_LINES, LINES, Log
 from envhub_worker.access.keys import AuthorizedClients
-from envhub_worker.access.telling.rate_limited_log import CLIENT_LINES, LINES, Log
 from envhub_worker.cli import listen, status
 from envhub_worker.protocol.keys import key_text, parse_key
 from tests.remote.listening import WORKER, Listening, listening

@@ -25,7 +25,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import ServerBusyError, WorkerDiedError
-from envhub_worker.access.telling import figures, usage
+from envhub_worker.access.audit import figures, usage
 from envhub_worker.cli import http_port
 from envhub_worker.cli.http_port import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpPort, parse_address
 from envhub_worker.cli.metrics import STALE_S, Page
@@ -394,9 +394,9 @@ def test_what_clients_say_cannot_make_a_label() -> None:
     assert {word for one in tally.requests.values() for word in one} == {"other"}
     assert tally.requests[figures.OTHERS]["other"] == 1000 - figures.MAX_CLIENTS
     assert tally.refusals == {"other": 1000}
-    clients = figures.Clients()
+    clients = figures.ClientFigures()
     clients.add_past(tally, usage.Usage(lambda _: None))
-    assert len(clients.told()) <= figures.MAX_CLIENTS + 1
+    assert len(clients.plain()) <= figures.MAX_CLIENTS + 1
     assert figures.client_name("a\n\x1b[2J" * 100, insecure=False).isprintable()
     assert len(figures.client_name("a" * 1000, insecure=False)) == 64
 

@@ -38,9 +38,9 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
 from envhub_sandbox.transport.shared_memory.shard import LaneShard
-from envhub_worker.access.port.connection_limit import Doorman
+from envhub_worker.access.audit.log import Log
+from envhub_worker.access.port.connection_limit import ConnectionLimiter
 from envhub_worker.access.remote_gate import RemoteGate
-from envhub_worker.access.telling.rate_limited_log import Log
 from envhub_worker.cli import listen
 from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.protocol import messages as m
@@ -361,14 +361,14 @@ def public_key(gate: RemoteGate) -> bytes:
     return keys.public
 
 
-def happen(doorman: Doorman, event: int, value: int = 0) -> None:
+def happen(doorman: ConnectionLimiter, event: int, value: int = 0) -> None:
     """Tell a doorman what libzmq's monitor would."""
     doorman._happened(event, value)
 
 
-def door_is_shut(doorman: Doorman) -> bool:
+def door_is_shut(doorman: ConnectionLimiter) -> bool:
     """Whether nobody is let in at present."""
-    return doorman._shut_door is not None
+    return doorman._shut_listener is not None
 
 
 # --- a repository's packages -------------------------------------------------------------------

@@ -17,7 +17,7 @@ import re
 import resource
 from collections.abc import Sequence
 
-from envhub_worker.lockdown.mechanisms import capabilities, landlock, process
+from envhub_worker.lockdown.mechanisms import landlock, process
 from envhub_worker.lockdown.mechanisms.landlock import READ, WRITE, Rule
 from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp import filter
@@ -45,7 +45,7 @@ def confine(folder: str) -> None:
     scoped = landlock.scopes(abi)
     machine = platform.machine()
     program = filter.compile_filter(machine, namespaced=False, network="none", scoped=scoped)
-    capabilities.drop_all()
+    process.drop_capabilities()
     process.set_no_new_privileges()
     # without an ABI it raises: no layer is left out
     landlock.restrict(landlock.ruleset(abi, "none"), [Rule(library, READ), Rule(folder, WRITE)])

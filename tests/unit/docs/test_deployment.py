@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
+from envhub_worker.access.audit.figures import Client, ServerFigures
 from envhub_worker.access.quotas import Permissions, Quotas
-from envhub_worker.access.telling.figures import Client, Facts
 from envhub_worker.cli import listen, metrics
 
 ROOT = Path(__file__).parents[3]
@@ -32,7 +32,7 @@ needs_systemd = pytest.mark.skipif(
 def exported() -> dict[str, set[str]]:
     """Every sample that a server with a client exports, and its labels."""
     parser = pytest.importorskip("prometheus_client.parser", reason="prometheus-client is missing")
-    facts = Facts(
+    facts = ServerFigures(
         profile="strict",
         permissions=Permissions(),
         quotas=Quotas(),

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 
-from envhub_worker.lockdown.mechanisms import reap
+from envhub_worker.lockdown.mechanisms import procfs
 from envhub_worker.supervisor.usage import Counting, usage_of
 
 
@@ -33,9 +33,9 @@ def test_who_asks_too_often_is_not_counted_for() -> None:
 def test_one_look_does_for_all() -> None:
     """What is below a process is found in what was seen before."""
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
-        children = reap.all_children()
+        children = procfs.all_children()
         held = usage_of(os.getpid(), [process.pid], children)
-        assert process.pid in reap.descendants(os.getpid(), children=children)
+        assert process.pid in procfs.descendants(os.getpid(), children=children)
         assert held["processes"] >= 1
         assert held["memory_bytes"] > 0
         assert held["files"] >= 3, "its standard streams"

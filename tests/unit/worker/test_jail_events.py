@@ -7,7 +7,7 @@ from typing import Any
 from envhub_worker.spawn.events import Denied, RunnerExited
 from envhub_worker.supervisor.jail_events import JailEvents
 from envhub_worker.supervisor.records import JailEntry, whole_jail
-from envhub_worker.supervisor.witness import Nobody
+from envhub_worker.supervisor.witness import Witness
 
 
 class _Jail:
@@ -41,7 +41,7 @@ def test_what_a_jail_was_denied_is_known_when_it_is_ended() -> None:
     jail: Any = _Jail(tried, RunnerExited(1, None, 9, "signal"))
     silent: Any = _Silent()
     entry = JailEntry(7, "one", b"", jail, (), silent)
-    events = JailEvents(silent, silent, {7: entry}, silent, Nobody())
+    events = JailEvents(silent, silent, {7: entry}, silent, Witness())
     try:
         events.end(entry, whole_jail("protocol"))
         assert entry.denied == ["socket AF_INET"]
@@ -59,7 +59,7 @@ def test_a_jail_that_cannot_be_heard_any_more_ends_alone() -> None:
         def poll(self) -> list[Any]:
             raise AssertionError("no room for a descriptor")
 
-    class Told(Nobody):
+    class Told(Witness):
         def failed(self, error: Exception) -> None:
             failures.append(str(error))
 

@@ -10,7 +10,7 @@ import pytest
 
 from envhub_worker.lockdown.limits.cgroups import Group
 from envhub_worker.protocol.confinement import Limits
-from envhub_worker.supervisor.reached import reached
+from envhub_worker.supervisor.usage import reached
 
 _NONE: dict[str, int] = {}
 

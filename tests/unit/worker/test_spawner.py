@@ -332,7 +332,7 @@ def test_killed_server_leaves_no_process(folder: Path, confinement: Confinement)
 
 def processes_below(root: int) -> list[int]:
     """Every descendant of ``root``."""
-    from envhub_worker.lockdown.mechanisms.reap import descendants
+    from envhub_worker.lockdown.mechanisms.procfs import descendants
 
     return descendants(root)
 

@@ -25,12 +25,13 @@ from pathlib import Path
 from time import monotonic
 from typing import IO, Any
 
-from envhub_worker.access.quotas import BusyError, Quotas, RefusedError
+from envhub_worker.access.quotas import BusyError, Quotas
 from envhub_worker.access.store.blob_store import make_passable
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.messages.busy import Busy
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import Runtime
+from envhub_worker.supervisor.records import RefusedError
 
 PROGRAM = "envhub_sandbox.dependencies.for_a_server"
 MAX_REQUIREMENTS = 1000

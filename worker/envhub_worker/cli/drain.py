@@ -12,7 +12,7 @@ import signal
 import sys
 from pathlib import Path
 
-from envhub_worker.access.telling.figures import pid_namespace
+from envhub_worker.access.audit.figures import pid_namespace
 from envhub_worker.cli import status
 from envhub_worker.protocol.errors import ProtocolError
 

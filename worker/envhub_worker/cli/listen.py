@@ -28,14 +28,13 @@ import zmq
 
 from envhub_worker import __version__
 from envhub_worker.access import keys
+from envhub_worker.access.audit.log import FORMS, LEVELS, Log
 from envhub_worker.access.keys import AuthorizedClients, KeyPair
 from envhub_worker.access.packages import MAKE_S, Packages, why_impossible
 from envhub_worker.access.port.connection_limit import MAX_CONNECTIONS
 from envhub_worker.access.quotas import Permissions, Quotas
 from envhub_worker.access.remote_gate import RemoteGate, Rules
 from envhub_worker.access.store.uploads import Uploads
-from envhub_worker.access.telling.log_lines import FORMS, LEVELS
-from envhub_worker.access.telling.rate_limited_log import Log
 from envhub_worker.cli.note import Note, Noted
 from envhub_worker.lockdown import probe, surroundings
 from envhub_worker.lockdown.mechanisms import landlock, locked_folder

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from envhub_worker.access.telling.figures import REFUSALS
+from envhub_worker.access.audit.figures import REFUSALS
 from envhub_worker.protocol.confinement import REASONS
 
 MISSING = (

@@ -21,7 +21,6 @@ from typing import Any
 from envhub_worker.lockdown import gpus, root_plan
 from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.lockdown.mechanisms import (
-    capabilities,
     kernel,
     landlock,
     mounts,
@@ -200,8 +199,8 @@ def _seccomp() -> str:
 
 
 def _capabilities() -> str:
-    capabilities.drop_all()
-    if capabilities.held():
+    process.drop_capabilities()
+    if process.held_capabilities():
         raise LayerUnavailableError("capabilities", "some could not be dropped", "")
     return "can be dropped"
 

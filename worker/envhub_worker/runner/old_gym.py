@@ -186,7 +186,7 @@ class OldEnv(gym.Env[Any, Any]):
 
 
 class OldVectorEnv:
-    """A vector environment of ``gym``, driven as it is: it resets in the step that ends an episode."""
+    """A vector environment of ``gym``, as it is: it resets in the step that ends an episode."""
 
     def __init__(self, env: Any) -> None:
         self.env = env

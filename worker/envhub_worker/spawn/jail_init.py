@@ -34,7 +34,7 @@ from typing import Any, NoReturn
 
 from envhub_worker.lockdown.context import Common, JailContext
 from envhub_worker.lockdown.limits.monitor import Guard
-from envhub_worker.lockdown.mechanisms import process, reap
+from envhub_worker.lockdown.mechanisms import process, procfs, reap
 from envhub_worker.lockdown.plan import HostFacts, plan
 from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp import notify, paths
@@ -107,7 +107,7 @@ class Init:
         except LayerUnavailableError as error:
             self._channel.send({"event": "failed", **error.to_wire()})
         finally:
-            reap.kill_descendants(keep=())
+            reap.kill_descendants()
 
     def _set_up(self, message: dict[str, Any], fds: list[int]) -> None:
         spec = JailSpec.from_wire(message["spec"])
@@ -162,11 +162,11 @@ class Init:
         if self._guard.seconds_left() == 0:
             # A runner that is still locking itself down runs our code, and cannot be measured yet.
             starting = [pid for pid, runner in self._runners.items() if runner.status is not None]
-            over = self._guard.look(reap.descendants(os.getpid(), starting))
+            over = self._guard.look(procfs.descendants(os.getpid(), starting))
             if over is not None:
                 for runner in self._runners.values():
                     runner.ended = runner.ended or over
-                reap.kill_descendants(keep=())
+                reap.kill_descendants()
 
     def _serve(self) -> None:
         received = self._channel.receive()
@@ -204,7 +204,7 @@ class Init:
                 runner.ended = runner.ended or ("killed", "")
                 # Not reaped yet, so the pid is still its own. Stopped, it cannot fork away.
                 os.kill(pid, signal.SIGSTOP)
-                reap.kill_below(pid)
+                reap.kill_descendants(root=pid)
                 os.kill(pid, signal.SIGKILL)
 
     def _answer(self, listener: int) -> None:
@@ -274,11 +274,11 @@ class Init:
                 self._tell_exit(runner, status)
                 self._end_orphans(pid)
         if ended and not self._runners:
-            reap.kill_descendants(keep=())  # daemons do not outlive the last runner
+            reap.kill_descendants()  # daemons do not outlive the last runner
 
     def _end_orphans(self, session: int) -> None:
         """End what a runner leaves behind, while others go on. Daemons end with the last runner."""
-        for pid in reap.descendants(os.getpid(), keep=self._runners):
+        for pid in procfs.descendants(os.getpid(), keep=self._runners):
             with contextlib.suppress(ProcessLookupError):
                 if os.getsid(pid) == session:
                     os.kill(pid, signal.SIGKILL)

@@ -192,4 +192,4 @@ class Zygote:
             self._reap()
             time.sleep(0.005)
         with contextlib.suppress(ChildProcessError):
-            reap.kill_descendants(keep=())
+            reap.kill_descendants()

@@ -24,7 +24,7 @@ PidfdFor = Callable[[m.Deposit], int | None]
 may not have it."""
 
 
-class Deposits:
+class FdStore:
     """Descriptors that wait for their runner."""
 
     def __init__(self, path: str, pidfd_for: PidfdFor) -> None:

@@ -24,11 +24,11 @@ from envhub_worker.spawn.spawner import (
     RunnerStarted,
     ZygoteDied,
 )
-from envhub_worker.supervisor.fd_store import Deposits
+from envhub_worker.supervisor.fd_store import FdStore
 from envhub_worker.supervisor.records import (
-    Answers,
     JailEntry,
     Pending,
+    Reply,
     for_operation,
     signal_name,
     waiting,
@@ -54,15 +54,15 @@ class JailEvents:
     def __init__(
         self,
         loop: Loop,
-        answers: Answers,
+        reply: Reply,
         jails: dict[int, JailEntry],
-        deposits: Deposits,
+        fds: FdStore,
         witness: Witness,
     ) -> None:
         self._loop = loop
-        self._answers = answers
+        self._reply = reply
         self._jails = jails
-        self._deposits = deposits
+        self._fds = fds
         self._witness = witness
         self.deaths: Counter[str] = Counter()
         self._around = around.Around()
@@ -121,7 +121,7 @@ class JailEvents:
             counts = tuple(map(len, replies))
             dead = tuple(sorted(pending.dead))
             answer = m.RelayedPartly(counts, dead) if dead else m.Relayed(counts)
-            self._answers.reply(pending.asker, answer, payload)
+            self._reply(pending.asker, answer, payload)
 
     def _read_output(self, entry: JailEntry) -> None:
         entry.output.read()
@@ -156,16 +156,15 @@ class JailEvents:
             if not opening.waiting:
                 entry.opening.remove(opening)
                 opened = m.JailOpened(entry.number, opening.runners, entry.report)
-                self._answers.reply(opening.asker, opened)
+                self._reply(opening.asker, opened)
                 took = monotonic() - opening.since
                 self._witness.opened(entry, len(opening.runners), took)
                 entry.opened = True
 
     def _failed(self, entry: JailEntry, event: Failed) -> None:
         for opening in entry.opening:
-            self._answers.refuse(
-                opening.asker, "SandboxUnavailableError", event.reason, event.layer, event.fix
-            )
+            why = ("SandboxUnavailableError", event.reason, event.layer, event.fix)
+            self._reply(opening.asker, m.Refused(*why))
         entry.opening.clear()
         self.end(entry, whole_jail("unavailable", detail=event.reason))
 
@@ -213,7 +212,7 @@ class JailEvents:
         entry.lost[death.runner] = death
         entry.jail.kill_runner(death.runner)  # it may live, and have broken the rules
         entry.pids.pop(death.runner, None)
-        close_fds(self._deposits.take(entry.number, death.runner))
+        close_fds(self._fds.take(entry.number, death.runner))
         if entry.idle is not None:
             entry.idle.forget(death.runner)
         link = entry.drop(death.runner)
@@ -224,7 +223,7 @@ class JailEvents:
         link.close()
         for opening in [one for one in entry.opening if death.runner in one.waiting]:
             entry.opening.remove(opening)
-            self._answers.reply(opening.asker, for_operation(death, "start"))
+            self._reply(opening.asker, for_operation(death, "start"))
         self._witness.lost(entry, death)
 
     def end(self, entry: JailEntry, death: m.Died) -> None:
@@ -236,9 +235,9 @@ class JailEvents:
         entry.output.read()
         entry.death = death = m.replace(death, tail=entry.output.text())
         for pending in waiting(entry):
-            self._answers.reply(pending.asker, for_operation(death, pending.operation))
+            self._reply(pending.asker, for_operation(death, pending.operation))
         for opening in entry.opening:
-            self._answers.reply(opening.asker, for_operation(death, "start"))
+            self._reply(opening.asker, for_operation(death, "start"))
         entry.opening.clear()
         self._witness.died(entry)
         self.kill(entry)
@@ -262,7 +261,7 @@ class JailEvents:
 
     def kill(self, entry: JailEntry) -> None:
         """End its processes; ``jail_gone`` is when they are gone."""
-        self._deposits.drop(entry.number)
+        self._fds.drop(entry.number)
         self._unwatch_control(entry)
         entry.jail.kill()
 
@@ -285,7 +284,7 @@ class JailEvents:
             self.end(entry, self._judged(entry, death))
         self._release(entry)
         for asker in entry.closing:
-            self._answers.reply(asker, m.Done())
+            self._reply(asker, m.Done())
         if entry.death is None:
             self._witness.closed(entry)
 
@@ -301,7 +300,7 @@ class JailEvents:
             entry.idle.close()
         for pending in waiting(entry):
             death = whole_jail("killed", detail="the jail was closed")
-            self._answers.reply(pending.asker, for_operation(death, pending.operation))
+            self._reply(pending.asker, for_operation(death, pending.operation))
         self._forget_some()
 
     def _forget_some(self) -> None:

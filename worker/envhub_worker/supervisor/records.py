@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import monotonic
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
+from envhub_worker.lockdown.mechanisms import procfs
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.confinement import Reason
@@ -15,6 +16,9 @@ from envhub_worker.spawn.spawner import Jail
 from envhub_worker.supervisor.idle_timer import Idleness
 from envhub_worker.supervisor.output_tail import OutputTail
 from envhub_worker.supervisor.runner_stream import RunnerLink
+
+_MAX_SAID = 4096
+"""Characters of a refusal."""
 
 
 class Asker(NamedTuple):
@@ -27,6 +31,30 @@ class Asker(NamedTuple):
     request_id: int
     session: bytes = b""
     key: bytes = b""
+
+
+Reply = Callable[..., None]
+"""Sends the reply to a request: takes the asker, the message and perhaps its payload."""
+
+
+class AnsweredError(Exception):
+    """Ends a request early, with its reply."""
+
+    def __init__(self, reply: m.Message) -> None:
+        super().__init__(reply)
+        self.reply = reply
+
+
+class RefusedError(AnsweredError):
+    """A request is not done. ``error`` is a name out of the client's table."""
+
+    def __init__(self, error: str, message: str, missing: str = "", fix: str = "") -> None:
+        # what the client has sent may be quoted in the message, at any length
+        super().__init__(m.Refused(error, message[:_MAX_SAID], missing, fix))
+        self.error, self.message, self.missing, self.fix = error, message, missing, fix
+
+    def __str__(self) -> str:
+        return self.message
 
 
 @dataclass
@@ -102,18 +130,6 @@ class JailEntry:
         return self.links.pop(runner)
 
 
-class Answers(Protocol):
-    """Where replies go."""
-
-    def reply(self, asker: Asker, message: m.Message, payload: Sequence[Buffer] = ()) -> None:
-        """Answer a request."""
-
-    def refuse(
-        self, asker: Asker, error: str, message: str, missing: str = "", fix: str = ""
-    ) -> None:
-        """Answer that it is not done."""
-
-
 def waiting(entry: JailEntry) -> list[Pending]:
     """Everything that runners owe an answer to; they owe it no more."""
     found = {}
@@ -150,15 +166,13 @@ def signal_name(number: int | None) -> str | None:
         return f"signal {number}"
 
 
-_STATES = {"R": "running", "S": "waiting", "D": "waiting", "T": "stopped", "t": "stopped"}
+_STATES = {b"R": "running", b"S": "waiting", b"D": "waiting", b"T": "stopped", b"t": "stopped"}
 
 
 def _state_of(pid: int) -> str:
-    """What the kernel says that a runner is doing: of a busy environment nobody else can tell."""
+    """What the kernel says that a runner is doing; a busy environment cannot say so itself."""
     try:
-        with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as file:
-            # the command may hold anything, parentheses and blanks included
-            return _STATES.get(file.read().rpartition(")")[2].split()[0], "gone")
+        return _STATES.get(procfs.stat(pid)[0], "gone")
     except (OSError, IndexError):
         return "gone"
 

@@ -58,11 +58,11 @@ class Zygotes:
         runtimes = (key[0] for key in self._spawners)
         return frozenset(one.packages for one in runtimes if isinstance(one, Runtime))
 
-    def fork(self, runtime: Runtime, confinement: Confinement, spec: JailSpec) -> tuple[Key, Jail]:
+    def fork(self, runtime: Runtime, spec: JailSpec) -> tuple[Key, Jail]:
         """A jail, and the name of the zygote that it is a fork of."""
         # a zygote is one environment's: not even what it has not imported is shared with another
-        key = (runtime, *(getattr(confinement, name) for name in _OF_POLICY))
-        spawner = self._spawners.pop(key, None) or self._start(key, runtime, confinement)
+        key = (runtime, *(getattr(spec.confinement, name) for name in _OF_POLICY))
+        spawner = self._spawners.pop(key, None) or self._start(key, runtime, spec.confinement)
         self._spawners[key] = spawner  # the one that was used last is the last
         return key, spawner.spawn(spec)
 

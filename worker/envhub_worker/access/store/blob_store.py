@@ -12,9 +12,9 @@ from collections.abc import Callable, Collection, Iterable
 from itertools import takewhile
 from pathlib import Path
 
-from envhub_worker.access.quotas import RefusedError
 from envhub_worker.lockdown.mechanisms.scratch import remove_tree
 from envhub_worker.protocol.records import dataclass
+from envhub_worker.supervisor.records import RefusedError
 
 BLOCK_BYTES = 4096
 """What the smallest file and each entry of a tree are charged: they take disk, too."""

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from envhub_worker.access.quotas import Quotas, RefusedError
+from envhub_worker.access.quotas import Quotas
 from envhub_worker.access.store.blob_store import (
     Listed,
     Store,
@@ -30,6 +30,7 @@ from envhub_worker.access.store.blob_store import (
 from envhub_worker.lockdown.mechanisms.scratch import remove_tree
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.text import size_text
+from envhub_worker.supervisor.records import RefusedError
 
 MAX_PIECE_BYTES = 8 << 20
 """One ``PutBlob``: the server writes and hashes it while everybody else waits."""

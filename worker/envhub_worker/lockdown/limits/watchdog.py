@@ -15,6 +15,7 @@ import re
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
+from envhub_worker.lockdown.mechanisms import procfs
 from envhub_worker.lockdown.seccomp.policy import SHARED_BYTES
 
 #: Bytes a second that a jail may be expected to fill: a few cores on huge pages.
@@ -140,7 +141,7 @@ class MemoryWatch:
 
 
 def _add_process(usage: Usage, pid: int) -> None:
-    fields = _fields(f"/proc/{pid}/status")
+    fields = procfs.numbers(f"/proc/{pid}/status")
     usage.private += fields.get(b"RssAnon", 0) + fields.get(b"VmSwap", 0)
     usage.kernel += fields.get(b"VmPTE", 0)
 
@@ -150,7 +151,7 @@ def _add_mappings(usage: Usage, pid: int) -> None:
 
     It keeps pages that nobody maps any more, while there is one that somebody does.
     """
-    maps = _content(f"/proc/{pid}/maps")
+    maps = procfs.content(f"/proc/{pid}/maps")
     usage.kernel += maps.count(b"\n") * _MAPPING
     sizes: dict[tuple[int, int], int] = {}
     for low, high, major, minor, inode in _SHARED.findall(maps):
@@ -183,18 +184,18 @@ def socket_bytes() -> int:
 
     The filter keeps the size of the buffers.
     """
-    return 2 * int(_content("/proc/sys/net/core/wmem_default") or _BUFFER) + _DESCRIPTOR
+    return 2 * int(procfs.content("/proc/sys/net/core/wmem_default") or _BUFFER) + _DESCRIPTOR
 
 
 def _sockets() -> int:
     """All sockets of our network namespace."""
-    words = _content("/proc/net/sockstat").split(None, 3)
+    words = procfs.content("/proc/net/sockstat").split(None, 3)
     return int(words[2]) if words[:2] == [b"sockets:", b"used"] else 0
 
 
 def shared_of_the_machine() -> int:
     """All memory that processes of this machine share, and files in memory."""
-    fields = _fields("/proc/meminfo")
+    fields = procfs.numbers("/proc/meminfo")
     swapped = fields.get(b"SwapTotal", 0) - fields.get(b"SwapFree", 0)
     return fields.get(b"Shmem", 0) + swapped
 
@@ -213,31 +214,12 @@ def unlinked_bytes(pids: Iterable[int], device: int) -> int:
     return sum(found.values())
 
 
-def _fields(path: str) -> dict[bytes, int]:
-    """``Name:   123 kB`` lines as bytes."""
-    found: dict[bytes, int] = {}
-    for line in _content(path).splitlines():
-        name, _, rest = line.partition(b":")
-        if rest.endswith(b" kB"):
-            found[name] = int(rest[:-3]) * 1024
-    return found
-
-
-def _content(path: str) -> bytes:
-    """A file of /proc; empty when its process has gone."""
-    try:
-        with open(path, "rb") as file:
-            return file.read()
-    except (FileNotFoundError, ProcessLookupError):
-        return b""
-
-
 def _proportional(pid: int) -> int:
     """This process's share of anonymous memory: shared pages divided among their owners.
 
     Changed pages of a file that is mapped privately are anonymous too.
     """
-    fields = _fields(f"/proc/{pid}/smaps_rollup")
+    fields = procfs.numbers(f"/proc/{pid}/smaps_rollup")
     return fields.get(b"Pss_Anon", fields.get(b"Pss", 0)) + fields.get(b"SwapPss", 0)
 
 

@@ -20,7 +20,7 @@ import struct
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
-from envhub_worker.lockdown.mechanisms import reap
+from envhub_worker.lockdown.mechanisms import procfs
 from envhub_worker.lockdown.mechanisms.kernel import syscall
 from envhub_worker.lockdown.seccomp.policy import refusal
 from envhub_worker.lockdown.seccomp.syscalls import c_int, name_of, number
@@ -96,14 +96,14 @@ def serve(
     def still_waits() -> object:
         return fcntl.ioctl(listener, _STILL_WAITS, struct.pack("=Q", identity))
 
-    caller = reap.process_of(thread)
+    caller = procfs.process_of(thread)
     request = Request(thread, caller, call, (first, second, third), tuple(words), still_waits)
     note(request)  # told before the caller goes on, so that nobody can look too early
     name = name_of(request.call)
     if name in permitted:
         answer = _PROCEED
     elif name in _SIGNALS:
-        answer = decide(request, lambda: reap.descendants(os.getpid()))
+        answer = decide(request, lambda: procfs.descendants(os.getpid()))
     else:
         answer = Answer(refusal(name))
     flags = _CONTINUE if answer.proceed else 0
@@ -159,7 +159,7 @@ def decide(request: Request, inside: _Inside) -> Answer:
     if request.call == number("tkill"):
         if first == request.thread:
             return _PROCEED
-        return _send_to_thread(reap.process_of(first), first, second, inside)
+        return _send_to_thread(procfs.process_of(first), first, second, inside)
     if first == request.caller:
         return _PROCEED
     return _send_to_thread(first, second, third, inside)

@@ -10,7 +10,7 @@ import os
 import re
 from collections.abc import Sequence
 
-from envhub_worker.lockdown.mechanisms import reap
+from envhub_worker.lockdown.mechanisms import procfs
 
 _PRETENDED = "sched_setscheduler sched_setparam sched_setattr sched_setaffinity"
 _WHICH = {"setpriority": 0, "ioprio_set": 1}  # and what says there that a process is meant
@@ -53,10 +53,10 @@ def never_was(path: str) -> bool:
 
 def _is_outside(number: int, caller: int, init: int) -> bool:
     """A number that is nobody's now may have been a child's: then nothing is said of it."""
-    process = reap.process_of(number)
+    process = procfs.process_of(number)
     if process == 0:
         return _never_was(number)
-    return process == init or (process != caller and not reap.is_below(process, init))
+    return process == init or (process != caller and not procfs.is_below(process, init))
 
 
 def _never_was(number: int) -> bool:

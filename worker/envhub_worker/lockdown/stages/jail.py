@@ -8,7 +8,7 @@ import os
 import signal
 
 from envhub_worker.lockdown.context import Common
-from envhub_worker.lockdown.mechanisms import capabilities, mounts, namespaces, process
+from envhub_worker.lockdown.mechanisms import mounts, namespaces, process, procfs
 from envhub_worker.lockdown.mechanisms.mounts import View
 from envhub_worker.lockdown.mechanisms.scratch import Scratch
 from envhub_worker.lockdown.report import Layer, LayerUnavailableError
@@ -136,10 +136,10 @@ def process_limit(limits: Limits, namespaced: bool) -> int:
 
 def _threads_of(uid: int) -> int:
     threads = 0
-    for name in os.listdir("/proc"):
+    for pid in procfs.pids():
         with contextlib.suppress(OSError):
-            if name.isdigit() and os.stat(f"/proc/{name}").st_uid == uid:
-                threads += len(os.listdir(f"/proc/{name}/task"))
+            if os.stat(f"/proc/{pid}").st_uid == uid:
+                threads += len(os.listdir(f"/proc/{pid}/task"))
     return threads
 
 
@@ -147,7 +147,7 @@ def _leave_the_zygote() -> None:
     """Own no namespace any more: the next user namespace is below the one that owns them."""
     namespaces.enter_user_namespace(namespaces.INSIDE_UID, namespaces.INSIDE_UID)
     namespaces.forbid_what_is_counted()
-    capabilities.drop_all()
+    process.drop_capabilities()
     process.set_no_new_privileges()
     process.set_dumpable(False)
     # The change of credentials disarmed it.

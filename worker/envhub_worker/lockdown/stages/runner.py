@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 
 from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.limits import rlimits
-from envhub_worker.lockdown.mechanisms import capabilities, landlock, process
+from envhub_worker.lockdown.mechanisms import landlock, process
 from envhub_worker.lockdown.mechanisms.landlock import DEVICE, READ, READ_DIR, WRITE, Rule
 from envhub_worker.lockdown.seccomp import filter
 from envhub_worker.lockdown.seccomp.paths import Own
@@ -58,7 +58,7 @@ def enter(
     process.set_dumpable(True)
     _be_killed_first()
     rlimits.apply(rlimits.wanted(jail.spec.confinement.limits, jail.processes))
-    capabilities.drop_all()
+    process.drop_capabilities()
     process.set_no_new_privileges()
     if jail.plan.landlock:
         wanted = landlock.ruleset(jail.common.landlock_abi, jail.common.config.network)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from functools import partial
 
 from envhub_worker.lockdown.context import JailContext
-from envhub_worker.lockdown.mechanisms import capabilities, process
+from envhub_worker.lockdown.mechanisms import process
 from envhub_worker.lockdown.mechanisms.kernel import CLONE_NEWUSER, mount, syscall, unshare
 from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp import filter
@@ -26,7 +26,7 @@ def run(jail: JailContext, descriptors: Iterable[int]) -> None:
     Raises:
         LayerUnavailableError: Layer ``self-test``: one of them does not hold.
     """
-    _hold("no capability is left", capabilities.held() == 0)
+    _hold("no capability is left", process.held_capabilities() == 0)
     _hold("no_new_privs is set", process.has_no_new_privileges())
     _hold("a system call filter is installed", filter.installed())
     for path, shared in jail.view.shared.items():

@@ -1,4 +1,4 @@
-"""What a server tells about itself: to its operator all of it, to a client what concerns it.
+"""A server's figures: its operator sees all of them, a client what concerns it.
 
 Plain values, made on the server's own thread and never changed afterwards, so that another may read
 them. Clients go by name, and what is counted by a word of theirs has a fixed list of words.
@@ -17,15 +17,14 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from envhub_worker import __version__
+from envhub_worker.access.audit.usage import Usage
 from envhub_worker.access.quotas import Permissions, Quotas
-from envhub_worker.access.sessions import Session
-from envhub_worker.access.telling.usage import Usage
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.text import printable
 from envhub_worker.supervisor.records import JailEntry
 
 MAX_CLIENTS = 256
-"""Names that are told apart; what comes after them is one."""
+"""Names that are kept apart; what comes after them is one."""
 OTHERS = "(others)"
 OPERATIONS = ("make_env", "reset", "step", "call", "get_attr", "set_attr", "render", "close")
 """What requests are counted by; a client may call its own anything."""
@@ -67,7 +66,7 @@ class Tally:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Facts:
+class ServerFigures:
     """What does not change while a server runs.
 
     Attributes:
@@ -113,7 +112,7 @@ class Facts:
 
 
 def pid_namespace() -> str:
-    """Where our process numbers hold; empty if the kernel does not tell."""
+    """Where our process numbers hold; empty if the kernel does not say."""
     with contextlib.suppress(OSError):
         return os.readlink("/proc/self/ns/pid")
     return ""
@@ -140,12 +139,8 @@ class Client:
         self.runners += len(entry.links)
         self.memory_limit_bytes += entry.jail.spec.confinement.limits.memory_bytes
 
-    def add_session(self, session: Session) -> None:
-        """Count a session."""
-        self.sessions += 1
 
-
-class Clients:
+class ClientFigures:
     """The shares of all clients, by name, and of no more names than can be counted."""
 
     def __init__(self) -> None:
@@ -168,7 +163,7 @@ class Clients:
         for name, memory in usage.memory_bytes.items():
             self.of(name).memory_bytes += memory
 
-    def told(self, name: str | None = None) -> Mapping[str, Any]:
+    def plain(self, name: str | None = None) -> Mapping[str, Any]:
         """As plain values: of everybody, or of one."""
         chosen = self.shares if name is None else {name: self.of(name)}
         return {one: asdict(share) for one, share in chosen.items()}

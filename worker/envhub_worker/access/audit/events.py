@@ -7,17 +7,18 @@ from collections.abc import Callable, Mapping
 from time import monotonic
 from typing import Any
 
+from envhub_worker.access.audit.log import Log
 from envhub_worker.access.sessions import WATCHER, Session
-from envhub_worker.access.telling.rate_limited_log import Log
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import KEY_BYTES, key_text
 from envhub_worker.protocol.messages import busy
 from envhub_worker.protocol.messages.busy import Busy
 from envhub_worker.protocol.shortages import shortage
 from envhub_worker.supervisor.records import Asker, JailEntry
+from envhub_worker.supervisor.witness import Witness
 
 
-class Events:
+class Events(Witness):
     """A line an event, under the name that the operator has given the client.
 
     Args:
@@ -53,66 +54,66 @@ class Events:
 
     def uploads(self, owner: bytes, snapshot: str, files: int, size: int) -> None:
         """A client is to bring so many files and bytes, which the server lacks of a snapshot."""
-        told = {"snapshot": snapshot, "files": files, "bytes": size}
-        self._client(owner, "upload", "info", **told)
+        fields = {"snapshot": snapshot, "files": files, "bytes": size}
+        self._client(owner, "upload", "info", **fields)
 
     def packages(self, owner: bytes, seconds: float, said: Mapping[str, Any]) -> None:
         """The program that makes packages has ended; what it says quotes a client."""
         made = said.get("made")
-        told = {name: made[name] for name in ("name", "bytes")} if made else {}
+        fields = {name: made[name] for name in ("name", "bytes")} if made else {}
         if "error" in said:
-            told = {"error": said["error"], "why": said["said"]}
+            fields = {"error": said["error"], "why": said["said"]}
         level = "warning" if "error" in said else "info"
-        self._client(owner, "packages", level, seconds=seconds, **told)
+        self._client(owner, "packages", level, seconds=seconds, **fields)
 
     def refused(self, asker: Asker, refused: m.Refused) -> None:
         """A request was not done. Who waits in line asks every second: that is said once."""
         owner, level = asker.session or asker.key, "warning"
-        told: dict[str, object] = {"error": refused.error, "why": refused.message}
+        fields: dict[str, object] = {"error": refused.error, "why": refused.message}
         if refused.error == busy.ERROR:
             found = Busy.read(refused.missing, refused.fix)
-            told |= {"quota": found.quota, "used": found.used, "limit": found.limit}
+            fields |= {"quota": found.quota, "used": found.used, "limit": found.limit}
             level = "debug" if (owner, found.quota) in self._in_line else level
             self._in_line.add((owner, found.quota))
         elif refused.missing:
-            told |= {"layer": refused.missing, "fix": refused.fix}
-        self._client(owner, "refused", level, **told)
+            fields |= {"layer": refused.missing, "fix": refused.fix}
+        self._client(owner, "refused", level, **fields)
 
-    # --- jails: the supervisor's witness -------------------------------------------------------
+    # --- jails ---------------------------------------------------------------------------------
 
     def opened(self, entry: JailEntry, runners: int, seconds: float) -> None:
         """A jail has come up, or further runners in it."""
         spec = entry.jail.spec
         self._in_line -= {one for one in self._in_line if one[0] == entry.session}
-        told = {**_jail(entry), "runners": runners, "seconds": seconds}
+        fields = {**_jail(entry), "runners": runners, "seconds": seconds}
         if entry.opened:
-            self._client(entry.session, "runners_started", "info", **told)
+            self._client(entry.session, "runners_started", "info", **fields)
             return
         self._count_opened(entry.session[:KEY_BYTES])
-        told |= {
+        fields |= {
             "environment": entry.name,
             "snapshot": spec.snapshot.rpartition("/")[2],
             "profile": spec.confinement.profile,
             "memory": spec.confinement.limits.memory_bytes,
         }
-        self._client(entry.session, "jail_opened", "info", **told)
+        self._client(entry.session, "jail_opened", "info", **fields)
 
     def lost(self, entry: JailEntry, death: m.Died) -> None:
         """A runner has died in a jail that goes on."""
-        told = {**_jail(entry), "environment": entry.name, "runner": death.runner, **_how(death)}
-        self._client(entry.session, "runner_died", "warning", **told)
+        fields = {**_jail(entry), "environment": entry.name, "runner": death.runner, **_how(death)}
+        self._client(entry.session, "runner_died", "warning", **fields)
 
     def died(self, entry: JailEntry) -> None:
         """A jail is dead; where it could not be made, its refusal says so."""
         refused = entry.death is not None and entry.death.reason == "unavailable"
         if entry.death is not None and (entry.opened or not refused):
-            told = {**_jail(entry), "environment": entry.name, **_how(entry.death), **_use(entry)}
-            self._client(entry.session, "jail_died", "warning", **told)
+            fields = {**_jail(entry), "environment": entry.name, **_how(entry.death), **_use(entry)}
+            self._client(entry.session, "jail_died", "warning", **fields)
 
     def closed(self, entry: JailEntry) -> None:
         """Nothing is left of a jail that its client has closed, or that the server ends with."""
-        told = {**_jail(entry), "environment": entry.name, **_use(entry)}
-        self._client(entry.session, "jail_closed", "info", **told)
+        fields = {**_jail(entry), "environment": entry.name, **_use(entry)}
+        self._client(entry.session, "jail_closed", "info", **fields)
 
     def failed(self, error: Exception) -> None:
         """Our own mistake, with the way to it; what this machine has no more of is none."""
@@ -124,10 +125,10 @@ class Events:
         why = f"{type(error).__name__}: {error}"
         self._log.say("server_error", "error", why=why, traceback=way)
 
-    def _client(self, owner: bytes, event: str, level: str, **fields: object) -> None:
+    def _client(self, owner: bytes, event: str, level: str, **more: object) -> None:
         key = owner[:KEY_BYTES]
         who = {"client": self._name_of(key) or _nameless(key), "session": session_id(owner)}
-        self._log.say(event, level, whose=key_text(key), **who, **fields)
+        self._log.say(event, level, whose=key_text(key), **who, **more)
 
 
 def session_id(owner: bytes) -> str:
@@ -145,13 +146,13 @@ def _jail(entry: JailEntry) -> dict[str, object]:
 
 def _how(death: m.Died) -> dict[str, object]:
     """Trust: the detail may quote a jail."""
-    told = {
+    fields = {
         "reason": death.reason,
         "signal": death.signal,
         "exit_code": death.exit_code,
         "detail": death.detail or None,
     }
-    return {name: value for name, value in told.items() if value is not None}
+    return {name: value for name, value in fields.items() if value is not None}
 
 
 def _use(entry: JailEntry) -> dict[str, object]:

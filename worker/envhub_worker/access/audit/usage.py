@@ -6,12 +6,14 @@ wait for. What it says of a process that came and went between two looks is noth
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+
+from envhub_worker.lockdown.mechanisms import procfs
 
 EVERY_S = 5.0
 _MOST_PROCESSES = 65_536
@@ -98,37 +100,28 @@ def _members(jails: Mapping[int, str]) -> Iterator[tuple[Process, str]]:
 
 
 def look_at(pid: int) -> Process | None:
-    """A process as the kernel tells of it, or None if it has gone."""
+    """A process as the kernel describes it, or None if it has gone."""
     try:
-        text = Path(f"/proc/{pid}/stat").read_bytes()
-        # the command may hold anything, parentheses and blanks included
-        words = text.rpartition(b")")[2].split()
+        words = procfs.stat(pid)
         spent = (int(words[_USER]) + int(words[_SYSTEM])) / _TICKS_A_S
         resident = int(words[_RESIDENT]) * _PAGE
         started = int(words[_STARTED])
+        return Process(pid, started, spent, _share(pid, resident))
     except (OSError, ValueError, IndexError):
         return None
-    return Process(pid, started, spent, _share(pid, resident))
 
 
 def _share(pid: int, resident: int) -> int:
     """What a process would give back: pages that it shares count in part."""
-    try:
-        for line in Path(f"/proc/{pid}/smaps_rollup").read_bytes().splitlines():
-            if line.startswith(b"Pss:"):
-                return int(line.split()[1]) * 1024
-    except (OSError, ValueError, IndexError):
-        pass
+    with contextlib.suppress(OSError):
+        return procfs.numbers(f"/proc/{pid}/smaps_rollup").get(b"Pss", resident)
     return resident
 
 
 def children(pid: int) -> list[int]:
     """The numbers of a process's children; none where the kernel does not tell."""
     found = list[int]()
-    try:
+    with contextlib.suppress(OSError):
         for thread in os.listdir(f"/proc/{pid}/task"):
-            text = Path(f"/proc/{pid}/task/{thread}/children").read_bytes()
-            found += map(int, text.split())
-    except (OSError, ValueError):
-        return found
+            found += map(int, procfs.content(f"/proc/{pid}/task/{thread}/children").split())
     return found

@@ -1,24 +1,24 @@
-"""Who goes: sessions that nothing holds any more, and jails whose client let go of them."""
+"""The end of sessions that nothing holds any more, and of jails whose client let go of them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from envhub_worker.access.audit.events import Events
 from envhub_worker.access.sessions import Session, Sessions
 from envhub_worker.access.store.uploads import Uploads
-from envhub_worker.access.telling.events import Events
 from envhub_worker.supervisor.jails import Jails
 
 _FORGOTTEN_S = 3600.0
 """Where silent clients keep their jails, those without any are forgotten after so long."""
 
 
-class Departures:
+class SessionExpiry:
     """Ends sessions of a ``RemoteGate``.
 
     Args:
         idle_s: How long the jails of a client that says nothing live on; 0 for ever.
-        open_wires: The connections that are there now; None if nobody counts them.
+        open_wires: The connections that are there now; None if they are not counted.
     """
 
     def __init__(
