@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 
 from envhub_worker.protocol.confinement import Confinement
-from envhub_worker.spawn.spawner import Failed
+from envhub_worker.spawn.jail import Failed
 from tests.integration.confinement_kit import (
     KIT,
     Cell,
@@ -541,7 +541,7 @@ result = "came back"
 
     def gone() -> bool:
         cell.pump()
-        ended[:] = [e for e in cell.events if isinstance(e, RunnerExited) and e.runner_id == runner]
+        ended[:] = [e for e in cell.events if isinstance(e, RunnerExited) and e.runner == runner]
         return bool(ended)
 
     wait_until(gone, "no exit event")
@@ -654,7 +654,7 @@ sys.path.insert(0, {kit!r})
 from pathlib import Path
 from confinement_kit import *
 from envhub_worker.protocol.confinement import Confinement
-from envhub_worker.spawn.spawner import Failed
+from envhub_worker.spawn.jail import Failed
 from envhub_worker.lockdown.seccomp import bpf, filter as seccomp
 from envhub_worker.lockdown.mechanisms import namespaces, process
 from envhub_worker.lockdown.seccomp.bpf import LOAD, RETURN, JUMP_EQUAL, Branch, Do, Label

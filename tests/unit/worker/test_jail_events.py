@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from envhub_worker.spawn.events import Denied, RunnerExited
+from envhub_worker.spawn.jail import Denied, RunnerExited
 from envhub_worker.supervisor.jail_events import JailEvents
 from envhub_worker.supervisor.records import JailEntry, whole_jail
 from envhub_worker.supervisor.witness import Witness

@@ -14,11 +14,11 @@ from envhub_sandbox.system.locks import held
 from envhub_sandbox.system.shared_lock import sharers
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.runtime import RECORD, Runtime
-from envhub_worker.spawn.spawner import RUNNER_TARGET, Failed, RunnerExited
+from envhub_worker.spawn.jail import Failed, RunnerExited, RunnerStarted
+from envhub_worker.spawn.spawner import RUNNER_TARGET
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from tests.integration.confinement_kit import (
     Cell,
-    Ready,
     make_snapshot,
     new_cell,
     open_folder,
@@ -133,7 +133,7 @@ def test_packages_that_cannot_be_read_are_told(
         cell = new_cell(spawner, make_snapshot(folder), confinement)
         cell.start()
         failed = cell.wait_for(Failed)
-        assert not [event for event in cell.events if isinstance(event, Ready)]
+        assert not [event for event in cell.events if isinstance(event, RunnerStarted)]
     packages.chmod(0o755)
     assert failed.layer == "packages"
     assert str(runtime.packages) in failed.reason

@@ -21,7 +21,6 @@ from envhub_worker.spawn.zygote_process import ZygoteProcess
 from tests.integration.confinement_kit import (
     Cell,
     JailExited,
-    Ready,
     RunnerExited,
     RunnerStarted,
     cell_in,
@@ -71,11 +70,10 @@ def processes_that_mention(text: str) -> list[int]:
 
 
 def test_runner_runs_code_and_is_announced_with_its_layers(cell: Cell) -> None:
-    """Ready, then RunnerStarted with a report, and the stream reaches the runner."""
+    """RunnerStarted with a report, and the stream reaches the runner."""
     assert cell.run("result = 6 * 7") == {"result": 42}
-    cell.wait_for(Ready)
     started = cell.wait_for(RunnerStarted)
-    assert started.runner_id == 1
+    assert started.runner == 1
     assert {"no-new-privileges", "rlimits"} <= {layer["layer"] for layer in started.report}
     assert all(layer["enforced"] in (True, False) for layer in started.report)
 
@@ -165,7 +163,7 @@ def test_killed_runner_takes_its_children_along(cell: Cell, folder: Path) -> Non
     wait_until(lambda: processes_that_mention(mark), "the child never came")
     cell.jail.kill_runner(1)
     exited = cell.wait_for(RunnerExited)
-    assert (exited.runner_id, exited.reason) == (1, "killed")
+    assert (exited.runner, exited.reason) == (1, "killed")
     wait_until(lambda: not processes_that_mention(mark), "the child lived on")
     assert cell.run("result = 1", second) == {"result": 1}
 
@@ -230,7 +228,9 @@ def test_a_process_that_started_ahead_is_used(folder: Path, confinement: Confine
         cell.start()
         assert cell.run("import sys; result = 'gymnasium' in sys.modules") == {"result": True}
         assert inside.zygote_pid(spawner) == ahead.pid
-        layers = {layer["layer"] for layer in cell.wait_for(Ready).report if layer["enforced"]}
+        layers = {
+            layer["layer"] for layer in cell.wait_for(RunnerStarted).report if layer["enforced"]
+        }
         assert {"self-test", "seccomp"} <= layers
     assert not os.path.exists(f"/proc/{ahead.pid}")
 

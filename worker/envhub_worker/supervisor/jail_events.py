@@ -16,14 +16,8 @@ from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.spawn.channel import close_fds
-from envhub_worker.spawn.spawner import (
-    Denied,
-    Failed,
-    JailExited,
-    RunnerExited,
-    RunnerStarted,
-    ZygoteDied,
-)
+from envhub_worker.spawn.jail import Denied, Failed, RunnerExited, RunnerStarted
+from envhub_worker.spawn.spawner import JailExited, ZygoteDied
 from envhub_worker.supervisor.fd_store import FdStore
 from envhub_worker.supervisor.records import (
     JailEntry,
@@ -149,10 +143,10 @@ class JailEvents:
                 self._denied(entry, event)
 
     def _runner_started(self, entry: JailEntry, event: RunnerStarted) -> None:
-        entry.pids[event.runner_id] = event.pid
+        entry.pids[event.runner] = event.pid
         entry.report = tuple(event.report)
         for opening in list(entry.opening):
-            opening.waiting.discard(event.runner_id)
+            opening.waiting.discard(event.runner)
             if not opening.waiting:
                 entry.opening.remove(opening)
                 opened = m.JailOpened(entry.number, opening.runners, entry.report)
@@ -170,7 +164,7 @@ class JailEvents:
 
     def _runner_exited(self, entry: JailEntry, event: RunnerExited) -> None:
         death = m.Died(
-            event.runner_id,
+            event.runner,
             event.reason,
             exit_code=event.code,
             signal=signal_name(event.signal),

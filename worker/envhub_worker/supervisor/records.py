@@ -12,7 +12,7 @@ from envhub_worker.lockdown.mechanisms import procfs
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.confinement import Reason
-from envhub_worker.spawn.spawner import Jail
+from envhub_worker.spawn.jail import Jail
 from envhub_worker.supervisor.idle_timer import Idleness
 from envhub_worker.supervisor.output_tail import OutputTail
 from envhub_worker.supervisor.runner_stream import RunnerLink

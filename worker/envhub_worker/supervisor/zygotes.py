@@ -9,7 +9,8 @@ from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.loop import Loop
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.runtime import Runtime
-from envhub_worker.spawn.spawner import Jail, JailExited, Spawner
+from envhub_worker.spawn.jail import Jail
+from envhub_worker.spawn.spawner import JailExited, Spawner
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from envhub_worker.supervisor.jail_events import JailEvents
 from envhub_worker.supervisor.records import JailEntry
