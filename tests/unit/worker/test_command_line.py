@@ -8,13 +8,13 @@ import pytest
 
 from envhub_worker.__main__ import main
 from envhub_worker.access.quotas import Quotas
-from envhub_worker.cli import listen
+from envhub_worker.cli import listen_options
 
 
 def parsed(*arguments: str) -> argparse.Namespace:
     """What ``listen`` is told."""
     parser = argparse.ArgumentParser()
-    listen.add_arguments(parser)
+    listen_options.add_options(parser)
     return parser.parse_args(arguments)
 
 
