@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import pytest
 
-from envhub_worker.lockdown.limits import rlimits
 from envhub_worker.lockdown.mechanisms import landlock
 from envhub_worker.lockdown.mechanisms.landlock import Ruleset
 from envhub_worker.lockdown.mechanisms.namespaces import user_namespace_unavailable
 from envhub_worker.lockdown.plan import HostFacts, plan
 from envhub_worker.lockdown.report import LayerUnavailableError
+from envhub_worker.lockdown.stages.runner import resource_limits
 from envhub_worker.protocol.confinement import GIB, MIB, Confinement, Limits
 
 USER = HostFacts(machine="x86_64", root=False, landlock_abi=7, memory="watchdog")
@@ -181,7 +181,7 @@ def test_landlock_write_includes_neither_devices_nor_more_than_abi_one_to_five()
 def test_rlimits_follow_the_limits() -> None:
     """Exactly these; a file may not be larger than the disk."""
     limits = Limits(open_files=9, disk_bytes=77, cpu_s=5)
-    assert rlimits.wanted(limits, 12) == {
+    assert resource_limits(limits, 12) == {
         resource.RLIMIT_CORE: (0, 0),
         resource.RLIMIT_FSIZE: (77, 77),
         resource.RLIMIT_NOFILE: (9, 9),

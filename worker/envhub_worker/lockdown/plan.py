@@ -6,12 +6,12 @@ a weaker profile goes without are listed too, with what stays possible.
 
 from __future__ import annotations
 
-from envhub_worker.lockdown.report import Layer, LayerUnavailableError
+from envhub_worker.lockdown.report import Layer, LayerUnavailableError, no_system_calls
 from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
 from envhub_worker.protocol.confinement import LEAST_LANDLOCK, MIB, NETWORKS, PROFILES, Confinement
 from envhub_worker.protocol.records import dataclass
 
-#: What the kernel counts per user and nobody can bound per jail.
+#: What the kernel counts per user and does not bound per jail.
 SHARED_QUOTAS = "pages of pipes, descriptors under way in sockets, epoll watches"
 
 # Without a pid namespace Landlock must itself guard signals: from this ABI on it does. Before it,
@@ -60,16 +60,11 @@ def plan(confinement: Confinement, facts: HostFacts) -> Plan:
     Raises:
         LayerUnavailableError: The profile names a layer that the host lacks.
     """
-    _check_names(confinement)
-    _check_seccomp(facts)
-    namespaced = confinement.profile == "strict"
-    landlock = _wants_landlock(confinement, facts)
-    if not namespaced and confinement.network == "loopback":
-        raise LayerUnavailableError(
-            "network-namespace",
-            f"the profile {confinement.profile} has no network of its own to give",
-            'Use profile "strict", or the network "none".',
-        )
+    landlock = _check(confinement, facts)
+    limits, namespaced = confinement.limits, confinement.profile == "strict"
+    ignored = "" if namespaced else "; changes of mode, owner and time are accepted and ignored"
+    cpu = "" if limits.cpu_s is None else f", {limits.cpu_s} CPU seconds"
+    rlimits = f"{limits.processes} processes, {limits.open_files} open files{cpu}, no core dumps"
     layers = [
         *_user_layers(facts, namespaced),
         *(_namespace_layers(confinement) if namespaced else _without_namespaces(confinement)),
@@ -77,15 +72,16 @@ def plan(confinement: Confinement, facts: HostFacts) -> Plan:
         Layer("no-new-privileges", True, "set-user-id programs gain nothing"),
         _landlock_layer(landlock, facts),
         *_signal_layers(facts, namespaced),
-        Layer("seccomp", True, _seccomp_detail(facts, namespaced)),
-        Layer("rlimits", True, _rlimits_detail(confinement)),
+        Layer("seccomp", True, f"allow-list for {facts.machine}{ignored}"),
+        Layer("rlimits", True, rlimits),
         *_limit_layers(confinement, facts, namespaced),
     ]
     measured = facts.memory == "watchdog"
     return Plan(namespaced=namespaced, landlock=landlock, measured=measured, layers=tuple(layers))
 
 
-def _check_names(confinement: Confinement) -> None:
+def _check(confinement: Confinement, facts: HostFacts) -> bool:
+    """Refuse what there cannot be; whether there is Landlock."""
     for name, value, known in (
         ("profile", confinement.profile, PROFILES),
         ("network", confinement.network, NETWORKS),
@@ -94,18 +90,8 @@ def _check_names(confinement: Confinement) -> None:
             raise LayerUnavailableError(
                 name, f"there is no {name} {value!r}", f"Choose one of {', '.join(known)}."
             )
-
-
-def _check_seccomp(facts: HostFacts) -> None:
     if facts.machine not in NUMBERS:
-        raise LayerUnavailableError(
-            "seccomp",
-            f"no system call table for {facts.machine}",
-            "Run on x86-64 or aarch64, or in a container on such a host.",
-        )
-
-
-def _wants_landlock(confinement: Confinement, facts: HostFacts) -> bool:
+        raise no_system_calls(facts.machine)
     least = LEAST_LANDLOCK[confinement.profile]
     if facts.landlock_abi < least:
         have = f"ABI {facts.landlock_abi}" if facts.landlock_abi else "none"
@@ -114,6 +100,12 @@ def _wants_landlock(confinement: Confinement, facts: HostFacts) -> bool:
             f"the profile {confinement.profile} needs Landlock ABI {least}, this kernel has {have}",
             "ABI 1 came with Linux 5.13, 3 with 6.2; it must be in the kernel's lsm= list, and a "
             "container's seccomp profile must allow it.",
+        )
+    if confinement.profile != "strict" and confinement.network == "loopback":
+        raise LayerUnavailableError(
+            "network-namespace",
+            f"the profile {confinement.profile} has no network of its own to give",
+            'Use profile "strict", or the network "none".',
         )
     return facts.landlock_abi > 0
 
@@ -129,14 +121,11 @@ def _user_layers(facts: HostFacts, namespaced: bool) -> list[Layer]:
 
 def _namespace_layers(confinement: Confinement) -> list[Layer]:
     limits = confinement.limits
+    scratch = f"one tmpfs of {limits.disk_bytes // MIB} MiB and {limits.disk_files} files"
     return [
         Layer("pid-namespace", True, "sees, signals and outlives no process but its own"),
         Layer("mount-namespace", True, "a private read-only root; other files do not exist"),
-        Layer(
-            "scratch",
-            True,
-            f"one tmpfs of {limits.disk_bytes // MIB} MiB and {limits.disk_files} files",
-        ),
+        Layer("scratch", True, scratch),
         _network_layer(confinement.network),
         Layer("ipc-namespace", True, "its own System V and POSIX objects"),
         Layer("uts-namespace", True, "a host name that says nothing"),
@@ -153,17 +142,14 @@ def _network_layer(network: str) -> Layer:
 
 def _without_namespaces(confinement: Confinement) -> list[Layer]:
     why = f"the profile {confinement.profile} goes without"
+    network = Layer("network", True, "no socket can be made but connected local pairs")
+    if confinement.network == "host":
+        network = Layer("network", False, "the host's network, by explicit choice")
     return [
         Layer("pid-namespace", False, f"{why}: processes of the host are visible"),
         Layer("mount-namespace", False, f"{why}: names and sizes of the host's files are visible"),
-        _bare_network_layer(confinement.network),
+        network,
     ]
-
-
-def _bare_network_layer(network: str) -> Layer:
-    if network == "host":
-        return Layer("network", False, "the host's network, by explicit choice")
-    return Layer("network", True, "no socket can be made but connected local pairs")
 
 
 def _landlock_layer(landlock: bool, facts: HostFacts) -> Layer:
@@ -178,24 +164,6 @@ def _signal_layers(facts: HostFacts, namespaced: bool) -> list[Layer]:
     if not needs_broker(namespaced=namespaced, landlock_abi=facts.landlock_abi):
         return []
     return [Layer("signals", True, "sent by the jail's init, to processes of the jail only")]
-
-
-def _seccomp_detail(facts: HostFacts, namespaced: bool) -> str:
-    extra = "" if namespaced else "; changes of mode, owner and time are accepted and ignored"
-    return f"allow-list for {facts.machine}{extra}"
-
-
-def _rlimits_detail(confinement: Confinement) -> str:
-    limits = confinement.limits
-    cpu = "" if limits.cpu_s is None else f", {limits.cpu_s} CPU seconds"
-    return f"{limits.processes} processes, {limits.open_files} open files{cpu}, no core dumps"
-
-
-def _quota_layer(facts: HostFacts) -> Layer:
-    """What the kernel counts per user, and a jail therefore takes from others' share."""
-    if facts.root:
-        return Layer("user-quotas", True, "its own: no other program runs as this user")
-    return Layer("user-quotas", False, f"shared with this user's programs: {SHARED_QUOTAS}")
 
 
 def _uncounted(confinement: Confinement, facts: HostFacts, namespaced: bool) -> str:
@@ -222,7 +190,11 @@ def _limit_layers(confinement: Confinement, facts: HostFacts, namespaced: bool) 
         "cgroup-v1": f"{amount}, counted by the kernel (cgroup v1)",
         "watchdog": f"{amount}, measured by the jail's init; bursts between two looks overshoot",
     }
-    layers = [Layer("memory", True, detail[facts.memory] + uncounted), _quota_layer(facts)]
+    # what the kernel counts per user, and a jail therefore takes from others' share
+    quotas = Layer("user-quotas", False, f"shared with this user's programs: {SHARED_QUOTAS}")
+    if facts.root:
+        quotas = Layer("user-quotas", True, "its own: no other program runs as this user")
+    layers = [Layer("memory", True, detail[facts.memory] + uncounted), quotas]
     if not namespaced:
         disk = f"{confinement.limits.disk_bytes // MIB} MiB, measured by the jail's init"
         layers.append(Layer("scratch", True, disk))

@@ -37,3 +37,12 @@ class LayerUnavailableError(Exception):
     def to_wire(self) -> dict[str, str]:
         """Plain data: ``{"layer", "reason", "fix"}``."""
         return {"layer": self.layer, "reason": self.reason, "fix": self.fix}
+
+
+def no_system_calls(machine: str) -> LayerUnavailableError:
+    """There is no table of system calls for ``machine``."""
+    return LayerUnavailableError(
+        "seccomp",
+        f"no system call table for {machine}",
+        "Run on x86-64 or aarch64, or in a container on such a host.",
+    )

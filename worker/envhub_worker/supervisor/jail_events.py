@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable
 from time import monotonic
 
-from envhub_worker.lockdown.limits import around
+from envhub_worker.lockdown.limits.cgroups import OUTER_LIMIT, SurroundingLimit
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import ProtocolError
@@ -59,7 +59,7 @@ class JailEvents:
         self._fds = fds
         self._witness = witness
         self.deaths: Counter[str] = Counter()
-        self._around = around.Around()
+        self._outer_limit = SurroundingLimit()
 
     def follow(self, entry: JailEntry) -> None:
         """Hear of a new jail from now on."""
@@ -175,8 +175,8 @@ class JailEvents:
     def _judged(self, entry: JailEntry, death: m.Died) -> m.Died:
         """A kill is the kernel's, where it has counted one for the memory around all of us."""
         by_signal = death.signal == "SIGKILL" and death.reason in ("signal", "exit")
-        if entry.death is None and by_signal and self._around.killed_one():
-            return m.replace(death, reason="out-of-memory", detail=around.WHY)
+        if entry.death is None and by_signal and self._outer_limit.killed_one():
+            return m.replace(death, reason="out-of-memory", detail=OUTER_LIMIT)
         return death
 
     def ended_with_the_server(self) -> None:
@@ -187,7 +187,7 @@ class JailEvents:
 
     def close(self) -> None:
         """Nothing happens any more."""
-        self._around.close()
+        self._outer_limit.close()
 
     def _runner_died(self, entry: JailEntry, death: m.Died) -> None:
         """The end of its jail too, unless that is kept."""
