@@ -28,7 +28,7 @@ from envhub_sandbox.errors import ServerBusyError, WorkerDiedError
 from envhub_worker.access.audit import figures, usage
 from envhub_worker.cli import http_port
 from envhub_worker.cli.http_port import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpPort, parse_address
-from envhub_worker.cli.metrics import STALE_S, Page
+from envhub_worker.cli.metrics import STALE_S, MetricsPage
 from tests.remote.listening import WORKER, Listening, listening
 from tests.support.processes import eventually
 
@@ -174,7 +174,7 @@ def test_readiness_is_red_in_a_drain(tmp_path: Path, repository: Path) -> None:
 def test_a_server_that_is_stuck_is_not_healthy(one: Watched) -> None:
     """Its port's own thread says so; there is nothing of last week's to read."""
     now = [0.0]
-    page = Page(True, lambda _: ("text/plain", b"figures"), lambda: now[0])
+    page = MetricsPage(True, lambda _: ("text/plain", b"figures"), lambda: now[0])
     assert page.answer("/healthz").status == page.answer("/metrics").status == 503
     page.publish({"draining_s": None})
     assert page.answer("/metrics").body == b"figures"
@@ -182,7 +182,7 @@ def test_a_server_that_is_stuck_is_not_healthy(one: Watched) -> None:
     now[0] = STALE_S + 1
     for path in ("/metrics", "/healthz", "/readyz"):
         assert page.answer(path).status == 503
-    unusable = Page(False, lambda _: ("text/plain", b""), lambda: now[0])
+    unusable = MetricsPage(False, lambda _: ("text/plain", b""), lambda: now[0])
     unusable.publish({"draining_s": None})
     assert unusable.answer("/readyz").status == 503
     assert unusable.answer("/healthz").status == 200

@@ -23,7 +23,7 @@ from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerEr
 from envhub_sandbox.transport.tcp import Link
 from envhub_worker.access import keys
 from envhub_worker.access.audit.log import LINES, PERIOD_S, Log
-from envhub_worker.access.gate import Arrived, Asked
+from envhub_worker.access.gate import ClientRequest, Incoming
 from envhub_worker.access.keys import AuthorizedClients
 from envhub_worker.access.packages import Packages
 from envhub_worker.access.port.connection_limit import ConnectionLimiter
@@ -173,10 +173,10 @@ def test_a_message_without_a_proved_key_is_refused(tmp_path: Path) -> None:
     """Where keys are needed an empty one is nobody's: neither a session nor a request."""
     gate, sessions = _gate(tmp_path), Sessions()
     with pytest.raises(RefusedError, match="not authorised"):
-        gate.greet(Arrived(b"id", b"", []), b"name", sessions, None)  # type: ignore[arg-type]
+        gate.greet(Incoming(b"id", b"", []), b"name", sessions, None)  # type: ignore[arg-type]
     asker = Asker(b"id", 1, b"x" * 40, b"")
     with pytest.raises(RefusedError, match="not authorised"):
-        gate.authorize(Asked(asker, m.GetSessions(), (), sessions, None))  # type: ignore[arg-type]
+        gate.authorize(ClientRequest(asker, m.GetSessions(), (), sessions, None))  # type: ignore[arg-type]
 
 
 def test_captured_bytes_are_worth_nothing(server: Listening, repository: Path, good: Any) -> None:

@@ -17,9 +17,9 @@ import re
 import resource
 from collections.abc import Sequence
 
+from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import landlock, process
 from envhub_worker.lockdown.mechanisms.landlock import READ, WRITE, Rule
-from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp import filter
 
 _LIMITS = (

@@ -15,7 +15,7 @@ from typing import Any
 import zmq
 
 from envhub_worker import __version__
-from envhub_worker.access.gate import Arrived, Asked, Gate, LocalGate
+from envhub_worker.access.gate import ClientRequest, Gate, Incoming, LocalGate
 from envhub_worker.access.sessions import Sessions
 from envhub_worker.lockdown.mechanisms.scratch import remove_tree
 from envhub_worker.loop import Loop, has_message, send
@@ -139,7 +139,7 @@ class Server:
                 return
             self._serve(self._gate.receive(self._router))
 
-    def _serve(self, arrived: Arrived) -> None:
+    def _serve(self, arrived: Incoming) -> None:
         identity, key, frames, _ = arrived
         if not frames:
             return
@@ -174,14 +174,14 @@ class Server:
         refused = RefusedError("LocalProtocolError", f"the request cannot be read: {said}")
         self.reply(Asker(identity, number, b"", key), refused.reply)
 
-    def _dispatch(self, asker: Asker, request: m.Message, arrived: Arrived) -> m.Message | None:
+    def _dispatch(self, asker: Asker, request: m.Message, arrived: Incoming) -> m.Message | None:
         """The reply; None where it was sent, or comes later. Raises ``AnsweredError``."""
         if isinstance(request, m.Hello):
             return self._hello(request, arrived)
         payload = arrived.frames[1:]
         if not asker.session:
             raise RefusedError("HelloError", "say Hello first")
-        asked = Asked(asker, request, payload, self._sessions, self._jails)
+        asked = ClientRequest(asker, request, payload, self._sessions, self._jails)
         request = self._gate.authorize(asked)
         if isinstance(request, m.Relay):
             self._jails.relay(asker, request, payload)
@@ -207,7 +207,7 @@ class Server:
     def _compression(self, identity: bytes, key: bytes) -> str:
         return self._sessions.compression(identity, key) if self._gate.compresses else ""
 
-    def _hello(self, request: m.Hello, arrived: Arrived) -> m.Message:
+    def _hello(self, request: m.Hello, arrived: Incoming) -> m.Message:
         if request.version != m.VERSION:
             raise RefusedError(
                 "VersionMismatchError",

@@ -7,13 +7,13 @@ import subprocess
 import sys
 
 from envhub_worker.lockdown.mechanisms import procfs
-from envhub_worker.supervisor.usage import Counting, usage_of
+from envhub_worker.supervisor.usage import CountLimit, usage_of
 
 
 def test_who_asks_too_often_is_not_counted_for() -> None:
     """Some at once, and then as many as the server has time for; no more are saved up."""
     time = [0.0]
-    counting = Counting(lambda: time[0])
+    counting = CountLimit(lambda: time[0])
 
     def granted() -> int:
         count = 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from envhub_worker.spawn.jail import Denied, RunnerExited
+from envhub_worker.spawn.jail import CallDenied, RunnerExited
 from envhub_worker.supervisor.jail_events import JailEvents
 from envhub_worker.supervisor.records import JailEntry, whole_jail
 from envhub_worker.supervisor.witness import Witness
@@ -37,7 +37,7 @@ class _Silent:
 
 def test_what_a_jail_was_denied_is_known_when_it_is_ended() -> None:
     """Also if what ends it is heard of first, on another descriptor; and it dies of that."""
-    tried = Denied("socket", "AF_INET")
+    tried = CallDenied("socket", "AF_INET")
     jail: Any = _Jail(tried, RunnerExited(1, None, 9, "signal"))
     silent: Any = _Silent()
     entry = JailEntry(7, "one", b"", jail, (), silent)

@@ -6,8 +6,8 @@ import posixpath
 
 import pytest
 
-from envhub_worker.lockdown.gpus import Granted, gpu_devices, gpus, granted
-from envhub_worker.lockdown.report import LayerUnavailableError
+from envhub_worker.lockdown.gpus import GpuGrant, gpu_devices, gpus, granted
+from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.root_plan import HostFiles, plan_root
 
 PCI = "/sys/devices/pci0000:00"
@@ -103,11 +103,11 @@ def test_all_is_what_computes_and_renders() -> None:
 
 def test_a_chosen_gpu_is_its_own_nodes_and_folders() -> None:
     """With what leads to it; nothing of the others, nor of AMD's driver."""
-    assert granted((0,), SERVER) == Granted(
+    assert granted((0,), SERVER) == GpuGrant(
         ("/dev/dri/renderD129", "/dev/nvidia-uvm", "/dev/nvidia1", "/dev/nvidiactl"),
         ("/sys/bus/pci/devices/0000:01:00.0", "/sys/class/drm/renderD129", "/sys/dev/char/226:129"),
     )
-    assert granted((3,), SERVER) == Granted(
+    assert granted((3,), SERVER) == GpuGrant(
         ("/dev/dri/renderD128", "/dev/kfd"),
         (
             *("/sys/bus/pci/devices/0000:00:02.0", "/sys/class/drm/renderD128"),
@@ -141,7 +141,7 @@ def test_what_a_device_in_a_device_is_part_of_is_its_folder() -> None:
 
 def test_nothing_is_granted_unasked() -> None:
     """Whatever there is."""
-    assert granted(False, SERVER) == Granted()
+    assert granted(False, SERVER) == GpuGrant()
 
 
 @pytest.mark.parametrize("gpu", [True, (0,)])

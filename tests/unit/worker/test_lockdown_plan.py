@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import pytest
 
+from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import landlock
 from envhub_worker.lockdown.mechanisms.landlock import Ruleset
 from envhub_worker.lockdown.mechanisms.namespaces import user_namespace_unavailable
 from envhub_worker.lockdown.plan import HostFacts, plan
-from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.stages.runner import resource_limits
 from envhub_worker.protocol.confinement import GIB, MIB, Confinement, Limits
 

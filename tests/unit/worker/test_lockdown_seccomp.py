@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_worker.lockdown.report import LayerUnavailableError
+from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.seccomp import bpf, filter
 from envhub_worker.lockdown.seccomp.bpf import Instruction
 from envhub_worker.lockdown.seccomp.policy import (

@@ -11,16 +11,16 @@ from pathlib import Path
 import pytest
 
 from envhub_worker.cli import state_folder, status
-from envhub_worker.cli.state_folder import Note, Noted
+from envhub_worker.cli.state_folder import Note, ServerNote
 
-A = Noted("tcp://127.0.0.1:1", "insecure", "/a key")
-B = Noted("tcp://127.0.0.1:2", "insecure", "/b")
+A = ServerNote("tcp://127.0.0.1:1", "insecure", "/a key")
+B = ServerNote("tcp://127.0.0.1:2", "insecure", "/b")
 
 _WRITER = """
 import os, signal, sys
 from pathlib import Path
-from envhub_worker.cli.state_folder import Note, Noted
-Note(Path(sys.argv[1]), Noted("tcp://127.0.0.1:1", "insecure", "/a"))
+from envhub_worker.cli.state_folder import Note, ServerNote
+Note(Path(sys.argv[1]), ServerNote("tcp://127.0.0.1:1", "insecure", "/a"))
 os.kill(os.getpid(), signal.SIGKILL)
 """
 

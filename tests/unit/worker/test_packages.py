@@ -14,7 +14,7 @@ from envhub_sandbox.system.locks import held
 from envhub_sandbox.system.shared_lock import sharers
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.runtime import RECORD, Runtime
-from envhub_worker.spawn.jail import Failed, RunnerExited, RunnerStarted
+from envhub_worker.spawn.jail import JailFailed, RunnerExited, RunnerStarted
 from envhub_worker.spawn.spawner import RUNNER_TARGET
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from tests.integration.confinement_kit import (
@@ -132,7 +132,7 @@ def test_packages_that_cannot_be_read_are_told(
     with spawner_in(folder, confinement, runtime=runtime) as spawner:
         cell = new_cell(spawner, make_snapshot(folder), confinement)
         cell.start()
-        failed = cell.wait_for(Failed)
+        failed = cell.wait_for(JailFailed)
         assert not [event for event in cell.events if isinstance(event, RunnerStarted)]
     packages.chmod(0o755)
     assert failed.layer == "packages"
@@ -168,7 +168,7 @@ def test_what_is_removed_all_the_same_is_not_blamed_on_the_kernel(
         gone = runtime.packages if what == "packages" else snapshot
         remove_tree(Path(gone))
         late = new_cell(spawner, snapshot, confinement)
-        failed = late.wait_for(Failed)
+        failed = late.wait_for(JailFailed)
     assert gone in failed.reason
     assert "was removed after this server began to use it" in failed.reason
     assert "call make_env again" in failed.fix

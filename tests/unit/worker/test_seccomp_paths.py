@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from envhub_worker.lockdown.seccomp.paths import Own, asked
+from envhub_worker.lockdown.seccomp.paths import OwnPaths, asked
 
-_OWN = Own(changed=("/sandbox/work", "/dev/null"), read=("/home/me/python",))
+_OWN = OwnPaths(changed=("/sandbox/work", "/dev/null"), read=("/home/me/python",))
 _HERE = -100 & 0xFFFFFFFFFFFFFFFF
 _WRITING = os.O_WRONLY | os.O_CREAT
 
@@ -22,7 +22,7 @@ def ask(
     call: str,
     *words: int | bytes,
     waits: Callable[[], object] = lambda: None,
-    own: Own = _OWN,
+    own: OwnPaths = _OWN,
 ) -> list[tuple[str, str]]:
     """What a call of this thread's is seen to ask for; bytes stand where their address would."""
     buffers = [ctypes.create_string_buffer(one) for one in words if isinstance(one, bytes)]
@@ -133,7 +133,7 @@ def test_nothing_is_read_of_who_has_gone() -> None:
 
 def test_a_link_of_its_own_is_told_as_where_it_leads(tmp_path: Path) -> None:
     """Where the call follows it; whatever lies there, and whatever lies outside of its folders."""
-    own = Own(changed=(str(tmp_path),), read=(), scratch=(str(tmp_path),))
+    own = OwnPaths(changed=(str(tmp_path),), read=(), scratch=(str(tmp_path),))
     for name, target in (
         ("key", "/home/other/key"),
         ("folder", "/home/other"),

@@ -14,7 +14,7 @@ import pytest
 from gymnasium.error import ClosedEnvironmentError
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
-from envhub_worker.runner.deferred import recording, standing_in
+from envhub_worker.runner.recording import recording, standing_in
 
 KINDS = {"sync": SyncVectorEnv, "async": AsyncVectorEnv}
 

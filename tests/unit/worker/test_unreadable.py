@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from envhub_worker import unreadable
+from envhub_worker import file_access
 from tests.support.interpreter import needs
 
 _LOOK = """
 import json, sys
 sys.path.insert(0, sys.argv[1])
-import unreadable
+import file_access
 found = {}
 for name in sys.argv[3:]:
     sys.path[:] = [sys.argv[2], *sys.path]
@@ -26,7 +26,7 @@ for name in sys.argv[3:]:
         exec(f"from {name} import anything")
         found[name] = None
     except ImportError as error:
-        found[name] = unreadable.why_hidden(error.name or "")
+        found[name] = file_access.why_hidden(error.name or "")
 print(json.dumps(found))
 """
 
@@ -39,7 +39,7 @@ def packages() -> Iterator[Path]:
         for place in ("open", "closed", "half", "half/inner"):
             (root / place).mkdir()
             (root / place / "__init__.py").write_text("anything = 1\n")
-        (root / "unreadable.py").write_bytes(Path(unreadable.__file__).read_bytes())
+        (root / "file_access.py").write_bytes(Path(file_access.__file__).read_bytes())
         for place in ("closed", "half/inner"):
             (root / place).chmod(0)
         root.chmod(0o755)

@@ -12,24 +12,24 @@ import pytest
 
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.messages import warned
-from envhub_worker.runner.warned import Warned
+from envhub_worker.runner.warning_log import WarningLog
 
 REPLY = m.pack(m.Value(1))
 
 
 @pytest.fixture
-def heard() -> Iterator[Warned]:
+def heard() -> Iterator[WarningLog]:
     """Somebody who listens; afterwards nobody does."""
     with warnings.catch_warnings():
         warnings.simplefilter("always")
-        one = Warned()
+        one = WarningLog()
         with pytest.MonkeyPatch.context() as patch:  # and shows nothing
             patch.setattr(warnings, "showwarning", lambda *_: None)
             one.listen()
             yield one
 
 
-def test_each_text_is_heard_once(heard: Warned) -> None:
+def test_each_text_is_heard_once(heard: WarningLog) -> None:
     """From any thread, and of each category."""
     for _ in range(3):
         warnings.warn("slow", stacklevel=1)
@@ -39,7 +39,7 @@ def test_each_text_is_heard_once(heard: Warned) -> None:
     assert heard.pending == [("UserWarning", "slow"), ("RuntimeWarning", "slow")]
 
 
-def test_gymnasiums_logger_is_heard_without_its_colors(heard: Warned) -> None:
+def test_gymnasiums_logger_is_heard_without_its_colors(heard: WarningLog) -> None:
     """It says what it says by a warning."""
     gym.logger.warn("too %s", "slow")
     assert heard.pending == [("UserWarning", "WARN: too slow")]
@@ -50,7 +50,7 @@ def test_what_is_shown_is_shown_still() -> None:
     with warnings.catch_warnings(), pytest.MonkeyPatch.context() as patch:
         shown: list[str] = []
         patch.setattr(warnings, "showwarning", lambda message, *_: shown.append(str(message)))
-        heard = Warned()
+        heard = WarningLog()
         heard.listen()
         warnings.showwarning("printed", UserWarning, "env.py", 1)
         warnings.showwarning("elsewhere", UserWarning, "env.py", 1, io.StringIO())
@@ -58,7 +58,7 @@ def test_what_is_shown_is_shown_still() -> None:
     assert heard.pending == [("UserWarning", "printed")]
 
 
-def test_what_has_no_text_is_not_heard(heard: Warned) -> None:
+def test_what_has_no_text_is_not_heard(heard: WarningLog) -> None:
     """Its class is the repository's own."""
 
     class Mute(UserWarning):
@@ -69,7 +69,7 @@ def test_what_has_no_text_is_not_heard(heard: Warned) -> None:
     assert heard.pending == []
 
 
-def test_a_flood_is_bounded(heard: Warned) -> None:
+def test_a_flood_is_bounded(heard: WarningLog) -> None:
     """In number and in length, for each reply and for all of them."""
     for number in range(2000):
         warnings.showwarning(f"{number} " + "\x1b" * 5000, UserWarning, "env.py", 1)

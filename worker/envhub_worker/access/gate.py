@@ -21,7 +21,7 @@ from envhub_worker.supervisor.records import Asker
 from envhub_worker.supervisor.witness import Witness
 
 
-class Asked(NamedTuple):
+class ClientRequest(NamedTuple):
     """A request, who asks, and what it is asked of."""
 
     asker: Asker
@@ -31,7 +31,7 @@ class Asked(NamedTuple):
     jails: Jails
 
 
-class Arrived(NamedTuple):
+class Incoming(NamedTuple):
     """A message as it came.
 
     Attributes:
@@ -45,7 +45,7 @@ class Arrived(NamedTuple):
     fd: int = -1
 
 
-Handler = Callable[[Asked, Any], m.Message]
+Handler = Callable[[ClientRequest, Any], m.Message]
 """Carries a request out that is permitted; returns the reply."""
 
 
@@ -63,15 +63,15 @@ class Gate:
     idle_s = 0
     witness = Witness()
 
-    def receive(self, router: zmq.Socket[bytes]) -> Arrived:
+    def receive(self, router: zmq.Socket[bytes]) -> Incoming:
         """A message that is there."""
         raise NotImplementedError
 
-    def greet(self, arrived: Arrived, name: bytes, sessions: Sessions, jails: Jails) -> None:
+    def greet(self, arrived: Incoming, name: bytes, sessions: Sessions, jails: Jails) -> None:
         """A session of this name begins, or is found again; raises ``RefusedError``."""
         raise NotImplementedError
 
-    def authorize(self, asked: Asked) -> m.Message:
+    def authorize(self, asked: ClientRequest) -> m.Message:
         """The request as it may be carried out, never a reply; raises ``RefusedError``."""
         raise NotImplementedError
 
@@ -99,15 +99,15 @@ class Gate:
 class LocalGate(Gate):
     """The folder of the socket, of mode 0700, is the gate: who can reach it is the user."""
 
-    def receive(self, router: zmq.Socket[bytes]) -> Arrived:
+    def receive(self, router: zmq.Socket[bytes]) -> Incoming:
         """No client has a key."""
         identity, *frames = receive(router)
-        return Arrived(identity, b"", frames)
+        return Incoming(identity, b"", frames)
 
-    def greet(self, arrived: Arrived, name: bytes, sessions: Sessions, jails: Jails) -> None:
+    def greet(self, arrived: Incoming, name: bytes, sessions: Sessions, jails: Jails) -> None:
         """Every client is welcome."""
         sessions.connect(arrived.identity, arrived.key, name)
 
-    def authorize(self, asked: Asked) -> m.Message:
+    def authorize(self, asked: ClientRequest) -> m.Message:
         """Everything is permitted."""
         return asked.request

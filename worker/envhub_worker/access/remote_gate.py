@@ -12,7 +12,7 @@ from envhub_worker.access.audit.figures import ClientFigures, ServerFigures, Tal
 from envhub_worker.access.audit.log import Log
 from envhub_worker.access.audit.usage import Usage
 from envhub_worker.access.drain import Drain
-from envhub_worker.access.gate import Arrived, Asked, Gate
+from envhub_worker.access.gate import ClientRequest, Gate, Incoming
 from envhub_worker.access.keys import AuthorizedClients, KeyPair
 from envhub_worker.access.packages import Packages
 from envhub_worker.access.places import Places
@@ -104,7 +104,7 @@ class RemoteGate(Gate):
         """CURVE, and what bounds a peer that keeps none of the rules."""
         self._port.secure(router, loop)
 
-    def receive(self, router: zmq.Socket[bytes]) -> Arrived:
+    def receive(self, router: zmq.Socket[bytes]) -> Incoming:
         """The key is the one that was proved in the handshake, never what the peer claims."""
         return self._port.receive(router)
 
@@ -117,7 +117,7 @@ class RemoteGate(Gate):
 
     # --- requests ------------------------------------------------------------------------------
 
-    def greet(self, arrived: Arrived, name: bytes, sessions: Sessions, jails: Jails) -> None:
+    def greet(self, arrived: Incoming, name: bytes, sessions: Sessions, jails: Jails) -> None:
         """Refuse a sender without a key of ours, and more sessions than the quota."""
         key = arrived.key
         self._refuse_unless_authorized(key)
@@ -133,7 +133,7 @@ class RemoteGate(Gate):
         if name not in known:
             self._events.came(session)
 
-    def authorize(self, asked: Asked) -> m.Message:
+    def authorize(self, asked: ClientRequest) -> m.Message:
         """Hold a request against keys and quotas."""
         asker, request = asked.asker, asked.request
         self._refuse_unless_authorized(asker.key)
@@ -164,7 +164,7 @@ class RemoteGate(Gate):
         if not self._is_known(key):
             raise RefusedError("WorkerError", "your key is not authorised any more")
 
-    def _authorize_open(self, asked: Asked, request: m.OpenJail) -> m.OpenJail:
+    def _authorize_open(self, asked: ClientRequest, request: m.OpenJail) -> m.OpenJail:
         key = asked.asker.key
         try:
             confinement = confinement_from_wire(request.confinement)
@@ -186,11 +186,11 @@ class RemoteGate(Gate):
             snapshot=self._uploads.tree(key, request.snapshot),
         )
 
-    def _need(self, asked: Asked, request: m.NeedPackages) -> m.Message:
+    def _need(self, asked: ClientRequest, request: m.NeedPackages) -> m.Message:
         asker = asked.asker
         return self._packages.need(asker.key, request, asked.jails.packages, asker.session)
 
-    def _offer(self, asked: Asked, request: m.OfferSnapshot) -> m.Message:
+    def _offer(self, asked: ClientRequest, request: m.OfferSnapshot) -> m.Message:
         asker = asked.asker
         in_use = {entry.jail.spec.snapshot for entry in asked.jails.open_ones()}
         wanted = self._uploads.offer(asker.session, asker.key, request, in_use)
@@ -201,19 +201,19 @@ class RemoteGate(Gate):
             self._events.uploads(asker.session, digest, len(wanted.hashes), size)
         return wanted
 
-    def _put(self, asked: Asked, request: m.PutBlob) -> m.Message:
+    def _put(self, asked: ClientRequest, request: m.PutBlob) -> m.Message:
         if len(asked.payload) != 1:
             raise RefusedError("LocalProtocolError", "PutBlob has one frame")
         self._uploads.put(asked.asker.session, asked.asker.key, request, asked.payload[0])
         return m.Done()
 
-    def _keep(self, asked: Asked, request: m.KeepAlive) -> m.Message:
+    def _keep(self, asked: ClientRequest, request: m.KeepAlive) -> m.Message:
         session = asked.sessions.find(asked.asker.identity, asked.asker.key)
         if session is not None and all(type(jail) is int for jail in request.jails[:4096]):
             asked.sessions.keep(session, request.jails[:4096])
         return m.Done()
 
-    def _list_sessions(self, asked: Asked, request: m.GetSessions) -> m.Message:
+    def _list_sessions(self, asked: ClientRequest, request: m.GetSessions) -> m.Message:
         key = asked.asker.key
         listed = self._sessions_of(key, asked.sessions, asked.jails)
         return m.Sessions(tuple(listed), self.figures(asked.sessions, asked.jails, key))

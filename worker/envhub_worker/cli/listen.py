@@ -39,7 +39,7 @@ from envhub_worker.cli.identity import (
     unusable,
 )
 from envhub_worker.cli.listen_options import add_options, quotas_of
-from envhub_worker.cli.state_folder import Note, Noted, state_folder
+from envhub_worker.cli.state_folder import Note, ServerNote, state_folder
 from envhub_worker.lockdown import probe, surroundings
 from envhub_worker.lockdown.mechanisms import landlock, locked_folder
 from envhub_worker.lockdown.mechanisms.locked_folder import LockedFolder
@@ -91,7 +91,7 @@ def _serve(
         store = state / "store"
         server = Server(arguments.bind, runtime.path, [str(store)], gate=gate)
         key_file = (arguments.key or state / "server.key").absolute()
-        note = Note(state, Noted(server.endpoint, identity.public, str(key_file)))
+        note = Note(state, ServerNote(server.endpoint, identity.public, str(key_file)))
     except zmq.ZMQError as error:
         runtime.remove()
         raise UsageError(f"--bind {arguments.bind}: {error.strerror}") from None
@@ -141,11 +141,11 @@ def _watched(metrics: str | None, log: Log, *, usable: bool) -> Iterator[Publish
         yield None
         return
     from envhub_worker.cli.http_port import HttpPort, parse_address
-    from envhub_worker.cli.metrics import Page, exposition
+    from envhub_worker.cli.metrics import MetricsPage, exposition
 
     host, number = parse_address(metrics)
     try:
-        page = Page(usable, exposition())
+        page = MetricsPage(usable, exposition())
     except ImportError as error:
         raise UsageError(str(error)) from None
 

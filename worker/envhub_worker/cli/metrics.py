@@ -30,7 +30,7 @@ class Answer(NamedTuple):
     body: bytes
 
 
-class Page:
+class MetricsPage:
     """What there is to read.
 
     Args:

@@ -82,7 +82,7 @@ def _is_ours(folder: Path) -> bool:
     return ours and not found.st_mode & 0o022 and os.access(folder, os.W_OK)
 
 
-class Noted(NamedTuple):
+class ServerNote(NamedTuple):
     """Where a server listens, its public key as text or ``insecure``, its secret key's file."""
 
     endpoint: str
@@ -93,7 +93,7 @@ class Noted(NamedTuple):
 class Note:
     """A server's own note. Another server on the same state folder replaces it."""
 
-    def __init__(self, state: Path, noted: Noted) -> None:
+    def __init__(self, state: Path, noted: ServerNote) -> None:
         self._path = state / _NAME
         new = state / f".{_NAME}-{os.getpid()}"
         self._file = os.open(new, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
@@ -110,7 +110,7 @@ class Note:
         os.close(self._file)
 
 
-def read_note(state: Path) -> Noted | None:
+def read_note(state: Path) -> ServerNote | None:
     """What the server that runs on a state folder has written down; None if there is none.
 
     Raises:
@@ -126,4 +126,4 @@ def read_note(state: Path) -> Noted | None:
         with contextlib.suppress(OSError):
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             return None
-        return Noted(*note.read().rstrip("\n").split(" ", 2))
+        return ServerNote(*note.read().rstrip("\n").split(" ", 2))

@@ -6,7 +6,7 @@ a weaker profile goes without are listed too, with what stays possible.
 
 from __future__ import annotations
 
-from envhub_worker.lockdown.report import Layer, LayerUnavailableError, no_system_calls
+from envhub_worker.lockdown.layers import Layer, LayerUnavailableError, no_system_calls
 from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
 from envhub_worker.protocol.confinement import LEAST_LANDLOCK, MIB, NETWORKS, PROFILES, Confinement
 from envhub_worker.protocol.records import dataclass

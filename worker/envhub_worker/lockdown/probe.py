@@ -19,6 +19,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from envhub_worker.lockdown import gpus, root_plan
+from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.lockdown.mechanisms import (
     kernel,
@@ -28,7 +29,6 @@ from envhub_worker.lockdown.mechanisms import (
     process,
     user,
 )
-from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp import filter
 
 _APPARMOR = """\

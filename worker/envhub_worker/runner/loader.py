@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from envhub_worker.protocol.messages import Load, LoadTask
-from envhub_worker.runner.signatures import Parameters, parameters_of, takes
+from envhub_worker.runner.parameters import Parameters, parameters_of, takes
 
 PACKAGE = "hub_env"
 

@@ -23,15 +23,15 @@ from envhub_worker.protocol.manifest.manifest import encode_env, encode_manifest
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
 from envhub_worker.runner import loader, manifest
-from envhub_worker.runner.deferred import standing_in
 from envhub_worker.runner.described import described
-from envhub_worker.runner.exceptions import raised
 from envhub_worker.runner.gymnasium_compat import joined_infos
 from envhub_worker.runner.infos import join
 from envhub_worker.runner.lane import Lane
+from envhub_worker.runner.raised import raised
+from envhub_worker.runner.recording import standing_in
 from envhub_worker.runner.sync_envs import SubEnvs
 from envhub_worker.runner.tasks import ResultError, Task, tasks_of
-from envhub_worker.runner.warned import Warned
+from envhub_worker.runner.warning_log import WarningLog
 from envhub_worker.runner.watches import Watches
 
 _ANCILLARY_BYTES = socket.CMSG_SPACE(8 * array("i").itemsize)
@@ -92,7 +92,7 @@ class Runner:
         self._tasks: dict[tuple[str, Any], Task] = {}
         self._envs: dict[int, Any] = {}
         self._stage = ""
-        self.warned = Warned()
+        self.warned = WarningLog()
         self.watches = Watches()
         self.lane: Lane | None = None
         self.descriptors: list[int] = []

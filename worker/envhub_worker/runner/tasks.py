@@ -17,7 +17,7 @@ from gymnasium.vector import VectorEnv
 
 from envhub_worker.protocol.manifest.manifest import TaskId
 from envhub_worker.runner import old_gym
-from envhub_worker.runner.deferred import Recording, recording
+from envhub_worker.runner.recording import Recording, recording
 from envhub_worker.runner.sync_envs import SubEnvs
 
 EnvFn = Callable[[], Any]

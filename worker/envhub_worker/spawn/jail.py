@@ -20,7 +20,7 @@ from envhub_worker.spawn.channel import Channel, close_fds
 
 
 @dataclass(frozen=True)
-class Failed:
+class JailFailed:
     """A layer that the profile names cannot be had here; the jail ends, nothing has run."""
 
     layer: str
@@ -58,7 +58,7 @@ class RunnerExited:
 
 
 @dataclass(frozen=True)
-class Denied:
+class CallDenied:
     """Something in the jail tried a system call that the policy denies, for the first time.
 
     Attributes:
@@ -70,12 +70,12 @@ class Denied:
     detail: str
 
 
-JailEvent = Failed | RunnerStarted | RunnerExited | Denied
+JailEvent = JailFailed | RunnerStarted | RunnerExited | CallDenied
 # by the names that ``jail_init`` gives them; the other fields of its messages are theirs
-_EVENTS: dict[str, type[Failed | RunnerExited | Denied]] = {
-    "failed": Failed,
+_EVENTS: dict[str, type[JailFailed | RunnerExited | CallDenied]] = {
+    "failed": JailFailed,
     "runner_exited": RunnerExited,
-    "denied": Denied,
+    "denied": CallDenied,
 }
 
 

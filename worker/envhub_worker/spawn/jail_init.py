@@ -33,10 +33,10 @@ from dataclasses import dataclass
 from typing import Any, NoReturn
 
 from envhub_worker.lockdown.context import Common, JailContext
-from envhub_worker.lockdown.limits.monitor import Guard
+from envhub_worker.lockdown.layers import LayerUnavailableError
+from envhub_worker.lockdown.limits.watchdog import Watchdog
 from envhub_worker.lockdown.mechanisms import process, procfs, reap
 from envhub_worker.lockdown.plan import HostFacts, plan
-from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp import notify, paths
 from envhub_worker.lockdown.seccomp.syscalls import name_of
 from envhub_worker.lockdown.spec import JailSpec
@@ -133,7 +133,7 @@ class Init:
             view=view,
             processes=jail.process_limit(spec.confinement.limits, wanted.namespaced),
         )
-        self._guard = Guard(self._jail, events)
+        self._watchdog = Watchdog(self._jail, events)
         report = [layer.to_wire() for layer in (*wanted.layers, jail.working_view(view))]
         self._channel.send({"event": "ready", "report": report})
 
@@ -145,7 +145,7 @@ class Init:
         self._poller.register(wakeup, select.POLLIN)
         while self._running:
             # until the next look at the limits; a jail without runners needs none
-            patience_ms = self._guard.seconds_left() * 1000 + 1 if self._runners else None
+            patience_ms = self._watchdog.seconds_left() * 1000 + 1 if self._runners else None
             ready = [fd for fd, _ in self._poller.poll(patience_ms)]
             for fd in ready:
                 if fd == wakeup:
@@ -164,10 +164,10 @@ class Init:
                 self._look()
 
     def _look(self) -> None:
-        if self._guard.seconds_left() == 0:
+        if self._watchdog.seconds_left() == 0:
             # A runner that is still locking itself down runs our code, and cannot be measured yet.
             starting = [pid for pid, runner in self._runners.items() if runner.status is not None]
-            over = self._guard.look(procfs.descendants(os.getpid(), starting))
+            over = self._watchdog.look(procfs.descendants(os.getpid(), starting))
             if over is not None:
                 for runner in self._runners.values():
                     runner.ended = runner.ended or over
@@ -197,7 +197,7 @@ class Init:
         pid = os.fork()
         if pid == 0:
             runner_entry.run(order)
-        self._guard.ignore(fds)
+        self._watchdog.ignore(fds)
         close_fds(fds)
         theirs.close()
         self._runners[pid] = _Runner(number, status)
@@ -293,4 +293,4 @@ class Init:
             return "exit", ""
         if signum == signal.SIGXCPU:
             return "cpu-limit", f"{self._jail.spec.confinement.limits.cpu_s} CPU seconds used"
-        return self._guard.killed_by_kernel() or ("signal", "")
+        return self._watchdog.killed_by_kernel() or ("signal", "")

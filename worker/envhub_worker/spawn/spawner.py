@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from envhub_worker.lockdown.context import ZygoteConfig
+from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.lockdown.mechanisms import user
 from envhub_worker.lockdown.mechanisms.locked_folder import LockedFolder
 from envhub_worker.lockdown.mechanisms.scratch import remove_tree
-from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.records import dataclass

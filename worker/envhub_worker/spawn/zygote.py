@@ -38,26 +38,25 @@ from dataclasses import replace
 from typing import cast
 
 from envhub_worker.lockdown.context import Common, ZygoteConfig
+from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import namespaces, process, reap
-from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.stages import zygote
-from envhub_worker.spawn import blas, jail_init, packages
+from envhub_worker.spawn import blas, jail_init
 from envhub_worker.spawn.channel import Channel, close_fds
 
 # What nearly every runner imports anyway. pyzmq is left out on purpose: a jail holds no ZeroMQ
 # socket, and a context started here would not survive the fork.
 _PRELOAD = (
-    "cloudpickle",
-    "ctypes",
-    "gymnasium",
-    "gymnasium.spaces",
-    "gymnasium.vector",
-    "gymnasium.wrappers",
-    "msgpack",
-    "numpy",
-    "numpy.random",
-    "tempfile",
-    "typing",
+    *("cloudpickle", "ctypes", "gymnasium", "gymnasium.spaces", "gymnasium.vector"),
+    *("gymnasium.wrappers", "msgpack", "numpy", "numpy.random", "tempfile", "typing"),
+)
+# Of the standard library, what numpy and Gymnasium import: the zygote may, it is the interpreter's.
+_STANDARD = (
+    *("contextvars", "csv", "ctypes", "datetime", "difflib", "heapq", "importlib.metadata"),
+    *("importlib.resources", "ipaddress", "locale", "logging", "mmap"),
+    *("multiprocessing.connection", "multiprocessing.context", "multiprocessing.sharedctypes"),
+    *("numbers", "pathlib", "pickle", "platform", "string", "tempfile", "threading", "typing"),
+    *("urllib.parse", "uuid", "zipfile"),
 )
 _JAIL = "envhub_worker.runner.runner"
 _END_S = 5.0
@@ -72,7 +71,7 @@ def main(argv: Sequence[str]) -> int:
     if argv[1:] == ["ahead"]:
         preload(_JAIL)
     elif argv[1:] == ["standard"]:
-        import_all(packages.STANDARD)
+        import_all(_STANDARD)
     received = channel.receive()
     if received is None:
         return 0

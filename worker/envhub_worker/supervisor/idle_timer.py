@@ -17,7 +17,7 @@ from envhub_worker.spawn.channel import close_fds
 _WORD = 8
 
 
-class Idleness:
+class IdleTimer:
     """The clock of one jail."""
 
     def __init__(self, limit_s: float) -> None:

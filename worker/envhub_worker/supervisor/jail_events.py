@@ -16,7 +16,7 @@ from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.spawn.channel import close_fds
-from envhub_worker.spawn.jail import Denied, Failed, RunnerExited, RunnerStarted
+from envhub_worker.spawn.jail import CallDenied, JailFailed, RunnerExited, RunnerStarted
 from envhub_worker.spawn.spawner import JailExited, ZygoteDied
 from envhub_worker.supervisor.fd_store import FdStore
 from envhub_worker.supervisor.records import (
@@ -135,11 +135,11 @@ class JailEvents:
         for event in events:
             if isinstance(event, RunnerStarted):
                 self._runner_started(entry, event)
-            elif isinstance(event, Failed):
+            elif isinstance(event, JailFailed):
                 self._failed(entry, event)
             elif isinstance(event, RunnerExited):
                 self._runner_exited(entry, event)
-            elif isinstance(event, Denied):
+            elif isinstance(event, CallDenied):
                 self._denied(entry, event)
 
     def _runner_started(self, entry: JailEntry, event: RunnerStarted) -> None:
@@ -155,7 +155,7 @@ class JailEvents:
                 self._witness.opened(entry, len(opening.runners), took)
                 entry.opened = True
 
-    def _failed(self, entry: JailEntry, event: Failed) -> None:
+    def _failed(self, entry: JailEntry, event: JailFailed) -> None:
         for opening in entry.opening:
             why = ("SandboxUnavailableError", event.reason, event.layer, event.fix)
             self._reply(opening.asker, m.Refused(*why))
@@ -247,10 +247,10 @@ class JailEvents:
             self._witness.failed(error)
             return
         for event in events:
-            if isinstance(event, Denied):
+            if isinstance(event, CallDenied):
                 self._denied(entry, event)
 
-    def _denied(self, entry: JailEntry, event: Denied) -> None:
+    def _denied(self, entry: JailEntry, event: CallDenied) -> None:
         entry.denied.append(f"{event.call} {event.detail}".strip())
 
     def kill(self, entry: JailEntry) -> None:

@@ -19,7 +19,7 @@ from envhub_worker.protocol.limits import WireLimits
 from envhub_worker.spawn.channel import close_fds
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from envhub_worker.supervisor.fd_store import FdStore
-from envhub_worker.supervisor.idle_timer import Idleness
+from envhub_worker.supervisor.idle_timer import IdleTimer
 from envhub_worker.supervisor.jail_events import JailEvents
 from envhub_worker.supervisor.output_tail import OutputTail
 from envhub_worker.supervisor.records import (
@@ -36,7 +36,7 @@ from envhub_worker.supervisor.records import (
     whole_jail,
 )
 from envhub_worker.supervisor.runner_stream import MAX_PENDING, RunnerLink
-from envhub_worker.supervisor.usage import Counting, reached, usage_of
+from envhub_worker.supervisor.usage import CountLimit, reached, usage_of
 from envhub_worker.supervisor.witness import Witness
 from envhub_worker.supervisor.zygotes import Zygotes
 
@@ -70,7 +70,7 @@ class Jails:
         self._limits = limits
         self._jails: dict[int, JailEntry] = {}
         self._packet_ids = itertools.count(1)
-        self._counting = Counting()
+        self._counting = CountLimit()
         self._fds = FdStore(str(fd_path), self._pidfd_for)
         loop.watch(self._fds.fileno(), self._fds.accept)
         self._events = JailEvents(loop, reply, self._jails, self._fds, witness)
@@ -166,7 +166,7 @@ class Jails:
     def expire(self, asker: Asker, request: m.ExpireIdle) -> m.Message:
         """End it once it has done nothing for so long."""
         entry = self._owned(asker, request.jail)
-        entry.idle = entry.idle or Idleness(request.idle_ms / 1000)
+        entry.idle = entry.idle or IdleTimer(request.idle_ms / 1000)
         return m.Done()
 
     def look(self) -> None:

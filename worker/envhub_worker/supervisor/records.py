@@ -13,7 +13,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.confinement import Reason
 from envhub_worker.spawn.jail import Jail
-from envhub_worker.supervisor.idle_timer import Idleness
+from envhub_worker.supervisor.idle_timer import IdleTimer
 from envhub_worker.supervisor.output_tail import OutputTail
 from envhub_worker.supervisor.runner_stream import RunnerLink
 
@@ -104,7 +104,7 @@ class JailEntry:
     opening: list[Opening] = field(default_factory=list)
     closing: list[Asker] = field(default_factory=list)
     kept: bool = False
-    idle: Idleness | None = None
+    idle: IdleTimer | None = None
     lost: dict[int, m.Died] = field(default_factory=dict)
     death: m.Died | None = None
     released: bool = False

@@ -21,7 +21,7 @@ _LEFT_BYTES = 1 << 16
 """Below that a scratch is full: it is counted in pages, and for each core."""
 
 
-class Counting:
+class CountLimit:
     """Bounds how often is counted: each time takes the server's one thread some milliseconds."""
 
     def __init__(self, now: Callable[[], float] = monotonic) -> None:

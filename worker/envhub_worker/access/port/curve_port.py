@@ -12,7 +12,7 @@ from collections.abc import Callable
 import zmq
 
 from envhub_worker.access.audit.log import Log
-from envhub_worker.access.gate import Arrived
+from envhub_worker.access.gate import Incoming
 from envhub_worker.access.keys import KeyPair
 from envhub_worker.access.port.connection_limit import ConnectionLimiter
 from envhub_worker.loop import Loop, receive
@@ -72,14 +72,14 @@ class CurvePort:
         # without it libzmq lets everybody in whom no handler was there to ask about
         router.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
 
-    def receive(self, router: zmq.Socket[bytes]) -> Arrived:
+    def receive(self, router: zmq.Socket[bytes]) -> Incoming:
         """The key is the one that was proved in the handshake, never what the peer claims."""
         identity = router.recv(zmq.NOBLOCK)
         # not of the frame before: libzmq 4.3.4 knows nothing of who sent the first one
         header = router.recv(zmq.NOBLOCK, copy=False)
         rest = receive(router) if header.more else []
         frames = [header.bytes, *rest]
-        return Arrived(identity, self._key_of(header), frames, _descriptor_of(header))
+        return Incoming(identity, self._key_of(header), frames, _descriptor_of(header))
 
     def _key_of(self, frame: zmq.Frame) -> bytes:
         if self._keys is None:

@@ -21,7 +21,7 @@ BLOCK_BYTES = 4096
 
 
 @dataclass(frozen=True)
-class Listed:
+class ListedFile:
     """One file of an offered snapshot."""
 
     path: str
@@ -43,7 +43,7 @@ def tree_charge(paths: Iterable[str]) -> int:
     return BLOCK_BYTES * entries
 
 
-class Store:
+class BlobStore:
     """The files of one key.
 
     Attributes:
@@ -73,7 +73,7 @@ class Store:
         """Where a snapshot lies, or would."""
         return self.home / "trees" / digest
 
-    def has_all(self, digest: str, files: Collection[Listed]) -> bool:
+    def has_all(self, digest: str, files: Collection[ListedFile]) -> bool:
         """Whether a snapshot lies there, whole."""
         return all(_is_there(self.tree(digest) / file.path, file.size) for file in files)
 
@@ -118,7 +118,7 @@ class Store:
                     os.unlink(item.path)
                     self.held -= self._blobs.pop(item.name, 0)
 
-    def lay_out(self, digest: str, files: list[Listed], copying: Callable[[int], None]) -> None:
+    def lay_out(self, digest: str, files: list[ListedFile], copying: Callable[[int], None]) -> None:
         """Build a tree beside its place and rename it: what bears a digest is complete.
 
         ``copying`` is told the size of each file that cannot be a link, before it is copied.

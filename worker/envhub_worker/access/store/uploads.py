@@ -21,8 +21,8 @@ from typing import Any
 
 from envhub_worker.access.quotas import Quotas
 from envhub_worker.access.store.blob_store import (
-    Listed,
-    Store,
+    BlobStore,
+    ListedFile,
     blob_charge,
     make_passable,
     tree_charge,
@@ -67,7 +67,7 @@ class Offer:
         reserved: What it may still be charged.
     """
 
-    store: Store
+    store: BlobStore
     needed: Collection[bytes]
     missing: dict[bytes, int]
     reserved: int
@@ -85,7 +85,7 @@ class Uploads:
         for left in [*folder.glob("*/parts"), *folder.glob("*/trees/.building-*")]:
             remove_tree(str(left))
         # counted now: later everybody would wait for it
-        self._stores = {home.name: Store(home) for home in folder.iterdir() if home.is_dir()}
+        self._stores = {home.name: BlobStore(home) for home in folder.iterdir() if home.is_dir()}
 
     def offer(
         self, owner: bytes, key: bytes, request: m.OfferSnapshot, in_use: Collection[str]
@@ -122,7 +122,7 @@ class Uploads:
         return m.Wanted(PREFIX + digest, tuple(missing))
 
     def _lay_out(
-        self, owner: bytes, digest: str, files: list[Listed], in_use: Collection[str]
+        self, owner: bytes, digest: str, files: list[ListedFile], in_use: Collection[str]
     ) -> None:
         offer = self._offers[owner]
 
@@ -210,19 +210,19 @@ class Uploads:
         """What a client's files are charged, and what it has offered to bring."""
         return self._charged(self._store(key))
 
-    def _store(self, key: bytes) -> Store:
+    def _store(self, key: bytes) -> BlobStore:
         name = key.hex()[:32] or "local"
         if name not in self._stores:
-            self._stores[name] = Store(self.folder / name)
+            self._stores[name] = BlobStore(self.folder / name)
         return self._stores[name]
 
-    def _offered(self, store: Store) -> list[Offer]:
+    def _offered(self, store: BlobStore) -> list[Offer]:
         return [offer for offer in self._offers.values() if offer.store is store]
 
-    def _charged(self, store: Store) -> int:
+    def _charged(self, store: BlobStore) -> int:
         return store.held + sum(offer.reserved for offer in self._offered(store))
 
-    def _make_room(self, store: Store, in_use: Collection[str]) -> None:
+    def _make_room(self, store: BlobStore, in_use: Collection[str]) -> None:
         """Remove the longest unused snapshots until all that is offered fits, whole."""
         if self._fits(store):
             return
@@ -242,12 +242,12 @@ class Uploads:
                 "them",
             )
 
-    def _fits(self, store: Store) -> bool:
+    def _fits(self, store: BlobStore) -> bool:
         trees = store.trees + len(self._offered(store))
         return trees <= MAX_TREES and self._charged(store) <= self._quotas.upload_bytes
 
 
-def checked_listing(files: tuple[object, ...], quotas: Quotas) -> list[Listed]:
+def checked_listing(files: tuple[object, ...], quotas: Quotas) -> list[ListedFile]:
     """A listing whose every entry keeps the rules, sorted by path.
 
     Trust: input from a client: names become paths of this machine.
@@ -279,7 +279,7 @@ def checked_listing(files: tuple[object, ...], quotas: Quotas) -> list[Listed]:
     return listed
 
 
-def _listed(file: object) -> Listed:
+def _listed(file: object) -> ListedFile:
     if type(file) is not tuple or [type(part) for part in file] != [str, int, bytes]:
         raise RefusedError("LocalProtocolError", "a file is (path, size, sha256)")
     path, size, sha256 = file
@@ -288,7 +288,7 @@ def _listed(file: object) -> Listed:
     wrong = wrong_with_path(path)
     if wrong:
         raise RefusedError("LocalProtocolError", f"the file {path[:200]!r} {wrong}")
-    return Listed(path, size, sha256)
+    return ListedFile(path, size, sha256)
 
 
 def wrong_with_path(path: str) -> str:
@@ -323,7 +323,7 @@ def _check_tree(paths: list[str]) -> None:
                 )
 
 
-def digest_of(files: list[Listed]) -> str:
+def digest_of(files: list[ListedFile]) -> str:
     """The name of a snapshot: a hash of its sorted listing."""
     rows = [[file.path, file.size, file.sha256.hex()] for file in files]
     return hashlib.sha256(json.dumps(rows).encode()).hexdigest()

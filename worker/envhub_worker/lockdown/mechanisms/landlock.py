@@ -12,8 +12,8 @@ import stat
 import struct
 from collections.abc import Iterable
 
+from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms.kernel import syscall
-from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp.syscalls import number
 from envhub_worker.protocol.records import dataclass
 

@@ -11,8 +11,8 @@ import socket
 import struct
 from collections.abc import Callable
 
+from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import kernel, process
-from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.protocol.shortages import shortage
 
 #: The user that a jail sees itself as. Not 0: programs treat that one specially.

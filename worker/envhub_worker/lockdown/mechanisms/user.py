@@ -7,8 +7,8 @@ import os
 import pwd
 import random
 
+from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import kernel, process, procfs
-from envhub_worker.lockdown.report import LayerUnavailableError
 
 CAP_CHOWN, CAP_SETGID, CAP_SETUID = 0, 6, 7
 

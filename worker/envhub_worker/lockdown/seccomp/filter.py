@@ -7,8 +7,8 @@ import errno
 import os
 from collections.abc import Mapping
 
+from envhub_worker.lockdown.layers import LayerUnavailableError, no_system_calls
 from envhub_worker.lockdown.mechanisms.kernel import prctl, syscall
-from envhub_worker.lockdown.report import LayerUnavailableError, no_system_calls
 from envhub_worker.lockdown.seccomp import bpf
 from envhub_worker.lockdown.seccomp.bpf import Branch, Do, Item, Label
 from envhub_worker.lockdown.seccomp.policy import (

@@ -69,7 +69,7 @@ _HARMLESS = ("/var/run/nscd/socket", "/run/nscd/socket")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Own:
+class OwnPaths:
     """What a jail's processes may do by name.
 
     Attributes:
@@ -87,7 +87,7 @@ def asked(
     call: str,
     words: Sequence[int],
     thread: int,
-    own: Own,
+    own: OwnPaths,
     still_waits: Callable[[], object],
 ) -> list[tuple[str, str]]:
     """What a waiting call asks for and is not its own: what it would do, and each path, shown.
@@ -128,7 +128,7 @@ def _named(
     memory: BinaryIO,
     thread: int,
     words: Sequence[int],
-    own: Own,
+    own: OwnPaths,
     last: bool,
     folder: int | None,
     path: int,
@@ -153,7 +153,7 @@ def _text(memory: BinaryIO, place: int) -> bytes:
     return text if end and len(text) < _LONGEST_PATH else b""
 
 
-def _absolute(thread: int, base: str, text: bytes, own: Own, *, last: bool) -> str:
+def _absolute(thread: int, base: str, text: bytes, own: OwnPaths, *, last: bool) -> str:
     """Where a path leads from where its caller stands; a base that is no folder makes none.
 
     What its own folders have of links is followed, at the end only where ``last``; what they lead
@@ -179,7 +179,7 @@ def _absolute(thread: int, base: str, text: bytes, own: Own, *, last: bool) -> s
     return f"/...{path}" if path.startswith("/") else ""  # wherever that is: nobody's own
 
 
-def _leads(thread: int, path: str, own: Own, pending: Sequence[str], *, last: bool) -> str:
+def _leads(thread: int, path: str, own: OwnPaths, pending: Sequence[str], *, last: bool) -> str:
     """What stands instead of an entry of a process, or of a link in a folder of its own.
 
     Raises:
@@ -215,7 +215,7 @@ def _link(thread: int, folder: str, names: Sequence[str]) -> str:
         os.close(place)
 
 
-def _addressed(memory: BinaryIO, place: int, size: int, thread: int, own: Own) -> str:
+def _addressed(memory: BinaryIO, place: int, size: int, thread: int, own: OwnPaths) -> str:
     """The socket's file; one without a name in the file system is the jail's own network's."""
     address = os.pread(memory.fileno(), min(size & 0xFFFFFFFF, _SOCKET_ADDRESS), place)
     text = address[2:].partition(b"\0")[0]
@@ -224,7 +224,7 @@ def _addressed(memory: BinaryIO, place: int, size: int, thread: int, own: Own) -
     return _absolute(thread, "cwd", text, own, last=True)
 
 
-def _may(deed: str, path: str, own: Own) -> bool:
+def _may(deed: str, path: str, own: OwnPaths) -> bool:
     if deed == "read":
         is_private = _PRIVATE.fullmatch(path) is not None or never_was(path)
         return not is_private or _is_within(path, own.read)

@@ -8,10 +8,10 @@ import os
 import signal
 
 from envhub_worker.lockdown.context import Common
+from envhub_worker.lockdown.layers import Layer, LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import mounts, namespaces, process, procfs
 from envhub_worker.lockdown.mechanisms.mounts import View
 from envhub_worker.lockdown.mechanisms.scratch import Scratch
-from envhub_worker.lockdown.report import Layer, LayerUnavailableError
 from envhub_worker.lockdown.root_plan import SHARED_MEMORY, within
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.confinement import Limits

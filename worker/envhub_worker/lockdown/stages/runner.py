@@ -10,7 +10,7 @@ from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.mechanisms import landlock, process
 from envhub_worker.lockdown.mechanisms.landlock import DEVICE, READ, READ_DIR, WRITE, Rule
 from envhub_worker.lockdown.seccomp import filter
-from envhub_worker.lockdown.seccomp.paths import Own
+from envhub_worker.lockdown.seccomp.paths import OwnPaths
 from envhub_worker.lockdown.stages import selftest
 from envhub_worker.protocol.confinement import Limits
 
@@ -113,14 +113,14 @@ def _writable(jail: JailContext) -> list[str]:
     return [scratch.home, scratch.temporary, scratch.work, *shared, *jail.view.shared]
 
 
-def own(jail: JailContext, pid: int, thread: int) -> Own:
+def own(jail: JailContext, pid: int, thread: int) -> OwnPaths:
     """What a process may change and read, by the names that it has for it."""
     streams = ("/dev/fd", "/dev/stdin", "/dev/stdout", "/dev/stderr")
     itself = ("/proc/self", "/proc/thread-self", f"/proc/{pid}", f"/proc/{thread}")
     scratch = tuple(_writable(jail))
     changed = (*scratch, *jail.common.devices, *streams, *itself)
     read = (*jail.common.trees, jail.spec.snapshot, *changed)
-    return Own(changed=changed, read=read, scratch=scratch)
+    return OwnPaths(changed=changed, read=read, scratch=scratch)
 
 
 def resource_limits(limits: Limits, processes: int | None) -> dict[int, tuple[int, int]]:

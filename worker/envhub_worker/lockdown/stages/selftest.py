@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterable
 from functools import partial
 
 from envhub_worker.lockdown.context import JailContext
+from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import process
 from envhub_worker.lockdown.mechanisms.kernel import CLONE_NEWUSER, mount, syscall, unshare
-from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp import filter
 from envhub_worker.lockdown.seccomp.syscalls import number
 

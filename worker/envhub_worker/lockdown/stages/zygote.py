@@ -19,10 +19,10 @@ from functools import partial
 import envhub_worker
 from envhub_worker.lockdown import gpus, root_plan
 from envhub_worker.lockdown.context import Common, ZygoteConfig
+from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import landlock, mounts, namespaces, process, user
 from envhub_worker.lockdown.mechanisms.kernel import CLONE_NEWNS, unshare
 from envhub_worker.lockdown.plan import needs_broker
-from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp.filter import compile_filter
 from envhub_worker.lockdown.seccomp.policy import table, watched
 

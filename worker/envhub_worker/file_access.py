@@ -1,12 +1,55 @@
-"""Tells why a file of the repository or of its packages could not be written, and what helps."""
+"""Why a file could not be read or written: closed to this process, or not there at all.
+
+The import system calls both missing; and what a jail shares with others it only reads.
+"""
 
 from __future__ import annotations
 
 import errno
 import os
+import stat
 import sys
 
 _REFUSALS = (errno.EACCES, errno.EPERM, errno.EROFS)
+
+
+def why_hidden(module: str) -> str:
+    """Why a module that was not found may be there all the same; empty if nothing hides it.
+
+    Args:
+        module: Its dotted name, as in ``ModuleNotFoundError.name``.
+    """
+    parent, _, last = module.rpartition(".")
+    package = sys.modules.get(parent) if parent else None
+    folders = sys.path if package is None else getattr(package, "__path__", ())
+    steps = module.split(".") if package is None else [last]
+    for folder in folders:
+        depths = range(len(steps) + 1)
+        places = [os.path.join(str(folder) or ".", *steps[:depth]) for depth in depths]
+        for place in (*places, *(f"{place}.py" for place in places[1:])):
+            closed = _closed(place)
+            if closed:
+                return closed
+    return ""
+
+
+def _closed(path: str) -> str:
+    """What keeps this process from reading a path, with its owner and mode; empty for nothing."""
+    try:
+        status = os.stat(path)
+    except PermissionError:
+        above = os.path.dirname(path)
+        return _closed(above) or f"{path} may not be read by uid {os.geteuid()}"
+    except OSError:
+        return ""
+    wanted = os.R_OK | os.X_OK if stat.S_ISDIR(status.st_mode) else os.R_OK
+    if os.access(path, wanted):
+        return ""
+    return (
+        f"{path} may not be read by uid {os.geteuid()}: it belongs to uid {status.st_uid} and has "
+        f"mode {stat.S_IMODE(status.st_mode):04o}. What is missing may be installed there; if all "
+        f"users may read it: chmod -R a+rX {path}"
+    )
 
 
 def why_unwritable(error: BaseException, root: str) -> str:

@@ -8,10 +8,9 @@ import os
 import traceback
 from collections.abc import Iterator
 
+from envhub_worker.file_access import why_hidden, why_unwritable
 from envhub_worker.protocol.messages import Raised
 from envhub_worker.protocol.text import printable
-from envhub_worker.runner.unwritable import why_unwritable
-from envhub_worker.unreadable import why_hidden
 
 _MAX_MESSAGE = 8_192
 _MAX_TRACEBACK = 32_768

@@ -24,7 +24,7 @@ _COLORS = re.compile("\x1b\\[[0-9;]*m")
 """With which Gymnasium's logger surrounds what it says."""
 
 
-class Warned:
+class WarningLog:
     """What has been warned of.
 
     Attributes:
