@@ -19,7 +19,7 @@ from envhub_worker.lockdown.seccomp.bpf import (
     listing,
     to_bytes,
 )
-from tests.unit.worker.bpf_machine import run
+from tests.unit.worker.lockdown.seccomp.bpf_machine import run
 
 
 def test_branch_skips_to_its_labels() -> None:

@@ -27,7 +27,7 @@ from envhub_worker.lockdown.seccomp.policy import (
     watched,
 )
 from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
-from tests.unit.worker.bpf_machine import run
+from tests.unit.worker.lockdown.seccomp.bpf_machine import run
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
