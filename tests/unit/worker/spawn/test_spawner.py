@@ -313,7 +313,7 @@ with spawner_in(Path({folder!r}), confinement) as spawner:
 def test_killed_server_leaves_no_process(folder: Path, confinement: Confinement) -> None:
     """SIGKILL of the server ends zygote, init, runner and a daemon of the jail."""
     mark = str(folder / "mark")
-    kit = str(Path(__file__).parents[2] / "integration")
+    kit = str(Path(__file__).parents[3] / "integration")
     daemon = DAEMON.format(mark=mark)
     profile = confinement.profile
     source = SERVER.format(kit=kit, folder=str(folder), profile=profile, daemon=daemon)

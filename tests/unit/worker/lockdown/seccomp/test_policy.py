@@ -29,7 +29,7 @@ from envhub_worker.lockdown.seccomp.policy import (
 from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
 from tests.unit.worker.lockdown.seccomp.bpf_machine import run
 
-GOLDEN = Path(__file__).parents[1] / "golden"
+GOLDEN = Path(__file__).parents[3] / "golden"
 ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 I386 = 0x40000003
 NOT_SUPPORTED = 0x00050000 | errno.EAFNOSUPPORT
