@@ -25,7 +25,8 @@ import zmq
 from envhub_worker import __version__
 from envhub_worker.access.audit.log import FORMS, Log
 from envhub_worker.access.keys import AuthorizedClients
-from envhub_worker.access.packages import Packages, why_impossible
+from envhub_worker.access.package_program import why_impossible
+from envhub_worker.access.packages import Packages
 from envhub_worker.access.quotas import Permissions
 from envhub_worker.access.remote_gate import RemoteGate, Rules
 from envhub_worker.access.store.uploads import Uploads
