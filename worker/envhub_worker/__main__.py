@@ -16,7 +16,7 @@
   one line of JSON once the endpoint is bound: what holds around this process
   (``protocol/messages/surroundings.py``).
 - ``--ahead`` starts a zygote at once, in the interpreter ``X`` and for the packages ``Y``, by
-  default this interpreter with its own, for whoever opens the first jail.
+  default this interpreter with its own, for the first jail.
 - environment: nothing is read from it but what Python itself needs.
 - exit code: 0 after a stop, 2 for wrong arguments.
 

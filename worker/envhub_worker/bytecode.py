@@ -53,7 +53,7 @@ def confine(folder: str) -> None:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Compile all that is below a folder, but for tests, which nobody imports."""
+    """Compile all that is below a folder, but for tests, which are not imported."""
     [folder] = argv
     try:
         confine(folder)

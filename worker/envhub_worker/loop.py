@@ -121,7 +121,7 @@ def receive(socket: zmq.Socket[bytes]) -> list[bytes]:
 def send(socket: zmq.Socket[bytes], frames: Sequence[Buffer], *, copy: bool) -> None:
     """Send without waiting; what a client's queue has no room for is dropped.
 
-    Without ``copy``, nobody may write large frames any more.
+    Without ``copy``, large frames may not be written any more.
     """
     for frame in frames[:-1]:
         socket.send(frame, _NOW | _MORE, copy)

@@ -10,7 +10,7 @@ from envhub_worker.access.quotas import RETRY_S, BusyError
 from envhub_worker.protocol.messages.busy import DRAINING, Busy
 
 _QUIET_S = 1.0
-"""Between the end of the last jail and the server's own: its client hears why from this one."""
+"""Between the end of the last jail and the server's own: its client learns why from this one."""
 
 
 class Drain:

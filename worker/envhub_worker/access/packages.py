@@ -344,7 +344,7 @@ def _not_here(request: m.NeedPackages) -> m.Packages:
     if request.always:
         raise RefusedError(
             "PolicyError",
-            "dependencies: this server makes no environments of a repository's own; its "
-            "operator starts it with --dependencies, or in an interpreter that has the packages",
+            "dependencies: this server makes no environments of a repository's own; start it "
+            "with --dependencies, or in an interpreter that has the packages",
         )
     return m.Packages("own", "", {}, "this server makes no environments (--dependencies)")

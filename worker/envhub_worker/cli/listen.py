@@ -1,8 +1,8 @@
 """``envhub-worker listen``: a worker server for clients on other hosts.
 
-It never listens without keys but on a loopback address and when told so, nor on all interfaces
-unless told so. Without ``--authorized-clients`` it makes a key for one client and prints it:
-nobody else comes in.
+It listens without keys only with --insecure-loopback and on a loopback address, and on all
+interfaces only where --bind names them. Without ``--authorized-clients`` it makes a key for one
+client and prints it: no other client comes in.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ Publish = Callable[[Mapping[str, Any]], None]
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Listen until told to stop."""
+    """Listen until a signal ends it."""
     try:
         with state_folder(arguments.state_dir) as state:
             return _listen(arguments, state)
@@ -115,7 +115,7 @@ def _serve(
             pid=os.getpid(),
         )
         server.run()
-    except Exception as error:  # not what it was told to do: see ``run`` for what is
+    except Exception as error:  # not an error of the arguments: those are for ``run``
         gate.witness.failed(error)
         return 1
     finally:
@@ -133,7 +133,7 @@ def _ends() -> list[signal.Signals]:
 
 @contextmanager
 def _watched(metrics: str | None, log: Log, *, usable: bool) -> Iterator[Publish | None]:
-    """The port for whoever watches, if one is wanted: gives what is to be called with figures.
+    """The port for monitoring, if one is wanted: gives what is to be called with figures.
 
     Raises:
         UsageError: It cannot be had; the text says why.
@@ -158,7 +158,7 @@ def _watched(metrics: str | None, log: Log, *, usable: bool) -> Iterator[Publish
     except OSError as error:
         raise UsageError(f"--metrics {metrics}: {error}") from None
     if not is_loopback(host):
-        log.say("metrics_are_open", why="whoever reaches them reads the clients' names: no keys")
+        log.say("metrics_are_open", why="who reaches them reads the clients' names: no keys")
     log.say("metrics", "info", url=f"http://{port.address}/metrics")
     try:
         yield page.publish

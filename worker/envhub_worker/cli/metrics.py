@@ -132,7 +132,7 @@ class ServerCollector:
         for name, key, text in _GAUGES:
             yield GaugeMetricFamily(name, text, float(figures[key]))
         yield GaugeMetricFamily(
-            "envhub_server_draining", "1 once it was told to end.", float(_drains(figures))
+            "envhub_server_draining", "1 once its end has begun.", float(_drains(figures))
         )
         yield from self._of_words()
         yield from self._of_clients(figures["clients"])

@@ -46,7 +46,7 @@ def state_dir(chosen: Path | None, *, create: bool) -> Path | None:
     if chosen is not None:
         if create:
             _make_private(chosen)
-        return chosen.absolute()  # jails are made elsewhere, and are told where snapshots lie
+        return chosen.absolute()  # jails are made elsewhere, and get the path of their snapshot
     home = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
     temporary = Path(tempfile.gettempdir()) / f"envhub-worker-{os.getuid()}"
     for candidate in (Path(home) / "envhub-worker", temporary):

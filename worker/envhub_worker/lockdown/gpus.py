@@ -93,7 +93,7 @@ def _is_nvidias(node: str) -> bool:
 
 
 def _address(node: str, host: HostFiles) -> str:
-    """The PCI address of what a node belongs to; empty if it has none, or it is not told."""
+    """The PCI address of what a node belongs to; empty if it has none, or none is known."""
     name = posixpath.basename(node)
     if not _is_nvidias(node):
         folder = real_path(f"/sys/class/drm/{name}", host)

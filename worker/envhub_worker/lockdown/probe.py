@@ -5,7 +5,7 @@
     {"host": {...}, "layers": [{"layer", "available", "detail", "fix"}...],
      "apparmor_profile": text | null}
 
-The layers are tried one by one, so that all that are missing are told, where a jail would stop
+The layers are tried one by one, so that all that are missing are listed, where a jail would stop
 at the first.
 """
 

@@ -1,6 +1,6 @@
 """Older releases of Gymnasium in a jail, as the client's own would have it: 0.26 to 1.0.
 
-What they lack is added here, so that nobody else asks for a version:
+What they lack is added here, so that no other module asks for a version:
 
 - **Autoreset.** Before 1.1 there is no mode to choose. 1.0 resets in the step after the end, as
   ``NextStep`` does; 0.29 in the same step, as ``SameStep`` does, but with the last observation as
@@ -108,7 +108,7 @@ joined_infos: Callable[[Any], Any] = renamed if _BEFORE_1_0 else _as_they_are
 
 
 class _WithMode(SyncVectorEnv):
-    """``SyncVectorEnv`` of 1.0, told its autoreset mode; what it does in ``step`` is not used."""
+    """``SyncVectorEnv`` of 1.0, with an autoreset mode; what it does in ``step`` is not used."""
 
     def __init__(self, env_fns: Any, *, copy: bool, autoreset_mode: str) -> None:
         super().__init__(env_fns, copy=copy)

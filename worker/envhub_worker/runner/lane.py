@@ -76,8 +76,8 @@ class Lane:
             os.close(fd)
         os.set_blocking(self.bell, False)
         self._asked = slabs.words(self._request)
-        self._told = slabs.words(self._reply)
-        self._told[slabs.PARKED] = 1
+        self._reply_words = slabs.words(self._reply)
+        self._reply_words[slabs.PARKED] = 1
         self._layout = layout
         self._env = env
         self._assemble = slabs.assembler(env.single_action_space)
@@ -122,12 +122,12 @@ class Lane:
         """Wait for the next request without sleeping, for as long as the client says."""
         asked, served = self._asked, self._served
         if self._spin_ns:
-            self._told[slabs.PARKED] = 0
+            self._reply_words[slabs.PARKED] = 0
             until = perf_counter_ns() + self._spin_ns
             while perf_counter_ns() < until:
                 if asked[slabs.SEQUENCE] != served:
                     return True
-        self._told[slabs.PARKED] = 1
+        self._reply_words[slabs.PARKED] = 1
         return asked[slabs.SEQUENCE] != served
 
     def serve(self) -> bool:
@@ -135,13 +135,13 @@ class Lane:
         sequence = self._asked[slabs.SEQUENCE]
         if sequence == self._served:
             return False
-        told = self._told
+        words = self._reply_words
         if sequence & _MEASURE or self._asked[slabs.MESSAGE]:
-            told[slabs.OUTCOME], told[slabs.LENGTH] = self._run()
+            words[slabs.OUTCOME], words[slabs.LENGTH] = self._run()
         else:
             self._run_measured()
         self._served = sequence
-        told[slabs.SEQUENCE] = sequence
+        words[slabs.SEQUENCE] = sequence
         if self._asked[slabs.PARKED]:
             self._ring()
         return True
@@ -151,9 +151,9 @@ class Lane:
             os.write(self._client_bell, _RING)
 
     def _run_measured(self) -> None:
-        told, start = self._told, perf_counter_ns()
-        told[slabs.OUTCOME], told[slabs.LENGTH] = self._run()
-        told[slabs.BUSY] = perf_counter_ns() - start
+        words, start = self._reply_words, perf_counter_ns()
+        words[slabs.OUTCOME], words[slabs.LENGTH] = self._run()
+        words[slabs.BUSY] = perf_counter_ns() - start
 
     def _run(self) -> tuple[int, int]:
         try:

@@ -23,7 +23,7 @@ def raised(error: BaseException, stage: str, root: str = "") -> Raised:
     """The message for an exception: its nearest builtin ancestor, its text, its traceback.
 
     Args:
-        root: The repository's folder: its files are told by their names in it.
+        root: The repository's folder: its files are named relative to it.
     """
     # a package that may not be read is imported all the same, as one without a file of its own
     why = ""
@@ -75,7 +75,7 @@ def _traceback(error: BaseException, root: str) -> str:
 
 
 def _chain(whole: traceback.TracebackException) -> Iterator[traceback.TracebackException]:
-    """An exception, and all that are told with it."""
+    """An exception, and all that its traceback shows."""
     waiting, seen = [whole], set()
     while waiting:
         one = waiting.pop()
@@ -88,7 +88,7 @@ def _chain(whole: traceback.TracebackException) -> Iterator[traceback.TracebackE
 
 
 def _tell(one: traceback.TracebackException, root: str) -> None:
-    """Leave out whose line helps nobody, and name the repository's files as it does."""
+    """Leave out frames that are not the repository's, and name its files relative to it."""
     theirs = [frame for frame in one.stack if not frame.filename.startswith((_OURS, *_IMPORTING))]
     syntax = getattr(one, "filename", None) is not None  # which tells its line without a frame
     if theirs or syntax:

@@ -2,11 +2,11 @@
 
 ``SyncVectorEnv(...)`` and ``AsyncVectorEnv(...)`` then only write down their arguments. The runner
 builds the sub-environments that it needs and drives them itself, so a suite of many tasks costs
-nothing before it is used. The object is a real instance of its class: whoever looks into it (a
+nothing before it is used. The object is a real instance of its class: a look into it (by a
 wrapper, the repository itself) makes it build itself after all, and it is driven as it is.
 
 Its end is no look: what was never built has nothing to close. Gymnasium's ``__del__`` asks for
-attributes, and would build all processes of every task that nobody used, only to end them.
+attributes, and would build all processes of every task that was not used, only to end them.
 
 Followed: ``gymnasium.vector.SyncVectorEnv.__init__`` and ``AsyncVectorEnv.__init__`` (0.26 to 1.4).
 """
@@ -47,7 +47,7 @@ class Recording:
 
 
 def recording(env: object) -> Recording | None:
-    """The recording of a vector environment that nobody has looked into or closed, else None."""
+    """The recording of a vector environment that was neither looked into nor closed, else None."""
     own = object.__getattribute__(env, "__dict__") if _is_lazy(env) else {}
     found = None if own.get("closed") else own.get(_KEY)
     return found if isinstance(found, Recording) else None

@@ -208,8 +208,8 @@ class Runner:
             return m.Value(False)
         reply = partial(self.reply, by_lane=True)
         fail = partial(raised, root=self._snapshot)
-        told = (self.warned.pending, self.watches)
-        self.lane = Lane(env, request, self.descriptors, reply, self._pack, fail, *told)
+        more = (self.warned.pending, self.watches)
+        self.lane = Lane(env, request, self.descriptors, reply, self._pack, fail, *more)
         return m.Value(True)
 
     def fetch_infos(self, request: m.FetchInfos) -> m.Message:

@@ -1,4 +1,4 @@
-"""Hears what the repository warns of, for the replies to take along: each text once.
+"""Records what the repository warns of, for the replies to take along: each text once.
 
 Python's own filters come first, as in any other process. What is heard is shown, too, as it was:
 it stands in what the jail prints. Followed: ``warnings.showwarning``.

@@ -1,4 +1,4 @@
-"""The process of a zygote, from its start until it hears what it is for.
+"""The process of a zygote, from its start until it reads its configuration.
 
 What a server needs first is a zygote, and that takes longest: so ``serve --ahead`` starts one
 before anything else is imported. In the server's own interpreter it imports what every runner
@@ -36,7 +36,7 @@ class ZygoteProcess:
 
     Attributes:
         channel: Its first message is the configuration.
-        folder: Goes with ``close`` of whoever uses it.
+        folder: Removed by ``Spawner.close``.
         pid: Of what was started, which may only wait for the zygote.
     """
 
@@ -77,7 +77,7 @@ class ZygoteProcess:
             return self._process.wait()
 
     def discard(self) -> None:
-        """Nobody is going to use it."""
+        """End it unused."""
         self.channel.close()
         self._process.kill()
         self._process.wait()

@@ -1,6 +1,6 @@
 """What happens to jails: they come up, answer, print, break rules and die.
 
-Nobody asks for any of it. Requests are in ``jails.py``; what both do to a jail is here, such as its
+None of it is asked for. Requests are in ``jails.py``; what both do to a jail is here, such as its
 end. Trust: a runner is hostile. What it says is not decoded, only its sizes and order are checked,
 and one that breaks the rules loses its jail.
 """
@@ -197,11 +197,11 @@ class JailEvents:
             self._lose(entry, death)
 
     def _lose(self, entry: JailEntry, death: m.Died) -> None:
-        """Go on without a runner: whoever waits for it hears how it died, and nobody else."""
+        """Go on without a runner: the requests that wait for it are answered with its death."""
         self.deaths[death.reason] += 1
         entry.output.read()
         death = m.replace(death, tail=entry.output.text())
-        # the last lines of earlier deaths have been told: many of them would be much
+        # the last lines of earlier deaths were sent already: all of them would be much
         entry.lost = {runner: m.replace(one, tail="") for runner, one in entry.lost.items()}
         entry.lost[death.runner] = death
         entry.jail.kill_runner(death.runner)  # it may live, and have broken the rules
@@ -237,7 +237,7 @@ class JailEvents:
         self.kill(entry)
 
     def _hear_last(self, entry: JailEntry) -> None:
-        """What it was denied has been told before whatever ends it, on another descriptor.
+        """Read what it was denied, which was sent before whatever ends it, on another descriptor.
 
         It ends also where that cannot be read: then it may be this that ends it.
         """
@@ -265,7 +265,7 @@ class JailEvents:
         entry.control = -1
 
     def jail_gone(self, event: JailExited) -> None:
-        """Nothing of a jail is left: whoever waits for that hears it."""
+        """Nothing of a jail is left: answer the requests that wait for that."""
         entry = next((one for one in self._jails.values() if one.jail is event.jail), None)
         if entry is None:
             return

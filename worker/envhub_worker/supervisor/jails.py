@@ -227,7 +227,7 @@ class Jails:
         """What the asker's jails are doing, and what they hold."""
         mine = [entry for entry in self._jails.values() if entry.session == asker.session]
         for entry in mine:
-            self._events.catch_up(entry)  # it said so before it answered whoever asks now
+            self._events.catch_up(entry)  # it said so before it answered the client that asks now
         children = self._counting.children() if mine else None
         return m.Status(tuple({**status_of(one), **_held(one, children)} for one in mine))
 
@@ -256,7 +256,7 @@ class Jails:
         return self._events.deaths
 
     def end(self, entry: JailEntry, why: str) -> None:
-        """End a jail that nobody closes; its client is told why if it comes back."""
+        """End a jail that no client closes; its client reads why if it comes back."""
         self._events.end(entry, whole_jail("idle", detail=why))
 
 

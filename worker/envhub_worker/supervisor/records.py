@@ -147,7 +147,7 @@ def owes(entry: JailEntry, runner: int) -> int:
 
 
 def for_operation(death: m.Died, operation: str) -> m.Died:
-    """A death, told to who waited for this."""
+    """A death, as the reply to this operation."""
     return m.replace(death, operation=operation)
 
 

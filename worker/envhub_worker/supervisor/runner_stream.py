@@ -99,7 +99,7 @@ class RunnerLink:
         """The replies that have arrived with their owners, or None at the end of the stream.
 
         Raises:
-            RemoteProtocolError: The runner sent what nobody asked for. Trust: it is hostile.
+            RemoteProtocolError: The runner sent what was not asked for. Trust: it is hostile.
         """
         try:
             data = self.sock.recv(self._reader.chunk)
@@ -121,7 +121,7 @@ class RunnerLink:
         return answers
 
     def _check_owed(self, request_id: int) -> None:
-        """Before there is memory for what nobody asked for."""
+        """Before memory is allocated for a reply that was not asked for."""
         expected = next(iter(self.pending), None)
         if request_id != expected:
             raise RemoteProtocolError(

@@ -1,1 +1,1 @@
-"""What an operator is told: lines of a log, and figures."""
+"""What an operator reads: lines of a log, and figures."""

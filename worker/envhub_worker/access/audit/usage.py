@@ -29,7 +29,7 @@ class Process:
 
     Attributes:
         started: When it was started, so that the number is not taken for another's.
-        memory_bytes: Its share of what it has in memory, or all of that where nobody may ask.
+        memory_bytes: Its share of what it has in memory; all of that where the share is not known.
     """
 
     pid: int

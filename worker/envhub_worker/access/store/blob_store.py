@@ -98,7 +98,7 @@ class BlobStore:
         self._blobs[blob.name] = blob_charge(size)
 
     def unused(self, in_use: Collection[str]) -> list[str]:
-        """Digests of the trees that nobody uses, the longest unused first."""
+        """Digests of the trees that are not in use, the longest unused first."""
         real = os.path.realpath(self.home / "trees")
         used = {os.path.realpath(path) for path in in_use}
         names = [name for name in self._trees if os.path.join(real, name) not in used]
@@ -121,7 +121,7 @@ class BlobStore:
     def lay_out(self, digest: str, files: list[ListedFile], copying: Callable[[int], None]) -> None:
         """Build a tree beside its place and rename it: what bears a digest is complete.
 
-        ``copying`` is told the size of each file that cannot be a link, before it is copied.
+        ``copying`` is called with the size of each file that cannot be a link, before it is copied.
         """
         tree = self.tree(digest)
         make_passable(tree.parent)
@@ -151,7 +151,7 @@ def _is_there(path: Path, size: int) -> bool:
 
 
 def make_passable(folder: Path) -> None:
-    """Make a folder that nobody else lists; root's jails, another user, pass through to a tree."""
+    """Make a folder that only its owner lists; root's jails pass through to a tree."""
     folder.mkdir(parents=True, exist_ok=True)
     os.chmod(folder, 0o711 if os.getuid() == 0 else 0o700)
 

@@ -5,8 +5,8 @@
     <folder>/<key>/blobs/<sha256>       files, 0444, hashed when they arrived
     <folder>/<key>/trees/<digest>/      snapshots: hard links to them, in folders 0555
 
-Each client key has a store of its own: whoever could name another's hashes would otherwise see
-its files. A snapshot is named by the digest of its listing, so the same listing is the same tree.
+Each client key has a store of its own: else a client that knows another's hashes would see its
+files. A snapshot is named by the digest of its listing, so the same listing is the same tree.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ class Uploads:
         """Take a piece of a wanted file; the last one makes it a blob.
 
         Raises:
-            RefusedError: Nobody wanted it, it is out of order, or it is not what its hash says.
+            RefusedError: It is not wanted, is out of order, or it is not what its hash says.
         """
         if len(request.sha256) != _SHA256_BYTES:  # it would be a file's name
             raise RefusedError("LocalProtocolError", "a hash has 32 bytes")

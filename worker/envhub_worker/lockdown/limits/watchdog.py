@@ -154,7 +154,7 @@ def _add_process(usage: Usage, pid: int) -> None:
 def _add_mappings(usage: Usage, pid: int) -> None:
     """Of each shared object what is mapped, or what the filter lets be made, if that is more.
 
-    It keeps pages that nobody maps any more, while there is one that somebody does.
+    It keeps pages that are not mapped any more, as long as one of them is.
     """
     maps = procfs.content(f"/proc/{pid}/maps")
     usage.kernel += maps.count(b"\n") * _MAPPING

@@ -70,7 +70,7 @@ def mount(source: str, target: str, kind: str, flags: int = 0, options: str = ""
 
 
 def unmount(target: str) -> None:
-    """Detach whatever is mounted at ``target``, now; it goes when nobody uses it."""
+    """Detach whatever is mounted at ``target``, now; it goes when it is not used any more."""
     _checked(_libc.umount2(os.fsencode(target), ctypes.c_int(MNT_DETACH)), target)
 
 

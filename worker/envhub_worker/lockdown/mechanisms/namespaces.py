@@ -104,7 +104,7 @@ def fork_in_new_pid_namespace() -> int:
 
 
 def forbid_what_is_counted() -> None:
-    """Let nobody below ours make a namespace or watch a file, should the filter let it by.
+    """Let no process below ours make a namespace or watch a file, should the filter let it by.
 
     The kernel counts these for each user, in each user namespace and all above it; so the user's
     other programs keep their share.

@@ -36,7 +36,7 @@ class Scratch:
         return cls(f"{folder}/home", f"{folder}/tmp", f"{folder}/work", shared_memory)
 
     def create(self, snapshot: str, owner: int | None) -> None:
-        """Make the folders, readable by nobody else, and link the snapshot into ``work``.
+        """Make the folders, readable by their owner alone, and link the snapshot into ``work``.
 
         Args:
             snapshot: Its top-level entries appear as symbolic links.

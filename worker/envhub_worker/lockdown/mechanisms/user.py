@@ -90,5 +90,5 @@ def become(uid: int) -> None:
     os.setgroups([])
     os.setresgid(uid, uid, uid)
     os.setresuid(uid, uid, uid)
-    # The change made /proc/self root's; without this nobody could write our user map.
+    # The change made /proc/self root's; without this our user map could not be written.
     process.set_dumpable(True)

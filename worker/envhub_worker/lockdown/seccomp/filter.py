@@ -163,7 +163,7 @@ def install(compiled: bytes, *, brokered: bool = False) -> int:
     """Filter this thread and its descendants for good. ``no_new_privs`` must be set.
 
     Returns:
-        Where the calls that ask arrive if ``brokered``, else -1. Whoever holds it decides.
+        Where the calls that ask arrive if ``brokered``, else -1. Its holder decides.
 
     Raises:
         LayerUnavailableError: The kernel refuses.

@@ -3,7 +3,7 @@
 The filter hands ``kill``, ``tkill`` and ``tgkill`` to init, which sends the signal when the
 target is a process of the jail. All of their arguments are numbers in registers, so nothing can
 change between the check and the act; a target is held by a pidfd before it is looked at, so no
-other process can take its pid. What a process sends to itself the kernel is told to go on with:
+other process can take its pid. The kernel goes on with what a process sends to itself:
 sent by init, it would interrupt the very call that waits for the answer.
 """
 
@@ -77,7 +77,7 @@ def serve(
     permitted: Collection[str],
     note: Callable[[Request], None],
 ) -> bool:
-    """Answer one request that waits at ``listener``; False when nobody is left to ask.
+    """Answer one request that waits at ``listener``; False when no caller is left.
 
     Args:
         permitted: Calls that the policy allows whatever their arguments, and that only ask so that
@@ -98,7 +98,7 @@ def serve(
 
     caller = procfs.process_of(thread)
     request = Request(thread, caller, call, (first, second, third), tuple(words), still_waits)
-    note(request)  # told before the caller goes on, so that nobody can look too early
+    note(request)  # before the caller goes on: what it did is known when it is looked for
     name = name_of(request.call)
     if name in permitted:
         answer = _PROCEED
@@ -113,7 +113,7 @@ def serve(
 
 
 MOST_DENIALS = 64
-"""Different ones that are told of a jail."""
+"""Different ones that are reported of a jail."""
 MOST_FILES = 32
 """Of these, files: a flood of names hides no other attempt."""
 
@@ -168,7 +168,7 @@ def decide(request: Request, inside: _Inside) -> Answer:
 def _kill(caller: int, target: int, signum: int, inside: _Inside) -> Answer:
     group = _group_of(caller)
     if group < 0:
-        return Answer(errno.ESRCH)  # it has gone since, and nobody waits for the answer
+        return Answer(errno.ESRCH)  # it has gone since: no caller waits for the answer
     # A process is alone with the jail in its own group: the host has a session of its own.
     if target in (caller, 0, -group):
         return _PROCEED

@@ -1,8 +1,8 @@
 """Which files a call asks for, as far as its caller's memory says so a moment later.
 
-The kernel is always told to go on with such a call: whether it may is decided by it, by mounts and
-Landlock, and nothing here can make it another. What is read is a stranger's memory, which another
-thread may have changed since, so that it is evidence of an attempt and proof of nothing.
+The kernel always goes on with such a call: whether it may is decided by it, by mounts and Landlock,
+and nothing here can make it another. What is read is a stranger's memory, which another thread may
+have changed since, so that it is evidence of an attempt and proof of nothing.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _PRIVATE = re.compile(
     r"|/proc/\d+(/task/\d+)?/(environ|mem|maps|smaps|auxv|io|fd|fdinfo|root|cwd|ns)(/.*)?",
     re.DOTALL,
 )
-"""What nobody reads by chance; libraries look for a configuration in many another place."""
+"""What is not read by chance; libraries look for a configuration in many another place."""
 _DOORS = re.compile(r"/proc/(?:self|thread-self|\d+)(?:/task/\d+)?/(root|cwd|fd/\d+)")
 """Below a process's own entries one is somewhere else."""
 _MOST_STEPS = 128
@@ -176,7 +176,7 @@ def _absolute(thread: int, base: str, text: bytes, own: OwnPaths, *, last: bool)
                 pending += leads.split("/")[::-1]
         if not pending:
             return f"/{'/'.join(done)}"
-    return f"/...{path}" if path.startswith("/") else ""  # wherever that is: nobody's own
+    return f"/...{path}" if path.startswith("/") else ""  # wherever that is: not its own
 
 
 def _leads(thread: int, path: str, own: OwnPaths, pending: Sequence[str], *, last: bool) -> str:

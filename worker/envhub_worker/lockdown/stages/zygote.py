@@ -161,7 +161,7 @@ def _check_interpreter() -> None:
 
 
 def _check_packages(folder: str) -> None:
-    """What lies deeper is told when it is imported: that it is there, and closed."""
+    """Of the top level; of what lies deeper the import says that it is there, and closed."""
     try:
         names = os.listdir(folder)
     except OSError as error:
