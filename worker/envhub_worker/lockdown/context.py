@@ -7,7 +7,6 @@ from typing import Any
 
 from envhub_worker.lockdown.mechanisms.mounts import View
 from envhub_worker.lockdown.mechanisms.scratch import Scratch
-from envhub_worker.lockdown.plan import Plan
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.records import dataclass
 
@@ -89,11 +88,12 @@ class JailContext:
 
     Attributes:
         processes: Cap for ``RLIMIT_NPROC``.
+        measured: No control group counts memory; init measures it.
     """
 
     spec: JailSpec
     common: Common
-    plan: Plan
     scratch: Scratch
     view: View
     processes: int
+    measured: bool

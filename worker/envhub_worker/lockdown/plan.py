@@ -39,49 +39,32 @@ class HostFacts:
     memory: str
 
 
-@dataclass(frozen=True, kw_only=True)
-class Plan:
-    """What the stages of lockdown do.
-
-    Attributes:
-        landlock: Restrict files (and TCP, signals, abstract sockets as the ABI allows).
-        measured: No control group counts memory; init measures it.
-    """
-
-    namespaced: bool
-    landlock: bool
-    measured: bool
-    layers: tuple[Layer, ...]
-
-
-def plan(confinement: Confinement, facts: HostFacts) -> Plan:
-    """The layers for ``confinement`` on a host like ``facts``.
+def plan(confinement: Confinement, facts: HostFacts) -> tuple[Layer, ...]:
+    """The layers for ``confinement`` on a host like ``facts``, in their order.
 
     Raises:
         LayerUnavailableError: The profile names a layer that the host lacks.
     """
-    landlock = _check(confinement, facts)
+    _check(confinement, facts)
     limits, namespaced = confinement.limits, confinement.profile == "strict"
     ignored = "" if namespaced else "; changes of mode, owner and time are accepted and ignored"
     cpu = "" if limits.cpu_s is None else f", {limits.cpu_s} CPU seconds"
     rlimits = f"{limits.processes} processes, {limits.open_files} open files{cpu}, no core dumps"
-    layers = [
+    return (
         *_user_layers(facts, namespaced),
         *(_namespace_layers(confinement) if namespaced else _without_namespaces(confinement)),
         Layer("capabilities", True, "none in any set"),
         Layer("no-new-privileges", True, "set-user-id programs gain nothing"),
-        _landlock_layer(landlock, facts),
+        _landlock_layer(facts.landlock_abi),
         *_signal_layers(facts, namespaced),
         Layer("seccomp", True, f"allow-list for {facts.machine}{ignored}"),
         Layer("rlimits", True, rlimits),
         *_limit_layers(confinement, facts, namespaced),
-    ]
-    measured = facts.memory == "watchdog"
-    return Plan(namespaced=namespaced, landlock=landlock, measured=measured, layers=tuple(layers))
+    )
 
 
-def _check(confinement: Confinement, facts: HostFacts) -> bool:
-    """Refuse what there cannot be; whether there is Landlock."""
+def _check(confinement: Confinement, facts: HostFacts) -> None:
+    """Refuse what there cannot be."""
     for name, value, known in (
         ("profile", confinement.profile, PROFILES),
         ("network", confinement.network, NETWORKS),
@@ -107,7 +90,6 @@ def _check(confinement: Confinement, facts: HostFacts) -> bool:
             f"the profile {confinement.profile} has no network of its own to give",
             'Use profile "strict", or the network "none".',
         )
-    return facts.landlock_abi > 0
 
 
 def _user_layers(facts: HostFacts, namespaced: bool) -> list[Layer]:
@@ -152,10 +134,9 @@ def _without_namespaces(confinement: Confinement) -> list[Layer]:
     ]
 
 
-def _landlock_layer(landlock: bool, facts: HostFacts) -> Layer:
-    if not landlock:
+def _landlock_layer(abi: int) -> Layer:
+    if not abi:
         return Layer("landlock", False, "this kernel or container has none")
-    abi = facts.landlock_abi
     scope = ", TCP" * (abi >= 4) + ", signals and abstract sockets" * (abi >= 6)
     return Layer("landlock", True, f"ABI {abi}: files{scope}")
 

@@ -59,19 +59,12 @@ def mode_of(env: Any, stated: Any) -> Any:
     Args:
         stated: What its metadata says, or None.
     """
-    if stated is not None or _MODES is not None or not _is_gymnasiums(env):
+    if stated is not None or _MODES is not None:
         return stated
-    return DEFAULT_MODE
-
-
-def _is_gymnasiums(env: Any) -> bool:
-    if isinstance(env, VectorEnv):
-        return True
-    return any(cls.__module__.startswith(_EXPERIMENTAL) for cls in type(env).__mro__)
-
-
-def _as_they_are(info: Any) -> Any:
-    return info
+    ours = isinstance(env, VectorEnv) or any(
+        cls.__module__.startswith(_EXPERIMENTAL) for cls in type(env).__mro__
+    )
+    return DEFAULT_MODE if ours else None
 
 
 def renamed(info: Any) -> Any:
@@ -80,17 +73,14 @@ def renamed(info: Any) -> Any:
         return info
     found: dict[Any, Any] = {}
     for key, value in info.items():
-        if not _is_mask(key, info):
+        is_mask = isinstance(key, str) and key.startswith("_") and key[1:] in info
+        if not is_mask:
             mask = info.get(f"_{key}")
             found.update(_entry(_RENAMED.get(key, key), value, mask))
     return found
 
 
 _RENAMED = {"final_observation": "final_obs"}
-
-
-def _is_mask(key: Any, info: dict[Any, Any]) -> bool:
-    return isinstance(key, str) and key.startswith("_") and key[1:] in info
 
 
 def _entry(key: Any, values: Any, mask: Any) -> dict[Any, Any]:
@@ -103,7 +93,7 @@ def _entry(key: Any, values: Any, mask: Any) -> dict[Any, Any]:
     return {key: values, f"_{key}": mask}
 
 
-joined_infos: Callable[[Any], Any] = renamed if _BEFORE_1_0 else _as_they_are
+joined_infos: Callable[[Any], Any] = renamed if _BEFORE_1_0 else lambda info: info
 """The infos of a vector environment with a ``step`` of its own, under the names of today."""
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.stream import Packet, pack_packet, read_packet
-from envhub_worker.runner.infos import InfoWriter, Pairs, join
+from envhub_worker.runner.infos import InfoWriter, Pairs
 from envhub_worker.runner.sync_envs import SubEnvs
 from envhub_worker.runner.watches import Watches
 
@@ -99,11 +99,14 @@ class Lane:
         batch.truncations = bools[count:][start:stop]
         bools[:count][start:stop] = bools[count:][start:stop] = False  # another may have died here
         bases = [slot * observed.slot_bytes for slot in range(observed.slots)]
-        rows = [[self._rows(leaf, base, start) for leaf in observed.leaves] for base in bases]
+        rows = [
+            [
+                slabs.view(self._observations, leaf, base=base)[start:stop]
+                for leaf in observed.leaves
+            ]
+            for base in bases
+        ]
         batch.write_to(rows)
-
-    def _rows(self, leaf: slabs.Leaf, base: int, start: int) -> Any:
-        return slabs.view(self._observations, leaf, base=base)[start : start + self._layout.count]
 
     def wake(self) -> bool:
         """After the doorbell: silence it, and serve while requests keep coming quickly.
@@ -143,12 +146,9 @@ class Lane:
         self._served = sequence
         words[slabs.SEQUENCE] = sequence
         if self._asked[slabs.PARKED]:
-            self._ring()
+            with contextlib.suppress(BlockingIOError):  # it is full: it has been rung already
+                os.write(self._client_bell, _RING)
         return True
-
-    def _ring(self) -> None:
-        with contextlib.suppress(BlockingIOError):  # it is full: it has been rung already
-            os.write(self._client_bell, _RING)
 
     def _run_measured(self) -> None:
         words, start = self._reply_words, perf_counter_ns()
@@ -227,7 +227,7 @@ class Lane:
 
     def infos(self) -> dict[Any, Any]:
         """The last step's infos."""
-        return join(self._pairs, self._layout.count, sliced=self._env.sliced)
+        return self._env.joined(self._pairs)
 
 
 def _raised_frame(message: m.Raised) -> Any:

@@ -56,15 +56,15 @@ def is_vector(value: object) -> bool:
 
 def adapted(env: Any) -> Any:
     """An environment of ``gym`` as one of Gymnasium; anything else as it is."""
-    return _told(OldEnv, env) if is_env(env) else env
+    return _warned(OldEnv, env) if is_env(env) else env
 
 
 def adapted_vector(env: Any) -> Any:
     """A vector environment of ``gym`` as one of Gymnasium; anything else as it is."""
-    return _told(OldVectorEnv, env) if is_vector(env) else env
+    return _warned(OldVectorEnv, env) if is_vector(env) else env
 
 
-def _told(adapter: Callable[[Any], Any], env: Any) -> Any:
+def _warned(adapter: Callable[[Any], Any], env: Any) -> Any:
     if not hasattr(np, "bool8"):  # numpy 2 has taken away what gym's own checks of a step use
         np.bool8 = np.bool_  # type: ignore[attr-defined]
     release = getattr(sys.modules.get("gym"), "__version__", "of an unknown release")
@@ -264,35 +264,13 @@ def space_of(space: Any) -> Any:
     )
 
 
-def _box(space: Any) -> Any:
-    return spaces.Box(space.low, space.high, space.shape, space.dtype)
-
-
-def _discrete(space: Any) -> Any:
-    return spaces.Discrete(int(space.n), start=int(getattr(space, "start", 0)))
-
-
-def _multi_discrete(space: Any) -> Any:
-    return spaces.MultiDiscrete(space.nvec, dtype=space.dtype)
-
-
-def _multi_binary(space: Any) -> Any:
-    return spaces.MultiBinary(space.n)
-
-
-def _tuple(space: Any) -> Any:
-    return spaces.Tuple([space_of(one) for one in space.spaces])
-
-
-def _dict(space: Any) -> Any:
-    return spaces.Dict(OrderedDict((key, space_of(one)) for key, one in space.spaces.items()))
-
-
 _SPACES: dict[str, Callable[[Any], Any]] = {
-    "Box": _box,
-    "Discrete": _discrete,
-    "MultiDiscrete": _multi_discrete,
-    "MultiBinary": _multi_binary,
-    "Tuple": _tuple,
-    "Dict": _dict,
+    "Box": lambda space: spaces.Box(space.low, space.high, space.shape, space.dtype),
+    "Discrete": lambda space: spaces.Discrete(int(space.n), start=int(getattr(space, "start", 0))),
+    "MultiDiscrete": lambda space: spaces.MultiDiscrete(space.nvec, dtype=space.dtype),
+    "MultiBinary": lambda space: spaces.MultiBinary(space.n),
+    "Tuple": lambda space: spaces.Tuple([space_of(one) for one in space.spaces]),
+    "Dict": lambda space: spaces.Dict(
+        OrderedDict((key, space_of(one)) for key, one in space.spaces.items())
+    ),
 }

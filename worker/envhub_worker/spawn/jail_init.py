@@ -123,18 +123,18 @@ class Init:
             landlock_abi=self._common.landlock_abi,
             memory=message["cgroup"] or "watchdog",
         )
-        wanted = plan(spec.confinement, facts)
+        layers = plan(spec.confinement, facts)
         scratch, view = jail.enter(spec, self._common, message["scratch"])
         self._jail = JailContext(
             spec=spec,
             common=self._common,
-            plan=wanted,
             scratch=scratch,
             view=view,
-            processes=jail.process_limit(spec.confinement.limits, wanted.namespaced),
+            processes=jail.process_limit(spec.confinement.limits, self._common.namespaced),
+            measured=not message["cgroup"],
         )
         self._watchdog = Watchdog(self._jail, events)
-        report = [layer.to_wire() for layer in (*wanted.layers, jail.working_view(view))]
+        report = [layer.to_wire() for layer in (*layers, jail.working_view(view))]
         self._channel.send({"event": "ready", "report": report})
 
     def _stop(self, *_: object) -> None:

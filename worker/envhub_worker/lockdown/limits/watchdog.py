@@ -260,12 +260,12 @@ class Watchdog:
             events: Where its control group counts out-of-memory; -1 to measure instead.
         """
         self._limits = jail.spec.confinement.limits
-        tmpfs = jail.scratch.temporary if jail.plan.namespaced else None
+        tmpfs = jail.scratch.temporary if jail.common.namespaced else None
         self._events = events
         self._seen_kills = 0
-        own_network = jail.plan.namespaced and jail.common.config.network != "host"
+        own_network = jail.common.namespaced and jail.common.config.network != "host"
         self._memory = MemoryWatch(self._limits.memory_bytes, tmpfs, own_network=own_network)
-        self._folder = None if jail.plan.namespaced else os.path.dirname(jail.scratch.home)
+        self._folder = None if jail.common.namespaced else os.path.dirname(jail.scratch.home)
         self._memory_due = time.monotonic()
         self._disk_due = time.monotonic() if self._folder else float("inf")
 

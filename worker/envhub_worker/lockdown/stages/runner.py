@@ -76,10 +76,10 @@ def enter(
     _apply(resource_limits(jail.spec.confinement.limits, jail.processes))
     process.drop_capabilities()
     process.set_no_new_privileges()
-    if jail.plan.landlock:
+    if jail.common.landlock_abi:
         wanted = landlock.ruleset(jail.common.landlock_abi, jail.common.config.network)
         landlock.restrict(wanted, rules(jail, os.getpid()))
-    program = jail.common.programs[jail.plan.measured]
+    program = jail.common.programs[jail.measured]
     listener = filter.install(program, brokered=jail.common.asks)
     if listener >= 0:
         give_to_init(listener)

@@ -51,7 +51,7 @@ def _denials(jail: JailContext) -> dict[str, Callable[[], object]]:
         denials["the snapshot cannot be written"] = lambda: os.open(entry, os.O_WRONLY)
     for path in jail.view.refused:
         denials[f"{path} cannot be written"] = partial(_make_unnamed, path)
-    if jail.plan.landlock or jail.common.namespaced:
+    if jail.common.landlock_abi or jail.common.namespaced:
         canary = jail.common.config.canary
         denials["files outside cannot be read"] = lambda: os.open(canary, os.O_RDONLY)
     if jail.common.landlock_abi >= 6 or jail.common.brokered:
