@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from envhub_worker.lockdown.limits import cgroups, watchdog
-from envhub_worker.lockdown.limits.cgroups import Group, Hierarchy, Tree
+from envhub_worker.lockdown.limits.cgroups import Group, Hierarchy, SurroundingLimit, Tree
 from envhub_worker.lockdown.limits.watchdog import (
     MemoryWatch,
     folder_usage,
@@ -122,6 +122,22 @@ def test_out_of_memory_kills_are_counted(tmp_path: Path) -> None:
         fd = os.open(tmp_path / "events", os.O_RDONLY)
         assert cgroups.oom_kills(fd) == 3
         os.close(fd)
+
+
+@pytest.mark.parametrize("name", ["memory.events", "memory/memory.oom_control"])
+def test_each_kill_is_one_death(tmp_path: Path, name: str) -> None:
+    """What the kernel had counted before the server came is nobody's; there may be no such file."""
+    assert not SurroundingLimit(tmp_path / "nowhere").killed_one()
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("low 0\noom_kill 3\n")
+    limit = SurroundingLimit(tmp_path)
+    assert not limit.killed_one()
+    path.write_text("low 0\noom_kill 5\n")
+    assert [limit.killed_one() for _ in range(3)] == [True, True, False]
+    limit.close()
+    limit.close()
+    assert not limit.killed_one()
 
 
 def test_next_look_comes_sooner_near_the_limit() -> None:

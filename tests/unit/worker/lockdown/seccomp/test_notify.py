@@ -1,7 +1,8 @@
-"""A call that asks before it is made is not interrupted by signals that would not interrupt it."""
+"""Calls that ask init before they are made: no signal interrupts them, and a caller may go."""
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import signal
@@ -11,9 +12,12 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
 import envhub_worker
 from envhub_worker.lockdown.seccomp import filter, notify
 from envhub_worker.lockdown.seccomp.policy import table, watched
+from envhub_worker.lockdown.seccomp.syscalls import number
 from tests.support.processes import eventually
 
 _ROUNDS = 20
@@ -99,3 +103,13 @@ def test_a_signal_interrupts_no_call_that_asks() -> None:
 def test_an_older_kernel_is_asked_without_it() -> None:
     """One that does not know the flag refuses it; whoever asks is heard all the same."""
     assert len(opens(1 << 30)) == _ROUNDS
+
+
+@pytest.mark.parametrize("to", ["its group", "init"])
+def test_a_caller_that_has_gone_since_ends_nobody(to: str) -> None:
+    """It was killed between its call and our look at its group: the answer reaches nobody."""
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    target = -gone.pid if to == "its group" else 1
+    asked = notify.Request(gone.pid, gone.pid, number("kill"), (target, 15, 0))
+    assert notify.decide(asked, list) == notify.Answer(errno.ESRCH)
