@@ -9,11 +9,13 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
 
 from envhub_worker import bootstrap
+from envhub_worker.lockdown.mechanisms.procfs import descendants
 from envhub_worker.protocol.confinement import LACKS_PACKAGES, Confinement, Limits
 from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.spawn.spawner import Spawner, ZygoteDied
@@ -139,19 +141,18 @@ def test_output_of_all_runners_arrives(cell: Cell) -> None:
         cell.wait_for_output(text)
 
 
-def test_exit_code_of_a_runner_is_told(cell: Cell) -> None:
-    """SystemExit inside the target ends the runner with its code."""
-    cell.run("import os; os._exit(7)")
+@pytest.mark.parametrize(
+    ("ends", "how"),
+    [
+        ("os._exit(7)", (7, None, "exit")),
+        ("os.kill(os.getpid(), 11)", (None, signal.SIGSEGV, "signal")),
+    ],
+)
+def test_how_a_runner_ended_is_reported(cell: Cell, ends: str, how: tuple[Any, ...]) -> None:
+    """With its code; a crash is a signal, not a code."""
+    cell.run(f"import os; {ends}")
     exited = cell.wait_for(RunnerExited)
-    assert (exited.code, exited.signal, exited.reason) == (7, None, "exit")
-
-
-def test_signal_that_ends_a_runner_is_told(cell: Cell) -> None:
-    """A crash is a signal, not a code."""
-    cell.run("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
-    exited = cell.wait_for(RunnerExited)
-    assert (exited.code, exited.signal) == (None, signal.SIGSEGV)
-    assert exited.reason == "signal"
+    assert (exited.code, exited.signal, exited.reason) == how
 
 
 def test_killed_runner_takes_its_children_along(cell: Cell, folder: Path) -> None:
@@ -277,8 +278,10 @@ def test_dead_zygote_is_told_with_its_log(folder: Path, confinement: Confinement
         readable_roots=[],
         runtime=Runtime(str(bare / "bin/python")),
     )
-    wait_until(lambda: any(isinstance(e, ZygoteDied) for e in _keep(spawner)), "it lives")
-    died = next(event for event in _SEEN if isinstance(event, ZygoteDied))
+    seen: list[Any] = []
+    wait_until(lambda: bool(seen.extend(spawner.poll()) or seen), "it lives")
+    [died] = seen
+    assert isinstance(died, ZygoteDied)
     assert "ModuleNotFoundError" in died.log
     assert "pip install cloudpickle gymnasium msgpack numpy pyzmq" in died.log
     assert "Traceback" not in died.log
@@ -286,18 +289,11 @@ def test_dead_zygote_is_told_with_its_log(folder: Path, confinement: Confinement
     spawner.close()
 
 
-_SEEN: list[object] = []
-
-
-def _keep(spawner: Spawner) -> list[object]:
-    _SEEN.extend(spawner.poll())
-    return _SEEN
-
-
 SERVER = """
 import sys, time
 sys.path.insert(0, {kit!r})
 from pathlib import Path
+from typing import Any
 from confinement_kit import *
 from envhub_worker.protocol.confinement import Confinement
 confinement = Confinement(profile={profile!r})
@@ -320,7 +316,7 @@ def test_killed_server_leaves_no_process(folder: Path, confinement: Confinement)
     server = subprocess.Popen([sys.executable, "-c", source], stdout=subprocess.PIPE)
     assert server.stdout is not None
     assert server.stdout.readline() == b"up\n"
-    below = processes_below(server.pid)
+    below = descendants(server.pid)
     assert len(below) >= 3
     wait_until(lambda: processes_that_mention(mark), "the daemon never came")
     server.kill()
@@ -328,13 +324,6 @@ def test_killed_server_leaves_no_process(folder: Path, confinement: Confinement)
     server.stdout.close()
     wait_until(lambda: not any(map(alive, below)), "a process lived on")
     wait_until(lambda: not processes_that_mention(mark), "the daemon lived on")
-
-
-def processes_below(root: int) -> list[int]:
-    """Every descendant of ``root``."""
-    from envhub_worker.lockdown.mechanisms.procfs import descendants
-
-    return descendants(root)
 
 
 def alive(pid: int) -> bool:

@@ -43,10 +43,10 @@ machines = pytest.mark.parametrize("machine", ["x86_64", "aarch64"])
 class Filter:
     """A compiled filter that answers by name."""
 
-    def __init__(self, machine: str, namespaced: bool, network: str = "none") -> None:
+    def __init__(self, machine: str, namespaced: bool, network: str = "none", **more: bool) -> None:
         self.machine = machine
         self.program: Sequence[Instruction] = filter.program(
-            machine, table(namespaced=namespaced, network=network)
+            machine, table(namespaced=namespaced, network=network, **more)
         )
 
     def __call__(self, name: str, *args: int) -> int:
@@ -179,12 +179,7 @@ def test_socket_families_without_network(machine: str, namespaced: bool) -> None
 @machines
 def test_local_sockets_end_where_the_hosts_abstract_names_begin(machine: str) -> None:
     """On the host's network, with a Landlock that does not keep them out of reach."""
-    verdicts = table(namespaced=True, network="host", scoped=False)
-    program = filter.program(machine, verdicts)
-
-    def verdict(name: str, *args: int) -> int:
-        return run(program, ARCH[machine], NUMBERS[machine][name], args)
-
+    verdict = Filter(machine, True, "host", scoped=False)
     assert verdict("socket", 1, 1) == verdict("socket", 1, 2) == NOT_SUPPORTED
     assert verdict("socketpair", 1, 2) == NOT_SUPPORTED
     assert verdict("socketpair", 1, 1) == verdict("socket", 2, 1) == ALLOW
@@ -308,13 +303,7 @@ def test_buffers_of_sockets_keep_their_size(machine: str) -> None:
 @machines
 def test_memory_out_of_sight_is_denied_where_it_is_measured(machine: str) -> None:
     """Files without a name, and shared memory but for a little; mapped files are what they were."""
-    counted = Filter(machine, True)
-    verdicts = table(namespaced=True, network="none", measured=True)
-    program = filter.program(machine, verdicts)
-
-    def measured(name: str, *args: int) -> int:
-        return run(program, ARCH[machine], NUMBERS[machine][name], args)
-
+    counted, measured = Filter(machine, True), Filter(machine, True, measured=True)
     shared, private, anonymous, validate, huge = 1, 2, 0x20, 3, 0x40000
     assert measured("memfd_create") == ENOSYS
     assert counted("memfd_create") == ALLOW
@@ -336,20 +325,9 @@ def test_memory_out_of_sight_is_denied_where_it_is_measured(machine: str) -> Non
 @machines
 def test_signals_are_handed_to_init_where_it_sends_them(machine: str) -> None:
     """All that name a process; what has no broker is denied, or falls back."""
-    verdicts = table(namespaced=False, network="none", brokered=True)
-    program = filter.program(machine, verdicts)
-    numbers = NUMBERS[machine]
-    answers = {
-        name: run(program, ARCH[machine], numbers[name], (1, 15))
-        for name in ("kill", "tkill", "tgkill", "rt_sigqueueinfo", "pidfd_send_signal")
-    }
-    assert answers == {
-        "kill": ASK,
-        "tkill": ASK,
-        "tgkill": ASK,
-        "rt_sigqueueinfo": EPERM,
-        "pidfd_send_signal": ENOSYS,
-    }
+    check = Filter(machine, False, brokered=True)
+    names = ("kill", "tkill", "tgkill", "rt_sigqueueinfo", "pidfd_send_signal")
+    assert [check(name, 1, 15) for name in names] == [ASK, ASK, ASK, EPERM, ENOSYS]
 
 
 @machines
