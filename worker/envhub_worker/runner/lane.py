@@ -76,8 +76,8 @@ class Lane:
             os.close(fd)
         os.set_blocking(self.bell, False)
         self._asked = slabs.words(self._request)
-        self._reply_words = slabs.words(self._reply)
-        self._reply_words[slabs.PARKED] = 1
+        self._told = slabs.words(self._reply)
+        self._told[slabs.PARKED] = 1
         self._layout = layout
         self._env = env
         self._assemble = slabs.assembler(env.single_action_space)
@@ -125,12 +125,12 @@ class Lane:
         """Wait for the next request without sleeping, for as long as the client says."""
         asked, served = self._asked, self._served
         if self._spin_ns:
-            self._reply_words[slabs.PARKED] = 0
+            self._told[slabs.PARKED] = 0
             until = perf_counter_ns() + self._spin_ns
             while perf_counter_ns() < until:
                 if asked[slabs.SEQUENCE] != served:
                     return True
-        self._reply_words[slabs.PARKED] = 1
+        self._told[slabs.PARKED] = 1
         return asked[slabs.SEQUENCE] != served
 
     def serve(self) -> bool:
@@ -138,7 +138,7 @@ class Lane:
         sequence = self._asked[slabs.SEQUENCE]
         if sequence == self._served:
             return False
-        words = self._reply_words
+        words = self._told
         if sequence & _MEASURE or self._asked[slabs.MESSAGE]:
             words[slabs.OUTCOME], words[slabs.LENGTH] = self._run()
         else:
@@ -151,7 +151,7 @@ class Lane:
         return True
 
     def _run_measured(self) -> None:
-        words, start = self._reply_words, perf_counter_ns()
+        words, start = self._told, perf_counter_ns()
         words[slabs.OUTCOME], words[slabs.LENGTH] = self._run()
         words[slabs.BUSY] = perf_counter_ns() - start
 
