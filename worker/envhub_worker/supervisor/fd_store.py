@@ -25,7 +25,7 @@ may not have it."""
 
 
 class FdStore:
-    """Descriptors that wait for their runner."""
+    """Descriptors that wait for their runner, and the socket that takes them."""
 
     def __init__(self, path: str, pidfd_for: PidfdFor) -> None:
         self._pidfd_for = pidfd_for

@@ -22,6 +22,7 @@ from envhub_worker.supervisor.fd_store import FdStore
 from envhub_worker.supervisor.records import (
     JailEntry,
     Pending,
+    RefusedError,
     Reply,
     for_operation,
     signal_name,
@@ -158,7 +159,7 @@ class JailEvents:
     def _failed(self, entry: JailEntry, event: JailFailed) -> None:
         for opening in entry.opening:
             why = ("SandboxUnavailableError", event.reason, event.layer, event.fix)
-            self._reply(opening.asker, m.Refused(*why))
+            self._reply(opening.asker, RefusedError(*why).reply)
         entry.opening.clear()
         self.end(entry, whole_jail("unavailable", detail=event.reason))
 
