@@ -13,8 +13,7 @@ import json
 import os
 from collections import OrderedDict, deque
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass as mutable_dataclass
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -24,7 +23,6 @@ from envhub_worker.access.quotas import BusyError, Quotas
 from envhub_worker.access.store.blob_store import make_passable
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.messages.busy import Busy
-from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.supervisor.records import RefusedError
 
@@ -54,7 +52,7 @@ Place = tuple[str, str]
 """Whose an order is, and its hash."""
 
 
-@mutable_dataclass
+@dataclass
 class Order:
     """An order that a client waits for.
 
@@ -70,25 +68,10 @@ class Order:
     progress: str = "at work"
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What became of an order: the program's own words, and when."""
-
-    said: Mapping[str, Any]
-    when: float
-
-
-@dataclass(frozen=True)
-class News:
-    """For the log: what became of an order.
-
-    Attributes:
-        owner: Whose session asked first.
-    """
-
-    owner: bytes
-    seconds: float
-    said: Mapping[str, Any]
+Outcome = tuple[Mapping[str, Any], float]
+"""What became of an order: the program's own words, and when."""
+News = tuple[bytes, float, Mapping[str, Any]]
+"""For the log: whose session ordered first, how long the program took, its last words."""
 
 
 class Packages:
@@ -192,7 +175,7 @@ class Packages:
     # --- orders --------------------------------------------------------------------------------
 
     def _answer(self, place: Place, found: Outcome) -> m.Packages | None:
-        said = found.said
+        said, when = found
         if "own" in said:
             return m.Packages("own", "", {}, "this server's interpreter has all of it")
         made = said.get("made")
@@ -202,7 +185,7 @@ class Packages:
             with contextlib.suppress(OSError):
                 os.utime(Path(made["packages"]).with_name("environment.json"))
             return m.Packages("made", name, made["facts"], "")
-        if made is None and monotonic() - found.when < _FAILED_S:
+        if made is None and monotonic() - when < _FAILED_S:
             raise RefusedError(str(said["error"]), str(said["said"]))
         del self._outcomes[place]
         return None
@@ -292,8 +275,8 @@ class Packages:
     def _end(self, place: Place, said: Mapping[str, Any], since: float) -> None:
         now = monotonic()
         order = self._line.pop(place)
-        self._outcomes[place] = Outcome(said, now)
-        self._news.append(News(order.owner, now - since, said))
+        self._outcomes[place] = said, now
+        self._news.append((order.owner, now - since, said))
         while len(self._outcomes) > _REMEMBERED:
             self._outcomes.popitem(last=False)
 

@@ -289,7 +289,7 @@ class RemoteGate(Gate):
         self._expiry.tick(sessions, jails)
         self._packages.look(jails.packages)
         for news in self._packages.news():
-            self._events.packages(news.owner, news.seconds, news.said)
+            self._events.packages(*news)
         if self._publish is not None:
             self._publish(self.figures(sessions, jails))
         watched = {entry.jail.pid: self._label_of(_key_of(entry)) for entry in jails.open_ones()}

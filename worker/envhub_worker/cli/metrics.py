@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from envhub_worker.access.audit.figures import REFUSALS
 from envhub_worker.protocol.confinement import REASONS
@@ -22,12 +22,8 @@ STALE_S = 30.0
 _TEXT = "text/plain; charset=utf-8"
 
 
-class Answer(NamedTuple):
-    """To a request for a page."""
-
-    status: int
-    kind: str
-    body: bytes
+Answer = tuple[int, str, bytes]
+"""To a request for a page: status, content type, body."""
 
 
 class MetricsPage:
@@ -60,16 +56,16 @@ class MetricsPage:
         if path == "/metrics" and published is not None and not wrong:
             return self._metrics(published[1])
         if path in ("/metrics", "/healthz"):
-            return Answer(503 if wrong else 200, _TEXT, f"{wrong or 'well'}\n".encode())
+            return 503 if wrong else 200, _TEXT, f"{wrong or 'well'}\n".encode()
         if path == "/readyz":
             wrong = wrong or self._unready(published)
-            return Answer(503 if wrong else 200, _TEXT, f"{wrong or 'ready'}\n".encode())
-        return Answer(404, _TEXT, b"/metrics, /healthz, /readyz\n")
+            return 503 if wrong else 200, _TEXT, f"{wrong or 'ready'}\n".encode()
+        return 404, _TEXT, b"/metrics, /healthz, /readyz\n"
 
     def _metrics(self, figures: Mapping[str, Any]) -> Answer:
         """Made once for each publication: to ask often costs the server nothing."""
         if self._rendered is None or self._rendered[0] is not figures:
-            self._rendered = figures, Answer(200, *self._render(figures))
+            self._rendered = figures, (200, *self._render(figures))
         return self._rendered[1]
 
     def _wrong(self, published: tuple[float, Mapping[str, Any]] | None) -> str:

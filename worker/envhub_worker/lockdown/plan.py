@@ -93,33 +93,27 @@ def _check(confinement: Confinement, facts: HostFacts) -> None:
 
 
 def _user_layers(facts: HostFacts, namespaced: bool) -> list[Layer]:
-    layers = []
-    if facts.root:
-        layers.append(Layer("unprivileged-user", True, "a user id that owns and runs nothing"))
-    if namespaced:
-        layers.append(Layer("user-namespace", True, "one user, and no capability over any other"))
-    return layers
+    user = Layer("unprivileged-user", True, "a user id that owns and runs nothing")
+    namespace = Layer("user-namespace", True, "one user, and no capability over any other")
+    return [user] * facts.root + [namespace] * namespaced
 
 
 def _namespace_layers(confinement: Confinement) -> list[Layer]:
     limits = confinement.limits
+    network = {
+        "host": "the host's network, by explicit choice",
+        "loopback": "only a loopback device",
+    }.get(confinement.network, "no device that is up")
     scratch = f"one tmpfs of {limits.disk_bytes // MIB} MiB and {limits.disk_files} files"
     return [
         Layer("pid-namespace", True, "sees, signals and outlives no process but its own"),
         Layer("mount-namespace", True, "a private read-only root; other files do not exist"),
         Layer("scratch", True, scratch),
-        _network_layer(confinement.network),
+        Layer("network-namespace", confinement.network != "host", network),
         Layer("ipc-namespace", True, "its own System V and POSIX objects"),
         Layer("uts-namespace", True, "a host name that says nothing"),
         Layer("cgroup-namespace", True, "does not see where it is counted"),
     ]
-
-
-def _network_layer(network: str) -> Layer:
-    if network == "host":
-        return Layer("network-namespace", False, "the host's network, by explicit choice")
-    device = "only a loopback device" if network == "loopback" else "no device that is up"
-    return Layer("network-namespace", True, device)
 
 
 def _without_namespaces(confinement: Confinement) -> list[Layer]:

@@ -26,7 +26,6 @@ from typing import NoReturn
 
 from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.layers import Layer, LayerUnavailableError
-from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.lockdown.mechanisms import process, reap
 from envhub_worker.lockdown.mechanisms.environment import jail_environment
 from envhub_worker.lockdown.spec import JailSpec
@@ -119,7 +118,8 @@ def confine(order: Order, init: Channel) -> None:
     # an order of its own, and after it there is nothing left to give up.
     process.die_with_parent(order.parent)
     os.setsid()
-    cgroups.join(order.joins)
+    for group in order.joins:
+        os.write(group, b"0")  # this process, which has one thread
     process.reset_signals(reap.HANDLED)
     descriptors = {0, 1, 2, order.status, *order.fds}
     process.close_all_but({*descriptors, *order.jail.view.shared.values()})

@@ -24,7 +24,6 @@ from envhub_worker.supervisor.records import (
     Pending,
     RefusedError,
     Reply,
-    for_operation,
     signal_name,
     waiting,
     whole_jail,
@@ -218,7 +217,7 @@ class JailEvents:
         link.close()
         for opening in [one for one in entry.opening if death.runner in one.waiting]:
             entry.opening.remove(opening)
-            self._reply(opening.asker, for_operation(death, "start"))
+            self._reply(opening.asker, m.replace(death, operation="start"))
         self._witness.lost(entry, death)
 
     def end(self, entry: JailEntry, death: m.Died) -> None:
@@ -230,9 +229,9 @@ class JailEvents:
         entry.output.read()
         entry.death = death = m.replace(death, tail=entry.output.text())
         for pending in waiting(entry):
-            self._reply(pending.asker, for_operation(death, pending.operation))
+            self._reply(pending.asker, m.replace(death, operation=pending.operation))
         for opening in entry.opening:
-            self._reply(opening.asker, for_operation(death, "start"))
+            self._reply(opening.asker, m.replace(death, operation="start"))
         entry.opening.clear()
         self._witness.died(entry)
         self.kill(entry)
@@ -295,7 +294,7 @@ class JailEvents:
             entry.idle.close()
         for pending in waiting(entry):
             death = whole_jail("killed", detail="the jail was closed")
-            self._reply(pending.asker, for_operation(death, pending.operation))
+            self._reply(pending.asker, m.replace(death, operation=pending.operation))
         self._forget_some()
 
     def _forget_some(self) -> None:

@@ -30,7 +30,6 @@ from envhub_worker.supervisor.records import (
     Pending,
     RefusedError,
     Reply,
-    for_operation,
     owes,
     status_of,
     whole_jail,
@@ -193,7 +192,7 @@ class Jails:
         if entry is None:
             raise RefusedError("WorkerDiedError", f"there is no jail {number}; it has been closed")
         if entry.death is not None:
-            raise AnsweredError(for_operation(entry.death, operation))
+            raise AnsweredError(m.replace(entry.death, operation=operation))
         return entry
 
     def close_jail(self, asker: Asker, request: m.CloseJail) -> m.Message | None:

@@ -80,7 +80,7 @@ class Pending:
     def lost(self, index: int, death: m.Died) -> None:
         """In the place of a runner's answer: how it died."""
         self.dead.add(index)
-        self.replies[index] = m.pack(for_operation(death, self.operation))
+        self.replies[index] = m.pack(m.replace(death, operation=self.operation))
 
 
 @dataclass
@@ -144,11 +144,6 @@ def owes(entry: JailEntry, runner: int) -> int:
     """How many answers a runner owes; one that has died owes none any more."""
     link = entry.links.get(runner)
     return 0 if link is None else len(link.pending)
-
-
-def for_operation(death: m.Died, operation: str) -> m.Died:
-    """A death, as the reply to this operation."""
-    return m.replace(death, operation=operation)
 
 
 def whole_jail(reason: Reason, **how: Any) -> m.Died:

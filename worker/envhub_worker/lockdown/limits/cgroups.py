@@ -238,12 +238,6 @@ def _settings(kind: str, folders: Sequence[str], limits: Limits) -> list[tuple[s
     ]
 
 
-def join(fds: Sequence[int]) -> None:
-    """Put this single-threaded process into the group of ``Group.open``."""
-    for fd in fds:
-        os.write(fd, b"0")
-
-
 def oom_kills(events: int) -> int:
     """How often the kernel ended a process of the group for its memory."""
     for line in os.pread(events, 4096, 0).splitlines():

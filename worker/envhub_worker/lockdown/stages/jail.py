@@ -69,10 +69,8 @@ def _mount(spec: JailSpec, common: Common) -> View:
 
 def _unmountable(error: OSError, spec: JailSpec, common: Common) -> LayerUnavailableError:
     where = f" at {error.filename}" if error.filename else ""
-    for what, path in (
-        ("the snapshot", spec.snapshot),
-        ("the folder of packages", common.config.packages),
-    ):
+    shared = {"the snapshot": spec.snapshot, "the folder of packages": common.config.packages}
+    for what, path in shared.items():
         if path and not _has_content(path):
             return LayerUnavailableError(
                 "mount-namespace",

@@ -31,7 +31,8 @@ def run(jail: JailContext, descriptors: Iterable[int]) -> None:
     _hold("a system call filter is installed", filter.installed())
     for path, shared in jail.view.shared.items():
         _hold(f"what is written to {path} stays in the jail", _stays_inside(path, shared))
-    _hold("only named descriptors are open", _open_descriptors() <= set(descriptors))
+    listed = {fd for fd in map(int, os.listdir("/proc/self/fd")) if _is_open(fd)}
+    _hold("only named descriptors are open", listed <= set(descriptors))
     for claim, attempt in _denials(jail).items():
         _hold(claim, _denied(attempt))
 
@@ -93,10 +94,6 @@ def _denied(attempt: Callable[[], object]) -> bool:
     except OSError:
         return True
     return False
-
-
-def _open_descriptors() -> set[int]:
-    return {fd for fd in map(int, os.listdir("/proc/self/fd")) if _is_open(fd)}
 
 
 def _is_open(fd: int) -> bool:
