@@ -99,7 +99,10 @@ def _serve(
     except BaseException:
         runtime.remove()
         raise
-    server.stop_on(*_ends(), gently=(signal.SIGTERM,))
+    # under ``nohup`` the end of a terminal does not end the server
+    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    ends = [signal.SIGINT] if ignored else [signal.SIGINT, signal.SIGHUP]
+    server.stop_on(*ends, gently=(signal.SIGTERM,))
     began = time.monotonic()
     try:
         if arguments.log_format == "text" or identity.authorized is None:  # a client needs it
@@ -123,12 +126,6 @@ def _serve(
         note.remove()
         runtime.remove()
     return 0
-
-
-def _ends() -> list[signal.Signals]:
-    """What ends the server at once; under ``nohup`` the end of a terminal does not."""
-    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-    return [signal.SIGINT] if ignored else [signal.SIGINT, signal.SIGHUP]
 
 
 @contextmanager

@@ -103,7 +103,8 @@ def plan_root(
         network: ``"host"`` adds what name resolution and TLS read.
     """
     links: dict[str, str] = dict(_DEV_LINKS)
-    wanted = [path for path in interpreter if not _exposes(path, private)]
+    hidden = list(private)
+    wanted = [path for path in interpreter if not any(within(one, path) for one in hidden)]
     trees = [*wanted, *readable, *_ETC_FOLDERS, *_SYS_FOLDERS, *_SYSTEM]
     copies = list(_ETC_FILES)
     texts = dict(_TEXTS)
@@ -139,10 +140,6 @@ def outermost(paths: Iterable[str]) -> tuple[str, ...]:
 def within(path: str, folder: str) -> bool:
     """Whether the normalised ``path`` is ``folder`` or below it."""
     return path == folder or path.startswith(folder.rstrip("/") + "/")
-
-
-def _exposes(path: str, private: Iterable[str]) -> bool:
-    return any(within(folder, path) for folder in private)
 
 
 def _resolve(path: str, links: dict[str, str], host: HostFiles) -> str:

@@ -48,7 +48,7 @@ class Recording:
 
 def recording(env: object) -> Recording | None:
     """The recording of a vector environment that was neither looked into nor closed, else None."""
-    own = object.__getattribute__(env, "__dict__") if _is_lazy(env) else {}
+    own = object.__getattribute__(env, "__dict__") if type(env) in _LAZY.values() else {}
     found = None if own.get("closed") else own.get(_KEY)
     return found if isinstance(found, Recording) else None
 
@@ -63,10 +63,6 @@ def standing_in() -> Iterator[None]:
     finally:
         for cls, real in _REAL_INIT.items():
             cls.__init__ = real
-
-
-def _is_lazy(env: object) -> bool:
-    return type(env) in _LAZY.values()
 
 
 def _recorder(cls: type[VectorEnv[Any, Any, Any]], lazy: type) -> Callable[..., None]:

@@ -295,10 +295,7 @@ class JailEvents:
         for pending in waiting(entry):
             death = whole_jail("killed", detail="the jail was closed")
             self._reply(pending.asker, m.replace(death, operation=pending.operation))
-        self._forget_some()
-
-    def _forget_some(self) -> None:
-        """The oldest dead, where there are many: their clients do not come back for them."""
+        # the oldest dead, where there are many: their clients do not come back for them
         dead = [number for number, one in self._jails.items() if one.released]
         for number in dead[:-MAX_DEAD]:
             del self._jails[number]

@@ -113,9 +113,9 @@ class RunnerLink:
         answers = []
         try:
             for packet in self._reader.feed(data):
-                answers.append((packet, self._owner(packet)))
+                answers.append((packet, self.pending.pop(packet.request_id)))
         except RemoteProtocolError:
-            # what came before the offence is dropped with it: its owners hear of the death
+            # what came before the offence is dropped with it: its owners get the death
             self.pending.update((packet.request_id, owner) for packet, owner in answers)
             raise
         return answers
@@ -127,9 +127,6 @@ class RunnerLink:
             raise RemoteProtocolError(
                 f"the runner answered request {request_id}, it owes {expected}"
             )
-
-    def _owner(self, packet: Packet) -> Any:
-        return self.pending.pop(packet.request_id)
 
     def close(self) -> None:
         """Close the stream. Idempotent."""

@@ -127,17 +127,14 @@ class Events(Witness):
 
     def _client(self, owner: bytes, event: str, level: str, **more: object) -> None:
         key = owner[:KEY_BYTES]
-        who = {"client": self._name_of(key) or _nameless(key), "session": session_id(owner)}
+        nameless = f"key {key_text(key)[:16]}" if any(key) else "anybody"
+        who = {"client": self._name_of(key) or nameless, "session": session_id(owner)}
         self._log.say(event, level, whose=key_text(key), **who, **more)
 
 
 def session_id(owner: bytes) -> str:
     """As ``envhub-worker status`` has it; a client chooses it."""
     return owner[KEY_BYTES:].hex()[:8]
-
-
-def _nameless(key: bytes) -> str:
-    return f"key {key_text(key)[:16]}" if any(key) else "anybody"
 
 
 def _jail(entry: JailEntry) -> dict[str, object]:

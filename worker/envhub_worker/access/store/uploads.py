@@ -14,6 +14,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -41,6 +42,7 @@ MAX_TREES = 1000
 MAX_STEPS = 200_000
 """Names in all paths of one snapshot."""
 PREFIX = "sha256:"
+_SNAPSHOT = re.compile(r"sha256:[0-9a-f]{64}")
 _SHA256_BYTES = 32
 _MAX_DEPTH = 64
 _MAX_PATH_BYTES = 4096
@@ -200,11 +202,11 @@ class Uploads:
         Raises:
             RefusedError: It is not here; a path is none.
         """
-        digest = snapshot.removeprefix(PREFIX)
-        tree = self._store(key).tree(digest)
-        if not snapshot.startswith(PREFIX) or not _is_digest(digest) or not tree.is_dir():
-            raise RefusedError("WorkerError", "this server has no such snapshot; offer it first")
-        return str(tree)
+        if _SNAPSHOT.fullmatch(snapshot):
+            tree = self._store(key).tree(snapshot.removeprefix(PREFIX))
+            if tree.is_dir():
+                return str(tree)
+        raise RefusedError("WorkerError", "this server has no such snapshot; offer it first")
 
     def used_bytes(self, key: bytes) -> int:
         """What a client's files are charged, and what it has offered to bring."""
@@ -327,7 +329,3 @@ def digest_of(files: list[ListedFile]) -> str:
     """The name of a snapshot: a hash of its sorted listing."""
     rows = [[file.path, file.size, file.sha256.hex()] for file in files]
     return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
-
-
-def _is_digest(text: str) -> bool:
-    return len(text) == 2 * _SHA256_BYTES and all(c in "0123456789abcdef" for c in text)

@@ -90,7 +90,10 @@ def restrict(wanted: Ruleset, rules: Iterable[Rule]) -> None:
     """
     try:
         words = struct.pack("=QQQ", wanted.files, wanted.tcp, wanted.scope)
-        fd = syscall(number("landlock_create_ruleset"), words, _size(wanted), 0)
+        # A kernel refuses a structure that is longer than its own, unless the rest is zero; the
+        # first ones know the first field only.
+        size = 24 if wanted.scope else 16 if wanted.tcp else 8
+        fd = syscall(number("landlock_create_ruleset"), words, size, 0)
         try:
             for rule in rules:
                 _add(fd, rule, wanted.files)
@@ -99,12 +102,6 @@ def restrict(wanted: Ruleset, rules: Iterable[Rule]) -> None:
             os.close(fd)
     except OSError as error:
         raise unavailable(error) from error
-
-
-def _size(wanted: Ruleset) -> int:
-    # A kernel refuses a structure that is longer than its own, unless the rest is zero; the
-    # first ones know the first field only.
-    return 24 if wanted.scope else 16 if wanted.tcp else 8
 
 
 def _add(ruleset_fd: int, rule: Rule, handled: int) -> None:

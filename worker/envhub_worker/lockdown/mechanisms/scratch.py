@@ -76,7 +76,8 @@ def _empty(root: int) -> None:
     pending = _unlink_files(root)
     while pending:
         name = pending.pop()
-        folder = _open_folder(name, root)
+        os.chmod(name, 0o700, dir_fd=root)
+        folder = os.open(name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=root)
         for child in _unlink_files(folder):
             # Renaming a folder into another one rewrites its "..", so it must be writable.
             os.chmod(child, 0o700, dir_fd=folder)
@@ -85,11 +86,6 @@ def _empty(root: int) -> None:
             pending.append(f"{prefix}-{moved}")
         os.close(folder)
         os.rmdir(name, dir_fd=root)
-
-
-def _open_folder(name: str, root: int) -> int:
-    os.chmod(name, 0o700, dir_fd=root)
-    return os.open(name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=root)
 
 
 def _unlink_files(folder: int) -> list[str]:
