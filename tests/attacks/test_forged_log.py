@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from envhub_worker.access import keys
-from envhub_worker.access.telling.log_lines import FORMS
-from envhub_worker.access.telling.rate_limited_log import Log
+from envhub_worker.access.audit.log import FORMS, Log
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.keys import key_text

@@ -24,8 +24,9 @@ from envhub_sandbox.dependencies.bounds import measured
 from envhub_sandbox.errors import DependencyError, EnvHubError
 from envhub_sandbox.sandboxes.process import BOOTSTRAP
 from envhub_worker.access.packages import Packages
-from envhub_worker.access.quotas import Quotas, RefusedError
+from envhub_worker.access.quotas import Quotas
 from envhub_worker.protocol import messages as m
+from envhub_worker.supervisor.records import RefusedError
 from tests.remote.listening import listening
 from tests.support.processes import eventually
 from tests.support.repositories import write_repository

@@ -18,15 +18,8 @@ from typing import Any
 
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.confinement import Confinement
-from envhub_worker.spawn.spawner import (
-    Jail,
-    JailExited,
-    Ready,
-    RunnerExited,
-    RunnerStarted,
-    Spawner,
-    ZygoteDied,
-)
+from envhub_worker.spawn.jail import Jail, RunnerExited, RunnerStarted
+from envhub_worker.spawn.spawner import JailExited, Spawner, ZygoteDied
 
 DEADLINE_S = 60.0
 KIT = os.path.abspath(__file__)
@@ -206,7 +199,6 @@ __all__ = [
     "KIT",
     "Cell",
     "JailExited",
-    "Ready",
     "RunnerExited",
     "RunnerStarted",
     "cell_in",

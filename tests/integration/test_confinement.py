@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 
 from envhub_worker.protocol.confinement import Confinement
-from envhub_worker.spawn.spawner import Failed
+from envhub_worker.spawn.jail import JailFailed
 from tests.integration.confinement_kit import (
     KIT,
     Cell,
@@ -541,7 +541,7 @@ result = "came back"
 
     def gone() -> bool:
         cell.pump()
-        ended[:] = [e for e in cell.events if isinstance(e, RunnerExited) and e.runner_id == runner]
+        ended[:] = [e for e in cell.events if isinstance(e, RunnerExited) and e.runner == runner]
         return bool(ended)
 
     wait_until(gone, "no exit event")
@@ -642,7 +642,7 @@ def test_denial_that_does_not_hold_aborts(profile: str) -> None:
             inside.runtime_folder(spawner).chmod(0o755)  # under root, the jail is another user
             cell = new_cell(spawner, make_snapshot(folder), confinement)
             cell.start()
-            failed = cell.wait_for(Failed)
+            failed = cell.wait_for(JailFailed)
             assert failed.layer == "self-test"
             assert "files outside cannot be read" in failed.reason
             assert not [event for event in cell.events if isinstance(event, RunnerStarted)]
@@ -654,17 +654,17 @@ sys.path.insert(0, {kit!r})
 from pathlib import Path
 from confinement_kit import *
 from envhub_worker.protocol.confinement import Confinement
-from envhub_worker.spawn.spawner import Failed
+from envhub_worker.spawn.jail import JailFailed
 from envhub_worker.lockdown.seccomp import bpf, filter as seccomp
 from envhub_worker.lockdown.mechanisms import namespaces, process
 from envhub_worker.lockdown.seccomp.bpf import LOAD, RETURN, JUMP_EQUAL, Branch, Do, Label
 from envhub_worker.lockdown.seccomp.syscalls import number
 {restrict}
 with open_folder() as folder, cell_in(folder, Confinement(profile={profile!r})) as cell:
-    while not any(isinstance(event, (Failed, RunnerStarted)) for event in cell.events):
+    while not any(isinstance(event, (JailFailed, RunnerStarted)) for event in cell.events):
         cell.pump()
     for event in cell.events:
-        if isinstance(event, Failed):
+        if isinstance(event, JailFailed):
             print(event.layer, "|", event.reason, "|", event.fix)
         elif isinstance(event, RunnerStarted):
             print("started", [l["layer"] for l in event.report if not l["enforced"]])

@@ -13,7 +13,6 @@ from envhub_worker.protocol.confinement import MIB, Confinement, Limits
 from envhub_worker.protocol.runtime import Runtime
 from tests.integration.confinement_kit import (
     Cell,
-    Ready,
     RunnerStarted,
     cell_in,
     make_snapshot,
@@ -186,20 +185,18 @@ result = failed
 def is_confined(cell: Cell, runner: int) -> bool:
     """Whether a runner was confined."""
     cell.pump()
-    return any(
-        isinstance(event, RunnerStarted) and event.runner_id == runner for event in cell.events
-    )
+    return any(isinstance(event, RunnerStarted) and event.runner == runner for event in cell.events)
 
 
 def test_report_says_how_files_are_seen(cell: Cell) -> None:
     """As one layer more."""
-    report = cell.wait_for(Ready).report
+    report = cell.wait_for(RunnerStarted).report
     [view] = [layer for layer in report if layer["layer"] == "working-view"]
     assert "copy on write" in view["detail"]
 
 
 ADVICE = """
-from envhub_worker.runner.exceptions import raised
+from envhub_worker.runner.raised import raised
 def advice(path, mode):
     try:
         open(path, mode)
@@ -226,7 +223,7 @@ def test_where_nothing_can_be_mounted_the_error_names_file_and_cure(how: str) ->
             for text, path in ((created, f"{root}/new"), (opened, f"{root}/env.py")):
                 assert f"{path} lies in the repository, which this jail only reads" in text
                 assert "on Linux 5.11 or later" in text
-            report = cell.wait_for(Ready).report
+            report = cell.wait_for(RunnerStarted).report
             [view] = [layer["detail"] for layer in report if layer["layer"] == "working-view"]
             assert "read-only" in view
             assert outcome(cell, "result = open('env.py').read()") == "VALUE = 7\n"

@@ -16,9 +16,9 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import ServerBusyError, WorkerDiedError
 from envhub_worker.access import keys
+from envhub_worker.access.audit.log import Log
 from envhub_worker.access.drain import Drain
 from envhub_worker.access.quotas import BusyError
-from envhub_worker.access.telling.rate_limited_log import Log
 from envhub_worker.protocol import messages as m
 from tests.remote.listening import WORKER, Listening, listening
 from tests.remote.test_clients import peer

@@ -20,9 +20,10 @@ from zmq.utils import z85
 from envhub_sandbox import RemoteSandbox, make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
 from envhub_worker.access import keys
+from envhub_worker.access.audit.log import CLIENT_LINES, LINES, Log
 from envhub_worker.access.keys import AuthorizedClients
-from envhub_worker.access.telling.rate_limited_log import CLIENT_LINES, LINES, Log
-from envhub_worker.cli import listen, status
+from envhub_worker.cli import identity as identities
+from envhub_worker.cli import listen_options, state_folder, status
 from envhub_worker.protocol.keys import key_text, parse_key
 from tests.remote.listening import WORKER, Listening, listening
 from tests.support import inside
@@ -94,9 +95,9 @@ def test_a_container_without_landlock_permits_no_weak_profile_by_itself(
     monkeypatch.setattr(*inside.CONTAINER_MARKS, ("/",))
     monkeypatch.setattr("envhub_worker.lockdown.mechanisms.landlock.version", lambda: abi)
     parser = argparse.ArgumentParser()
-    listen.add_arguments(parser)
+    listen_options.add_options(parser)
     assert parser.parse_args([]).weakest_profile == default
-    assert ("no jail can be opened" in listen.unusable("container", default)) is (abi == 0)
+    assert ("no jail can be opened" in identities.unusable("container", default)) is (abi == 0)
 
 
 def test_without_landlock_a_weak_profile_is_for_one_client(
@@ -107,11 +108,11 @@ def test_without_landlock_a_weak_profile_is_for_one_client(
     path = tmp_path / "clients"
     path.write_text(f"{one}\n{other}\n")
     parser = argparse.ArgumentParser()
-    listen.add_arguments(parser)
+    listen_options.add_options(parser)
     options = parser.parse_args(
         ["--weakest-profile", "container", "--authorized-clients", str(path)]
     )
-    identity = listen.Identity(keys.generate(), path)
+    identity = identities.Identity(keys.generate(), path)
     monkeypatch.setattr("envhub_worker.lockdown.mechanisms.landlock.version", lambda: 0)
     with pytest.raises(ValueError, match="without Landlock"):
         inside.gate_of(options, tmp_path, identity)
@@ -131,14 +132,14 @@ def test_without_landlock_a_weak_profile_is_for_one_client(
 )
 def test_only_tcp_addresses_are_bound(bind: str) -> None:
     """Anything else is a mistake."""
-    with pytest.raises(listen.UsageError, match="--bind takes"):
-        listen.check_bind(bind, False)
+    with pytest.raises(identities.UsageError, match="--bind takes"):
+        identities.check_bind(bind, False)
 
 
 def test_the_default_is_loopback() -> None:
     """Nobody listens on all interfaces without saying so."""
     parser = argparse.ArgumentParser()
-    listen.add_arguments(parser)
+    listen_options.add_options(parser)
     assert parser.parse_args([]).bind.startswith("tcp://127.0.0.1:")
 
 
@@ -162,12 +163,14 @@ def test_a_server_says_what_its_client_has_to_write(
 
 def test_the_line_names_the_profile_where_the_default_cannot_be_had() -> None:
     """In most containers: what is printed must work when it is pasted."""
-    identity = listen.Identity(keys.generate(), None, keys.generate(), Path("x"), True, "no-userns")
-    said = listen.announcement("tcp://0.0.0.0:5555", identity)
+    identity = identities.Identity(
+        keys.generate(), None, keys.generate(), Path("x"), True, "no-userns"
+    )
+    said = identities.announcement("tcp://0.0.0.0:5555", identity)
     assert said.count("policy={'profile': 'no-userns'}") == 2
     assert 'RemoteSandbox("tcp://127.0.0.1:5555"' in said
     strict = dataclasses.replace(identity, profile="strict")
-    assert "policy=" not in listen.announcement("tcp://127.0.0.1:1", strict)
+    assert "policy=" not in identities.announcement("tcp://127.0.0.1:1", strict)
 
 
 def test_a_second_start_keeps_the_keys_and_does_not_print_the_secret(tmp_path: Path) -> None:
@@ -302,9 +305,9 @@ def test_a_state_folder_of_somebody_else_is_not_used(
     monkeypatch.setenv("XDG_STATE_HOME", "/proc/nowhere")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     folder = tmp_path / f"envhub-worker-{os.getuid()}"
-    assert listen.state_dir(None, create=True) == folder
+    assert state_folder.state_dir(None, create=True) == folder
     folder.chmod(0o777)
-    assert listen.state_dir(None, create=True) is None
+    assert state_folder.state_dir(None, create=True) is None
 
 
 def test_a_relative_state_folder_is_where_one_stands(
@@ -312,7 +315,7 @@ def test_a_relative_state_folder_is_where_one_stands(
 ) -> None:
     """Jails are made elsewhere, and are told where snapshots lie."""
     monkeypatch.chdir(tmp_path)
-    assert listen.state_dir(Path("here"), create=True) == tmp_path / "here"
+    assert state_folder.state_dir(Path("here"), create=True) == tmp_path / "here"
 
 
 @pytest.mark.parametrize("bind", ["a taken port", "tcp://192.0.2.1:5555", "tcp://no.invalid:5555"])

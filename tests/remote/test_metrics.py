@@ -25,10 +25,10 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import ServerBusyError, WorkerDiedError
-from envhub_worker.access.telling import figures, usage
+from envhub_worker.access.audit import figures, usage
 from envhub_worker.cli import http_port
 from envhub_worker.cli.http_port import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpPort, parse_address
-from envhub_worker.cli.metrics import STALE_S, Page
+from envhub_worker.cli.metrics import STALE_S, MetricsPage
 from tests.remote.listening import WORKER, Listening, listening
 from tests.support.processes import eventually
 
@@ -174,18 +174,18 @@ def test_readiness_is_red_in_a_drain(tmp_path: Path, repository: Path) -> None:
 def test_a_server_that_is_stuck_is_not_healthy(one: Watched) -> None:
     """Its port's own thread says so; there is nothing of last week's to read."""
     now = [0.0]
-    page = Page(True, lambda _: ("text/plain", b"figures"), lambda: now[0])
-    assert page.answer("/healthz").status == page.answer("/metrics").status == 503
+    page = MetricsPage(True, lambda _: ("text/plain", b"figures"), lambda: now[0])
+    assert page.answer("/healthz")[0] == page.answer("/metrics")[0] == 503
     page.publish({"draining_s": None})
-    assert page.answer("/metrics").body == b"figures"
-    assert page.answer("/readyz").status == 200
+    assert page.answer("/metrics")[2] == b"figures"
+    assert page.answer("/readyz")[0] == 200
     now[0] = STALE_S + 1
     for path in ("/metrics", "/healthz", "/readyz"):
-        assert page.answer(path).status == 503
-    unusable = Page(False, lambda _: ("text/plain", b""), lambda: now[0])
+        assert page.answer(path)[0] == 503
+    unusable = MetricsPage(False, lambda _: ("text/plain", b""), lambda: now[0])
     unusable.publish({"draining_s": None})
-    assert unusable.answer("/readyz").status == 503
-    assert unusable.answer("/healthz").status == 200
+    assert unusable.answer("/readyz")[0] == 503
+    assert unusable.answer("/healthz")[0] == 200
 
 
 # --- where it listens --------------------------------------------------------------------------
@@ -394,9 +394,9 @@ def test_what_clients_say_cannot_make_a_label() -> None:
     assert {word for one in tally.requests.values() for word in one} == {"other"}
     assert tally.requests[figures.OTHERS]["other"] == 1000 - figures.MAX_CLIENTS
     assert tally.refusals == {"other": 1000}
-    clients = figures.Clients()
+    clients = figures.ClientFigures()
     clients.add_past(tally, usage.Usage(lambda _: None))
-    assert len(clients.told()) <= figures.MAX_CLIENTS + 1
+    assert len(clients.plain()) <= figures.MAX_CLIENTS + 1
     assert figures.client_name("a\n\x1b[2J" * 100, insecure=False).isprintable()
     assert len(figures.client_name("a" * 1000, insecure=False)) == 64
 

@@ -24,7 +24,7 @@ from envhub_worker.access.quotas import (
     check_policy,
 )
 from envhub_worker.access.sessions import MAX_HELD, Sessions
-from envhub_worker.cli import listen
+from envhub_worker.cli import listen_options
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.runtime import Runtime
@@ -91,7 +91,7 @@ def test_the_sums_of_a_key_are_bounded() -> None:
 def test_the_quota_of_runners_has_its_former_name_too(name: str) -> None:
     """Who wrote the option down when runners were called hosts is understood."""
     parser = argparse.ArgumentParser()
-    listen.add_arguments(parser)
+    listen_options.add_options(parser)
     assert parser.parse_args([name, "3"]).max_runners == 3
 
 

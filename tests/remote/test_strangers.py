@@ -22,21 +22,21 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerError
 from envhub_sandbox.transport.tcp import Link
 from envhub_worker.access import keys
-from envhub_worker.access.gate import Arrived, Asked, Greeting
+from envhub_worker.access.audit.log import LINES, PERIOD_S, Log
+from envhub_worker.access.gate import ClientRequest, Incoming
 from envhub_worker.access.keys import AuthorizedClients
 from envhub_worker.access.packages import Packages
-from envhub_worker.access.port.connection_limit import Doorman
-from envhub_worker.access.quotas import Permissions, Quotas, RefusedError
+from envhub_worker.access.port.connection_limit import ConnectionLimiter
+from envhub_worker.access.quotas import Permissions, Quotas
 from envhub_worker.access.remote_gate import RemoteGate, Rules
 from envhub_worker.access.sessions import Sessions
 from envhub_worker.access.store.uploads import Uploads
-from envhub_worker.access.telling.rate_limited_log import LINES, PERIOD_S, Log
 from envhub_worker.cli import listen
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import key_text
-from envhub_worker.supervisor.records import Asker
-from envhub_worker.supervisor.witness import Nobody
+from envhub_worker.supervisor.records import Asker, RefusedError
+from envhub_worker.supervisor.witness import Witness
 from tests.remote.listening import Listening, listening
 from tests.remote.relay import relay
 from tests.support import inside
@@ -153,7 +153,7 @@ def test_nobody_comes_in_while_nobody_can_be_asked(tmp_path: Path) -> None:
         gate, pair = _gate(tmp_path), keys.generate()
         with zmq.Context() as context:
             router, peer = context.socket(zmq.ROUTER), context.socket(zmq.DEALER)
-            gate.secure(router, Loop(Nobody().failed))
+            gate.secure(router, Loop(Witness().failed))
             gate.close(Sessions())
             if not enforced:
                 router.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 0)
@@ -173,10 +173,10 @@ def test_a_message_without_a_proved_key_is_refused(tmp_path: Path) -> None:
     """Where keys are needed an empty one is nobody's: neither a session nor a request."""
     gate, sessions = _gate(tmp_path), Sessions()
     with pytest.raises(RefusedError, match="not authorised"):
-        gate.greet(Greeting(Arrived(b"id", b"", []), b"name", sessions, None))  # type: ignore[arg-type]
+        gate.greet(Incoming(b"id", b"", []), b"name", sessions, None)  # type: ignore[arg-type]
     asker = Asker(b"id", 1, b"x" * 40, b"")
     with pytest.raises(RefusedError, match="not authorised"):
-        gate.authorize(Asked(asker, m.GetSessions(), (), sessions, None))  # type: ignore[arg-type]
+        gate.authorize(ClientRequest(asker, m.GetSessions(), (), sessions, None))  # type: ignore[arg-type]
 
 
 def test_captured_bytes_are_worth_nothing(server: Listening, repository: Path, good: Any) -> None:
@@ -292,7 +292,7 @@ def test_a_door_that_cannot_be_shut_ends_nothing(monkeypatch: pytest.MonkeyPatch
     """Without a descriptor left the server goes on, says so, and tries again."""
     said = list[str]()
     with zmq.Context() as context, context.socket(zmq.ROUTER) as router:
-        doorman = Doorman(router, Loop(Nobody().failed), Log(said.append), 1)
+        doorman = ConnectionLimiter(router, Loop(Witness().failed), Log(said.append), 1)
         router.bind("tcp://127.0.0.1:*")
         for broken in ("os.listdir", "os.dup"):
             with monkeypatch.context() as patch:

@@ -15,10 +15,11 @@ from envhub_sandbox import make_env
 from envhub_sandbox.sandboxes import upload
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_worker.access.quotas import Quotas, RefusedError
+from envhub_worker.access.quotas import Quotas
 from envhub_worker.access.store.blob_store import BLOCK_BYTES
 from envhub_worker.access.store.uploads import PREFIX, Uploads
 from envhub_worker.protocol import messages as m
+from envhub_worker.supervisor.records import RefusedError
 from tests.remote.listening import Listening, counting
 from tests.support import inside
 

@@ -17,7 +17,7 @@ from envhub_sandbox.sandboxes.remote import RemoteSandbox
 from envhub_sandbox.session.jails.line import wait_in_line
 from envhub_sandbox.transport.deadline import StartupDeadline
 from envhub_worker.access import keys
-from envhub_worker.access.line import Line
+from envhub_worker.access.places import Line
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.messages.busy import LONGEST_S, Busy
 from tests.remote.listening import Listening, listening

@@ -38,10 +38,11 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
 from envhub_sandbox.transport.shared_memory.shard import LaneShard
-from envhub_worker.access.port.connection_limit import Doorman
+from envhub_worker.access.audit.log import Log
+from envhub_worker.access.port.connection_limit import ConnectionLimiter
 from envhub_worker.access.remote_gate import RemoteGate
-from envhub_worker.access.telling.rate_limited_log import Log
-from envhub_worker.cli import listen
+from envhub_worker.cli import listen, listen_options
+from envhub_worker.cli.identity import Identity
 from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
@@ -252,7 +253,7 @@ WAITS_FOR_A_SERVER: tuple[Spot, Spot] = ((launcher_module, "_CLOSE_S"), (remote,
 """For how long a close waits for a server's word, also where it has gone."""
 MAKER: Spot = (making, "Proxies")
 """What ``make_env`` starts to work with when its arguments have been checked."""
-CONTAINER_MARKS: Spot = (listen, "_CONTAINER_MARKS")
+CONTAINER_MARKS: Spot = (listen_options, "_CONTAINER_MARKS")
 """The files by which a container is told."""
 CGROUP_WRITE: Spot = (cgroups, "_write")
 """What writes a file of a control group."""
@@ -349,7 +350,7 @@ def step_aside(group: str) -> None:
     cgroups._step_aside(group)
 
 
-def gate_of(options: Any, folder: Path, identity: listen.Identity) -> Any:
+def gate_of(options: Any, folder: Path, identity: Identity) -> Any:
     """The gate that ``envhub-worker listen`` puts before a server."""
     return listen._gate(options, folder, identity, Log())
 
@@ -361,14 +362,14 @@ def public_key(gate: RemoteGate) -> bytes:
     return keys.public
 
 
-def happen(doorman: Doorman, event: int, value: int = 0) -> None:
+def happen(doorman: ConnectionLimiter, event: int, value: int = 0) -> None:
     """Tell a doorman what libzmq's monitor would."""
     doorman._happened(event, value)
 
 
-def door_is_shut(doorman: Doorman) -> bool:
+def door_is_shut(doorman: ConnectionLimiter) -> bool:
     """Whether nobody is let in at present."""
-    return doorman._shut_door is not None
+    return doorman._shut_listener is not None
 
 
 # --- a repository's packages -------------------------------------------------------------------

@@ -61,7 +61,11 @@ _PARTS = (
         ("envhub_sandbox/session", "envhub_sandbox/vector", "envhub_sandbox/transport"),
         "faults.md",
     ),
-    ("Loading a repository, and what it returns", ("envhub_worker/runner",), "authors.md"),
+    (
+        "Loading a repository, and what it returns",
+        ("envhub_worker/runner", "envhub_worker/file_access"),
+        "authors.md",
+    ),
     ("Values", ("envhub_worker/protocol",), "values.md"),
     (
         "The command line",

@@ -16,7 +16,7 @@
   one line of JSON once the endpoint is bound: what holds around this process
   (``protocol/messages/surroundings.py``).
 - ``--ahead`` starts a zygote at once, in the interpreter ``X`` and for the packages ``Y``, by
-  default this interpreter with its own, for whoever opens the first jail.
+  default this interpreter with its own, for the first jail.
 - environment: nothing is read from it but what Python itself needs.
 - exit code: 0 after a stop, 2 for wrong arguments.
 
@@ -37,13 +37,12 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 
-from envhub_worker import std_streams
 from envhub_worker.cli import serve
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command: see the head of this file."""
-    std_streams.replace_missing()  # before anything of ours is opened
+    replace_missing_streams()  # before anything of ours is opened
     # jails of root are another user, who must get through to what we make; what is private says so
     os.umask(0o022)
     argv = sys.argv[1:] if argv is None else argv
@@ -52,6 +51,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     run: Callable[[argparse.Namespace], int] = arguments.run
     return run(arguments)
+
+
+def replace_missing_streams() -> None:
+    """See to it that the numbers 0, 1 and 2 are taken, and that ``print`` finds a stream.
+
+    Else files of ours would have them: what a library prints, as libzmq does before it aborts,
+    would go into a socket or a lock, and a zygote would have them as its own streams.
+    """
+    while (null := os.open(os.devnull, os.O_RDWR)) < 3:  # the lowest that is free
+        os.set_inheritable(null, True)
+    os.close(null)
+    sys.stdin = sys.stdin or open(os.devnull)  # noqa: SIM115
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
 
 
 def _parser(*, all_commands: bool) -> tuple[argparse.ArgumentParser, list[str]]:

@@ -17,9 +17,9 @@ import re
 import resource
 from collections.abc import Sequence
 
-from envhub_worker.lockdown.mechanisms import capabilities, landlock, process
+from envhub_worker.lockdown.layers import LayerUnavailableError
+from envhub_worker.lockdown.mechanisms import landlock, process
 from envhub_worker.lockdown.mechanisms.landlock import READ, WRITE, Rule
-from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp import filter
 
 _LIMITS = (
@@ -45,7 +45,7 @@ def confine(folder: str) -> None:
     scoped = landlock.scopes(abi)
     machine = platform.machine()
     program = filter.compile_filter(machine, namespaced=False, network="none", scoped=scoped)
-    capabilities.drop_all()
+    process.drop_capabilities()
     process.set_no_new_privileges()
     # without an ABI it raises: no layer is left out
     landlock.restrict(landlock.ruleset(abi, "none"), [Rule(library, READ), Rule(folder, WRITE)])
@@ -53,7 +53,7 @@ def confine(folder: str) -> None:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Compile all that is below a folder, but for tests, which nobody imports."""
+    """Compile all that is below a folder, but for tests, which are not imported."""
     [folder] = argv
     try:
         confine(folder)

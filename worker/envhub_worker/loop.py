@@ -1,15 +1,25 @@
-"""One thread, one poll: who waits for which descriptor."""
+"""One thread, one poll: callbacks for descriptors; and whole ZeroMQ messages, sent and received.
+
+The functions for messages do without what pyzmq's own do for each frame.
+"""
 
 from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from time import monotonic
 from typing import Any
 
 import zmq
 
+from envhub_worker.protocol.codec.kinds import Buffer
+
+# plain numbers: as members of an enumeration they cost more than the calls that take them
+_MORE = int(zmq.SNDMORE)
+_NOW = int(zmq.NOBLOCK)
+_EVENTS = int(zmq.EVENTS)
+_READABLE = int(zmq.POLLIN)
 _POLL_MS = 1000
 _SIGNALS = 64
 """Read at once."""
@@ -21,7 +31,7 @@ class Loop:
     """Calls back when a descriptor or a ZeroMQ socket is ready, until ``stop``.
 
     Args:
-        failed: Is told what a callback raised. It must not raise.
+        failed: Called with what a callback raised. It must not raise.
     """
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
@@ -53,7 +63,7 @@ class Loop:
     def call_on(self, signals: Mapping[int, Callable[[], None]]) -> None:
         """Call back at these signals, between two rounds; to be called on the main thread."""
         woken, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-        signal.set_wakeup_fd(wakes)  # it is told the signals' numbers, a byte each
+        signal.set_wakeup_fd(wakes)  # it gets the signals' numbers, a byte each
         for number in signals:
             signal.signal(number, lambda *_: None)
 
@@ -91,3 +101,28 @@ class Loop:
             self._failed(error)
         else:
             self._failures = 0
+
+
+def has_message(socket: zmq.Socket[bytes]) -> bool:
+    """Whether ``receive`` would return one: without the exception that ends a vain attempt."""
+    return bool(int(socket.getsockopt(_EVENTS)) & _READABLE)
+
+
+def receive(socket: zmq.Socket[bytes]) -> list[bytes]:
+    """The frames of a message that is there; raises ``zmq.Again`` if none is."""
+    frame = socket.recv(_NOW, copy=False)
+    frames = [frame.bytes]
+    while frame.more:
+        frame = socket.recv(_NOW, copy=False)
+        frames.append(frame.bytes)
+    return frames
+
+
+def send(socket: zmq.Socket[bytes], frames: Sequence[Buffer], *, copy: bool) -> None:
+    """Send without waiting; what a client's queue has no room for is dropped.
+
+    Without ``copy``, large frames may not be written any more.
+    """
+    for frame in frames[:-1]:
+        socket.send(frame, _NOW | _MORE, copy)
+    socket.send(frames[-1], _NOW, copy)

@@ -14,12 +14,11 @@ from typing import Any
 
 import zmq
 
-from envhub_worker import __version__, multipart
-from envhub_worker.access.gate import Arrived, Asked, Gate, Greeting, LocalGate
-from envhub_worker.access.quotas import RefusedError
+from envhub_worker import __version__
+from envhub_worker.access.gate import ClientRequest, Gate, Incoming, LocalGate
 from envhub_worker.access.sessions import Sessions
 from envhub_worker.lockdown.mechanisms.scratch import remove_tree
-from envhub_worker.loop import Loop
+from envhub_worker.loop import Loop, has_message, send
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.errors import ProtocolError
@@ -28,15 +27,13 @@ from envhub_worker.protocol.messages import compression
 from envhub_worker.protocol.shortages import shortage
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from envhub_worker.supervisor.jails import Jails
-from envhub_worker.supervisor.records import Asker
+from envhub_worker.supervisor.records import AnsweredError, Asker, RefusedError
 
 _RCVHWM = 64
 _ROUND = 64
 """Messages that are served before the jails have their turn."""
 _LAST_WORDS_MS = 500
 """For how long what was said last is sent on after a drain."""
-_MAX_SAID = 4096
-"""Characters of a refusal."""
 
 
 class Server:
@@ -64,10 +61,15 @@ class Server:
         self._context = zmq.Context()
         self._router = self._listen(endpoint)
         self._loop.watch(self._router, self._serve_clients)
-        fd_path = fd_path or runtime_dir / "fds"
-        witness = self._gate.witness
         self._jails = Jails(
-            self._loop, self, runtime_dir, readable_roots, limits, fd_path, ahead, witness
+            self._loop,
+            self.reply,
+            runtime_dir,
+            readable_roots,
+            limits,
+            fd_path or runtime_dir / "fds",
+            ahead,
+            self._gate.witness,
         )
         self._loop.tick(self._tick)
         if client_pidfd is not None:
@@ -133,11 +135,11 @@ class Server:
 
     def _serve_clients(self) -> None:
         for _ in range(_ROUND):
-            if not multipart.has_message(self._router):
+            if not has_message(self._router):
                 return
             self._serve(self._gate.receive(self._router))
 
-    def _serve(self, arrived: Arrived) -> None:
+    def _serve(self, arrived: Incoming) -> None:
         identity, key, frames, _ = arrived
         if not frames:
             return
@@ -151,70 +153,61 @@ class Server:
             return
         asker = Asker(identity, number, b"" if session is None else session.owner, key)
         try:
-            self._dispatch(asker, request, arrived)
-        except RefusedError as refused:
-            self.refuse(asker, refused.error, refused.message, refused.missing, refused.fix)
+            reply = self._dispatch(asker, request, arrived)
+            if reply is not None:
+                self.reply(asker, reply)
+        except AnsweredError as early:
+            self.reply(asker, early.reply)
         except Exception as error:
             if not isinstance(error, ProtocolError):  # that is the client's mistake
                 self._gate.witness.failed(error)
             said = f"{type(error).__name__} on the server: {error}"
-            self.refuse(asker, "WorkerError", shortage(error, "on the server") or said)
+            said = shortage(error, "on the server") or said
+            self.reply(asker, RefusedError("WorkerError", said).reply)
 
     def _refuse_unread(self, identity: bytes, key: bytes, frame: Any, error: Exception) -> None:
-        """A request that cannot be read: as long as its id can be, its sender need not wait."""
+        """Answer a request that cannot be read, if at least its id can be."""
         number = m.id_of(frame)
         if number is None:
             return  # not our protocol
-        asker = Asker(identity, number, b"", key)
-        known = isinstance(error, ProtocolError)
-        said = str(error) if known else type(error).__name__
-        self.refuse(asker, "LocalProtocolError", f"the request cannot be read: {said}")
+        said = str(error) if isinstance(error, ProtocolError) else type(error).__name__
+        refused = RefusedError("LocalProtocolError", f"the request cannot be read: {said}")
+        self.reply(Asker(identity, number, b"", key), refused.reply)
 
-    def _dispatch(self, asker: Asker, request: m.Message, arrived: Arrived) -> None:
+    def _dispatch(self, asker: Asker, request: m.Message, arrived: Incoming) -> m.Message | None:
+        """The reply; None where it was sent, or comes later. Raises ``AnsweredError``."""
         if isinstance(request, m.Hello):
-            self._hello(asker, request, arrived)
-            return
+            return self._hello(request, arrived)
         payload = arrived.frames[1:]
         if not asker.session:
-            self.refuse(asker, "HelloError", "say Hello first")
-            return
-        asked = Asked(asker, request, payload, self._sessions, self._jails)
+            raise RefusedError("HelloError", "say Hello first")
+        asked = ClientRequest(asker, request, payload, self._sessions, self._jails)
         request = self._gate.authorize(asked)
         if isinstance(request, m.Relay):
             self._jails.relay(asker, request, payload)
-        elif isinstance(request, m.Agree):
+            return None
+        if isinstance(request, m.Agree):
             self._agree(asker, request)
-        elif handler := _HANDLERS.get(type(request)):
-            handler(self._jails, asker, request)
-        elif special := self._gate.handlers.get(type(request)):
-            self.reply(asker, special(asked._replace(request=request)))
-        else:
-            self.refuse(asker, "LocalProtocolError", f"{type(request).__name__} is no request")
+            return None
+        if handler := _HANDLERS.get(type(request)):
+            return handler(self._jails, asker, request)
+        if special := self._gate.handlers.get(type(request)):
+            return special(asked._replace(request=request), request)
+        raise RefusedError("LocalProtocolError", f"{type(request).__name__} is no request")
 
     def reply(self, asker: Asker, message: m.Message, payload: Sequence[Buffer] = ()) -> None:
         """Answer a request."""
-        self._gate.answered(asker)
-        header = m.pack_header(message, asker.request_id)
-        frames = [*header, *payload]
-        agreed = self._compression(asker.identity, asker.key)
-        if agreed:
+        self._gate.answered(asker, message)
+        frames = [*m.pack_header(message, asker.request_id), *payload]
+        if agreed := self._compression(asker.identity, asker.key):
             frames = compression.pack_frames(frames, agreed)
         copy = sum(map(len, payload)) < LARGE_BYTES
-        multipart.send(self._router, [asker.identity, *frames], copy=copy)
+        send(self._router, [asker.identity, *frames], copy=copy)
 
     def _compression(self, identity: bytes, key: bytes) -> str:
         return self._sessions.compression(identity, key) if self._gate.compresses else ""
 
-    def refuse(
-        self, asker: Asker, error: str, message: str, missing: str = "", fix: str = ""
-    ) -> None:
-        """Answer that it is not done."""
-        # what the client has sent may be quoted in it, at any length
-        refused = m.Refused(error, message[:_MAX_SAID], missing, fix)
-        self.reply(asker, refused)
-        self._gate.refused(asker, refused)
-
-    def _hello(self, asker: Asker, request: m.Hello, arrived: Arrived) -> None:
+    def _hello(self, request: m.Hello, arrived: Incoming) -> m.Message:
         if request.version != m.VERSION:
             raise RefusedError(
                 "VersionMismatchError",
@@ -223,8 +216,8 @@ class Server:
             )
         if not request.session:
             raise RefusedError("LocalProtocolError", "a session has a name")
-        self._gate.greet(Greeting(arrived, request.session, self._sessions, self._jails))
-        self.reply(asker, m.Welcome(m.VERSION, __version__, os.getpid()))
+        self._gate.greet(arrived, request.session, self._sessions, self._jails)
+        return m.Welcome(m.VERSION, __version__, os.getpid())
 
     def _agree(self, asker: Asker, request: m.Agree) -> None:
         """Answer before it holds, so that the answer itself can be read."""
@@ -234,7 +227,7 @@ class Server:
         self._sessions.agree(asker.identity, asker.key, str(chosen))
 
 
-_HANDLERS: dict[type[m.Message], Callable[[Jails, Asker, Any], None]] = {
+_HANDLERS: dict[type[m.Message], Callable[[Jails, Asker, Any], m.Message | None]] = {
     m.OpenJail: Jails.open,
     m.StartRunners: Jails.start_more,
     m.KeepJail: Jails.keep,

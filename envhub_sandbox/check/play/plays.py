@@ -26,7 +26,7 @@ _LASTS = 3.0
 """Seconds, where there are so few frames that at their own rate a film were over at once."""
 _STILLS = 4
 _SAMPLES = 10
-"""How often memory is counted in a play: a server counts only so often (``Counting``)."""
+"""How often memory is counted in a play: a server counts only so often (``CountLimit``)."""
 
 
 @dataclass(frozen=True)

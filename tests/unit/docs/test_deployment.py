@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 
+from envhub_worker.access.audit.figures import Client, ServerFigures
 from envhub_worker.access.quotas import Permissions, Quotas
-from envhub_worker.access.telling.figures import Client, Facts
-from envhub_worker.cli import listen, metrics
+from envhub_worker.cli import identity, listen_options, metrics
 
 ROOT = Path(__file__).parents[3]
 UNIT = ROOT / "examples" / "deployment" / "envhub-worker.service"
@@ -32,7 +32,7 @@ needs_systemd = pytest.mark.skipif(
 def exported() -> dict[str, set[str]]:
     """Every sample that a server with a client exports, and its labels."""
     parser = pytest.importorskip("prometheus_client.parser", reason="prometheus-client is missing")
-    facts = Facts(
+    facts = ServerFigures(
         profile="strict",
         permissions=Permissions(),
         quotas=Quotas(),
@@ -116,9 +116,9 @@ def test_the_unit_starts_what_there_is() -> None:
     words = command.split()
     assert words[1] == "listen"
     parser = argparse.ArgumentParser(exit_on_error=False)
-    listen.add_arguments(parser)
+    listen_options.add_options(parser)
     options = parser.parse_args(words[2:])
-    listen.check_bind(options.bind, options.insecure_loopback)
+    identity.check_bind(options.bind, options.insecure_loopback)
     assert options.drain_s < int(lines("TimeoutStopSec")[0])
     assert str(options.state_dir) == f"/var/lib/{lines('StateDirectory')[0]}"
     assert lines("KillMode") == ["mixed"]

@@ -94,20 +94,18 @@ MAY_IMPORT = {
     "envhub_sandbox.errors": set(),
     "envhub_sandbox.option_names": set(),
     "envhub_sandbox.system": set(),
-    "envhub_worker.__main__": {"cli", "std_streams"},
+    "envhub_worker.__main__": {"cli"},
     "envhub_worker.cli": {"", "access", "lockdown", "server", "spawn"},
-    "envhub_worker.server": {"", "access", "lockdown", "loop", "multipart", "spawn", "supervisor"},
-    "envhub_worker.access": {"", "lockdown", "loop", "multipart", "supervisor"},
+    "envhub_worker.server": {"", "access", "lockdown", "loop", "spawn", "supervisor"},
+    "envhub_worker.access": {"", "lockdown", "loop", "supervisor"},
     "envhub_worker.supervisor": {"lockdown", "loop", "spawn"},
     "envhub_worker.spawn": {"bootstrap", "lockdown"},
     "envhub_worker.lockdown": {""},
-    "envhub_worker.runner": {"lockdown", "unreadable"},
+    "envhub_worker.runner": {"file_access", "lockdown"},
     "envhub_worker.bootstrap": set(),
     "envhub_worker.bytecode": {"lockdown"},
-    "envhub_worker.multipart": set(),
     "envhub_worker.loop": set(),
-    "envhub_worker.std_streams": set(),
-    "envhub_worker.unreadable": set(),
+    "envhub_worker.file_access": set(),
     "envhub_worker.protocol": set(),
     "envhub_worker": set(),
 }
@@ -127,7 +125,7 @@ IGNORANT = {
 # where ZeroMQ is spoken; everything else speaks in messages
 ZEROMQ = {
     "envhub_sandbox.transport",
-    *("envhub_worker.loop", "envhub_worker.multipart", "envhub_worker.server"),
+    *("envhub_worker.loop", "envhub_worker.server"),
     *("envhub_worker.access", "envhub_worker.cli"),
 }
 WITHOUT_IO = {"asyncio", "multiprocessing", "os", "select", "socket", "subprocess", "zmq"}

@@ -12,10 +12,9 @@ from pathlib import Path
 import pytest
 import zmq
 
-from envhub_worker.access.gate import Asked, LocalGate
-from envhub_worker.access.telling.events import Events
-from envhub_worker.access.telling.log_lines import json_line
-from envhub_worker.access.telling.rate_limited_log import Log
+from envhub_worker.access.audit.events import Events
+from envhub_worker.access.audit.log import Log, json_line
+from envhub_worker.access.gate import ClientRequest, LocalGate
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.server import Server
@@ -30,7 +29,7 @@ class Failing(LocalGate):
         self.error = error
         self.witness = Events(log, lambda key: None, lambda key: None)
 
-    def authorize(self, asked: Asked) -> m.Message:
+    def authorize(self, asked: ClientRequest) -> m.Message:
         """Raises."""
         raise self.error
 

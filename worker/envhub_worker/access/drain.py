@@ -5,17 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from envhub_worker.access.line import RETRY_S
-from envhub_worker.access.quotas import BusyError
-from envhub_worker.access.telling.rate_limited_log import Log
+from envhub_worker.access.audit.log import Log
+from envhub_worker.access.quotas import RETRY_S, BusyError
 from envhub_worker.protocol.messages.busy import DRAINING, Busy
 
 _QUIET_S = 1.0
-"""Between the end of the last jail and the server's own: its client hears why from this one."""
+"""Between the end of the last jail and the server's own: its client learns why from this one."""
 
 
 class Drain:
-    """When a server was told to end, and what that means for its clients.
+    """When a server was asked to end, and what that means for its clients.
 
     Args:
         drain_s: How long what runs may go on; 0 waits for nothing.
@@ -39,7 +38,7 @@ class Drain:
 
     @property
     def left_s(self) -> float | None:
-        """How long what runs may go on; None as long as nobody has said so."""
+        """How long what runs may go on; None before it begins."""
         return None if self._until is None else max(0.0, self._until - self._clock())
 
     def begin(self, log: Log) -> bool:

@@ -9,21 +9,19 @@ it all.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import zmq
 
 from envhub_worker.access.sessions import Sessions
-from envhub_worker.loop import Loop
-from envhub_worker.multipart import receive
+from envhub_worker.loop import Loop, receive
 from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.jails import Jails
 from envhub_worker.supervisor.records import Asker
-from envhub_worker.supervisor.witness import Nobody, Witness
+from envhub_worker.supervisor.witness import Witness
 
 
-class Asked(NamedTuple):
+class ClientRequest(NamedTuple):
     """A request, who asks, and what it is asked of."""
 
     asker: Asker
@@ -33,13 +31,11 @@ class Asked(NamedTuple):
     jails: Jails
 
 
-class Arrived(NamedTuple):
+class Incoming(NamedTuple):
     """A message as it came.
 
     Attributes:
-        identity: The routing id of its sender.
-        key: The key that he has proved; empty where none is needed.
-        frames: The message.
+        key: The key that its sender has proved; empty where none is needed.
         fd: The descriptor of the connection that it came over; -1 if that is not known.
     """
 
@@ -49,106 +45,69 @@ class Arrived(NamedTuple):
     fd: int = -1
 
 
-class Greeting(NamedTuple):
-    """A ``Hello``: whose it is, and the name of the session that it asks for."""
-
-    arrived: Arrived
-    name: bytes
-    sessions: Sessions
-    jails: Jails
-
-
-Handler = Callable[[Asked], m.Message]
+Handler = Callable[[ClientRequest, Any], m.Message]
 """Carries a request out that is permitted; returns the reply."""
 
 
-class Gate(Protocol):
-    """Decides what a client may.
+class Gate:
+    """Decides what a client may. Nothing is permitted by default: each gate has to say it.
 
     Attributes:
         handlers: The requests that only this gate knows.
         compresses: Whether frames are worth compressing.
         idle_s: How long the jails of a client that says nothing live on; 0 for ever.
-        witness: Is told what becomes of jails.
     """
 
-    handlers: Mapping[type[m.Message], Handler]
-    compresses: bool
-    idle_s: int
-    witness: Witness
+    handlers: Mapping[type[m.Message], Handler] = {}
+    compresses = False
+    idle_s = 0
+    witness = Witness()
+
+    def receive(self, router: zmq.Socket[bytes]) -> Incoming:
+        """A message that is there."""
+        raise NotImplementedError
+
+    def greet(self, arrived: Incoming, name: bytes, sessions: Sessions, jails: Jails) -> None:
+        """A session of this name begins, or is found again; raises ``RefusedError``."""
+        raise NotImplementedError
+
+    def authorize(self, asked: ClientRequest) -> m.Message:
+        """The request as it may be carried out, never a reply; raises ``RefusedError``."""
+        raise NotImplementedError
 
     def secure(self, router: zmq.Socket[bytes], loop: Loop) -> None:
         """Set what must be set before the socket is bound."""
 
-    def receive(self, router: zmq.Socket[bytes]) -> Arrived:
-        """A message that is there."""
-
-    def greet(self, greeting: Greeting) -> None:
-        """A session begins, or is found again; raises ``RefusedError``."""
-
-    def authorize(self, asked: Asked) -> m.Message:
-        """The request as it may be carried out, never a reply; raises ``RefusedError``."""
-
-    def answered(self, asker: Asker) -> None:
-        """A request was answered."""
-
-    def refused(self, asker: Asker, refused: m.Refused) -> None:
-        """A request was answered so."""
+    def answered(self, asker: Asker, reply: m.Message) -> None:
+        """A request is answered so."""
 
     def tick(self, sessions: Sessions, jails: Jails) -> None:
-        """Time has passed."""
+        """A second has passed."""
 
     def drain(self) -> bool:
         """Let nothing new in from now on; False if nothing that runs is waited for."""
+        return False
 
     def drained(self, jails: Jails) -> bool:
         """Whether that has been said, and nothing runs any more."""
+        return False
 
     def close(self, sessions: Sessions) -> None:
-        """Everybody has to go; close what ``secure`` opened."""
+        """End all sessions; close what ``secure`` opened."""
 
 
-class LocalGate:
-    """The folder of the socket is the gate: whoever can reach it is the user."""
+class LocalGate(Gate):
+    """The folder of the socket, of mode 0700, is the gate: who can reach it is the user."""
 
-    handlers: Mapping[type[m.Message], Handler] = MappingProxyType({})
-    compresses = False
-    idle_s = 0
-    witness: Witness = Nobody()
-
-    def secure(self, router: zmq.Socket[bytes], loop: Loop) -> None:
-        """Nothing: the folder is of mode 0700."""
-
-    def receive(self, router: zmq.Socket[bytes]) -> Arrived:
-        """Nobody has a key."""
+    def receive(self, router: zmq.Socket[bytes]) -> Incoming:
+        """No client has a key."""
         identity, *frames = receive(router)
-        return Arrived(identity, b"", frames)
+        return Incoming(identity, b"", frames)
 
-    def greet(self, greeting: Greeting) -> None:
-        """Everybody is welcome."""
-        arrived = greeting.arrived
-        greeting.sessions.connect(arrived.identity, arrived.key, greeting.name)
+    def greet(self, arrived: Incoming, name: bytes, sessions: Sessions, jails: Jails) -> None:
+        """Every client is welcome."""
+        sessions.connect(arrived.identity, arrived.key, name)
 
-    def authorize(self, asked: Asked) -> m.Message:
+    def authorize(self, asked: ClientRequest) -> m.Message:
         """Everything is permitted."""
         return asked.request
-
-    def answered(self, asker: Asker) -> None:
-        """Nothing is counted."""
-
-    def refused(self, asker: Asker, refused: m.Refused) -> None:
-        """Its client says so."""
-
-    def tick(self, sessions: Sessions, jails: Jails) -> None:
-        """The server ends with its client."""
-
-    def drain(self) -> bool:
-        """There is one client, and it would wait for itself."""
-        return False
-
-    def drained(self, jails: Jails) -> bool:
-        """Never."""
-        return False
-
-    def close(self, sessions: Sessions) -> None:
-        """There is nothing to close."""

@@ -63,7 +63,7 @@ def save(pair: KeyPair, folder: Path, name: str) -> tuple[Path, Path]:
 
 
 def _write(path: Path, text: str, mode: int) -> None:
-    # created with its mode: nobody can read it in between
+    # created with its mode: it is never readable in between
     with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "w") as file:
         file.write(f"{text}\n")
 
@@ -81,7 +81,6 @@ class AuthorizedClients:
     begin a comment. It is read anew when it changes, so that a client can be taken off it.
 
     Args:
-        path: The file, or None.
         known: Keys that may come in without it.
         most: How many may be on it; None for any number.
     """

@@ -1,10 +1,8 @@
 """Packages that clients' repositories need, where the operator permits that (``--dependencies``).
 
-They are made by another program, which the operator has installed beside this one: the client's
-own, with its bounds. It chooses versions, installs wheels by their hashes, runs nothing of them,
-and says what it did. Each client key has a folder of its own and one of them at work at a time, all
-keys together a few; whatever nobody asks for any more is given up, and so is what takes too long:
-who fills a turn with it keeps nobody else waiting for good.
+They are made by another program (``package_program.py``). Each client key has a folder of its own
+and one program at work at a time, all keys together a few; an order that is not asked for any more
+is given up, and so is one that takes too long: it delays the others only so far.
 """
 
 from __future__ import annotations
@@ -13,32 +11,27 @@ import contextlib
 import hashlib
 import json
 import os
-import signal
-import subprocess
-import sys
-import tempfile
 from collections import OrderedDict, deque
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass as mutable_dataclass
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
-from typing import IO, Any
+from typing import Any
 
-from envhub_worker.access.quotas import BusyError, Quotas, RefusedError
+from envhub_worker.access.package_program import PackageProgram
+from envhub_worker.access.quotas import BusyError, Quotas
 from envhub_worker.access.store.blob_store import make_passable
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.messages.busy import Busy
-from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import Runtime
+from envhub_worker.supervisor.records import RefusedError
 
-PROGRAM = "envhub_sandbox.dependencies.for_a_server"
 MAX_REQUIREMENTS = 1000
 MAX_TEXT = 2000
 MAX_WAITING = 2
 """Orders of one key that wait or are at work."""
 MAX_IN_LINE = 64
-"""Of everybody."""
+"""Of all keys."""
 MAX_AT_WORK = 4
 """Programs at once; of one key there is one."""
 MAKE_S = 1800.0
@@ -46,70 +39,39 @@ MAKE_S = 1800.0
 MAX_PER_HOUR = 60
 """Of one key: each asks the index."""
 _REMEMBERED = 512
-_RESULT_BYTES = 1 << 20
 _HOUR_S = 3600.0
 _FORGOTTEN_S = 60.0
-"""What nobody has asked for in so long, nobody waits for."""
+"""An order that was not asked for in so long is given up."""
 _FAILED_S = 30.0
 """For so long an order that failed is not tried again."""
 _HANDED_S = 600.0
 _RETRY_S = 10.0
 _STOP_S = 30.0
-_CHECK_S = 60.0
 
 Place = tuple[str, str]
 """Whose an order is, and its hash."""
 
 
-@mutable_dataclass
+@dataclass
 class Order:
-    """What somebody waits for.
+    """An order that a client waits for.
 
     Attributes:
-        plain: For the program.
         owner: Whose session asked first.
         asked: When it was asked for last.
-        told: What the program has said last.
+        progress: What the program has said last.
     """
 
     plain: dict[str, Any]
     owner: bytes = b""
     asked: float = field(default_factory=monotonic)
-    told: str = "at work"
+    progress: str = "at work"
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What became of an order: the program's own words, and when."""
-
-    said: Mapping[str, Any]
-    when: float
-
-
-@mutable_dataclass
-class Work:
-    """The program, at work."""
-
-    place: Place
-    process: subprocess.Popen[bytes]
-    said: IO[bytes]
-    since: float = field(default_factory=monotonic)
-    told_to_end: float | None = None
-
-
-@dataclass(frozen=True)
-class News:
-    """For the log: what became of an order.
-
-    Attributes:
-        owner: Whose session asked first.
-        seconds: How long the program was at it.
-        said: Its last words.
-    """
-
-    owner: bytes
-    seconds: float
-    said: Mapping[str, Any]
+Outcome = tuple[Mapping[str, Any], float]
+"""What became of an order: the program's own words, and when."""
+News = tuple[bytes, float, Mapping[str, Any]]
+"""For the log: whose session ordered first, how long the program took, its last words."""
 
 
 class Packages:
@@ -117,8 +79,6 @@ class Packages:
 
     Args:
         folder: Where they lie; None where the operator does not permit any.
-        quotas: How much of them each key may have.
-        make_s: For how long an order may be at work.
     """
 
     def __init__(self, folder: Path | None, quotas: Quotas, make_s: float = MAKE_S) -> None:
@@ -129,7 +89,7 @@ class Packages:
         self._outcomes: OrderedDict[Place, Outcome] = OrderedDict()
         self._handed: dict[Place, tuple[Runtime, float]] = {}
         self._begun: dict[str, deque[float]] = {}
-        self._at_work: dict[str, Work] = {}  # by key
+        self._at_work: dict[str, PackageProgram] = {}  # by key
         self._news: list[News] = []
         if folder is not None:
             make_passable(folder)
@@ -140,10 +100,8 @@ class Packages:
         """How far they are; begins, or goes on, to make them.
 
         Args:
-            key: The client's key.
             request: Trust: input from a client.
             in_use: Folders of packages that must stay.
-            owner: The client's session, for the log.
 
         Raises:
             RefusedError: They cannot be made, or not now.
@@ -167,8 +125,8 @@ class Packages:
             if place in self._outcomes:
                 return self.need(key, request, in_use, owner)
         order.asked = monotonic()
-        told = order.told if self._is_at(place) else self._waits(place)
-        return m.Packages("making", "", {}, told)
+        progress = order.progress if self._is_at(place) else self._waits(place)
+        return m.Packages("making", "", {}, progress)
 
     def runtime(self, key: bytes, name: str) -> Runtime:
         """What a client's packages are, and their interpreter.
@@ -184,7 +142,7 @@ class Packages:
         return found[0]
 
     def look(self, in_use: Collection[str]) -> None:
-        """Take what is done, give up what nobody waits for, and begin the next."""
+        """Take what is done, give up what is not asked for, and begin the next."""
         now = monotonic()
         for work in list(self._at_work.values()):
             self._follow(work, now)
@@ -201,24 +159,23 @@ class Packages:
 
     def news(self) -> list[News]:
         """What became of orders since this was asked last."""
-        told, self._news = self._news, []
-        return told
+        news, self._news = self._news, []
+        return news
 
     def close(self) -> None:
         """End the programs; they leave nothing half-made, or the next ones remove it."""
         works, self._at_work = list(self._at_work.values()), {}
+        now = monotonic()
         for work in works:
-            work.process.terminate()
-        until = monotonic() + _STOP_S
+            work.terminate(now)
+        until = now + _STOP_S
         for work in works:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                work.process.wait(max(0.0, until - monotonic()))
-            _kill(work)
+            work.kill(max(0.0, until - monotonic()))
 
     # --- orders --------------------------------------------------------------------------------
 
     def _answer(self, place: Place, found: Outcome) -> m.Packages | None:
-        said = found.said
+        said, when = found
         if "own" in said:
             return m.Packages("own", "", {}, "this server's interpreter has all of it")
         made = said.get("made")
@@ -228,7 +185,7 @@ class Packages:
             with contextlib.suppress(OSError):
                 os.utime(Path(made["packages"]).with_name("environment.json"))
             return m.Packages("made", name, made["facts"], "")
-        if made is None and monotonic() - found.when < _FAILED_S:
+        if made is None and monotonic() - when < _FAILED_S:
             raise RefusedError(str(said["error"]), str(said["said"]))
         del self._outcomes[place]
         return None
@@ -238,13 +195,10 @@ class Packages:
         hour = self._begun.setdefault(place[0], deque(maxlen=MAX_PER_HOUR))
         while hour and monotonic() - hour[0] > _HOUR_S:
             hour.popleft()
+        yours = "orders of your key for packages"
         for used, limit, what in (
-            (mine, MAX_WAITING, "orders of your key for packages wait already"),
-            (
-                len(hour),
-                MAX_PER_HOUR,
-                "orders of your key for packages were begun in the last hour",
-            ),
+            (mine, MAX_WAITING, f"{yours} wait already"),
+            (len(hour), MAX_PER_HOUR, f"{yours} were begun in the last hour"),
             (len(self._line), MAX_IN_LINE, "orders for packages wait already"),
         ):
             if used >= limit:
@@ -258,14 +212,10 @@ class Packages:
     def _next(self) -> list[Place]:
         """Who waits, in turn: first the key for which nothing was begun for longest."""
         waiting = [place for place in self._line if not self._is_at(place)]
-        return sorted(waiting, key=lambda place: self._last(place[0]))
-
-    def _last(self, home: str) -> float:
-        begun = self._begun.get(home)
-        return begun[-1] if begun else 0.0
+        return sorted(waiting, key=lambda place: (self._begun.get(place[0]) or [0.0])[-1])
 
     def _waits(self, place: Place) -> str:
-        """What is told to one who waits. Of others it says how many there are, and no more."""
+        """The progress of an order that waits. Of others it says only how many there are."""
         if place[0] in self._at_work:
             return "waiting for other packages of your key"
         before = self._next().index(place)
@@ -280,7 +230,9 @@ class Packages:
         folder = self._folder / place[0]
         now = monotonic()
         self._handed = {
-            at: held for at, held in self._handed.items() if self._is_live(held, now, in_use)
+            at: (runtime, when)
+            for at, (runtime, when) in self._handed.items()
+            if runtime.packages in in_use or now - when < _HANDED_S
         }
         keep = [name for home, name in self._handed if home == place[0]]
         order = self._line[place].plain | {
@@ -291,36 +243,31 @@ class Packages:
         self._begun.setdefault(place[0], deque(maxlen=MAX_PER_HOUR)).append(now)
         try:
             make_passable(folder)
-            self._at_work[place[0]] = _started(place, order)
-        except OSError as error:  # a full disk, no process left: whoever asked hears it, once
+            self._at_work[place[0]] = PackageProgram(place, order)
+        except OSError as error:  # a full disk, no process left: the client reads it, once
             text = f"the program that makes packages cannot be started: {error.strerror}"
             self._end(place, {"error": "DependencyError", "said": text}, now)
 
-    def _is_live(self, held: tuple[Runtime, float], now: float, in_use: Collection[str]) -> bool:
-        return held[0].packages in in_use or now - held[1] < _HANDED_S
-
-    def _follow(self, work: Work, now: float) -> None:
+    def _follow(self, work: PackageProgram, now: float) -> None:
         order = self._line[work.place]
-        said = _said(work)
-        if work.process.poll() is None:
-            order.told = str(said.get("told", order.told))
+        said, code = work.said(), work.code
+        if code is None:
+            order.progress = str(said.get("told", order.progress))
             late = now - work.since > self._make_s
-            if work.told_to_end is None and (late or now - order.asked > _FORGOTTEN_S):
-                work.process.terminate()
-                work.told_to_end = now
-            elif work.told_to_end is not None and now - work.told_to_end > _STOP_S:
-                _kill(work)
+            if work.ended_at is None and (late or now - order.asked > _FORGOTTEN_S):
+                work.terminate(now)
+            elif work.ended_at is not None and now - work.ended_at > _STOP_S:
+                work.kill()
             return
         del self._at_work[work.place[0]]
-        work.said.close()
-        if work.told_to_end is not None:
+        work.close()
+        if work.ended_at is not None:
             text = (
                 f"they were not made in time: the server gives an order {self._make_s:.0f} s "
                 "(--packages-s)"
             )
             said = {"error": "IndexUnavailableError", "said": text}
         elif not said.keys() & {"own", "made", "error"}:
-            code = work.process.returncode
             text = f"the program that makes packages ended with {code}; its server's log says why"
             said = {"error": "DependencyError", "said": text}
         self._end(work.place, said, work.since)
@@ -328,54 +275,10 @@ class Packages:
     def _end(self, place: Place, said: Mapping[str, Any], since: float) -> None:
         now = monotonic()
         order = self._line.pop(place)
-        self._outcomes[place] = Outcome(said, now)
-        self._news.append(News(order.owner, now - since, said))
+        self._outcomes[place] = said, now
+        self._news.append((order.owner, now - since, said))
         while len(self._outcomes) > _REMEMBERED:
             self._outcomes.popitem(last=False)
-
-
-def _started(place: Place, order: Mapping[str, Any]) -> Work:
-    with contextlib.ExitStack() as undo:
-        said = undo.enter_context(tempfile.TemporaryFile())
-        with tempfile.TemporaryFile() as given:
-            given.write(json.dumps(order).encode())
-            given.seek(0)
-            ourselves = os.pidfd_open(os.getpid())  # it ends when we do, whatever ends us
-            try:
-                process = subprocess.Popen(
-                    [*command(), f"--server-pidfd={ourselves}"],
-                    stdin=given,
-                    stdout=said,
-                    cwd="/",
-                    start_new_session=True,
-                    pass_fds=(ourselves,),
-                )
-            finally:
-                os.close(ourselves)
-        undo.pop_all()  # it lasts as long as the program
-    return Work(place, process, said)
-
-
-def command() -> list[str]:
-    """The program, in the interpreter that this one runs in."""
-    return [sys.executable, "-I", "-m", PROGRAM]
-
-
-def why_impossible() -> str:
-    """What hinders the program here; empty for nothing."""
-    try:
-        done = subprocess.run(
-            [*command(), "check"], stdin=subprocess.DEVNULL, capture_output=True, timeout=_CHECK_S
-        )
-    except subprocess.TimeoutExpired:
-        return f"the program that makes packages did not answer in {_CHECK_S:.0f} s"
-    if done.returncode == 0:
-        return ""
-    said = done.stderr.decode(errors="replace").strip().splitlines() or ["no word"]
-    return (
-        f"packages are made by envhub-sandbox itself, which is not ready beside this worker "
-        f"({sys.executable}): {said[-1][:500]}. Run: {sys.executable} -m pip install envhub-sandbox"
-    )
 
 
 def checked(request: m.NeedPackages) -> dict[str, Any]:
@@ -424,22 +327,7 @@ def _not_here(request: m.NeedPackages) -> m.Packages:
     if request.always:
         raise RefusedError(
             "PolicyError",
-            "dependencies: this server makes no environments of a repository's own; whoever runs "
-            "it starts it with --dependencies, or in an interpreter that has the packages",
+            "dependencies: this server makes no environments of a repository's own; start it "
+            "with --dependencies, or in an interpreter that has the packages",
         )
     return m.Packages("own", "", {}, "this server makes no environments (--dependencies)")
-
-
-def _said(work: Work) -> Mapping[str, Any]:
-    """What the program has said; nothing while it writes."""
-    try:
-        found = json.loads(os.pread(work.said.fileno(), _RESULT_BYTES, 0))
-        return found if isinstance(found, dict) else {}
-    except ValueError:
-        return {}
-
-
-def _kill(work: Work) -> None:
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(work.process.pid, signal.SIGKILL)
-    work.process.wait()

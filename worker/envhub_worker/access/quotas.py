@@ -6,34 +6,23 @@ from collections.abc import Iterable
 from dataclasses import dataclass as mutable_dataclass
 from dataclasses import field
 
-from envhub_worker.access.line import RETRY_S
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import GIB, MIB, PROFILES, Confinement
 from envhub_worker.protocol.messages import busy as busy_words
 from envhub_worker.protocol.messages.busy import Busy
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.text import size_text
-from envhub_worker.supervisor.records import Asker
+from envhub_worker.supervisor.records import Asker, RefusedError
 
-
-class RefusedError(Exception):
-    """A request is not done. ``error`` is a name out of the client's table."""
-
-    missing = ""
-    fix = ""
-
-    def __init__(self, error: str, message: str) -> None:
-        super().__init__(message)
-        self.error = error
-        self.message = message
+RETRY_S = 1.0
+"""When to ask again. A client that does not keeps no other waiting."""
 
 
 class BusyError(RefusedError):
     """There is no room at present."""
 
     def __init__(self, busy: Busy, message: str) -> None:
-        super().__init__(busy_words.ERROR, message)
-        self.missing, self.fix = busy.quota, busy.words()
+        super().__init__(busy_words.ERROR, message, busy.quota, busy.words())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,11 +30,9 @@ class Quotas:
     """Of one client key, all its processes together.
 
     Attributes:
-        jails: Open jails.
         runners: Processes of environments in them.
         memory_bytes: The sum of its open jails' memory limits.
         upload_bytes: Files of snapshots that it has brought here; the longest unused go first.
-        upload_files: Files of one snapshot.
         packages_bytes: Environments of its repositories' packages, and what was downloaded for
             them; the longest unused go first.
         inflight_bytes: Requests that its jails have not answered yet.
@@ -149,7 +136,7 @@ def check_jail(open_jails: Iterable[Use], more: Use, quotas: Quotas) -> None:
 
 @mutable_dataclass
 class InFlight:
-    """Bytes that clients have sent and nobody has answered yet."""
+    """Bytes that clients have sent and that are not answered yet."""
 
     _of: dict[bytes, int] = field(default_factory=dict)
     _requests: dict[tuple[bytes, int], tuple[Asker, bytes, int]] = field(default_factory=dict)

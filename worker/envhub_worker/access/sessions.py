@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
 WATCHER = b"status"
-"""The session of whoever only looks: the same each time, and not counted."""
+"""The session of a client that only looks: the same each time, and not counted."""
 
 CONNECTIONS_OF_ONE = 4096
 """Of one session; the longest unused is dropped."""
@@ -22,7 +22,7 @@ class Connection:
     """One of a session's.
 
     Attributes:
-        wire: Its number, by which it is known whether it is still there; 0 if that is not told.
+        wire: Its number, by which it is known whether it is still there; 0 if that is not known.
         compression: What was agreed on; empty for none.
     """
 
@@ -38,7 +38,6 @@ class Session:
         key: The client's public key, as ZAP gave it; empty where there is none.
         name: The client's own random bytes.
         heard: When it last said anything.
-        since: When it said Hello for the first time.
         held: The jails that it holds, and when it last said so or used them; None before it said
             so for the first time.
     """
@@ -52,7 +51,7 @@ class Session:
 
     @property
     def owner(self) -> bytes:
-        """What its jails are marked with: nobody with another key can have it."""
+        """What its jails are marked with: no client with another key can have it."""
         return self.key + self.name
 
 
@@ -146,7 +145,7 @@ class Sessions:
             session.held[jail] = self._clock()
 
     def unheld(self, session: Session, jail: int, idle_s: float) -> bool:
-        """Whether a jail has been held by nobody for so long; the first answer starts the time."""
+        """Whether no client has held a jail for so long; the first answer starts the time."""
         if session.held is None:
             return False
         return self._clock() - session.held.setdefault(jail, self._clock()) > idle_s

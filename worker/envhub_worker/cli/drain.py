@@ -1,6 +1,6 @@
-"""``envhub-worker drain``: tell the ``listen`` of this state folder to end, and wait until it has.
+"""``envhub-worker drain``: end the ``listen`` of this state folder gently, and wait until it has.
 
-It is told by SIGTERM: for how long open jails go on is its own ``--drain-s``.
+It sends SIGTERM: for how long open jails go on is the server's own ``--drain-s``.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import signal
 import sys
 from pathlib import Path
 
-from envhub_worker.access.telling.figures import pid_namespace
+from envhub_worker.access.audit.figures import pid_namespace
 from envhub_worker.cli import status
 from envhub_worker.protocol.errors import ProtocolError
 
@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Send the signal; 0 once the server has ended, or been told."""
+    """Send the signal; 0 once the server has ended, or the signal is sent."""
     try:
         pidfd, drains = _server(arguments.state_dir)
     except (OSError, ValueError, ProtocolError, status.UnreachableError) as error:
@@ -45,18 +45,18 @@ def _server(chosen: Path | None) -> tuple[int, bool]:
         raise status.UnreachableError(
             "a server without keys cannot prove that it is ours: send it SIGTERM yourself"
         )
-    told = status.of_server(*address)
-    if not told["pid_namespace"] or told["pid_namespace"] != pid_namespace():
+    facts = status.of_server(*address)
+    if not facts["pid_namespace"] or facts["pid_namespace"] != pid_namespace():
         raise status.UnreachableError(
             "the server runs in a container, where processes have other numbers than here: stop it "
             "as containers are stopped, or run this inside"
         )
-    pidfd = os.pidfd_open(told["pid"])
+    pidfd = os.pidfd_open(facts["pid"])
     try:
         # a number may be given out anew; who says again that it is his has had it meanwhile
-        if status.of_server(*address)["pid"] != told["pid"]:
+        if status.of_server(*address)["pid"] != facts["pid"]:
             raise status.UnreachableError("the server has just been replaced: try again")
     except BaseException:
         os.close(pidfd)
         raise
-    return pidfd, told["draining_s"] is not None
+    return pidfd, facts["draining_s"] is not None

@@ -1,8 +1,8 @@
-"""A port that answers GET, for whoever watches the server: small, slow and bounded.
+"""A port that answers GET, for monitoring: small, slow and bounded.
 
 One thread, one poll, a page made beforehand. Who sends much, sends slowly or comes in crowds gets
-little: a request has a size and a time, and a newcomer takes the place of whoever has been there
-the longest. Nothing of it touches the server's own loop.
+little: a request has a size and a time, and a newcomer takes the place of the connection that has
+been there the longest. Nothing of it touches the server's own loop.
 """
 
 from __future__ import annotations
@@ -45,10 +45,8 @@ class HttpPort:
     """Listens until it is closed.
 
     Args:
-        host: An address, not a name.
         port: 0 for any that is free.
         answer: The page of a path. What it raises is a 500.
-        failed: Told of that.
 
     Raises:
         OSError: The address is not to be had.
@@ -110,7 +108,7 @@ class HttpPort:
             sock, _ = self._listener.accept()
         except BlockingIOError:
             return
-        except OSError:  # no descriptor is left: whoever knocks goes on knocking
+        except OSError:  # no descriptor is left: who knocks goes on knocking
             self._stopped.wait(_PAUSE_S)
             return
         if len(self._connections) >= MAX_CONNECTIONS:

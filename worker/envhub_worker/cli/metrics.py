@@ -1,16 +1,16 @@
 """``listen --metrics``: the server's figures as Prometheus reads them, and whether it is well.
 
-The figures are what the server's own thread published last: whoever asks here, however often, asks
-nothing of it. Needs prometheus_client, for the text; that is the extra ``metrics``.
+The figures are what the server's own thread published last: to ask here, however often, costs that
+thread nothing. Needs prometheus_client, for the text; that is the extra ``metrics``.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
-from envhub_worker.access.telling.figures import REFUSALS
+from envhub_worker.access.audit.figures import REFUSALS
 from envhub_worker.protocol.confinement import REASONS
 
 MISSING = (
@@ -22,21 +22,15 @@ STALE_S = 30.0
 _TEXT = "text/plain; charset=utf-8"
 
 
-class Answer(NamedTuple):
-    """To a request for a page."""
-
-    status: int
-    kind: str
-    body: bytes
+Answer = tuple[int, str, bytes]
+"""To a request for a page: status, content type, body."""
 
 
-class Page:
+class MetricsPage:
     """What there is to read.
 
     Args:
-        usable: Whether jails can be opened here at all.
         render: Makes text of figures, and says of which kind.
-        clock: Seconds.
     """
 
     def __init__(
@@ -52,7 +46,7 @@ class Page:
         self._rendered: tuple[Mapping[str, Any], Answer] | None = None
 
     def publish(self, figures: Mapping[str, Any]) -> None:
-        """Put figures in the place of the last ones; nobody changes them any more."""
+        """Put figures in the place of the last ones; they do not change any more."""
         self._published = self._clock(), {**figures, "ready": self._usable and not _drains(figures)}
 
     def answer(self, path: str) -> Answer:
@@ -62,16 +56,16 @@ class Page:
         if path == "/metrics" and published is not None and not wrong:
             return self._metrics(published[1])
         if path in ("/metrics", "/healthz"):
-            return Answer(503 if wrong else 200, _TEXT, f"{wrong or 'well'}\n".encode())
+            return 503 if wrong else 200, _TEXT, f"{wrong or 'well'}\n".encode()
         if path == "/readyz":
             wrong = wrong or self._unready(published)
-            return Answer(503 if wrong else 200, _TEXT, f"{wrong or 'ready'}\n".encode())
-        return Answer(404, _TEXT, b"/metrics, /healthz, /readyz\n")
+            return 503 if wrong else 200, _TEXT, f"{wrong or 'ready'}\n".encode()
+        return 404, _TEXT, b"/metrics, /healthz, /readyz\n"
 
     def _metrics(self, figures: Mapping[str, Any]) -> Answer:
         """Made once for each publication: to ask often costs the server nothing."""
         if self._rendered is None or self._rendered[0] is not figures:
-            self._rendered = figures, Answer(200, *self._render(figures))
+            self._rendered = figures, (200, *self._render(figures))
         return self._rendered[1]
 
     def _wrong(self, published: tuple[float, Mapping[str, Any]] | None) -> str:
@@ -124,73 +118,59 @@ class ServerCollector:
         """The metrics, one family each."""
         from prometheus_client.core import GaugeMetricFamily, InfoMetricFamily
 
-        told = self._figures
+        figures = self._figures
         words = ("version", "python", "profile", "weakest_profile")
         yield InfoMetricFamily(
             "envhub_server",
             "Versions, and what can be enforced.",
-            {**{word: str(told[word]) for word in words}, "protocol": str(told["protocol"])},
+            {**{word: str(figures[word]) for word in words}, "protocol": str(figures["protocol"])},
         )
         for name, key, text in _GAUGES:
-            yield GaugeMetricFamily(name, text, float(told[key]))
+            yield GaugeMetricFamily(name, text, float(figures[key]))
         yield GaugeMetricFamily(
-            "envhub_server_draining", "1 once it was told to end.", float(_drains(told))
+            "envhub_server_draining", "1 once its end has begun.", float(_drains(figures))
         )
         yield from self._of_words()
-        yield from self._of_clients(told["clients"])
+        yield from self._of_clients(figures["clients"])
 
     def _of_words(self) -> Iterator[Any]:
-        told, disk = self._figures, self._figures["disk"]
-        yield _family("envhub_server_quota", "Of one client key.", "quota", told["quotas"])
-        yield _family("envhub_server_waiting", "Who waits for room.", "quota", told["waiting"])
-        disk = {"free": disk["free_bytes"], "size": disk["size_bytes"]}
-        text = "The disk that keys and snapshots lie on."
-        yield _family("envhub_server_state_disk_bytes", text, "what", disk)
+        figures, disk = self._figures, self._figures["disk"]
         # all of them from the start on: what has not happened yet is 0, and no gap
-        refusals = {word: told["refusals"].get(word, 0) for word in (*REFUSALS, "other")}
-        text = "Requests that were not carried out."
-        yield _family("envhub_server_refusals", text, "reason", refusals, counts=True)
-        deaths: dict[str, float] = {word: told["deaths"].get(word, 0) for word in REASONS}
-        text = "Jails that ended unasked."
-        yield _family("envhub_server_deaths", text, "reason", deaths, counts=True)
+        refusals = {word: figures["refusals"].get(word, 0) for word in (*REFUSALS, "other")}
+        deaths = {word: figures["deaths"].get(word, 0) for word in REASONS}
+        disk = {"free": disk["free_bytes"], "size": disk["size_bytes"]}
+        for name, text, label, values, counts in (
+            ("quota", "Of one client key.", "quota", figures["quotas"], False),
+            ("waiting", "Clients that wait for room.", "quota", figures["waiting"], False),
+            ("state_disk_bytes", "The disk of keys and snapshots.", "what", disk, False),
+            ("refusals", "Requests that were not carried out.", "reason", refusals, True),
+            ("deaths", "Jails that ended unasked.", "reason", deaths, True),
+        ):
+            rows = [([word], value) for word, value in values.items()]
+            yield _family(f"envhub_server_{name}", text, (label,), rows, counts=counts)
 
     def _of_clients(self, clients: Mapping[str, Any]) -> Iterator[Any]:
-        for name, key, text in _CLIENT_GAUGES:
-            yield _family(name, text, "client", {who: one[key] for who, one in clients.items()})
-        for name, key, text in _CLIENT_COUNTERS:
-            values = {who: one[key] for who, one in clients.items()}
-            yield _family(name, text, "client", values, counts=True)
+        for table in (_CLIENT_GAUGES, _CLIENT_COUNTERS):
+            for name, key, text in table:
+                rows = [([who], one[key]) for who, one in clients.items()]
+                counts = table is _CLIENT_COUNTERS
+                yield _family(name, text, ("client",), rows, counts=counts)
+        rows = [
+            ([who, word], value)
+            for who, one in clients.items()
+            for word, value in one["requests"].items()
+        ]
         text = "What clients asked of their environments."
         labels = ("client", "operation")
-        yield _nested("envhub_server_requests", text, labels, clients, "requests", counts=True)
+        yield _family("envhub_server_requests", text, labels, rows, counts=True)
 
 
 def _family(
-    name: str, text: str, label: str, values: Mapping[str, float], *, counts: bool = False
-) -> Any:
-    return _filled(name, text, (label,), [([one], value) for one, value in values.items()], counts)
-
-
-def _nested(
-    name: str,
-    text: str,
-    labels: Sequence[str],
-    clients: Mapping[str, Any],
-    key: str,
-    *,
-    counts: bool = False,
-) -> Any:
-    rows = [
-        ([who, word], value) for who, one in clients.items() for word, value in one[key].items()
-    ]
-    return _filled(name, text, labels, rows, counts)
-
-
-def _filled(
     name: str,
     text: str,
     labels: Sequence[str],
     rows: Sequence[tuple[Sequence[str], float]],
+    *,
     counts: bool,
 ) -> Any:
     from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily

@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run a worker server until it is told to stop or its client ends."""
+    """Run a worker server until a signal ends it or its client ends."""
     arguments.runtime_dir.mkdir(mode=0o700, exist_ok=True)
     try:
         return _serve_in(arguments)
@@ -93,7 +93,7 @@ def _ahead(arguments: argparse.Namespace) -> ZygoteProcess | None:
     runtime = Runtime(arguments.python, arguments.packages)
     try:
         return ZygoteProcess.ahead(arguments.runtime_dir, runtime)
-    except OSError:  # whoever opens a jail in that interpreter is told
+    except OSError:  # opening a jail in that interpreter says why
         return None
 
 

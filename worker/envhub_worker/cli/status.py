@@ -5,23 +5,22 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import zmq
 
 from envhub_worker.access import keys
 from envhub_worker.access.sessions import WATCHER
-from envhub_worker.cli import note
-from envhub_worker.cli.listen import reachable, state_dir
+from envhub_worker.cli.identity import reachable
+from envhub_worker.cli.state_folder import read_note, state_dir
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.keys import parse_key
 from envhub_worker.protocol.text import counted, printable, size_text
 
 _WAIT_MS = 5_000
+_Reply = TypeVar("_Reply", bound=m.Message)
 
 
 class UnreachableError(Exception):
@@ -75,7 +74,7 @@ def address_here(chosen: Path | None) -> tuple[str, bytes | None, keys.KeyPair]:
 def _noted(chosen: Path | None) -> tuple[str, bytes | None, keys.KeyPair] | None:
     """What a server of this user wrote down when it started; None if there is none."""
     state = state_dir(chosen, create=False)
-    noted = None if state is None else note.read(state)
+    noted = None if state is None else read_note(state)
     if noted is None:
         return None
     if noted.public == "insecure":
@@ -98,10 +97,17 @@ def _ask(
     endpoint: str, server_key: bytes | None, pair: keys.KeyPair
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """The sessions, and what the server says about itself."""
-    with _greeted(endpoint, server_key, pair) as (socket, _):
+    with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.IPV6, "[" in endpoint)
+        if server_key is not None:
+            socket.setsockopt(zmq.CURVE_SERVERKEY, server_key)
+            socket.setsockopt(zmq.CURVE_PUBLICKEY, pair.public)
+            socket.setsockopt(zmq.CURVE_SECRETKEY, pair.secret)
+        socket.connect(endpoint)
+        _request(socket, m.Hello(m.VERSION, WATCHER), 1, m.Welcome)
         reply = _request(socket, m.GetSessions(), 2, m.Sessions)
-        assert isinstance(reply, m.Sessions)
-        return [dict(one) for one in reply.sessions if isinstance(one, dict)], reply.server
+    return [dict(one) for one in reply.sessions if isinstance(one, dict)], reply.server
 
 
 def of_server(endpoint: str, server_key: bytes | None, pair: keys.KeyPair) -> dict[str, Any]:
@@ -116,26 +122,9 @@ def of_server(endpoint: str, server_key: bytes | None, pair: keys.KeyPair) -> di
     return server
 
 
-@contextmanager
-def _greeted(
-    endpoint: str, server_key: bytes | None, pair: keys.KeyPair
-) -> Iterator[tuple[zmq.Socket[bytes], m.Welcome]]:
-    with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.setsockopt(zmq.IPV6, "[" in endpoint)
-        if server_key is not None:
-            socket.setsockopt(zmq.CURVE_SERVERKEY, server_key)
-            socket.setsockopt(zmq.CURVE_PUBLICKEY, pair.public)
-            socket.setsockopt(zmq.CURVE_SECRETKEY, pair.secret)
-        socket.connect(endpoint)
-        welcome = _request(socket, m.Hello(m.VERSION, WATCHER), 1, m.Welcome)
-        assert isinstance(welcome, m.Welcome)
-        yield socket, welcome
-
-
 def _request(
-    socket: zmq.Socket[bytes], request: m.Message, number: int, kind: type[m.Message]
-) -> m.Message:
+    socket: zmq.Socket[bytes], request: m.Message, number: int, kind: type[_Reply]
+) -> _Reply:
     socket.send_multipart(m.pack_header(request, number))
     if not socket.poll(_WAIT_MS):
         raise UnreachableError("the server does not answer: is the key one that it knows?")

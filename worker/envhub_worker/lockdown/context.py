@@ -7,7 +7,6 @@ from typing import Any
 
 from envhub_worker.lockdown.mechanisms.mounts import View
 from envhub_worker.lockdown.mechanisms.scratch import Scratch
-from envhub_worker.lockdown.plan import Plan
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.records import dataclass
 
@@ -19,13 +18,9 @@ class ZygoteConfig:
     Attributes:
         parent: The server's pid.
         target: What a runner runs once it is confined, as ``"module:function"``.
-        profile: The profile of its jails.
-        network: Their network.
         gpu: Whether they get all GPUs, or the indices of those that they get.
-        readable: Further paths that they read.
         packages: The folder of packages that their code comes with, symbolic links resolved, or
             empty. Not trusted: only a runner imports from it, once it is confined.
-        roots: Folders that snapshots lie in.
         place: An empty folder of the zygote's own.
         canary: A file that exists and that no jail may read.
         user: The user to become where the server is root, else None.
@@ -60,12 +55,9 @@ class Common:
     """What a zygote hands to each of its inits.
 
     Attributes:
-        config: Its own start.
         pid: The zygote's pid as an init sees it as its parent.
-        namespaced: Whether the jails have namespaces.
         trees: Read-only trees of the private root.
         roots: The snapshot folders, symbolic links resolved.
-        devices: Device nodes that may be used.
         covered: (files, folders) of /proc to hide.
         landlock_abi: 0 where there is none.
         brokered: Whether init sends the jails' signals.
@@ -95,17 +87,13 @@ class JailContext:
     """What init knows and its runners need.
 
     Attributes:
-        spec: The jail.
-        common: What the zygote gives.
-        plan: Which layers hold.
-        scratch: The writable folders.
-        view: How it sees its snapshot and its packages.
         processes: Cap for ``RLIMIT_NPROC``.
+        measured: No control group counts memory; init measures it.
     """
 
     spec: JailSpec
     common: Common
-    plan: Plan
     scratch: Scratch
     view: View
     processes: int
+    measured: bool

@@ -11,7 +11,7 @@ import posixpath
 import re
 from collections.abc import Collection
 
-from envhub_worker.lockdown.report import LayerUnavailableError
+from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.root_plan import HostFiles, real_path
 from envhub_worker.protocol.records import dataclass
 
@@ -25,11 +25,10 @@ _KFD, _KFD_FOLDER = "/dev/kfd", "/sys/class/kfd/kfd"
 
 
 @dataclass(frozen=True)
-class Granted:
+class GpuGrant:
     """What a jail gets.
 
     Attributes:
-        devices: Device nodes.
         folders: Paths of /sys; links among them are followed.
     """
 
@@ -42,14 +41,14 @@ def gpu_devices(host: HostFiles) -> tuple[str, ...]:
     return _granted(gpus(host), host).devices
 
 
-def granted(gpu: bool | tuple[int, ...], host: HostFiles) -> Granted:
+def granted(gpu: bool | tuple[int, ...], host: HostFiles) -> GpuGrant:
     """What ``gpu`` grants on this host: nothing, all GPUs, or those of some indices.
 
     Raises:
         LayerUnavailableError: There is no such GPU. It would be missed later, and only by some.
     """
     if gpu is False:
-        return Granted()
+        return GpuGrant()
     found = gpus(host)
     wanted = range(len(found)) if gpu is True else gpu
     if not found:
@@ -94,7 +93,7 @@ def _is_nvidias(node: str) -> bool:
 
 
 def _address(node: str, host: HostFiles) -> str:
-    """The PCI address of what a node belongs to; empty if it has none, or it is not told."""
+    """The PCI address of what a node belongs to; empty if it has none, or none is known."""
     name = posixpath.basename(node)
     if not _is_nvidias(node):
         folder = real_path(f"/sys/class/drm/{name}", host)
@@ -107,7 +106,7 @@ def _address(node: str, host: HostFiles) -> str:
     return ""
 
 
-def _granted(chosen: Collection[tuple[str, ...]], host: HostFiles) -> Granted:
+def _granted(chosen: Collection[tuple[str, ...]], host: HostFiles) -> GpuGrant:
     own = [node for nodes in chosen for node in nodes]
     shared = [*_NVIDIAS_SHARED] if any(map(_is_nvidias, own)) else []
     is_amds = any(not any(map(_is_nvidias, nodes)) for nodes in chosen)
@@ -115,7 +114,7 @@ def _granted(chosen: Collection[tuple[str, ...]], host: HostFiles) -> Granted:
     folders = [folder for node in own for folder in _folders(node, host)]
     folders += [_KFD_FOLDER] if is_amds else []
     devices = [*own, *(node for node in shared if host.exists(node))]
-    return Granted(tuple(sorted(devices)), tuple(sorted(set(folders))))
+    return GpuGrant(tuple(sorted(devices)), tuple(sorted(set(folders))))
 
 
 def _folders(node: str, host: HostFiles) -> list[str]:

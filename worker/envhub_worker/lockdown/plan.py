@@ -6,12 +6,12 @@ a weaker profile goes without are listed too, with what stays possible.
 
 from __future__ import annotations
 
-from envhub_worker.lockdown.report import Layer, LayerUnavailableError
+from envhub_worker.lockdown.layers import Layer, LayerUnavailableError, no_system_calls
 from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
 from envhub_worker.protocol.confinement import LEAST_LANDLOCK, MIB, NETWORKS, PROFILES, Confinement
 from envhub_worker.protocol.records import dataclass
 
-#: What the kernel counts per user and nobody can bound per jail.
+#: What the kernel counts per user and does not bound per jail.
 SHARED_QUOTAS = "pages of pipes, descriptors under way in sockets, epoll watches"
 
 # Without a pid namespace Landlock must itself guard signals: from this ABI on it does. Before it,
@@ -29,8 +29,6 @@ class HostFacts:
     """What decides, of this host.
 
     Attributes:
-        machine: As ``os.uname`` says it.
-        root: Whether the server runs as root.
         landlock_abi: 0 where there is none.
         memory: What caps memory: ``"cgroup-v2"``, ``"cgroup-v1"`` or ``"watchdog"``.
     """
@@ -41,55 +39,32 @@ class HostFacts:
     memory: str
 
 
-@dataclass(frozen=True, kw_only=True)
-class Plan:
-    """What the stages of lockdown do.
-
-    Attributes:
-        namespaced: Enter namespaces and a private root.
-        landlock: Restrict files (and TCP, signals, abstract sockets as the ABI allows).
-        measured: No control group counts memory; init measures it.
-        layers: All of it in order, for the report.
-    """
-
-    namespaced: bool
-    landlock: bool
-    measured: bool
-    layers: tuple[Layer, ...]
-
-
-def plan(confinement: Confinement, facts: HostFacts) -> Plan:
-    """The layers for ``confinement`` on a host like ``facts``.
+def plan(confinement: Confinement, facts: HostFacts) -> tuple[Layer, ...]:
+    """The layers for ``confinement`` on a host like ``facts``, in their order.
 
     Raises:
         LayerUnavailableError: The profile names a layer that the host lacks.
     """
-    _check_names(confinement)
-    _check_seccomp(facts)
-    namespaced = confinement.profile == "strict"
-    landlock = _wants_landlock(confinement, facts)
-    if not namespaced and confinement.network == "loopback":
-        raise LayerUnavailableError(
-            "network-namespace",
-            f"the profile {confinement.profile} has no network of its own to give",
-            'Use profile "strict", or the network "none".',
-        )
-    layers = [
+    _check(confinement, facts)
+    limits, namespaced = confinement.limits, confinement.profile == "strict"
+    ignored = "" if namespaced else "; changes of mode, owner and time are accepted and ignored"
+    cpu = "" if limits.cpu_s is None else f", {limits.cpu_s} CPU seconds"
+    rlimits = f"{limits.processes} processes, {limits.open_files} open files{cpu}, no core dumps"
+    return (
         *_user_layers(facts, namespaced),
         *(_namespace_layers(confinement) if namespaced else _without_namespaces(confinement)),
         Layer("capabilities", True, "none in any set"),
         Layer("no-new-privileges", True, "set-user-id programs gain nothing"),
-        _landlock_layer(landlock, facts),
+        _landlock_layer(facts.landlock_abi),
         *_signal_layers(facts, namespaced),
-        Layer("seccomp", True, _seccomp_detail(facts, namespaced)),
-        Layer("rlimits", True, _rlimits_detail(confinement)),
+        Layer("seccomp", True, f"allow-list for {facts.machine}{ignored}"),
+        Layer("rlimits", True, rlimits),
         *_limit_layers(confinement, facts, namespaced),
-    ]
-    measured = facts.memory == "watchdog"
-    return Plan(namespaced=namespaced, landlock=landlock, measured=measured, layers=tuple(layers))
+    )
 
 
-def _check_names(confinement: Confinement) -> None:
+def _check(confinement: Confinement, facts: HostFacts) -> None:
+    """Refuse what there cannot be."""
     for name, value, known in (
         ("profile", confinement.profile, PROFILES),
         ("network", confinement.network, NETWORKS),
@@ -98,18 +73,8 @@ def _check_names(confinement: Confinement) -> None:
             raise LayerUnavailableError(
                 name, f"there is no {name} {value!r}", f"Choose one of {', '.join(known)}."
             )
-
-
-def _check_seccomp(facts: HostFacts) -> None:
     if facts.machine not in NUMBERS:
-        raise LayerUnavailableError(
-            "seccomp",
-            f"no system call table for {facts.machine}",
-            "Run on x86-64 or aarch64, or in a container on such a host.",
-        )
-
-
-def _wants_landlock(confinement: Confinement, facts: HostFacts) -> bool:
+        raise no_system_calls(facts.machine)
     least = LEAST_LANDLOCK[confinement.profile]
     if facts.landlock_abi < least:
         have = f"ABI {facts.landlock_abi}" if facts.landlock_abi else "none"
@@ -119,61 +84,53 @@ def _wants_landlock(confinement: Confinement, facts: HostFacts) -> bool:
             "ABI 1 came with Linux 5.13, 3 with 6.2; it must be in the kernel's lsm= list, and a "
             "container's seccomp profile must allow it.",
         )
-    return facts.landlock_abi > 0
+    if confinement.profile != "strict" and confinement.network == "loopback":
+        raise LayerUnavailableError(
+            "network-namespace",
+            f"the profile {confinement.profile} has no network of its own to give",
+            'Use profile "strict", or the network "none".',
+        )
 
 
 def _user_layers(facts: HostFacts, namespaced: bool) -> list[Layer]:
-    layers = []
-    if facts.root:
-        layers.append(Layer("unprivileged-user", True, "a user id that owns and runs nothing"))
-    if namespaced:
-        layers.append(Layer("user-namespace", True, "one user, and no capability over any other"))
-    return layers
+    user = Layer("unprivileged-user", True, "a user id that owns and runs nothing")
+    namespace = Layer("user-namespace", True, "one user, and no capability over any other")
+    return [user] * facts.root + [namespace] * namespaced
 
 
 def _namespace_layers(confinement: Confinement) -> list[Layer]:
     limits = confinement.limits
+    network = {
+        "host": "the host's network, by explicit choice",
+        "loopback": "only a loopback device",
+    }.get(confinement.network, "no device that is up")
+    scratch = f"one tmpfs of {limits.disk_bytes // MIB} MiB and {limits.disk_files} files"
     return [
         Layer("pid-namespace", True, "sees, signals and outlives no process but its own"),
         Layer("mount-namespace", True, "a private read-only root; other files do not exist"),
-        Layer(
-            "scratch",
-            True,
-            f"one tmpfs of {limits.disk_bytes // MIB} MiB and {limits.disk_files} files",
-        ),
-        _network_layer(confinement.network),
+        Layer("scratch", True, scratch),
+        Layer("network-namespace", confinement.network != "host", network),
         Layer("ipc-namespace", True, "its own System V and POSIX objects"),
         Layer("uts-namespace", True, "a host name that says nothing"),
         Layer("cgroup-namespace", True, "does not see where it is counted"),
     ]
 
 
-def _network_layer(network: str) -> Layer:
-    if network == "host":
-        return Layer("network-namespace", False, "the host's network, by explicit choice")
-    device = "only a loopback device" if network == "loopback" else "no device that is up"
-    return Layer("network-namespace", True, device)
-
-
 def _without_namespaces(confinement: Confinement) -> list[Layer]:
     why = f"the profile {confinement.profile} goes without"
+    network = Layer("network", True, "no socket can be made but connected local pairs")
+    if confinement.network == "host":
+        network = Layer("network", False, "the host's network, by explicit choice")
     return [
         Layer("pid-namespace", False, f"{why}: processes of the host are visible"),
         Layer("mount-namespace", False, f"{why}: names and sizes of the host's files are visible"),
-        _bare_network_layer(confinement.network),
+        network,
     ]
 
 
-def _bare_network_layer(network: str) -> Layer:
-    if network == "host":
-        return Layer("network", False, "the host's network, by explicit choice")
-    return Layer("network", True, "no socket can be made but connected local pairs")
-
-
-def _landlock_layer(landlock: bool, facts: HostFacts) -> Layer:
-    if not landlock:
+def _landlock_layer(abi: int) -> Layer:
+    if not abi:
         return Layer("landlock", False, "this kernel or container has none")
-    abi = facts.landlock_abi
     scope = ", TCP" * (abi >= 4) + ", signals and abstract sockets" * (abi >= 6)
     return Layer("landlock", True, f"ABI {abi}: files{scope}")
 
@@ -182,24 +139,6 @@ def _signal_layers(facts: HostFacts, namespaced: bool) -> list[Layer]:
     if not needs_broker(namespaced=namespaced, landlock_abi=facts.landlock_abi):
         return []
     return [Layer("signals", True, "sent by the jail's init, to processes of the jail only")]
-
-
-def _seccomp_detail(facts: HostFacts, namespaced: bool) -> str:
-    extra = "" if namespaced else "; changes of mode, owner and time are accepted and ignored"
-    return f"allow-list for {facts.machine}{extra}"
-
-
-def _rlimits_detail(confinement: Confinement) -> str:
-    limits = confinement.limits
-    cpu = "" if limits.cpu_s is None else f", {limits.cpu_s} CPU seconds"
-    return f"{limits.processes} processes, {limits.open_files} open files{cpu}, no core dumps"
-
-
-def _quota_layer(facts: HostFacts) -> Layer:
-    """What the kernel counts per user, and a jail therefore takes from others' share."""
-    if facts.root:
-        return Layer("user-quotas", True, "its own: no other program runs as this user")
-    return Layer("user-quotas", False, f"shared with this user's programs: {SHARED_QUOTAS}")
 
 
 def _uncounted(confinement: Confinement, facts: HostFacts, namespaced: bool) -> str:
@@ -226,7 +165,11 @@ def _limit_layers(confinement: Confinement, facts: HostFacts, namespaced: bool) 
         "cgroup-v1": f"{amount}, counted by the kernel (cgroup v1)",
         "watchdog": f"{amount}, measured by the jail's init; bursts between two looks overshoot",
     }
-    layers = [Layer("memory", True, detail[facts.memory] + uncounted), _quota_layer(facts)]
+    # what the kernel counts per user, and a jail therefore takes from others' share
+    quotas = Layer("user-quotas", False, f"shared with this user's programs: {SHARED_QUOTAS}")
+    if facts.root:
+        quotas = Layer("user-quotas", True, "its own: no other program runs as this user")
+    layers = [Layer("memory", True, detail[facts.memory] + uncounted), quotas]
     if not namespaced:
         disk = f"{confinement.limits.disk_bytes // MIB} MiB, measured by the jail's init"
         layers.append(Layer("scratch", True, disk))

@@ -5,7 +5,7 @@
     {"host": {...}, "layers": [{"layer", "available", "detail", "fix"}...],
      "apparmor_profile": text | null}
 
-The layers are tried one by one, so that all that are missing are told, where a jail would stop
+The layers are tried one by one, so that all that are missing are listed, where a jail would stop
 at the first.
 """
 
@@ -19,9 +19,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from envhub_worker.lockdown import gpus, root_plan
+from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.lockdown.mechanisms import (
-    capabilities,
     kernel,
     landlock,
     mounts,
@@ -29,7 +29,6 @@ from envhub_worker.lockdown.mechanisms import (
     process,
     user,
 )
-from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp import filter
 
 _APPARMOR = """\
@@ -200,8 +199,8 @@ def _seccomp() -> str:
 
 
 def _capabilities() -> str:
-    capabilities.drop_all()
-    if capabilities.held():
+    process.drop_capabilities()
+    if process.held_capabilities():
         raise LayerUnavailableError("capabilities", "some could not be dropped", "")
     return "can be dropped"
 

@@ -53,8 +53,6 @@ class RootPlan:
         folders: Empty folders (mount points).
         trees: Paths that appear where they are on the host, read-only, with all below them.
         roots: The same for folders that snapshots lie in; a jail covers them up again.
-        devices: Device nodes that appear where they are.
-        copies: Small files whose content is copied.
         links: Symbolic links: path to target.
         texts: Files of our own: path to content.
     """
@@ -73,7 +71,6 @@ class HostFiles:
     """The few questions that the plan asks about the host's files.
 
     Attributes:
-        exists: Whether a path exists.
         readlink: A symbolic link's target, or None for anything else.
         listdir: Names in a folder; empty where there is none.
         read: What is in a small file; empty where there is none.
@@ -103,12 +100,11 @@ def plan_root(
         roots: Folders that snapshots lie in; each jail later sees only its own snapshot.
         private: Folders that must never appear because an interpreter names something above
             them (a ``sys.path`` entry that is somebody's home).
-        devices: Device nodes that are granted.
         network: ``"host"`` adds what name resolution and TLS read.
-        host: The host's files.
     """
     links: dict[str, str] = dict(_DEV_LINKS)
-    wanted = [path for path in interpreter if not _exposes(path, private)]
+    hidden = list(private)
+    wanted = [path for path in interpreter if not any(within(one, path) for one in hidden)]
     trees = [*wanted, *readable, *_ETC_FOLDERS, *_SYS_FOLDERS, *_SYSTEM]
     copies = list(_ETC_FILES)
     texts = dict(_TEXTS)
@@ -144,10 +140,6 @@ def outermost(paths: Iterable[str]) -> tuple[str, ...]:
 def within(path: str, folder: str) -> bool:
     """Whether the normalised ``path`` is ``folder`` or below it."""
     return path == folder or path.startswith(folder.rstrip("/") + "/")
-
-
-def _exposes(path: str, private: Iterable[str]) -> bool:
-    return any(within(folder, path) for folder in private)
 
 
 def _resolve(path: str, links: dict[str, str], host: HostFiles) -> str:

@@ -27,8 +27,6 @@ class JailSpec:
     Attributes:
         snapshot: Absolute path of the read-only snapshot root.
         entry: The entry file, relative to it.
-        confinement: What the jail is permitted.
-        name: For logs.
     """
 
     snapshot: str

@@ -1,6 +1,6 @@
 """Older releases of Gymnasium in a jail, as the client's own would have it: 0.26 to 1.0.
 
-What they lack is added here, so that nobody else asks for a version:
+What they lack is added here, so that no other module asks for a version:
 
 - **Autoreset.** Before 1.1 there is no mode to choose. 1.0 resets in the step after the end, as
   ``NextStep`` does; 0.29 in the same step, as ``SameStep`` does, but with the last observation as
@@ -57,22 +57,14 @@ def mode_of(env: Any, stated: Any) -> Any:
     """The autoreset mode of a vector environment with a ``step`` of its own.
 
     Args:
-        env: The environment.
         stated: What its metadata says, or None.
     """
-    if stated is not None or _MODES is not None or not _is_gymnasiums(env):
+    if stated is not None or _MODES is not None:
         return stated
-    return DEFAULT_MODE
-
-
-def _is_gymnasiums(env: Any) -> bool:
-    if isinstance(env, VectorEnv):
-        return True
-    return any(cls.__module__.startswith(_EXPERIMENTAL) for cls in type(env).__mro__)
-
-
-def _as_they_are(info: Any) -> Any:
-    return info
+    ours = isinstance(env, VectorEnv) or any(
+        cls.__module__.startswith(_EXPERIMENTAL) for cls in type(env).__mro__
+    )
+    return DEFAULT_MODE if ours else None
 
 
 def renamed(info: Any) -> Any:
@@ -81,17 +73,14 @@ def renamed(info: Any) -> Any:
         return info
     found: dict[Any, Any] = {}
     for key, value in info.items():
-        if not _is_mask(key, info):
+        is_mask = isinstance(key, str) and key.startswith("_") and key[1:] in info
+        if not is_mask:
             mask = info.get(f"_{key}")
             found.update(_entry(_RENAMED.get(key, key), value, mask))
     return found
 
 
 _RENAMED = {"final_observation": "final_obs"}
-
-
-def _is_mask(key: Any, info: dict[Any, Any]) -> bool:
-    return isinstance(key, str) and key.startswith("_") and key[1:] in info
 
 
 def _entry(key: Any, values: Any, mask: Any) -> dict[Any, Any]:
@@ -104,12 +93,12 @@ def _entry(key: Any, values: Any, mask: Any) -> dict[Any, Any]:
     return {key: values, f"_{key}": mask}
 
 
-joined_infos: Callable[[Any], Any] = renamed if _BEFORE_1_0 else _as_they_are
+joined_infos: Callable[[Any], Any] = renamed if _BEFORE_1_0 else lambda info: info
 """The infos of a vector environment with a ``step`` of its own, under the names of today."""
 
 
 class _WithMode(SyncVectorEnv):
-    """``SyncVectorEnv`` of 1.0, told its autoreset mode; what it does in ``step`` is not used."""
+    """``SyncVectorEnv`` of 1.0, with an autoreset mode; what it does in ``step`` is not used."""
 
     def __init__(self, env_fns: Any, *, copy: bool, autoreset_mode: str) -> None:
         super().__init__(env_fns, copy=copy)

@@ -19,8 +19,6 @@ def join(pairs: Pairs, count: int, *, sliced: bool = False) -> dict[Any, Any]:
     """The infos of ``count`` sub-environments.
 
     Args:
-        pairs: Each one's own.
-        count: How many there are here.
         sliced: Whether there are others elsewhere. What does not go together here may do so there,
             where another sub-environment is the first: then they have to be asked for one by one.
     """
@@ -36,11 +34,7 @@ class InfoWriter:
     """Writes infos into a slab: as columns while their schema stays the same, else encoded.
 
     Args:
-        reply: The mapped reply slab.
         start: Offset of its info area.
-        count: Sub-environments of the shard.
-        pack: Gives the frames of a message.
-        sliced: Whether there are other shards.
     """
 
     def __init__(

@@ -20,7 +20,7 @@ import numpy as np
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.stream import Packet, pack_packet, read_packet
-from envhub_worker.runner.infos import InfoWriter, Pairs, join
+from envhub_worker.runner.infos import InfoWriter, Pairs
 from envhub_worker.runner.sync_envs import SubEnvs
 from envhub_worker.runner.watches import Watches
 
@@ -33,19 +33,14 @@ class Lane:
     """One environment's steps.
 
     Args:
-        env: Its sub-environments.
         attach: Which rows of the batch they are, and how many slots there are.
         fds: Request slab, reply slab, observation slab, our doorbell, the client's. Owned from
             now on.
-        answer: Gives the frames of the answer to a message.
-        pack: Gives the frames of a message.
-        raised: Makes a message of an exception.
         warned: What the repository has warned of, and no reply has taken along: while there is
             something, answers are fetched by the server, with that in front of them.
         watches: What the client has had watched; what has changed of it goes the same way.
 
     Attributes:
-        number: The environment's.
         unsent: The frames of the last answer, if it did not fit.
     """
 
@@ -104,11 +99,14 @@ class Lane:
         batch.truncations = bools[count:][start:stop]
         bools[:count][start:stop] = bools[count:][start:stop] = False  # another may have died here
         bases = [slot * observed.slot_bytes for slot in range(observed.slots)]
-        rows = [[self._rows(leaf, base, start) for leaf in observed.leaves] for base in bases]
+        rows = [
+            [
+                slabs.view(self._observations, leaf, base=base)[start:stop]
+                for leaf in observed.leaves
+            ]
+            for base in bases
+        ]
         batch.write_to(rows)
-
-    def _rows(self, leaf: slabs.Leaf, base: int, start: int) -> Any:
-        return slabs.view(self._observations, leaf, base=base)[start : start + self._layout.count]
 
     def wake(self) -> bool:
         """After the doorbell: silence it, and serve while requests keep coming quickly.
@@ -140,25 +138,22 @@ class Lane:
         sequence = self._asked[slabs.SEQUENCE]
         if sequence == self._served:
             return False
-        told = self._told
+        words = self._told
         if sequence & _MEASURE or self._asked[slabs.MESSAGE]:
-            told[slabs.OUTCOME], told[slabs.LENGTH] = self._run()
+            words[slabs.OUTCOME], words[slabs.LENGTH] = self._run()
         else:
             self._run_measured()
         self._served = sequence
-        told[slabs.SEQUENCE] = sequence
+        words[slabs.SEQUENCE] = sequence
         if self._asked[slabs.PARKED]:
-            self._ring()
+            with contextlib.suppress(BlockingIOError):  # it is full: it has been rung already
+                os.write(self._client_bell, _RING)
         return True
 
-    def _ring(self) -> None:
-        with contextlib.suppress(BlockingIOError):  # it is full: it has been rung already
-            os.write(self._client_bell, _RING)
-
     def _run_measured(self) -> None:
-        told, start = self._told, perf_counter_ns()
-        told[slabs.OUTCOME], told[slabs.LENGTH] = self._run()
-        told[slabs.BUSY] = perf_counter_ns() - start
+        words, start = self._told, perf_counter_ns()
+        words[slabs.OUTCOME], words[slabs.LENGTH] = self._run()
+        words[slabs.BUSY] = perf_counter_ns() - start
 
     def _run(self) -> tuple[int, int]:
         try:
@@ -232,7 +227,7 @@ class Lane:
 
     def infos(self) -> dict[Any, Any]:
         """The last step's infos."""
-        return join(self._pairs, self._layout.count, sliced=self._env.sliced)
+        return self._env.joined(self._pairs)
 
 
 def _raised_frame(message: m.Raised) -> Any:

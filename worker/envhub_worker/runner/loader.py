@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from envhub_worker.protocol.messages import Load, LoadTask
-from envhub_worker.runner.signatures import Parameters, parameters_of, takes
+from envhub_worker.runner.parameters import Parameters, parameters_of, takes
 
 PACKAGE = "hub_env"
 
@@ -35,8 +35,6 @@ def import_entry(snapshot: str, entry: str, scratch: str) -> Callable[..., Any]:
     """Import the entry file and give its ``make_env``.
 
     Args:
-        snapshot: The repository's root.
-        entry: Path of the file in it, as in the hub reference.
         scratch: A writable folder that outlives this call.
 
     Raises:
@@ -50,13 +48,10 @@ def import_entry(snapshot: str, entry: str, scratch: str) -> Callable[..., Any]:
     module = importlib.import_module(".".join([PACKAGE, *parts]))
     make_env = getattr(module, "make_env", None)
     if not callable(make_env):
+        kind = f"{type(make_env).__module__}.{type(make_env).__qualname__}"
+        lacks = "it has no such name" if make_env is None else f"its make_env is a {kind}"
         raise EntryError(
-            f"{entry} must expose `make_env(n_envs=int, use_async_envs=bool)`; "
-            + (
-                "it has no such name"
-                if make_env is None
-                else f"its make_env is a {_type(make_env)}"
-            )
+            f"{entry} must expose `make_env(n_envs=int, use_async_envs=bool)`; {lacks}"
         )
     return make_env  # type: ignore[no-any-return]
 
@@ -144,7 +139,3 @@ def _check_arguments(parameters: Parameters, taken: dict[str, Any], given: dict[
             f"make_env needs {', '.join(missing)}; pass env_kwargs, or a config object where it is "
             "cfg"
         )
-
-
-def _type(value: object) -> str:
-    return f"{type(value).__module__}.{type(value).__qualname__}"

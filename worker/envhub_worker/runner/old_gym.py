@@ -33,7 +33,7 @@ from gymnasium.vector.utils import batch_space, iterate
 from envhub_worker.runner import gymnasium_compat as compat
 from envhub_worker.runner.described import facts_of
 from envhub_worker.runner.infos import join
-from envhub_worker.runner.signatures import names, parameters_of, takes
+from envhub_worker.runner.parameters import names, parameters_of, takes
 
 _OPTIONAL = ("seed", "options", "return_info")
 _MODES = ("rgb_array", "ansi")
@@ -56,15 +56,15 @@ def is_vector(value: object) -> bool:
 
 def adapted(env: Any) -> Any:
     """An environment of ``gym`` as one of Gymnasium; anything else as it is."""
-    return _told(OldEnv, env) if is_env(env) else env
+    return _warned(OldEnv, env) if is_env(env) else env
 
 
 def adapted_vector(env: Any) -> Any:
     """A vector environment of ``gym`` as one of Gymnasium; anything else as it is."""
-    return _told(OldVectorEnv, env) if is_vector(env) else env
+    return _warned(OldVectorEnv, env) if is_vector(env) else env
 
 
-def _told(adapter: Callable[[Any], Any], env: Any) -> Any:
+def _warned(adapter: Callable[[Any], Any], env: Any) -> Any:
     if not hasattr(np, "bool8"):  # numpy 2 has taken away what gym's own checks of a step use
         np.bool8 = np.bool_  # type: ignore[attr-defined]
     release = getattr(sys.modules.get("gym"), "__version__", "of an unknown release")
@@ -119,11 +119,7 @@ def _takes(method: Any, name: str) -> bool:
 
 
 class OldEnv(gym.Env[Any, Any]):
-    """An environment of ``gym``. What Gymnasium's do not have is looked up, and set, in it.
-
-    Args:
-        env: The environment, with its wrappers.
-    """
+    """An environment of ``gym``. What Gymnasium's do not have is looked up, and set, in it."""
 
     def __init__(self, env: Any) -> None:
         asked = getattr(env, "render_mode", None) is None and all(
@@ -190,11 +186,7 @@ class OldEnv(gym.Env[Any, Any]):
 
 
 class OldVectorEnv:
-    """A vector environment of ``gym``, driven as it is: it resets in the step that ends an episode.
-
-    Args:
-        env: The vector environment.
-    """
+    """A vector environment of ``gym``, as it is: it resets in the step that ends an episode."""
 
     def __init__(self, env: Any) -> None:
         self.env = env
@@ -272,35 +264,13 @@ def space_of(space: Any) -> Any:
     )
 
 
-def _box(space: Any) -> Any:
-    return spaces.Box(space.low, space.high, space.shape, space.dtype)
-
-
-def _discrete(space: Any) -> Any:
-    return spaces.Discrete(int(space.n), start=int(getattr(space, "start", 0)))
-
-
-def _multi_discrete(space: Any) -> Any:
-    return spaces.MultiDiscrete(space.nvec, dtype=space.dtype)
-
-
-def _multi_binary(space: Any) -> Any:
-    return spaces.MultiBinary(space.n)
-
-
-def _tuple(space: Any) -> Any:
-    return spaces.Tuple([space_of(one) for one in space.spaces])
-
-
-def _dict(space: Any) -> Any:
-    return spaces.Dict(OrderedDict((key, space_of(one)) for key, one in space.spaces.items()))
-
-
 _SPACES: dict[str, Callable[[Any], Any]] = {
-    "Box": _box,
-    "Discrete": _discrete,
-    "MultiDiscrete": _multi_discrete,
-    "MultiBinary": _multi_binary,
-    "Tuple": _tuple,
-    "Dict": _dict,
+    "Box": lambda space: spaces.Box(space.low, space.high, space.shape, space.dtype),
+    "Discrete": lambda space: spaces.Discrete(int(space.n), start=int(getattr(space, "start", 0))),
+    "MultiDiscrete": lambda space: spaces.MultiDiscrete(space.nvec, dtype=space.dtype),
+    "MultiBinary": lambda space: spaces.MultiBinary(space.n),
+    "Tuple": lambda space: spaces.Tuple([space_of(one) for one in space.spaces]),
+    "Dict": lambda space: spaces.Dict(
+        OrderedDict((key, space_of(one)) for key, one in space.spaces.items())
+    ),
 }

@@ -23,15 +23,15 @@ from envhub_worker.protocol.manifest.manifest import encode_env, encode_manifest
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
 from envhub_worker.runner import loader, manifest
-from envhub_worker.runner.deferred import standing_in
 from envhub_worker.runner.described import described
-from envhub_worker.runner.exceptions import raised
 from envhub_worker.runner.gymnasium_compat import joined_infos
-from envhub_worker.runner.infos import join
+from envhub_worker.runner.infos import Pairs
 from envhub_worker.runner.lane import Lane
+from envhub_worker.runner.raised import raised
+from envhub_worker.runner.recording import standing_in
 from envhub_worker.runner.sync_envs import SubEnvs
 from envhub_worker.runner.tasks import ResultError, Task, tasks_of
-from envhub_worker.runner.warned import Warned
+from envhub_worker.runner.warning_log import WarningLog
 from envhub_worker.runner.watches import Watches
 
 _ANCILLARY_BYTES = socket.CMSG_SPACE(8 * array("i").itemsize)
@@ -83,16 +83,7 @@ def _send(stream: socket.socket, request_id: int, frames: list[Any]) -> None:
 
 
 class Runner:
-    """The state of one runner: the repository's tasks and the environments built of them.
-
-    Args:
-        snapshot: The folder of the repository.
-        entry: The entry file in it.
-
-    Attributes:
-        warned: What the repository has warned of.
-        watches: What the client has had watched.
-    """
+    """The state of one runner: the repository's tasks and the environments built of them."""
 
     def __init__(self, snapshot: str, entry: str) -> None:
         self._pack = partial(m.pack, describer=described)
@@ -101,7 +92,7 @@ class Runner:
         self._tasks: dict[tuple[str, Any], Task] = {}
         self._envs: dict[int, Any] = {}
         self._stage = ""
-        self.warned = Warned()
+        self.warned = WarningLog()
         self.watches = Watches()
         self.lane: Lane | None = None
         self.descriptors: list[int] = []
@@ -173,10 +164,8 @@ class Runner:
         """``VectorEnv.reset``."""
         env = self._envs[request.env]
         if isinstance(env, SubEnvs):
-            pairs = env.run_reset(request.seeds, request.options, request.mask)
-            return m.ResetDone(
-                env.batch.observation(), join(pairs, env.num_envs, sliced=env.sliced)
-            )
+            infos = env.joined(env.run_reset(request.seeds, request.options, request.mask))
+            return m.ResetDone(env.batch.observation(), infos)
         options: Any = request.options
         if request.mask is not None:
             options = {} if options is None else options  # our own copy
@@ -193,19 +182,13 @@ class Runner:
                 actions = batches.restore_batch(space, actions)
             observation, rewards, terminated, truncated, info = env.step(actions)
             return m.StepDone(observation, rewards, terminated, truncated, joined_infos(info))
-        infos = join(env.run_step(request.actions), env.num_envs, sliced=env.sliced)
-        batch = env.batch
-        flags = (batch.rewards, batch.terminations, batch.truncations)
-        return m.StepDone(batch.observation(), *flags, infos)
+        return _step_done(env, env.run_step(request.actions))
 
     def revive(self, request: m.Revive) -> m.Message:
         """Begin anew in the place of sub-environments that died: see ``m.Revive``."""
         env = self._envs[request.env]
         if isinstance(env, SubEnvs):
-            infos = join(env.run_revive(request.seeds), env.num_envs, sliced=env.sliced)
-            batch = env.batch
-            flags = (batch.rewards, batch.terminations, batch.truncations)
-            return m.StepDone(batch.observation(), *flags, infos)
+            return _step_done(env, env.run_revive(request.seeds))
         observation, info = env.reset(seed=request.seeds)
         no, yes = np.zeros(env.num_envs, np.bool_), np.ones(env.num_envs, np.bool_)
         return m.StepDone(observation, np.zeros(env.num_envs), no, yes, info)
@@ -217,8 +200,8 @@ class Runner:
             return m.Value(False)
         reply = partial(self.reply, by_lane=True)
         fail = partial(raised, root=self._snapshot)
-        told = (self.warned.pending, self.watches)
-        self.lane = Lane(env, request, self.descriptors, reply, self._pack, fail, *told)
+        more = (self.warned.pending, self.watches)
+        self.lane = Lane(env, request, self.descriptors, reply, self._pack, fail, *more)
         return m.Value(True)
 
     def fetch_infos(self, request: m.FetchInfos) -> m.Message:
@@ -267,9 +250,7 @@ class Runner:
 
     def get_one(self, request: m.GetOne) -> m.Message:
         """An attribute of one sub-environment."""
-        if request.index is None:
-            return m.Value(None)
-        value = self._found(request)
+        value = None if request.index is None else self._found(request)
         return m.Method() if callable(value) else m.Value(value)
 
     def call_one(self, request: m.CallOne) -> m.Message:
@@ -312,6 +293,12 @@ class Runner:
         if env is not None:
             env.close()
         return m.Value(None)
+
+
+def _step_done(env: SubEnvs, pairs: Pairs) -> m.Message:
+    batch, infos = env.batch, env.joined(pairs)
+    flags = (batch.rewards, batch.terminations, batch.truncations)
+    return m.StepDone(batch.observation(), *flags, infos)
 
 
 def _scratch() -> str:

@@ -20,7 +20,7 @@ from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
 from envhub_worker.runner.gymnasium_compat import SyncBase
-from envhub_worker.runner.infos import Pairs
+from envhub_worker.runner.infos import Pairs, join
 
 Store = Callable[[int, Any], None]
 
@@ -216,6 +216,10 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         batch.stay()
         self._done = done
         return infos
+
+    def joined(self, pairs: Pairs) -> dict[Any, Any]:
+        """Infos of these sub-environments as one."""
+        return join(pairs, self.num_envs, sliced=self.sliced)
 
     def _each(self, actions: Any) -> Iterator[Any]:
         if self._restores:

@@ -17,7 +17,7 @@ from gymnasium.vector import VectorEnv
 
 from envhub_worker.protocol.manifest.manifest import TaskId
 from envhub_worker.runner import old_gym
-from envhub_worker.runner.deferred import Recording, recording
+from envhub_worker.runner.recording import Recording, recording
 from envhub_worker.runner.sync_envs import SubEnvs
 
 EnvFn = Callable[[], Any]
@@ -80,9 +80,6 @@ def tasks_of(result: Any, n_envs: int, use_async_envs: bool, again: EnvFn) -> li
     """The tasks in ``make_env``'s result.
 
     Args:
-        result: What ``make_env(n_envs, use_async_envs)`` returned.
-        n_envs: What the caller asked for.
-        use_async_envs: What the caller asked for.
         again: Calls ``make_env`` with ``n_envs=1``, for one more single ``Env``.
 
     Raises:

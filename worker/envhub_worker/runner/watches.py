@@ -1,10 +1,10 @@
 """Attributes that the client has had watched, so that it need not ask for them after each step.
 
 An evaluation asks for its task's description after every step, which costs as much as the step. So
-what is read again and again is looked at here after each request, and the client is told when it
-is something else. Only what can be looked at without any code of the repository's running in
-between, and by nobody being noticed, is watched: plain attributes with plain values, in a process
-with one thread that no signal runs anything in. Followed: ``gymnasium.Wrapper.get_wrapper_attr``.
+what is read again and again is looked at here after each request, and the client learns when it is
+something else. Only what can be looked at without running any code of the repository is watched:
+plain attributes with plain values, in a process with one thread that no signal runs anything in.
+Followed: ``gymnasium.Wrapper.get_wrapper_attr``.
 """
 
 from __future__ import annotations
@@ -47,12 +47,9 @@ _Reading = tuple[Callable[[str], Any], Any]
 class Watches:
     """What is watched of the environments of one runner.
 
-    Args:
-        alone: Tells whether nobody can change anything between two requests.
-
     Attributes:
         readings: Of each attribute; empty if nothing is watched. Always the same dict.
-        changed: What the client is to be told, likewise.
+        changed: What the client is to learn, likewise.
     """
 
     def __init__(self, alone: Callable[[], bool] = is_alone) -> None:
@@ -94,10 +91,10 @@ class Watches:
         """
         if not self.changed or len(frames) >= DEFAULT_LIMITS.frames:
             return frames
-        told = list(self.changed)[: changed.MOST]
-        for key in told:
+        keys = list(self.changed)[: changed.MOST]
+        for key in keys:
             del self.changed[key]
-        return changed.in_front(told, frames)
+        return changed.in_front(keys, frames)
 
 
 def _can_be_watched(env: Any, name: str, values: Any) -> bool:

@@ -48,7 +48,6 @@ def thread_count(environment: Mapping[str, str], cores: int, runners: int) -> in
 
     Args:
         environment: The runner's; the variables that OpenBLAS reads decide, where there is one.
-        cores: That this process may use.
         runners: Of the jail, this one included: they share the cores.
     """
     for name in _VARIABLES:

@@ -52,6 +52,12 @@ class Channel:
         self._unsent.append((data, tuple(os.dup(fd) for fd in fds)))
         self.flush()
 
+    def send_pidfd(self, message: Message, pid: int) -> None:
+        """Send with a pidfd of ``pid``, a child that is not reaped yet, or this process."""
+        pidfd = os.pidfd_open(pid)
+        self.send(message, [pidfd])
+        os.close(pidfd)
+
     def flush(self) -> None:
         """Send what is waiting, as far as the socket takes it. A peer that is gone is no error."""
         while self._unsent:
@@ -74,7 +80,7 @@ class Channel:
         try:
             data, fds, flags = self._receive()
         except ConnectionResetError:
-            # Told once, when the peer closed with our messages unread; its own still come.
+            # Comes once, when the peer closed with our messages unread; its own still come.
             data, fds, flags = self._receive()
         if not data:
             return None

@@ -33,10 +33,10 @@ from dataclasses import dataclass
 from typing import Any, NoReturn
 
 from envhub_worker.lockdown.context import Common, JailContext
-from envhub_worker.lockdown.limits.monitor import Guard
-from envhub_worker.lockdown.mechanisms import process, reap
+from envhub_worker.lockdown.layers import LayerUnavailableError
+from envhub_worker.lockdown.limits.watchdog import Watchdog
+from envhub_worker.lockdown.mechanisms import process, procfs, reap
 from envhub_worker.lockdown.plan import HostFacts, plan
-from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp import notify, paths
 from envhub_worker.lockdown.seccomp.syscalls import name_of
 from envhub_worker.lockdown.spec import JailSpec
@@ -49,6 +49,11 @@ from envhub_worker.spawn.channel import Channel, close_fds
 
 def run(control: int, output: int, common: Common) -> NoReturn:
     """Be the init of a jail in this freshly forked child of the zygote. Never returns."""
+    # In this order: the zygote's signal handlers go first, for they would write into its pipe.
+    # Then our end is tied to the zygote's, before anything can hold us up. The output is the
+    # jail's before the first line that may print. Only what is named stays open: what else a fork
+    # has inherited belongs to the zygote. The specification is read last, when no descriptor is
+    # left that it could leak through.
     code = 1
     try:
         process.reset_signals(reap.HANDLED)
@@ -73,7 +78,6 @@ class _Runner:
     """A runner as its init knows it.
 
     Attributes:
-        number: The server's number for it.
         status: Where it reports, until it is confined.
         ended: (reason, detail) of the end that we gave it.
     """
@@ -108,7 +112,7 @@ class Init:
         except LayerUnavailableError as error:
             self._channel.send({"event": "failed", **error.to_wire()})
         finally:
-            reap.kill_descendants(keep=())
+            reap.kill_descendants()
 
     def _set_up(self, message: dict[str, Any], fds: list[int]) -> None:
         spec = JailSpec.from_wire(message["spec"])
@@ -119,18 +123,18 @@ class Init:
             landlock_abi=self._common.landlock_abi,
             memory=message["cgroup"] or "watchdog",
         )
-        wanted = plan(spec.confinement, facts)
+        layers = plan(spec.confinement, facts)
         scratch, view = jail.enter(spec, self._common, message["scratch"])
         self._jail = JailContext(
             spec=spec,
             common=self._common,
-            plan=wanted,
             scratch=scratch,
             view=view,
-            processes=jail.process_limit(spec.confinement.limits, wanted.namespaced),
+            processes=jail.process_limit(spec.confinement.limits, self._common.namespaced),
+            measured=not message["cgroup"],
         )
-        self._guard = Guard(self._jail, events)
-        report = [layer.to_wire() for layer in (*wanted.layers, jail.working_view(view))]
+        self._watchdog = Watchdog(self._jail, events)
+        report = [layer.to_wire() for layer in (*layers, jail.working_view(view))]
         self._channel.send({"event": "ready", "report": report})
 
     def _stop(self, *_: object) -> None:
@@ -140,7 +144,9 @@ class Init:
         self._poller.register(self._channel, select.POLLIN)
         self._poller.register(wakeup, select.POLLIN)
         while self._running:
-            ready = [fd for fd, _ in self._poller.poll(self._patience())]
+            # until the next look at the limits; a jail without runners needs none
+            patience_ms = self._watchdog.seconds_left() * 1000 + 1 if self._runners else None
+            ready = [fd for fd, _ in self._poller.poll(patience_ms)]
             for fd in ready:
                 if fd == wakeup:
                     reap.drain(wakeup)
@@ -149,25 +155,23 @@ class Init:
                 elif fd in self._listeners:
                     self._answer(fd)
                 else:
-                    self._read_reports(fd)
+                    for pid, runner in self._runners.items():
+                        if runner.status is not None and runner.status.fileno() == fd:
+                            self._read_report(pid)
             if wakeup in ready:
                 self._reap()
             if self._runners:
                 self._look()
 
-    def _patience(self) -> float | None:
-        """Milliseconds until the next look at the limits; a jail without runners needs none."""
-        return self._guard.seconds_left() * 1000 + 1 if self._runners else None
-
     def _look(self) -> None:
-        if self._guard.seconds_left() == 0:
+        if self._watchdog.seconds_left() == 0:
             # A runner that is still locking itself down runs our code, and cannot be measured yet.
             starting = [pid for pid, runner in self._runners.items() if runner.status is not None]
-            over = self._guard.look(reap.descendants(os.getpid(), starting))
+            over = self._watchdog.look(procfs.descendants(os.getpid(), starting))
             if over is not None:
                 for runner in self._runners.values():
                     runner.ended = runner.ended or over
-                reap.kill_descendants(keep=())
+                reap.kill_descendants()
 
     def _serve(self) -> None:
         received = self._channel.receive()
@@ -193,7 +197,7 @@ class Init:
         pid = os.fork()
         if pid == 0:
             runner_entry.run(order)
-        self._guard.ignore(fds)
+        self._watchdog.ignore(fds)
         close_fds(fds)
         theirs.close()
         self._runners[pid] = _Runner(number, status)
@@ -205,7 +209,7 @@ class Init:
                 runner.ended = runner.ended or ("killed", "")
                 # Not reaped yet, so the pid is still its own. Stopped, it cannot fork away.
                 os.kill(pid, signal.SIGSTOP)
-                reap.kill_below(pid)
+                reap.kill_descendants(root=pid)
                 os.kill(pid, signal.SIGKILL)
 
     def _answer(self, listener: int) -> None:
@@ -215,38 +219,37 @@ class Init:
             os.close(listener)
 
     def _note(self, request: notify.Request) -> None:
-        """Tell what was tried, each thing once; a runner's own test of its denials is none."""
+        """Report what was tried, each thing once; a runner's own test of its denials is none."""
+        # it may have reported a moment ago, and be a stranger's since
+        self._read_report(request.caller)
         runner = self._runners.get(request.caller)
         if runner is not None and runner.status is not None:
-            # it may have reported a moment ago, and be a stranger's since
-            self._read_report(request.caller, runner, runner.status)
-            if runner.status is not None:
-                return
+            return
         call = name_of(request.call)
         if call not in paths.NAMED or call not in self._common.watched:
             detail = notify.detail(request)
             if detail or not notify.is_own_affair(call, self._common.watched):
-                self._tell_denied(call, detail)
+                self._report_denied(call, detail)
             return
         mine = own(self._jail, request.caller, request.thread)
         waits = request.still_waits
         for deed, path in paths.asked(call, request.words, request.thread, mine, waits):
-            told = sum(text.startswith("/") for _, text in self._denials)
-            if told < notify.MOST_FILES:
-                self._tell_denied(deed, path)
+            known = sum(text.startswith("/") for _, text in self._denials)
+            if known < notify.MOST_FILES:
+                self._report_denied(deed, path)
 
-    def _tell_denied(self, call: str, detail: str) -> None:
+    def _report_denied(self, call: str, detail: str) -> None:
         denial = (call, detail)
         if denial not in self._denials and len(self._denials) < notify.MOST_DENIALS:
             self._denials.add(denial)
             self._channel.send({"event": "denied", "call": call, "detail": detail})
 
-    def _read_reports(self, fd: int) -> None:
-        for pid, runner in self._runners.items():
-            if runner.status is not None and runner.status.fileno() == fd:
-                self._read_report(pid, runner, runner.status)
-
-    def _read_report(self, pid: int, runner: _Runner, status: Channel) -> None:
+    def _read_report(self, pid: int) -> None:
+        """What a runner has reported, if ``pid`` is one that is still to be confined."""
+        runner = self._runners.get(pid)
+        if runner is None or runner.status is None:
+            return
+        status = runner.status
         messages, ended = status.drain()
         for message, fds in messages:
             if "layer" in message:
@@ -255,54 +258,39 @@ class Init:
                 self._listeners.update(fds)
                 self._poller.register(fds[0], select.POLLIN)
             else:
-                self._tell_started(pid, runner, message["report"])
+                fields = {"runner": runner.number, "report": message["report"]}
+                # not reaped yet: even if it has ended, the pid is this one's
+                self._channel.send_pidfd({"event": "runner_started", **fields}, pid)
         if ended:  # or it died before it was confined: its exit says so
             self._poller.unregister(status)
             status.close()
             runner.status = None
 
-    def _tell_started(self, pid: int, runner: _Runner, report: list[dict[str, Any]]) -> None:
-        pidfd = os.pidfd_open(pid)  # not reaped yet: even if it has ended, it is this one
-        fields = {"runner": runner.number, "report": report}
-        self._channel.send({"event": "runner_started", **fields}, [pidfd])
-        os.close(pidfd)
-
     def _reap(self) -> None:
-        ended = [(pid, status) for pid, status in reap.reap(self._before_reaping)]
+        ended = list(reap.reap(self._read_report))
         for pid, status in ended:
             runner = self._runners.pop(pid, None)
             if runner is not None:
-                self._tell_exit(runner, status)
+                self._report_exit(runner, status)
                 self._end_orphans(pid)
         if ended and not self._runners:
-            reap.kill_descendants(keep=())  # daemons do not outlive the last runner
+            reap.kill_descendants()  # daemons do not outlive the last runner
 
     def _end_orphans(self, session: int) -> None:
         """End what a runner leaves behind, while others go on. Daemons end with the last runner."""
-        for pid in reap.descendants(os.getpid(), keep=self._runners):
+        for pid in procfs.descendants(os.getpid(), keep=self._runners):
             with contextlib.suppress(ProcessLookupError):
                 if os.getsid(pid) == session:
                     os.kill(pid, signal.SIGKILL)
 
-    def _before_reaping(self, pid: int) -> None:
-        runner = self._runners.get(pid)
-        if runner is not None and runner.status is not None:
-            self._read_report(pid, runner, runner.status)
-
-    def _tell_exit(self, runner: _Runner, status: int) -> None:
-        fields = process.exit_fields(status)
+    def _report_exit(self, runner: _Runner, status: int) -> None:
+        fields = {"runner": runner.number, **process.exit_fields(status)}
         reason, detail = runner.ended or self._reason(fields["signal"])
-        event = {
-            "event": "runner_exited",
-            "runner": runner.number,
-            "reason": reason,
-            "detail": detail,
-        }
-        self._channel.send({**event, **fields})
+        self._channel.send({"event": "runner_exited", "reason": reason, "detail": detail, **fields})
 
     def _reason(self, signum: int | None) -> tuple[Reason, str]:
         if signum is None:
             return "exit", ""
         if signum == signal.SIGXCPU:
             return "cpu-limit", f"{self._jail.spec.confinement.limits.cpu_s} CPU seconds used"
-        return self._guard.killed_by_kernel() or ("signal", "")
+        return self._watchdog.killed_by_kernel() or ("signal", "")

@@ -2,14 +2,21 @@
 
 Everything here runs before anything of the repository does. The order is the point: what needs
 a privilege comes before its drop, and the syscall filter comes last.
+
+Packages of a repository's own are brought in after that, and not before: such a folder holds a
+stranger's code, and much of it would run by itself: the lines of ``.pth`` files, plugins that
+another package imports, and whatever it calls ``numpy``. So the zygote of such jails runs without
+``site``, never has the folder on its path, and imports the standard library only.
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 import random
 import runpy
+import site
 import socket
 import sys
 import tempfile
@@ -18,14 +25,13 @@ from collections.abc import Callable
 from typing import NoReturn
 
 from envhub_worker.lockdown.context import JailContext
-from envhub_worker.lockdown.limits import cgroups
+from envhub_worker.lockdown.layers import Layer, LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import process, reap
 from envhub_worker.lockdown.mechanisms.environment import jail_environment
-from envhub_worker.lockdown.report import Layer, LayerUnavailableError
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.lockdown.stages import runner
 from envhub_worker.protocol.records import dataclass
-from envhub_worker.spawn import blas, packages
+from envhub_worker.spawn import blas
 from envhub_worker.spawn.channel import Channel
 
 _SELF_TEST = Layer("self-test", True, "the denials above were tried and held")
@@ -36,8 +42,6 @@ class Order:
     """What init asks a new runner to be.
 
     Attributes:
-        parent: Init's pid.
-        jail: The jail.
         fds: The stream to the server, then whatever the server passes through.
         runners: How many the jail has, this one included.
         joins: Where to join the jail's control group, if it has one.
@@ -87,7 +91,7 @@ def _main(order: Order) -> Callable[[socket.socket, JailSpec, list[int]], int | 
     config = order.jail.common.config
     if not config.packages:
         return _resolve(config.target)
-    packages.bring_in(config.packages, order.jail.scratch.home)
+    _bring_in(config.packages, order.jail.scratch.home)
     try:
         with blas.threads_at_load(order.runners):
             return _resolve(config.target)
@@ -107,9 +111,15 @@ def _resolve(target: str) -> Callable[[socket.socket, JailSpec, list[int]], int 
 
 def confine(order: Order, init: Channel) -> None:
     """Give up everything that the jail does not need."""
+    # In this order: the end of init is our end from the first line on. A session of our own is
+    # what init ends orphans by. The control group is joined before anything is allocated that it
+    # should count, and while its descriptors are open: the next line but one closes them. The
+    # environment is built while the zygote's can still be read. ``runner.enter`` is last; it has
+    # an order of its own, and after it there is nothing left to give up.
     process.die_with_parent(order.parent)
     os.setsid()
-    cgroups.join(order.joins)
+    for group in order.joins:
+        os.write(group, b"0")  # this process, which has one thread
     process.reset_signals(reap.HANDLED)
     descriptors = {0, 1, 2, order.status, *order.fds}
     process.close_all_but({*descriptors, *order.jail.view.shared.values()})
@@ -145,3 +155,45 @@ def _flush() -> None:
             stream.flush()
         except BaseException:
             continue  # the stranger may have replaced or closed it
+
+
+def _bring_in(folder: str, home: str) -> None:
+    """Make this confined process one of an environment whose packages are ``folder``.
+
+    Behind the standard library, as the packages of any interpreter, with their ``.pth`` files; and
+    what of ``site`` a program may expect. What it starts as ``sys.executable`` has them as well.
+
+    Args:
+        home: The jail's own home. All of its runners make the same there.
+    """
+    environment = f"{home}/.environment"
+    _make_environment(environment, folder)
+    sys.executable = f"{environment}/bin/python"
+    sys.prefix = sys.exec_prefix = environment
+    os.environ["PATH"] = f"{environment}/bin:{folder}/bin:{os.environ['PATH']}"
+    os.environ["VIRTUAL_ENV"] = environment
+    site.setquit()
+    site.setcopyright()
+    site.sethelper()
+    site.addsitedir(folder)
+
+
+def _make_environment(environment: str, folder: str) -> None:
+    """A virtual environment, as ``venv`` makes it, around packages that lie elsewhere."""
+    major, minor = sys.version_info[:2]
+    library = f"{environment}/lib/python{major}.{minor}"
+    binaries = f"{environment}/bin"
+    for path in (library, binaries):
+        os.makedirs(path, exist_ok=True)
+    base = os.path.realpath(sys.executable)
+    links = {f"{library}/site-packages": folder}
+    links |= {
+        f"{binaries}/{name}": base for name in ("python", "python3", f"python{major}.{minor}")
+    }
+    for path, target in links.items():
+        with contextlib.suppress(FileExistsError):
+            os.symlink(target, path)
+    draft = f"{environment}/{os.getpid()}.draft"
+    with open(draft, "w") as file:
+        file.write(f"home = {os.path.dirname(base)}\ninclude-system-site-packages = false\n")
+    os.replace(draft, f"{environment}/pyvenv.cfg")

@@ -38,26 +38,25 @@ from dataclasses import replace
 from typing import cast
 
 from envhub_worker.lockdown.context import Common, ZygoteConfig
+from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import namespaces, process, reap
-from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.stages import zygote
-from envhub_worker.spawn import blas, jail_init, packages
+from envhub_worker.spawn import blas, jail_init
 from envhub_worker.spawn.channel import Channel, close_fds
 
 # What nearly every runner imports anyway. pyzmq is left out on purpose: a jail holds no ZeroMQ
 # socket, and a context started here would not survive the fork.
 _PRELOAD = (
-    "cloudpickle",
-    "ctypes",
-    "gymnasium",
-    "gymnasium.spaces",
-    "gymnasium.vector",
-    "gymnasium.wrappers",
-    "msgpack",
-    "numpy",
-    "numpy.random",
-    "tempfile",
-    "typing",
+    *("cloudpickle", "ctypes", "gymnasium", "gymnasium.spaces", "gymnasium.vector"),
+    *("gymnasium.wrappers", "msgpack", "numpy", "numpy.random", "tempfile", "typing"),
+)
+# Of the standard library, what numpy and Gymnasium import: the zygote may, it is the interpreter's.
+_STANDARD = (
+    *("contextvars", "csv", "ctypes", "datetime", "difflib", "heapq", "importlib.metadata"),
+    *("importlib.resources", "ipaddress", "locale", "logging", "mmap"),
+    *("multiprocessing.connection", "multiprocessing.context", "multiprocessing.sharedctypes"),
+    *("numbers", "pathlib", "pickle", "platform", "string", "tempfile", "threading", "typing"),
+    *("urllib.parse", "uuid", "zipfile"),
 )
 _JAIL = "envhub_worker.runner.runner"
 _END_S = 5.0
@@ -72,7 +71,7 @@ def main(argv: Sequence[str]) -> int:
     if argv[1:] == ["ahead"]:
         preload(_JAIL)
     elif argv[1:] == ["standard"]:
-        import_all(packages.STANDARD)
+        import_all(_STANDARD)
     received = channel.receive()
     if received is None:
         return 0
@@ -97,10 +96,8 @@ def main(argv: Sequence[str]) -> int:
 
 def preload(target: str) -> None:
     """Import what every runner needs, the code that serves it included: ours, and inert."""
-    import_all(_PRELOAD)
     place, _, _ = target.partition(":")
-    if not place.endswith(".py"):
-        importlib.import_module(place)
+    import_all([*_PRELOAD, *([] if place.endswith(".py") else [place])])
 
 
 def import_all(modules: Iterable[str]) -> None:
@@ -135,7 +132,8 @@ class Zygote:
         poller = select.poll()
         poller.register(self._channel, select.POLLIN)
         poller.register(wakeup, select.POLLIN)
-        self._tell_ready()
+        # Our own end is known by this handle; the pid that the server started may only wait.
+        self._channel.send_pidfd({"event": "ready"}, os.getpid())
         while self._running:
             ready = [fd for fd, _ in poller.poll()]
             if wakeup in ready:
@@ -145,33 +143,22 @@ class Zygote:
                 self._serve()
         self._end()
 
-    def _tell_ready(self) -> None:
-        # Our own death is told by this handle; the pid that the server started may only wait.
-        pidfd = os.pidfd_open(os.getpid())
-        self._channel.send({"event": "ready"}, [pidfd])
-        os.close(pidfd)
-
     def _stop(self, *_: object) -> None:
         self._running = False
 
     def _serve(self) -> None:
         received = self._channel.receive()
         if received is None:
-            self._running = False
-        else:
-            message, fds = received
-            self._spawn(message["id"], fds)
-
-    def _spawn(self, jail: int, fds: list[int]) -> None:
-        control, output = fds
+            self._stop()
+            return
+        message, fds = received
+        jail, (control, output) = message["id"], fds
         pid = namespaces.fork_in_new_pid_namespace() if self._common.namespaced else os.fork()
         if pid == 0:
             jail_init.run(control, output, self._common)
         close_fds(fds)
         self._inits[pid] = jail
-        pidfd = os.pidfd_open(pid)
-        self._channel.send({"event": "spawned", "id": jail}, [pidfd])
-        os.close(pidfd)
+        self._channel.send_pidfd({"event": "spawned", "id": jail}, pid)
 
     def _reap(self) -> None:
         gone = False
@@ -192,4 +179,4 @@ class Zygote:
             self._reap()
             time.sleep(0.005)
         with contextlib.suppress(ChildProcessError):
-            reap.kill_descendants(keep=())
+            reap.kill_descendants()

@@ -1,4 +1,4 @@
-"""The process of a zygote, from its start until it hears what it is for.
+"""The process of a zygote, from its start until it reads its configuration.
 
 What a server needs first is a zygote, and that takes longest: so ``serve --ahead`` starts one
 before anything else is imported. In the server's own interpreter it imports what every runner
@@ -31,14 +31,12 @@ class ZygoteProcess:
     Args:
         runtime: Its interpreter, and the packages of its jails. Where it has any, it starts without
             ``site``, and so sees none: not those, and not the interpreter's own.
-        runtime_dir: An existing folder of the server's own.
         ahead: Import before the configuration comes, and so before any confinement: only where that
             is from what the server has imported the same from.
 
     Attributes:
         channel: Its first message is the configuration.
-        folder: Goes with ``close`` of whoever uses it.
-        log: Both outputs.
+        folder: Removed by ``Spawner.close``.
         pid: Of what was started, which may only wait for the zygote.
     """
 
@@ -79,7 +77,7 @@ class ZygoteProcess:
             return self._process.wait()
 
     def discard(self) -> None:
-        """Nobody is going to use it."""
+        """End it unused."""
         self.channel.close()
         self._process.kill()
         self._process.wait()

@@ -24,8 +24,8 @@ PidfdFor = Callable[[m.Deposit], int | None]
 may not have it."""
 
 
-class Deposits:
-    """Descriptors that wait for their runner."""
+class FdStore:
+    """Descriptors that wait for their runner, and the socket that takes them."""
 
     def __init__(self, path: str, pidfd_for: PidfdFor) -> None:
         self._pidfd_for = pidfd_for

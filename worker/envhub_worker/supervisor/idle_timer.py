@@ -1,4 +1,4 @@
-"""For how long nobody has asked anything of a jail.
+"""How long a jail has been idle: no request, and no step.
 
 Steps by the fast lane do not pass the server. But their slabs do, on their way to the runner: the
 client counts its requests in one, which a runner cannot write, and the runner its replies in
@@ -17,12 +17,8 @@ from envhub_worker.spawn.channel import close_fds
 _WORD = 8
 
 
-class Idleness:
-    """The clock of one jail.
-
-    Args:
-        limit_s: How long is too long.
-    """
+class IdleTimer:
+    """The clock of one jail."""
 
     def __init__(self, limit_s: float) -> None:
         self.limit_s = limit_s
@@ -51,9 +47,9 @@ class Idleness:
     def passed(self, busy: bool) -> bool:
         """Whether it was too long; ``busy``: some runner owes an answer to a message."""
         asked = [_sequence(request) for request, _ in self._slabs.values()]
-        told = [_sequence(reply) for _, reply in self._slabs.values()]
-        if busy or asked != told or asked + told != self._seen:
-            self._seen = asked + told
+        answered = [_sequence(reply) for _, reply in self._slabs.values()]
+        if busy or asked != answered or asked + answered != self._seen:
+            self._seen = asked + answered
             self.begin()
         return monotonic() - self._since >= self.limit_s
 

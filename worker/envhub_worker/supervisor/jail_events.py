@@ -1,6 +1,6 @@
 """What happens to jails: they come up, answer, print, break rules and die.
 
-Nobody asks for any of it. Requests are in ``jails.py``; what both do to a jail is here, such as its
+None of it is asked for. Requests are in ``jails.py``; what both do to a jail is here, such as its
 end. Trust: a runner is hostile. What it says is not decoded, only its sizes and order are checked,
 and one that breaks the rules loses its jail.
 """
@@ -11,25 +11,19 @@ from collections import Counter
 from collections.abc import Callable
 from time import monotonic
 
-from envhub_worker.lockdown.limits import around
+from envhub_worker.lockdown.limits.cgroups import OUTER_LIMIT, SurroundingLimit
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.spawn.channel import close_fds
-from envhub_worker.spawn.spawner import (
-    Denied,
-    Failed,
-    JailExited,
-    RunnerExited,
-    RunnerStarted,
-    ZygoteDied,
-)
-from envhub_worker.supervisor.fd_store import Deposits
+from envhub_worker.spawn.jail import CallDenied, JailFailed, RunnerExited, RunnerStarted
+from envhub_worker.spawn.spawner import JailExited, ZygoteDied
+from envhub_worker.supervisor.fd_store import FdStore
 from envhub_worker.supervisor.records import (
-    Answers,
     JailEntry,
     Pending,
-    for_operation,
+    RefusedError,
+    Reply,
     signal_name,
     waiting,
     whole_jail,
@@ -45,11 +39,7 @@ class JailEvents:
     """Writes down what happens, and tells everybody who waits for it.
 
     Args:
-        loop: Calls back when a descriptor is ready.
-        answers: Takes the replies.
         jails: All jails of the server; what has ended long ago is taken out.
-        deposits: Descriptors that wait for runners.
-        witness: Is told what becomes of each.
 
     Attributes:
         deaths: How many jails, and runners of kept jails, have ended unasked, by reason.
@@ -58,18 +48,18 @@ class JailEvents:
     def __init__(
         self,
         loop: Loop,
-        answers: Answers,
+        reply: Reply,
         jails: dict[int, JailEntry],
-        deposits: Deposits,
+        fds: FdStore,
         witness: Witness,
     ) -> None:
         self._loop = loop
-        self._answers = answers
+        self._reply = reply
         self._jails = jails
-        self._deposits = deposits
+        self._fds = fds
         self._witness = witness
         self.deaths: Counter[str] = Counter()
-        self._around = around.Around()
+        self._outer_limit = SurroundingLimit()
 
     def follow(self, entry: JailEntry) -> None:
         """Hear of a new jail from now on."""
@@ -125,7 +115,7 @@ class JailEvents:
             counts = tuple(map(len, replies))
             dead = tuple(sorted(pending.dead))
             answer = m.RelayedPartly(counts, dead) if dead else m.Relayed(counts)
-            self._answers.reply(pending.asker, answer, payload)
+            self._reply(pending.asker, answer, payload)
 
     def _read_output(self, entry: JailEntry) -> None:
         entry.output.read()
@@ -145,37 +135,36 @@ class JailEvents:
         for event in events:
             if isinstance(event, RunnerStarted):
                 self._runner_started(entry, event)
-            elif isinstance(event, Failed):
+            elif isinstance(event, JailFailed):
                 self._failed(entry, event)
             elif isinstance(event, RunnerExited):
                 self._runner_exited(entry, event)
-            elif isinstance(event, Denied):
+            elif isinstance(event, CallDenied):
                 self._denied(entry, event)
 
     def _runner_started(self, entry: JailEntry, event: RunnerStarted) -> None:
-        entry.pids[event.runner_id] = event.pid
+        entry.pids[event.runner] = event.pid
         entry.report = tuple(event.report)
         for opening in list(entry.opening):
-            opening.waiting.discard(event.runner_id)
+            opening.waiting.discard(event.runner)
             if not opening.waiting:
                 entry.opening.remove(opening)
                 opened = m.JailOpened(entry.number, opening.runners, entry.report)
-                self._answers.reply(opening.asker, opened)
+                self._reply(opening.asker, opened)
                 took = monotonic() - opening.since
                 self._witness.opened(entry, len(opening.runners), took)
                 entry.opened = True
 
-    def _failed(self, entry: JailEntry, event: Failed) -> None:
+    def _failed(self, entry: JailEntry, event: JailFailed) -> None:
         for opening in entry.opening:
-            self._answers.refuse(
-                opening.asker, "SandboxUnavailableError", event.reason, event.layer, event.fix
-            )
+            why = ("SandboxUnavailableError", event.reason, event.layer, event.fix)
+            self._reply(opening.asker, RefusedError(*why).reply)
         entry.opening.clear()
         self.end(entry, whole_jail("unavailable", detail=event.reason))
 
     def _runner_exited(self, entry: JailEntry, event: RunnerExited) -> None:
         death = m.Died(
-            event.runner_id,
+            event.runner,
             event.reason,
             exit_code=event.code,
             signal=signal_name(event.signal),
@@ -186,8 +175,8 @@ class JailEvents:
     def _judged(self, entry: JailEntry, death: m.Died) -> m.Died:
         """A kill is the kernel's, where it has counted one for the memory around all of us."""
         by_signal = death.signal == "SIGKILL" and death.reason in ("signal", "exit")
-        if entry.death is None and by_signal and self._around.killed_one():
-            return m.replace(death, reason="out-of-memory", detail=around.WHY)
+        if entry.death is None and by_signal and self._outer_limit.killed_one():
+            return m.replace(death, reason="out-of-memory", detail=OUTER_LIMIT)
         return death
 
     def ended_with_the_server(self) -> None:
@@ -198,7 +187,7 @@ class JailEvents:
 
     def close(self) -> None:
         """Nothing happens any more."""
-        self._around.close()
+        self._outer_limit.close()
 
     def _runner_died(self, entry: JailEntry, death: m.Died) -> None:
         """The end of its jail too, unless that is kept."""
@@ -208,16 +197,16 @@ class JailEvents:
             self._lose(entry, death)
 
     def _lose(self, entry: JailEntry, death: m.Died) -> None:
-        """Go on without a runner: whoever waits for it hears how it died, and nobody else."""
+        """Go on without a runner: the requests that wait for it are answered with its death."""
         self.deaths[death.reason] += 1
         entry.output.read()
         death = m.replace(death, tail=entry.output.text())
-        # the last lines of earlier deaths have been told: many of them would be much
+        # the last lines of earlier deaths were sent already: all of them would be much
         entry.lost = {runner: m.replace(one, tail="") for runner, one in entry.lost.items()}
         entry.lost[death.runner] = death
         entry.jail.kill_runner(death.runner)  # it may live, and have broken the rules
         entry.pids.pop(death.runner, None)
-        close_fds(self._deposits.take(entry.number, death.runner))
+        close_fds(self._fds.take(entry.number, death.runner))
         if entry.idle is not None:
             entry.idle.forget(death.runner)
         link = entry.drop(death.runner)
@@ -228,7 +217,7 @@ class JailEvents:
         link.close()
         for opening in [one for one in entry.opening if death.runner in one.waiting]:
             entry.opening.remove(opening)
-            self._answers.reply(opening.asker, for_operation(death, "start"))
+            self._reply(opening.asker, m.replace(death, operation="start"))
         self._witness.lost(entry, death)
 
     def end(self, entry: JailEntry, death: m.Died) -> None:
@@ -240,15 +229,15 @@ class JailEvents:
         entry.output.read()
         entry.death = death = m.replace(death, tail=entry.output.text())
         for pending in waiting(entry):
-            self._answers.reply(pending.asker, for_operation(death, pending.operation))
+            self._reply(pending.asker, m.replace(death, operation=pending.operation))
         for opening in entry.opening:
-            self._answers.reply(opening.asker, for_operation(death, "start"))
+            self._reply(opening.asker, m.replace(death, operation="start"))
         entry.opening.clear()
         self._witness.died(entry)
         self.kill(entry)
 
     def _hear_last(self, entry: JailEntry) -> None:
-        """What it was denied has been told before whatever ends it, on another descriptor.
+        """Read what it was denied, which was sent before whatever ends it, on another descriptor.
 
         It ends also where that cannot be read: then it may be this that ends it.
         """
@@ -258,15 +247,15 @@ class JailEvents:
             self._witness.failed(error)
             return
         for event in events:
-            if isinstance(event, Denied):
+            if isinstance(event, CallDenied):
                 self._denied(entry, event)
 
-    def _denied(self, entry: JailEntry, event: Denied) -> None:
+    def _denied(self, entry: JailEntry, event: CallDenied) -> None:
         entry.denied.append(f"{event.call} {event.detail}".strip())
 
     def kill(self, entry: JailEntry) -> None:
         """End its processes; ``jail_gone`` is when they are gone."""
-        self._deposits.drop(entry.number)
+        self._fds.drop(entry.number)
         self._unwatch_control(entry)
         entry.jail.kill()
 
@@ -276,7 +265,7 @@ class JailEvents:
         entry.control = -1
 
     def jail_gone(self, event: JailExited) -> None:
-        """Nothing of a jail is left: whoever waits for that hears it."""
+        """Nothing of a jail is left: answer the requests that wait for that."""
         entry = next((one for one in self._jails.values() if one.jail is event.jail), None)
         if entry is None:
             return
@@ -289,7 +278,7 @@ class JailEvents:
             self.end(entry, self._judged(entry, death))
         self._release(entry)
         for asker in entry.closing:
-            self._answers.reply(asker, m.Done())
+            self._reply(asker, m.Done())
         if entry.death is None:
             self._witness.closed(entry)
 
@@ -305,11 +294,8 @@ class JailEvents:
             entry.idle.close()
         for pending in waiting(entry):
             death = whole_jail("killed", detail="the jail was closed")
-            self._answers.reply(pending.asker, for_operation(death, pending.operation))
-        self._forget_some()
-
-    def _forget_some(self) -> None:
-        """The oldest dead, where there are many: their clients do not come back for them."""
+            self._reply(pending.asker, m.replace(death, operation=pending.operation))
+        # the oldest dead, where there are many: their clients do not come back for them
         dead = [number for number, one in self._jails.items() if one.released]
         for number in dead[:-MAX_DEAD]:
             del self._jails[number]

@@ -11,32 +11,32 @@ import secrets
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from envhub_worker.lockdown.mechanisms.reap import Children
+from envhub_worker.lockdown.mechanisms.procfs import Children
 from envhub_worker.lockdown.spec import JailSpec, confinement_from_wire
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import WireLimits
 from envhub_worker.spawn.channel import close_fds
 from envhub_worker.spawn.zygote_process import ZygoteProcess
-from envhub_worker.supervisor.fd_store import Deposits
-from envhub_worker.supervisor.idle_timer import Idleness
+from envhub_worker.supervisor.fd_store import FdStore
+from envhub_worker.supervisor.idle_timer import IdleTimer
 from envhub_worker.supervisor.jail_events import JailEvents
 from envhub_worker.supervisor.output_tail import OutputTail
-from envhub_worker.supervisor.reached import reached
 from envhub_worker.supervisor.records import (
-    Answers,
+    AnsweredError,
     Asker,
     JailEntry,
     Opening,
     Pending,
-    for_operation,
+    RefusedError,
+    Reply,
     owes,
     status_of,
     whole_jail,
 )
 from envhub_worker.supervisor.runner_stream import MAX_PENDING, RunnerLink
-from envhub_worker.supervisor.usage import Counting, usage_of
-from envhub_worker.supervisor.witness import Nobody, Witness
+from envhub_worker.supervisor.usage import CountLimit, reached, usage_of
+from envhub_worker.supervisor.witness import Witness
 from envhub_worker.supervisor.zygotes import Zygotes
 
 MAX_RUNNERS = 64
@@ -51,35 +51,28 @@ class Jails:
     """All jails of a server.
 
     Args:
-        loop: Calls back when one of their descriptors is ready.
-        answers: Takes the replies.
-        runtime_dir: An existing folder of the server's own.
-        readable_roots: Where snapshots lie.
-        limits: Bounds on what a runner may say.
         fd_path: The socket that takes descriptors.
         ahead: A process for the first zygote.
-        witness: Is told what becomes of each.
     """
 
     def __init__(
         self,
         loop: Loop,
-        answers: Answers,
+        reply: Reply,
         runtime_dir: Path,
         readable_roots: Sequence[str],
         limits: WireLimits,
         fd_path: Path,
-        ahead: ZygoteProcess | None = None,
-        witness: Witness | None = None,
+        ahead: ZygoteProcess | None,
+        witness: Witness,
     ) -> None:
-        self._answers = answers
         self._limits = limits
         self._jails: dict[int, JailEntry] = {}
         self._packet_ids = itertools.count(1)
-        self._counting = Counting()
-        self._deposits = Deposits(str(fd_path), self._pidfd_for)
-        loop.watch(self._deposits.fileno(), self._deposits.accept)
-        self._events = JailEvents(loop, answers, self._jails, self._deposits, witness or Nobody())
+        self._counting = CountLimit()
+        self._fds = FdStore(str(fd_path), self._pidfd_for)
+        loop.watch(self._fds.fileno(), self._fds.accept)
+        self._events = JailEvents(loop, reply, self._jails, self._fds, witness)
         self._zygotes = Zygotes(loop, runtime_dir, readable_roots, self._jails, self._events, ahead)
 
     def close(self) -> None:
@@ -88,18 +81,17 @@ class Jails:
             self._events.kill(entry)
         self._zygotes.close()
         self._events.ended_with_the_server()
-        self._deposits.close()
+        self._fds.close()
         self._events.close()
 
-    # --- requests ------------------------------------------------------------------------------
+    # --- requests: what is returned is the reply; None, where that comes later ------------------
 
     def open(self, asker: Asker, request: m.OpenJail) -> None:
         """Fork a jail for a snapshot, and its first runners."""
         if len(self.open_ones()) >= MAX_JAILS or not 1 <= request.runners <= MAX_RUNNERS:
-            self._answers.refuse(
-                asker, "WorkerError", f"at most {MAX_JAILS} jails of 1 to {MAX_RUNNERS} runners"
+            raise RefusedError(
+                "WorkerError", f"at most {MAX_JAILS} jails of 1 to {MAX_RUNNERS} runners"
             )
-            return
         confinement = confinement_from_wire(request.confinement)
         spec = JailSpec(
             snapshot=request.snapshot,
@@ -107,7 +99,7 @@ class Jails:
             confinement=confinement,
             name=request.name,
         )
-        zygote, jail = self._zygotes.fork(request.runtime, confinement, spec)
+        zygote, jail = self._zygotes.fork(request.runtime, spec)
         entry = JailEntry(
             number=secrets.randbits(62),
             name=request.name,
@@ -123,51 +115,36 @@ class Jails:
     def start_more(self, asker: Asker, request: m.StartRunners) -> None:
         """Fork further runners in an open jail."""
         entry = self._owned(asker, request.jail)
-        if entry is None:
-            return
         if not 1 <= request.runners <= MAX_RUNNERS - len(entry.links):
-            self._answers.refuse(asker, "WorkerError", f"a jail has at most {MAX_RUNNERS} runners")
-            return
+            raise RefusedError("WorkerError", f"a jail has at most {MAX_RUNNERS} runners")
         if len(entry.lost) > MAX_LOST:
-            self._answers.refuse(
-                asker, "WorkerError", f"{len(entry.lost)} of its runners have died"
-            )
-            return
+            raise RefusedError("WorkerError", f"{len(entry.lost)} of its runners have died")
         self._start_runners(asker, entry, request.runners)
 
     def _start_runners(self, asker: Asker, entry: JailEntry, count: int) -> None:
-        runners = tuple(self._start_runner(entry) for _ in range(count))
-        entry.opening.append(Opening(asker, set(runners), runners))
-
-    def _start_runner(self, entry: JailEntry) -> int:
-        runner, sock = entry.jail.start_runner()
-        entry.links[runner] = RunnerLink(sock, self._limits)
-        self._events.follow_runner(entry, runner)
-        return runner
+        runners = []
+        for _ in range(count):
+            runner, sock = entry.jail.start_runner()
+            entry.links[runner] = RunnerLink(sock, self._limits)
+            self._events.follow_runner(entry, runner)
+            runners.append(runner)
+        entry.opening.append(Opening(asker, set(runners), tuple(runners)))
 
     def relay(self, asker: Asker, request: m.Relay, payload: list[bytes]) -> None:
         """Hand the payload to runners; the reply goes out once all of them have answered."""
         entry = self._owned(asker, request.jail)
-        if entry is None:
-            return
         targets = _targets(entry, request, payload)
         if targets is None:
-            self._answers.refuse(
-                asker, "LocalProtocolError", "the parts of Relay do not fit its frames"
-            )
-            return
+            raise RefusedError("LocalProtocolError", "the parts of Relay do not fit its frames")
         if any(owes(entry, runner) >= MAX_PENDING for runner, _ in targets):
-            self._answers.refuse(
-                asker, "WorkerError", f"a runner owes {MAX_PENDING} answers already"
-            )
-            return
+            raise RefusedError("WorkerError", f"a runner owes {MAX_PENDING} answers already")
         pending = Pending(asker, request.operation, [None] * len(targets))
         for index, (runner, frames) in enumerate(targets):
             if runner in entry.lost:
                 pending.lost(index, entry.lost[runner])
                 continue
             link = entry.links[runner]
-            fds = self._deposits.take(entry.number, runner) if request.deposited else []
+            fds = self._fds.take(entry.number, runner) if request.deposited else []
             try:
                 link.send(next(self._packet_ids), frames, (pending, index), fds)
                 if entry.idle is not None and fds:
@@ -180,20 +157,16 @@ class Jails:
         if pending.dead:
             self._events.gather(pending)
 
-    def keep(self, asker: Asker, request: m.KeepJail) -> None:
-        """From now on the death of a runner is its own affair."""
-        entry = self._owned(asker, request.jail)
-        if entry is not None:
-            entry.kept = True
-            self._answers.reply(asker, m.Done())
+    def keep(self, asker: Asker, request: m.KeepJail) -> m.Message:
+        """From now on the death of a runner does not end the jail."""
+        self._owned(asker, request.jail).kept = True
+        return m.Done()
 
-    def expire(self, asker: Asker, request: m.ExpireIdle) -> None:
+    def expire(self, asker: Asker, request: m.ExpireIdle) -> m.Message:
         """End it once it has done nothing for so long."""
         entry = self._owned(asker, request.jail)
-        if entry is not None:
-            if entry.idle is None:
-                entry.idle = Idleness(request.idle_ms / 1000)
-            self._answers.reply(asker, m.Done())
+        entry.idle = entry.idle or IdleTimer(request.idle_ms / 1000)
+        return m.Done()
 
     def look(self) -> None:
         """End the jails that have done nothing for longer than they may; about once a second."""
@@ -203,64 +176,59 @@ class Jails:
                 self.end(entry, f"it was idle for more than {entry.idle.limit_s:g} s")
 
     def _pidfd_for(self, request: m.Deposit) -> int | None:
-        entry = self._jails.get(request.jail)
-        if entry is None or entry.session != request.session or entry.death is not None:
+        entry = self._found(request.session, request.jail)
+        if entry is None or entry.death is not None or request.runner not in entry.links:
             return None
-        if request.runner not in entry.links:
-            return None
-        # the zygote tells of the jail, and may do so only after that has told of itself
+        # the zygote reports the jail, and may do so only after it has reported itself
         return entry.jail.runner_pidfd(request.runner) if entry.kept else entry.jail.pidfd
 
-    def _owned(self, asker: Asker, number: int, operation: str = "") -> JailEntry | None:
+    def _found(self, session: bytes, number: int) -> JailEntry | None:
         entry = self._jails.get(number)
-        if entry is None or entry.session != asker.session:
-            self._answers.refuse(
-                asker, "WorkerDiedError", f"there is no jail {number}; it has been closed"
-            )
-            return None
+        return entry if entry is not None and entry.session == session else None
+
+    def _owned(self, asker: Asker, number: int, operation: str = "") -> JailEntry:
+        """A jail of the asker's that lives; raises the reply where it has none."""
+        entry = self._found(asker.session, number)
+        if entry is None:
+            raise RefusedError("WorkerDiedError", f"there is no jail {number}; it has been closed")
         if entry.death is not None:
-            self._answers.reply(asker, for_operation(entry.death, operation))
-            return None
+            raise AnsweredError(m.replace(entry.death, operation=operation))
         return entry
 
-    def close_jail(self, asker: Asker, request: m.CloseJail) -> None:
+    def close_jail(self, asker: Asker, request: m.CloseJail) -> m.Message | None:
         """End a jail; also after its death, for ``Done`` means that nothing of it is left."""
-        entry = self._jails.get(request.jail)
-        if entry is None or entry.session != asker.session:
-            self._answers.reply(asker, m.Done())
-        elif entry.released:
-            del self._jails[entry.number]
-            self._answers.reply(asker, m.Done())
-        else:  # also after its death: Done means that nothing of it is left
+        entry = self._found(asker.session, request.jail)
+        if entry is not None and not entry.released:
             entry.closing.append(asker)
             self._events.kill(entry)
-
-    def read_output(self, asker: Asker, request: m.ReadOutput) -> None:
-        """Tell the last lines that a jail printed."""
-        entry = self._owned(asker, request.jail, request.operation)
+            return None
         if entry is not None:
-            if entry.idle is not None:
-                entry.idle.begin()  # so that the request that follows finds it alive
-            entry.output.read()
-            self._answers.reply(asker, m.Output(entry.output.text()))
+            del self._jails[entry.number]
+        return m.Done()
 
-    def follow_output(self, asker: Asker, request: m.FollowOutput) -> None:
-        """Tell what a jail has printed since, also if it is dead."""
-        entry = self._jails.get(request.jail)
-        if entry is None or entry.session != asker.session:
-            self._answers.refuse(asker, "WorkerError", f"there is no jail {request.jail}")
-            return
+    def read_output(self, asker: Asker, request: m.ReadOutput) -> m.Message:
+        """The last lines that a jail printed."""
+        entry = self._owned(asker, request.jail, request.operation)
+        if entry.idle is not None:
+            entry.idle.begin()  # so that the request that follows finds it alive
         entry.output.read()
-        self._answers.reply(asker, m.OutputBytes(*entry.output.since(request.offset)))
+        return m.Output(entry.output.text())
 
-    def status(self, asker: Asker, request: m.GetStatus) -> None:
-        """Tell what the asker's jails are doing, and what they hold."""
+    def follow_output(self, asker: Asker, request: m.FollowOutput) -> m.Message:
+        """What a jail has printed since, also if it is dead."""
+        entry = self._found(asker.session, request.jail)
+        if entry is None:
+            raise RefusedError("WorkerError", f"there is no jail {request.jail}")
+        entry.output.read()
+        return m.OutputBytes(*entry.output.since(request.offset))
+
+    def status(self, asker: Asker, request: m.GetStatus) -> m.Message:
+        """What the asker's jails are doing, and what they hold."""
         mine = [entry for entry in self._jails.values() if entry.session == asker.session]
         for entry in mine:
-            self._events.catch_up(entry)  # it said so before it answered whoever asks now
+            self._events.catch_up(entry)  # it said so before it answered the client that asks now
         children = self._counting.children() if mine else None
-        rows = tuple({**status_of(one), **_held(one, children)} for one in mine)
-        self._answers.reply(asker, m.Status(rows))
+        return m.Status(tuple({**status_of(one), **_held(one, children)} for one in mine))
 
     # --- for the gate --------------------------------------------------------------------------
 
@@ -287,7 +255,7 @@ class Jails:
         return self._events.deaths
 
     def end(self, entry: JailEntry, why: str) -> None:
-        """End a jail that nobody closes; its client is told why if it comes back."""
+        """End a jail that no client closes; its client reads why if it comes back."""
         self._events.end(entry, whole_jail("idle", detail=why))
 
 

@@ -37,7 +37,7 @@ class OutputTail:
             data = os.read(self._fd, _CHUNK)
         except BlockingIOError:
             return
-        self.ended = not data  # closed by whoever watches it: its number is soon another's
+        self.ended = not data  # its watcher closes it: its number is soon another's
         self._kept += data
         self._total += len(data)
         if len(self._kept) > 2 * self._limit:

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import monotonic
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
+from envhub_worker.lockdown.mechanisms import procfs
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.confinement import Reason
-from envhub_worker.spawn.spawner import Jail
-from envhub_worker.supervisor.idle_timer import Idleness
+from envhub_worker.spawn.jail import Jail
+from envhub_worker.supervisor.idle_timer import IdleTimer
 from envhub_worker.supervisor.output_tail import OutputTail
 from envhub_worker.supervisor.runner_stream import RunnerLink
+
+_MAX_SAID = 4096
+"""Characters of a refusal."""
 
 
 class Asker(NamedTuple):
@@ -27,6 +31,30 @@ class Asker(NamedTuple):
     request_id: int
     session: bytes = b""
     key: bytes = b""
+
+
+Reply = Callable[..., None]
+"""Sends the reply to a request: takes the asker, the message and perhaps its payload."""
+
+
+class AnsweredError(Exception):
+    """Ends a request early, with its reply."""
+
+    def __init__(self, reply: m.Message) -> None:
+        super().__init__(reply)
+        self.reply = reply
+
+
+class RefusedError(AnsweredError):
+    """A request is not done. ``error`` is a name out of the client's table."""
+
+    def __init__(self, error: str, message: str, missing: str = "", fix: str = "") -> None:
+        # what the client has sent may be quoted in the message, at any length
+        super().__init__(m.Refused(error, message[:_MAX_SAID], missing, fix))
+        self.error, self.message, self.missing, self.fix = error, message, missing, fix
+
+    def __str__(self) -> str:
+        return self.message
 
 
 @dataclass
@@ -52,7 +80,7 @@ class Pending:
     def lost(self, index: int, death: m.Died) -> None:
         """In the place of a runner's answer: how it died."""
         self.dead.add(index)
-        self.replies[index] = m.pack(for_operation(death, self.operation))
+        self.replies[index] = m.pack(m.replace(death, operation=self.operation))
 
 
 @dataclass
@@ -60,8 +88,6 @@ class JailEntry:
     """A jail and everything that waits for it.
 
     Attributes:
-        opened: Whether it has come up.
-        since: When it was asked for.
         moved: Bytes to and from runners that it has lost.
         denied: What was tried in it and is denied, where it records that.
     """
@@ -78,7 +104,7 @@ class JailEntry:
     opening: list[Opening] = field(default_factory=list)
     closing: list[Asker] = field(default_factory=list)
     kept: bool = False
-    idle: Idleness | None = None
+    idle: IdleTimer | None = None
     lost: dict[int, m.Died] = field(default_factory=dict)
     death: m.Died | None = None
     released: bool = False
@@ -104,18 +130,6 @@ class JailEntry:
         return self.links.pop(runner)
 
 
-class Answers(Protocol):
-    """Where replies go."""
-
-    def reply(self, asker: Asker, message: m.Message, payload: Sequence[Buffer] = ()) -> None:
-        """Answer a request."""
-
-    def refuse(
-        self, asker: Asker, error: str, message: str, missing: str = "", fix: str = ""
-    ) -> None:
-        """Answer that it is not done."""
-
-
 def waiting(entry: JailEntry) -> list[Pending]:
     """Everything that runners owe an answer to; they owe it no more."""
     found = {}
@@ -130,11 +144,6 @@ def owes(entry: JailEntry, runner: int) -> int:
     """How many answers a runner owes; one that has died owes none any more."""
     link = entry.links.get(runner)
     return 0 if link is None else len(link.pending)
-
-
-def for_operation(death: m.Died, operation: str) -> m.Died:
-    """A death, told to who waited for this."""
-    return m.replace(death, operation=operation)
 
 
 def whole_jail(reason: Reason, **how: Any) -> m.Died:
@@ -152,15 +161,13 @@ def signal_name(number: int | None) -> str | None:
         return f"signal {number}"
 
 
-_STATES = {"R": "running", "S": "waiting", "D": "waiting", "T": "stopped", "t": "stopped"}
+_STATES = {b"R": "running", b"S": "waiting", b"D": "waiting", b"T": "stopped", b"t": "stopped"}
 
 
 def _state_of(pid: int) -> str:
-    """What the kernel says that a runner is doing: of a busy environment nobody else can tell."""
+    """What the kernel says that a runner is doing; a busy environment cannot say so itself."""
     try:
-        with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as file:
-            # the command may hold anything, parentheses and blanks included
-            return _STATES.get(file.read().rpartition(")")[2].split()[0], "gone")
+        return _STATES.get(procfs.stat(pid)[0], "gone")
     except (OSError, IndexError):
         return "gone"
 

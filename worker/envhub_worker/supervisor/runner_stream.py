@@ -99,7 +99,7 @@ class RunnerLink:
         """The replies that have arrived with their owners, or None at the end of the stream.
 
         Raises:
-            RemoteProtocolError: The runner sent what nobody asked for. Trust: it is hostile.
+            RemoteProtocolError: The runner sent what was not asked for. Trust: it is hostile.
         """
         try:
             data = self.sock.recv(self._reader.chunk)
@@ -113,23 +113,20 @@ class RunnerLink:
         answers = []
         try:
             for packet in self._reader.feed(data):
-                answers.append((packet, self._owner(packet)))
+                answers.append((packet, self.pending.pop(packet.request_id)))
         except RemoteProtocolError:
-            # what came before the offence is dropped with it: its owners hear of the death
+            # what came before the offence is dropped with it: its owners get the death
             self.pending.update((packet.request_id, owner) for packet, owner in answers)
             raise
         return answers
 
     def _check_owed(self, request_id: int) -> None:
-        """Before there is memory for what nobody asked for."""
+        """Before memory is allocated for a reply that was not asked for."""
         expected = next(iter(self.pending), None)
         if request_id != expected:
             raise RemoteProtocolError(
                 f"the runner answered request {request_id}, it owes {expected}"
             )
-
-    def _owner(self, packet: Packet) -> Any:
-        return self.pending.pop(packet.request_id)
 
     def close(self) -> None:
         """Close the stream. Idempotent."""

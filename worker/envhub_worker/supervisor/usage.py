@@ -1,49 +1,50 @@
-"""What a jail holds of this machine right now, counted from outside: by what the kernel says."""
+"""What a jail holds of this machine, and which of its limits it has come to.
+
+Counted from outside: by what the kernel and its file system say right now. What is used up is
+denied to the jail from then on, and nothing that the jail says is needed to know it.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator, Mapping
 from time import monotonic
 
-from envhub_worker.lockdown.mechanisms import reap
+from envhub_worker.lockdown.mechanisms import procfs
+from envhub_worker.lockdown.root_plan import TEMPORARY
+from envhub_worker.protocol.confinement import Limits
 
-_KIB = 1024
 _AT_ONCE = 64
 _A_SECOND = 16
+_LEFT_BYTES = 1 << 16
+"""Below that a scratch is full: it is counted in pages, and for each core."""
 
 
-class Counting:
-    """How often is counted for whoever asks: each time takes the server's one thread some ms.
-
-    Args:
-        now: The time in seconds.
-    """
+class CountLimit:
+    """Bounds how often is counted: each time takes the server's one thread some milliseconds."""
 
     def __init__(self, now: Callable[[], float] = monotonic) -> None:
         self._now = now
         self._left = float(_AT_ONCE)
         self._seen = now()
 
-    def children(self) -> reap.Children | None:
-        """Who is below whom on this machine; None for whoever asks too often."""
+    def children(self) -> procfs.Children | None:
+        """The children of each process on this machine; None where it was asked too often."""
         now = self._now()
         self._left = min(_AT_ONCE, self._left + (now - self._seen) * _A_SECOND)
         self._seen = now
         if self._left < 1:
             return None
         self._left -= 1
-        return reap.all_children()
+        return procfs.all_children()
 
 
-def usage_of(init: int, runners: Collection[int], children: reap.Children) -> dict[str, int]:
+def usage_of(init: int, runners: Collection[int], children: procfs.Children) -> dict[str, int]:
     """Processes, threads and memory of a jail; empty where it has gone, or has not begun.
 
     Args:
         init: The pid of its first process, which adopts whatever is orphaned in it.
-        runners: The pids of its runners.
-        children: Who is below whom on this machine.
 
     Returns:
         ``processes``: all that live or wait to be reaped, without init. ``threads``: theirs, beyond
@@ -52,32 +53,41 @@ def usage_of(init: int, runners: Collection[int], children: reap.Children) -> di
     """
     if init <= 0:
         return {}
-    processes = reap.descendants(init, children=children)
-    fields = {pid: _fields(pid) for pid in {*processes, *runners}}
-    threads = sum(max(fields[pid].get("Threads", 1), 1) - 1 for pid in processes)
-    kib = sum(fields[pid].get(name, 0) for pid in runners for name in ("RssAnon", "VmSwap"))
-    files = sum(map(descriptors, runners))
+    processes = procfs.descendants(init, children=children)
+    fields = {pid: _status(pid) for pid in {*processes, *runners}}
+    held = (fields[pid].get(name, 0) for pid in runners for name in (b"RssAnon", b"VmSwap"))
     return {
         "processes": len(processes),
-        "threads": threads,
-        "files": files,
-        "memory_bytes": _KIB * kib,
+        "threads": sum(max(fields[pid].get(b"Threads", 1), 1) - 1 for pid in processes),
+        "files": sum(map(procfs.descriptors, runners)),
+        "memory_bytes": sum(held),
     }
 
 
-def descriptors(pid: int) -> int:
-    """How many files a process has open; 0 where it has gone, or may not be looked at."""
+def _status(pid: int) -> dict[bytes, int]:
     with contextlib.suppress(OSError):
-        return len(os.listdir(f"/proc/{pid}/fd"))
-    return 0
+        return procfs.numbers(f"/proc/{pid}/status")
+    return {}
 
 
-def _fields(pid: int) -> dict[str, int]:
-    """The numbers of ``/proc/PID/status``; none of a process that has gone."""
-    try:
-        with open(f"/proc/{pid}/status", encoding="utf-8", errors="replace") as file:
-            lines = file.read().splitlines()
-    except OSError:
-        return {}
-    words = (line.split() for line in lines)
-    return {row[0].rstrip(":"): int(row[1]) for row in words if len(row) > 1 and row[1].isdecimal()}
+def reached(
+    limits: Limits, usage: Mapping[str, int], runners: Collection[int], *, own_root: bool
+) -> Iterator[str]:
+    """The names of limits that are used up.
+
+    Args:
+        usage: Of ``usage_of``; empty where nothing was counted.
+        own_root: Whether its scratch is a file system of its own.
+    """
+    if usage and usage["processes"] + usage["threads"] >= limits.processes:
+        yield "PROCESSES"
+    if any(procfs.descriptors(pid) >= limits.open_files - 1 for pid in runners):  # a pipe takes two
+        yield "OPEN_FILES"
+    for pid in runners if own_root else ():
+        with contextlib.suppress(OSError):
+            left = os.statvfs(f"/proc/{pid}/root{TEMPORARY}")
+            if left.f_bavail * left.f_frsize < _LEFT_BYTES:
+                yield "DISK_BYTES"
+            if left.f_ffree == 0:
+                yield "DISK_FILES"
+            return

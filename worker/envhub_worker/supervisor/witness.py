@@ -1,17 +1,19 @@
-"""Who is told what becomes of jails: a log, or nobody."""
+"""What is called about everything that happens to jails."""
 
 from __future__ import annotations
 
 import contextlib
 import traceback
-from typing import Protocol
 
 from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.records import JailEntry
 
 
-class Witness(Protocol):
-    """Hears of every jail. It must not raise, and must not keep what it is shown."""
+class Witness:
+    """Called about every jail. It must not raise, and must not keep what it is shown.
+
+    This one writes nothing down: the server's client is on this machine, and logs by itself.
+    """
 
     def opened(self, entry: JailEntry, runners: int, seconds: float) -> None:
         """A jail has come up, or further runners in it, so long after it was asked for."""
@@ -26,25 +28,6 @@ class Witness(Protocol):
         """Nothing is left of a jail that its client has closed, or that the server ends with."""
 
     def failed(self, error: Exception) -> None:
-        """The server itself has met an error, of which it does not die."""
-
-
-class Nobody:
-    """The server's client is on this machine, and logs by itself."""
-
-    def opened(self, entry: JailEntry, runners: int, seconds: float) -> None:
-        """Nothing."""
-
-    def lost(self, entry: JailEntry, death: m.Died) -> None:
-        """Nothing."""
-
-    def died(self, entry: JailEntry) -> None:
-        """Nothing."""
-
-    def closed(self, entry: JailEntry) -> None:
-        """Nothing."""
-
-    def failed(self, error: Exception) -> None:
-        """On stderr, which its client keeps."""
-        with contextlib.suppress(OSError, ValueError):  # nobody may read it any more
+        """The server itself has met an error, of which it does not die: on stderr."""
+        with contextlib.suppress(OSError, ValueError):  # stderr may have no reader any more
             traceback.print_exception(error)

@@ -9,7 +9,8 @@ from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.loop import Loop
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.runtime import Runtime
-from envhub_worker.spawn.spawner import Jail, JailExited, Spawner
+from envhub_worker.spawn.jail import Jail
+from envhub_worker.spawn.spawner import JailExited, Spawner
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from envhub_worker.supervisor.jail_events import JailEvents
 from envhub_worker.supervisor.records import JailEntry
@@ -25,11 +26,6 @@ class Zygotes:
     """Started when a jail needs one, ended when they are too many.
 
     Args:
-        loop: Calls back when one of them has something to say.
-        runtime_dir: An existing folder of the server's own.
-        readable_roots: Where snapshots lie.
-        jails: All jails of the server.
-        events: Is told of jails and zygotes that have gone.
         ahead: A process for the first of them.
     """
 
@@ -63,11 +59,11 @@ class Zygotes:
         runtimes = (key[0] for key in self._spawners)
         return frozenset(one.packages for one in runtimes if isinstance(one, Runtime))
 
-    def fork(self, runtime: Runtime, confinement: Confinement, spec: JailSpec) -> tuple[Key, Jail]:
+    def fork(self, runtime: Runtime, spec: JailSpec) -> tuple[Key, Jail]:
         """A jail, and the name of the zygote that it is a fork of."""
         # a zygote is one environment's: not even what it has not imported is shared with another
-        key = (runtime, *(getattr(confinement, name) for name in _OF_POLICY))
-        spawner = self._spawners.pop(key, None) or self._start(key, runtime, confinement)
+        key = (runtime, *(getattr(spec.confinement, name) for name in _OF_POLICY))
+        spawner = self._spawners.pop(key, None) or self._start(key, runtime, spec.confinement)
         self._spawners[key] = spawner  # the one that was used last is the last
         return key, spawner.spawn(spec)
 

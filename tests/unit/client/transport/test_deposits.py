@@ -63,7 +63,7 @@ def test_a_server_that_has_not_heard_of_the_jail_is_asked_again(
     ours, theirs = os.pipe()
     fds = [os.dup(ours) for _ in range(fd_store.FDS)]
     known = [-1] * 10 + [ours]
-    deposits = fd_store.Deposits("fds", lambda request: known.pop(0))
+    deposits = fd_store.FdStore("fds", lambda request: known.pop(0))
 
     def serve() -> None:
         while known:

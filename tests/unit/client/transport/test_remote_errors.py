@@ -15,7 +15,7 @@ from envhub_sandbox import errors
 from envhub_sandbox.transport.replies import check, death, expect, raised, refusal
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import REASONS
-from envhub_worker.runner.exceptions import raised as described
+from envhub_worker.runner.raised import raised as described
 
 ESCAPE = "\x1b]0;owned\x07\x1b[2J\r"
 

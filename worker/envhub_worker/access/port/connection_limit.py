@@ -1,8 +1,8 @@
 """Knows which connections are open, and lets no more in while there are too many of them.
 
 Strangers make them, too, and each takes a descriptor and memory before any key is asked for.
-libzmq cannot pause its listener, and ends a listener's connections with it. So the kernel is told
-to drop what knocks: those that are in stay, and whoever knocks again later is let in.
+libzmq cannot pause its listener, and ends a listener's connections with it. So a filter has the
+kernel drop what knocks: connections that are open stay, and who knocks again later is let in.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import struct
 
 import zmq
 
-from envhub_worker.access.telling.rate_limited_log import Log
+from envhub_worker.access.audit.log import Log
 from envhub_worker.loop import Loop
 
 MAX_CONNECTIONS = 1024
@@ -28,13 +28,10 @@ _SO_DETACH_FILTER = 27
 _DROP = struct.pack("=HBBI", 0x06, 0, 0, 0)  # BPF: return 0 bytes of the packet
 
 
-class Doorman:
+class ConnectionLimiter:
     """Watches a socket's connections. To be made before it is bound.
 
     Args:
-        router: The socket.
-        loop: Calls back.
-        log: Takes what is refused.
         limit: Connections at once. The backlog may come in besides.
     """
 
@@ -45,7 +42,7 @@ class Doorman:
         self._open = 0
         self._accepted = 0
         self._wires: dict[int, int] = {}
-        self._shut_door: socket.socket | None = None
+        self._shut_listener: socket.socket | None = None
         self._monitor = router.get_monitor_socket(_EVENTS)
         loop.watch(self._monitor, self._drain)
 
@@ -62,7 +59,7 @@ class Doorman:
             self._open += 1
             self._accepted += 1
             self._wires[value] = self._accepted
-            if self._open >= self._limit and self._shut_door is None:
+            if self._open >= self._limit and self._shut_listener is None:
                 self._shut()
         elif event == zmq.EVENT_DISCONNECTED:
             self._open -= 1
@@ -85,41 +82,41 @@ class Doorman:
 
     def _shut(self) -> None:
         """Without descriptors or permission it stays open, and the next one tries again."""
-        door = None
+        listener = None
         try:
-            door = _listener(str(self._router.get_string(zmq.LAST_ENDPOINT)))
-            if door is None:
+            listener = _listener(str(self._router.get_string(zmq.LAST_ENDPOINT)))
+            if listener is None:
                 return
             program = ctypes.create_string_buffer(_DROP)
             filters = struct.pack("@HP", 1, ctypes.addressof(program))
-            door.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, filters)
+            listener.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, filters)
         except OSError as error:
-            if door is not None:
-                door.close()
+            if listener is not None:
+                listener.close()
             self._log.say("connections_full", connections=self._open, why=f"and no end: {error}")
             return
-        self._shut_door = door
+        self._shut_listener = listener
         self._log.say("connections_full", connections=self._open, why="no more for the moment")
 
     def tick(self) -> None:
         """Let others in once there is room."""
-        if self._shut_door is not None and self._open < self._limit:
+        if self._shut_listener is not None and self._open < self._limit:
             with contextlib.suppress(OSError):  # there is no filter any more
-                self._shut_door.setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)
-            self._shut_door.close()
-            self._shut_door = None
+                self._shut_listener.setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)
+            self._shut_listener.close()
+            self._shut_listener = None
 
     def close(self) -> None:
         """Stop watching."""
-        if self._shut_door is not None:
-            self._shut_door.close()
+        if self._shut_listener is not None:
+            self._shut_listener.close()
         # in this order: a context does not end while the monitor's other end is open
         self._router.disable_monitor()
         self._monitor.close()
 
 
 def _listener(endpoint: str) -> socket.socket | None:
-    """The listening socket of an endpoint of ours: libzmq does not tell, but the kernel does."""
+    """The listening socket of an endpoint of ours: the kernel names it, libzmq does not."""
     port = int(endpoint.rpartition(":")[2])
     for name in os.listdir("/proc/self/fd"):
         fd = int(name)

@@ -12,16 +12,16 @@ from collections.abc import Callable, Collection, Iterable
 from itertools import takewhile
 from pathlib import Path
 
-from envhub_worker.access.quotas import RefusedError
 from envhub_worker.lockdown.mechanisms.scratch import remove_tree
 from envhub_worker.protocol.records import dataclass
+from envhub_worker.supervisor.records import RefusedError
 
 BLOCK_BYTES = 4096
 """What the smallest file and each entry of a tree are charged: they take disk, too."""
 
 
 @dataclass(frozen=True)
-class Listed:
+class ListedFile:
     """One file of an offered snapshot."""
 
     path: str
@@ -43,11 +43,8 @@ def tree_charge(paths: Iterable[str]) -> int:
     return BLOCK_BYTES * entries
 
 
-class Store:
+class BlobStore:
     """The files of one key.
-
-    Args:
-        home: Where they lie; what is there is counted once.
 
     Attributes:
         held: Bytes that they are charged.
@@ -76,7 +73,7 @@ class Store:
         """Where a snapshot lies, or would."""
         return self.home / "trees" / digest
 
-    def has_all(self, digest: str, files: Collection[Listed]) -> bool:
+    def has_all(self, digest: str, files: Collection[ListedFile]) -> bool:
         """Whether a snapshot lies there, whole."""
         return all(_is_there(self.tree(digest) / file.path, file.size) for file in files)
 
@@ -101,7 +98,7 @@ class Store:
         self._blobs[blob.name] = blob_charge(size)
 
     def unused(self, in_use: Collection[str]) -> list[str]:
-        """Digests of the trees that nobody uses, the longest unused first."""
+        """Digests of the trees that are not in use, the longest unused first."""
         real = os.path.realpath(self.home / "trees")
         used = {os.path.realpath(path) for path in in_use}
         names = [name for name in self._trees if os.path.join(real, name) not in used]
@@ -121,10 +118,10 @@ class Store:
                     os.unlink(item.path)
                     self.held -= self._blobs.pop(item.name, 0)
 
-    def lay_out(self, digest: str, files: list[Listed], copying: Callable[[int], None]) -> None:
+    def lay_out(self, digest: str, files: list[ListedFile], copying: Callable[[int], None]) -> None:
         """Build a tree beside its place and rename it: what bears a digest is complete.
 
-        ``copying`` is told the size of each file that cannot be a link, before it is copied.
+        ``copying`` is called with the size of each file that cannot be a link, before it is copied.
         """
         tree = self.tree(digest)
         make_passable(tree.parent)
@@ -154,7 +151,7 @@ def _is_there(path: Path, size: int) -> bool:
 
 
 def make_passable(folder: Path) -> None:
-    """Make a folder that nobody else lists; root's jails, another user, pass through to a tree."""
+    """Make a folder that only its owner lists; root's jails pass through to a tree."""
     folder.mkdir(parents=True, exist_ok=True)
     os.chmod(folder, 0o711 if os.getuid() == 0 else 0o700)
 

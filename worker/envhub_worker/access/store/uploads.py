@@ -5,8 +5,8 @@
     <folder>/<key>/blobs/<sha256>       files, 0444, hashed when they arrived
     <folder>/<key>/trees/<digest>/      snapshots: hard links to them, in folders 0555
 
-Each client key has a store of its own: whoever could name another's hashes would otherwise see
-its files. A snapshot is named by the digest of its listing, so the same listing is the same tree.
+Each client key has a store of its own: else a client that knows another's hashes would see its
+files. A snapshot is named by the digest of its listing, so the same listing is the same tree.
 """
 
 from __future__ import annotations
@@ -14,15 +14,16 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from envhub_worker.access.quotas import Quotas, RefusedError
+from envhub_worker.access.quotas import Quotas
 from envhub_worker.access.store.blob_store import (
-    Listed,
-    Store,
+    BlobStore,
+    ListedFile,
     blob_charge,
     make_passable,
     tree_charge,
@@ -30,6 +31,7 @@ from envhub_worker.access.store.blob_store import (
 from envhub_worker.lockdown.mechanisms.scratch import remove_tree
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.text import size_text
+from envhub_worker.supervisor.records import RefusedError
 
 MAX_PIECE_BYTES = 8 << 20
 """One ``PutBlob``: the server writes and hashes it while everybody else waits."""
@@ -40,6 +42,7 @@ MAX_TREES = 1000
 MAX_STEPS = 200_000
 """Names in all paths of one snapshot."""
 PREFIX = "sha256:"
+_SNAPSHOT = re.compile(r"sha256:[0-9a-f]{64}")
 _SHA256_BYTES = 32
 _MAX_DEPTH = 64
 _MAX_PATH_BYTES = 4096
@@ -61,25 +64,19 @@ class Offer:
     """What a session is about to bring.
 
     Attributes:
-        store: Where to.
         needed: The hashes of all its files: they stay until its tree is laid out.
         missing: Of these, the ones that are not here yet, with their sizes.
         reserved: What it may still be charged.
     """
 
-    store: Store
+    store: BlobStore
     needed: Collection[bytes]
     missing: dict[bytes, int]
     reserved: int
 
 
 class Uploads:
-    """The snapshots of all clients.
-
-    Args:
-        folder: Where they lie.
-        quotas: How much of them each client may have.
-    """
+    """The snapshots of all clients."""
 
     def __init__(self, folder: Path, quotas: Quotas) -> None:
         self.folder = folder
@@ -90,7 +87,7 @@ class Uploads:
         for left in [*folder.glob("*/parts"), *folder.glob("*/trees/.building-*")]:
             remove_tree(str(left))
         # counted now: later everybody would wait for it
-        self._stores = {home.name: Store(home) for home in folder.iterdir() if home.is_dir()}
+        self._stores = {home.name: BlobStore(home) for home in folder.iterdir() if home.is_dir()}
 
     def offer(
         self, owner: bytes, key: bytes, request: m.OfferSnapshot, in_use: Collection[str]
@@ -98,9 +95,6 @@ class Uploads:
         """What is missing of a snapshot. Nothing: it lies ready.
 
         Args:
-            owner: The client's session.
-            key: The client's key.
-            request: The listing.
             in_use: Trees that must stay, by path.
 
         Raises:
@@ -130,7 +124,7 @@ class Uploads:
         return m.Wanted(PREFIX + digest, tuple(missing))
 
     def _lay_out(
-        self, owner: bytes, digest: str, files: list[Listed], in_use: Collection[str]
+        self, owner: bytes, digest: str, files: list[ListedFile], in_use: Collection[str]
     ) -> None:
         offer = self._offers[owner]
 
@@ -145,7 +139,7 @@ class Uploads:
         """Take a piece of a wanted file; the last one makes it a blob.
 
         Raises:
-            RefusedError: Nobody wanted it, it is out of order, or it is not what its hash says.
+            RefusedError: It is not wanted, is out of order, or it is not what its hash says.
         """
         if len(request.sha256) != _SHA256_BYTES:  # it would be a file's name
             raise RefusedError("LocalProtocolError", "a hash has 32 bytes")
@@ -208,29 +202,29 @@ class Uploads:
         Raises:
             RefusedError: It is not here; a path is none.
         """
-        digest = snapshot.removeprefix(PREFIX)
-        tree = self._store(key).tree(digest)
-        if not snapshot.startswith(PREFIX) or not _is_digest(digest) or not tree.is_dir():
-            raise RefusedError("WorkerError", "this server has no such snapshot; offer it first")
-        return str(tree)
+        if _SNAPSHOT.fullmatch(snapshot):
+            tree = self._store(key).tree(snapshot.removeprefix(PREFIX))
+            if tree.is_dir():
+                return str(tree)
+        raise RefusedError("WorkerError", "this server has no such snapshot; offer it first")
 
     def used_bytes(self, key: bytes) -> int:
         """What a client's files are charged, and what it has offered to bring."""
         return self._charged(self._store(key))
 
-    def _store(self, key: bytes) -> Store:
+    def _store(self, key: bytes) -> BlobStore:
         name = key.hex()[:32] or "local"
         if name not in self._stores:
-            self._stores[name] = Store(self.folder / name)
+            self._stores[name] = BlobStore(self.folder / name)
         return self._stores[name]
 
-    def _offered(self, store: Store) -> list[Offer]:
+    def _offered(self, store: BlobStore) -> list[Offer]:
         return [offer for offer in self._offers.values() if offer.store is store]
 
-    def _charged(self, store: Store) -> int:
+    def _charged(self, store: BlobStore) -> int:
         return store.held + sum(offer.reserved for offer in self._offered(store))
 
-    def _make_room(self, store: Store, in_use: Collection[str]) -> None:
+    def _make_room(self, store: BlobStore, in_use: Collection[str]) -> None:
         """Remove the longest unused snapshots until all that is offered fits, whole."""
         if self._fits(store):
             return
@@ -250,12 +244,12 @@ class Uploads:
                 "them",
             )
 
-    def _fits(self, store: Store) -> bool:
+    def _fits(self, store: BlobStore) -> bool:
         trees = store.trees + len(self._offered(store))
         return trees <= MAX_TREES and self._charged(store) <= self._quotas.upload_bytes
 
 
-def checked_listing(files: tuple[object, ...], quotas: Quotas) -> list[Listed]:
+def checked_listing(files: tuple[object, ...], quotas: Quotas) -> list[ListedFile]:
     """A listing whose every entry keeps the rules, sorted by path.
 
     Trust: input from a client: names become paths of this machine.
@@ -287,7 +281,7 @@ def checked_listing(files: tuple[object, ...], quotas: Quotas) -> list[Listed]:
     return listed
 
 
-def _listed(file: object) -> Listed:
+def _listed(file: object) -> ListedFile:
     if type(file) is not tuple or [type(part) for part in file] != [str, int, bytes]:
         raise RefusedError("LocalProtocolError", "a file is (path, size, sha256)")
     path, size, sha256 = file
@@ -296,7 +290,7 @@ def _listed(file: object) -> Listed:
     wrong = wrong_with_path(path)
     if wrong:
         raise RefusedError("LocalProtocolError", f"the file {path[:200]!r} {wrong}")
-    return Listed(path, size, sha256)
+    return ListedFile(path, size, sha256)
 
 
 def wrong_with_path(path: str) -> str:
@@ -331,11 +325,7 @@ def _check_tree(paths: list[str]) -> None:
                 )
 
 
-def digest_of(files: list[Listed]) -> str:
+def digest_of(files: list[ListedFile]) -> str:
     """The name of a snapshot: a hash of its sorted listing."""
     rows = [[file.path, file.size, file.sha256.hex()] for file in files]
     return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
-
-
-def _is_digest(text: str) -> bool:
-    return len(text) == 2 * _SHA256_BYTES and all(c in "0123456789abcdef" for c in text)

@@ -11,6 +11,7 @@ import contextlib
 import fcntl
 import os
 from collections.abc import Sequence
+from pathlib import Path
 
 from envhub_worker.lockdown.mechanisms.locked_folder import unheld
 from envhub_worker.protocol.confinement import Limits
@@ -237,12 +238,6 @@ def _settings(kind: str, folders: Sequence[str], limits: Limits) -> list[tuple[s
     ]
 
 
-def join(fds: Sequence[int]) -> None:
-    """Put this single-threaded process into the group of ``Group.open``."""
-    for fd in fds:
-        os.write(fd, b"0")
-
-
 def oom_kills(events: int) -> int:
     """How often the kernel ended a process of the group for its memory."""
     for line in os.pread(events, 4096, 0).splitlines():
@@ -261,3 +256,43 @@ def _remove(folders: Sequence[str]) -> None:
     for folder in folders:
         with contextlib.suppress(OSError):
             os.rmdir(folder)
+
+
+_COUNTS = ("memory.events", "memory/memory.oom_control")  # of version 2, and of version 1
+OUTER_LIMIT = (
+    "the memory limit around the server (its container's) was reached: the kernel ended a process"
+)
+
+
+class SurroundingLimit:
+    """The memory limit around the server itself: a container's, which all its jails share.
+
+    Tells a process that was killed for that limit from one that was killed otherwise.
+    """
+
+    def __init__(self, root: Path = Path("/sys/fs/cgroup")) -> None:
+        self._events = -1
+        for name in _COUNTS:
+            if self._events < 0:
+                with contextlib.suppress(OSError):
+                    self._events = os.open(root / name, os.O_RDONLY | os.O_CLOEXEC)
+        self._seen = self._count()
+
+    def killed_one(self) -> bool:
+        """Whether the kernel has ended one more process for it since this was asked last."""
+        if self._count() <= self._seen:
+            return False
+        self._seen += 1
+        return True
+
+    def _count(self) -> int:
+        try:
+            return oom_kills(self._events) if self._events >= 0 else 0
+        except (OSError, ValueError):
+            return 0
+
+    def close(self) -> None:
+        """Close the descriptor. Idempotent."""
+        if self._events >= 0:
+            os.close(self._events)
+            self._events = -1

@@ -1,4 +1,4 @@
-"""Measuring a jail's memory and scratch where no cgroup and no quota count them.
+"""Ends a jail over its limits: measures memory and scratch where no cgroup and no quota count them.
 
 A resource limit counts one process, and misses files in memory (memfd), shared anonymous memory
 and what waits in sockets and pipes. So init looks at all processes of the jail, the sooner the
@@ -12,10 +12,16 @@ import contextlib
 import functools
 import os
 import re
+import signal
+import time
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
+from envhub_worker.lockdown.context import JailContext
+from envhub_worker.lockdown.limits import cgroups
+from envhub_worker.lockdown.mechanisms import procfs
 from envhub_worker.lockdown.seccomp.policy import SHARED_BYTES
+from envhub_worker.protocol.confinement import MIB, Reason
 
 #: Bytes a second that a jail may be expected to fill: a few cores on huge pages.
 _FILL_RATE = 8 * 1024**3
@@ -86,7 +92,6 @@ class MemoryWatch:
         """A watch for ``limit`` bytes.
 
         Args:
-            limit: What the jail may use.
             tmpfs: A path in the jail's own, if it has one.
             own_network: Whether all sockets of our network namespace are the jail's, those too
                 that wait in another socket, where no process has them.
@@ -141,7 +146,7 @@ class MemoryWatch:
 
 
 def _add_process(usage: Usage, pid: int) -> None:
-    fields = _fields(f"/proc/{pid}/status")
+    fields = procfs.numbers(f"/proc/{pid}/status")
     usage.private += fields.get(b"RssAnon", 0) + fields.get(b"VmSwap", 0)
     usage.kernel += fields.get(b"VmPTE", 0)
 
@@ -149,9 +154,9 @@ def _add_process(usage: Usage, pid: int) -> None:
 def _add_mappings(usage: Usage, pid: int) -> None:
     """Of each shared object what is mapped, or what the filter lets be made, if that is more.
 
-    It keeps pages that nobody maps any more, while there is one that somebody does.
+    It keeps pages that are not mapped any more, as long as one of them is.
     """
-    maps = _content(f"/proc/{pid}/maps")
+    maps = procfs.content(f"/proc/{pid}/maps")
     usage.kernel += maps.count(b"\n") * _MAPPING
     sizes: dict[tuple[int, int], int] = {}
     for low, high, major, minor, inode in _SHARED.findall(maps):
@@ -184,18 +189,18 @@ def socket_bytes() -> int:
 
     The filter keeps the size of the buffers.
     """
-    return 2 * int(_content("/proc/sys/net/core/wmem_default") or _BUFFER) + _DESCRIPTOR
+    return 2 * int(procfs.content("/proc/sys/net/core/wmem_default") or _BUFFER) + _DESCRIPTOR
 
 
 def _sockets() -> int:
     """All sockets of our network namespace."""
-    words = _content("/proc/net/sockstat").split(None, 3)
+    words = procfs.content("/proc/net/sockstat").split(None, 3)
     return int(words[2]) if words[:2] == [b"sockets:", b"used"] else 0
 
 
 def shared_of_the_machine() -> int:
     """All memory that processes of this machine share, and files in memory."""
-    fields = _fields("/proc/meminfo")
+    fields = procfs.numbers("/proc/meminfo")
     swapped = fields.get(b"SwapTotal", 0) - fields.get(b"SwapFree", 0)
     return fields.get(b"Shmem", 0) + swapped
 
@@ -214,31 +219,12 @@ def unlinked_bytes(pids: Iterable[int], device: int) -> int:
     return sum(found.values())
 
 
-def _fields(path: str) -> dict[bytes, int]:
-    """``Name:   123 kB`` lines as bytes."""
-    found: dict[bytes, int] = {}
-    for line in _content(path).splitlines():
-        name, _, rest = line.partition(b":")
-        if rest.endswith(b" kB"):
-            found[name] = int(rest[:-3]) * 1024
-    return found
-
-
-def _content(path: str) -> bytes:
-    """A file of /proc; empty when its process has gone."""
-    try:
-        with open(path, "rb") as file:
-            return file.read()
-    except (FileNotFoundError, ProcessLookupError):
-        return b""
-
-
 def _proportional(pid: int) -> int:
     """This process's share of anonymous memory: shared pages divided among their owners.
 
     Changed pages of a file that is mapped privately are anonymous too.
     """
-    fields = _fields(f"/proc/{pid}/smaps_rollup")
+    fields = procfs.numbers(f"/proc/{pid}/smaps_rollup")
     return fields.get(b"Pss_Anon", fields.get(b"Pss", 0)) + fields.get(b"SwapPss", 0)
 
 
@@ -255,3 +241,84 @@ def folder_usage(root: str, most_files: int) -> tuple[int, int]:
                     if entry.is_dir(follow_symlinks=False):
                         pending.append(entry.path)
     return size, files
+
+
+# Counting files may take long; it then happens the more seldom.
+_DISK_SHARE = 20
+_DISK_LOOK_S = 0.5
+# The kernel has already acted; this only ends what it left, and gives it its name.
+_EVENTS_LOOK_S = 0.5
+
+
+class Watchdog:
+    """Memory, by its control group's account or by measuring; scratch where no quota bounds it."""
+
+    def __init__(self, jail: JailContext, events: int) -> None:
+        """A watchdog for ``jail``.
+
+        Args:
+            events: Where its control group counts out-of-memory; -1 to measure instead.
+        """
+        self._limits = jail.spec.confinement.limits
+        tmpfs = jail.scratch.temporary if jail.common.namespaced else None
+        self._events = events
+        self._seen_kills = 0
+        own_network = jail.common.namespaced and jail.common.config.network != "host"
+        self._memory = MemoryWatch(self._limits.memory_bytes, tmpfs, own_network=own_network)
+        self._folder = None if jail.common.namespaced else os.path.dirname(jail.scratch.home)
+        self._memory_due = time.monotonic()
+        self._disk_due = time.monotonic() if self._folder else float("inf")
+
+    def seconds_left(self) -> float:
+        """Until the next look."""
+        return max(0.0, min(self._memory_due, self._disk_due) - time.monotonic())
+
+    def ignore(self, fds: list[int]) -> None:
+        """Do not count these files: they are the client's."""
+        self._memory.ignore(fds)
+
+    def look(self, pids: Collection[int]) -> tuple[Reason, str] | None:
+        """(reason, detail) when the jail must end, else None."""
+        now = time.monotonic()
+        verdict = None
+        if now >= self._memory_due:
+            verdict = self._look_at_memory(pids)
+        if verdict is None and self._folder is not None and now >= self._disk_due:
+            verdict = self._look_at_disk(self._folder, pids)
+        return verdict
+
+    def killed_by_kernel(self) -> tuple[Reason, str] | None:
+        """Whether the kernel has ended a process of the control group for its memory."""
+        if self._events < 0 or cgroups.oom_kills(self._events) <= self._seen_kills:
+            return None
+        self._seen_kills = cgroups.oom_kills(self._events)
+        limit = self._limits.memory_bytes // MIB
+        return "out-of-memory", f"over {limit} MiB: the kernel ended one of its processes"
+
+    def _look_at_memory(self, pids: Collection[int]) -> tuple[Reason, str] | None:
+        if self._events >= 0:
+            self._memory_due = time.monotonic() + _EVENTS_LOOK_S
+            return self.killed_by_kernel()
+        used, hidden = self._memory.look(pids)
+        for pid in hidden:
+            # It runs a program that may not be read, and so cannot be measured.
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        limit = self._limits.memory_bytes
+        self._memory_due = time.monotonic() + seconds_to_next_look(used, limit)
+        if used <= limit:
+            return None
+        return "out-of-memory", f"{used // MIB} MiB in use, {limit // MIB} MiB permitted"
+
+    def _look_at_disk(self, folder: str, pids: Collection[int]) -> tuple[Reason, str] | None:
+        before = time.monotonic()
+        size, files = folder_usage(folder, self._limits.disk_files)
+        size += unlinked_bytes(pids, os.stat(folder).st_dev)
+        after = time.monotonic()
+        self._disk_due = after + max(_DISK_LOOK_S, _DISK_SHARE * (after - before))
+        if size > self._limits.disk_bytes:
+            allowed = self._limits.disk_bytes // MIB
+            return "disk-limit", f"{size // MIB} MiB of files, {allowed} MiB permitted"
+        if files > self._limits.disk_files:
+            return "disk-limit", f"over {self._limits.disk_files} files"
+        return None

@@ -42,10 +42,7 @@ def jail_environment(
     """What a runner of a jail sees.
 
     Args:
-        base: The zygote's own environment.
         granted: Variables that the caller grants by name; they win.
-        home: The jail's private home.
-        temporary: The jail's private folder for temporary files.
     """
     kept = {name: value for name, value in base.items() if name in ("PATH", *_INHERITED)}
     return {

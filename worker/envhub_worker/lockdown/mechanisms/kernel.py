@@ -70,7 +70,7 @@ def mount(source: str, target: str, kind: str, flags: int = 0, options: str = ""
 
 
 def unmount(target: str) -> None:
-    """Detach whatever is mounted at ``target``, now; it goes when nobody uses it."""
+    """Detach whatever is mounted at ``target``, now; it goes when it is not used any more."""
     _checked(_libc.umount2(os.fsencode(target), ctypes.c_int(MNT_DETACH)), target)
 
 
@@ -88,11 +88,10 @@ def clone_tree(path: str) -> int:
         raise OSError(error.errno, error.strerror, path) from None
 
 
-def restrict_tree(tree: int, attributes: int, *, recursive: bool = True, userns: int = 0) -> None:
+def restrict_tree(tree: int, attributes: int, *, userns: int = 0) -> None:
     """Add mount ``attributes`` (``ATTR_*``) to the detached ``tree``."""
-    flags = _AT_EMPTY_PATH | (_AT_RECURSIVE if recursive else 0)
     words = struct.pack("=QQQQ", attributes, 0, 0, userns)
-    syscall(number("mount_setattr"), tree, b"", flags, words, len(words))
+    syscall(number("mount_setattr"), tree, b"", _AT_EMPTY_PATH | _AT_RECURSIVE, words, len(words))
 
 
 def restrict_mount(path: str, attributes: int) -> None:
@@ -103,10 +102,9 @@ def restrict_mount(path: str, attributes: int) -> None:
 
 def attach_tree(tree: int, path: str) -> None:
     """Attach the detached ``tree`` at ``path``; the descriptor stays the caller's."""
-    target = os.fsencode(path)
-    flags = _MOVE_MOUNT_F_EMPTY_PATH
+    words = (b"", _AT_FDCWD, os.fsencode(path), _MOVE_MOUNT_F_EMPTY_PATH)
     try:
-        syscall(number("move_mount"), tree, b"", _AT_FDCWD, target, flags)
+        syscall(number("move_mount"), tree, *words)
     except OSError as error:
         raise OSError(error.errno, error.strerror, path) from None
 
@@ -115,7 +113,7 @@ def capget() -> tuple[int, int, int]:
     """This thread's (effective, permitted, inheritable) capabilities as bit masks."""
     header = struct.pack("=Ii", _CAPABILITY_VERSION_3, 0)
     data = ctypes.create_string_buffer(24)
-    syscall_buffer(number("capget"), header, data)
+    _checked(_libc.syscall(ctypes.c_long(number("capget")), header, data))
     words = struct.unpack("=6I", data.raw)
     effective, permitted, inheritable = (words[n] | words[n + 3] << 32 for n in range(3))
     return effective, permitted, inheritable
@@ -127,11 +125,6 @@ def capset(effective: int, permitted: int, inheritable: int) -> None:
     low = [mask & 0xFFFFFFFF for mask in (effective, permitted, inheritable)]
     high = [mask >> 32 for mask in (effective, permitted, inheritable)]
     syscall(number("capset"), header, struct.pack("=6I", *low, *high))
-
-
-def syscall_buffer(call: int, header: bytes, buffer: ctypes.Array[ctypes.c_char]) -> int:
-    """Call the kernel with a constant and a buffer that it fills."""
-    return _checked(_libc.syscall(ctypes.c_long(call), header, buffer))
 
 
 def _checked(result: int, path: str | None = None) -> int:

@@ -12,8 +12,8 @@ import stat
 import struct
 from collections.abc import Iterable
 
+from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms.kernel import syscall
-from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp.syscalls import number
 from envhub_worker.protocol.records import dataclass
 
@@ -46,13 +46,7 @@ class Rule:
 
 @dataclass(frozen=True)
 class Ruleset:
-    """What the kernel is asked to handle; everything handled is denied but for the rules.
-
-    Attributes:
-        files: Mask of file accesses.
-        tcp: Mask of TCP accesses.
-        scope: Mask of what may not leave the domain.
-    """
+    """What the kernel is asked to handle; everything handled is denied but for the rules."""
 
     files: int
     tcp: int
@@ -63,7 +57,6 @@ def ruleset(abi: int, network: str) -> Ruleset:
     """All that ``abi`` can handle. An unknown bit would be refused, so it is clamped.
 
     Args:
-        abi: From ``version()``.
         network: ``"none"`` denies all TCP; otherwise its own layer decides.
     """
     bits = {1: 13, 2: 14, 3: 15, 4: 15}.get(abi, 16)
@@ -97,7 +90,10 @@ def restrict(wanted: Ruleset, rules: Iterable[Rule]) -> None:
     """
     try:
         words = struct.pack("=QQQ", wanted.files, wanted.tcp, wanted.scope)
-        fd = syscall(number("landlock_create_ruleset"), words, _size(wanted), 0)
+        # A kernel refuses a structure that is longer than its own, unless the rest is zero; the
+        # first ones know the first field only.
+        size = 24 if wanted.scope else 16 if wanted.tcp else 8
+        fd = syscall(number("landlock_create_ruleset"), words, size, 0)
         try:
             for rule in rules:
                 _add(fd, rule, wanted.files)
@@ -106,12 +102,6 @@ def restrict(wanted: Ruleset, rules: Iterable[Rule]) -> None:
             os.close(fd)
     except OSError as error:
         raise unavailable(error) from error
-
-
-def _size(wanted: Ruleset) -> int:
-    # A kernel refuses a structure that is longer than its own, unless the rest is zero; the
-    # first ones know the first field only.
-    return 24 if wanted.scope else 16 if wanted.tcp else 8
 
 
 def _add(ruleset_fd: int, rule: Rule, handled: int) -> None:

@@ -1,7 +1,7 @@
 """A folder of a server's own among the temporary files, locked for as long as the server lives.
 
-Whoever ends the server by a signal that nobody can catch leaves its folders behind. The kernel
-gives the lock back, so the next server, or ``envhub gc``, can tell and remove them.
+A server that is ended by SIGKILL leaves its folders behind. The kernel gives the lock back, so the
+next server, or ``envhub gc``, can tell and remove them.
 """
 
 from __future__ import annotations
@@ -26,11 +26,7 @@ class LockedFolder:
     """A new one. It is private; its owner may let others pass.
 
     Args:
-        prefix: What its name begins with.
         place: Where it lies; by default below the folder for temporary files.
-
-    Attributes:
-        path: Its path.
     """
 
     def __init__(self, prefix: str, place: Path | None = None) -> None:
@@ -38,7 +34,7 @@ class LockedFolder:
         new = self.path / f".{_LOCK}"
         self._lock = os.open(new, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         fcntl.flock(self._lock, fcntl.LOCK_EX)
-        os.rename(new, self.path / _LOCK)  # under that name nobody sees it without its lock
+        os.rename(new, self.path / _LOCK)  # under that name it is never seen without its lock
 
     def remove(self) -> None:
         """Remove it, with all that is in it. Idempotent."""
@@ -70,7 +66,7 @@ def unheld(path: str | Path) -> Iterator[None]:
 
     Raises:
         BlockingIOError: A process holds it.
-        OSError: There is no such file, or that cannot be told.
+        OSError: There is no such file, or the file system has no locks.
     """
     fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:

@@ -12,54 +12,24 @@ import contextlib
 import os
 import stat
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 from envhub_worker.lockdown import root_plan
-from envhub_worker.lockdown.mechanisms import namespaces
-from envhub_worker.lockdown.mechanisms.kernel import (
-    ATTR_IDMAP,
-    ATTR_NODEV,
-    ATTR_NOEXEC,
-    ATTR_NOSUID,
-    ATTR_RDONLY,
-    MS_NODEV,
-    MS_NOEXEC,
-    MS_NOSUID,
-    MS_PRIVATE,
-    MS_REC,
-    attach_tree,
-    clone_tree,
-    mount,
-    pivot_root,
-    restrict_mount,
-    restrict_tree,
-    unmount,
-)
+from envhub_worker.lockdown.mechanisms import kernel, namespaces
 from envhub_worker.lockdown.root_plan import HOME, SHARED_MEMORY, TEMPORARY, WORK, RootPlan, within
 
-_READ_ONLY = ATTR_RDONLY | ATTR_NOSUID | ATTR_NODEV
+_READ_ONLY = kernel.ATTR_RDONLY | kernel.ATTR_NOSUID | kernel.ATTR_NODEV
+_PLAIN = kernel.MS_NOSUID | kernel.MS_NODEV
 _SCRATCH = "/.scratch"
 _SKELETON = "/.skeleton"
 
 # Of what /proc shows about the host, this stays: libraries ask for it. The rest is covered.
 _PROC_KEPT = frozenset(
-    [
-        "cgroups",
-        "cpuinfo",
-        "devices",
-        "filesystems",
-        "loadavg",
-        "meminfo",
-        "mounts",
-        "net",
-        "self",
-        "stat",
-        "sys",
-        "sysvipc",
-        "thread-self",
-        "uptime",
-        "version",
-    ]
+    {
+        *("cgroups", "cpuinfo", "devices", "filesystems", "loadavg", "meminfo", "mounts", "net"),
+        *("self", "stat", "sys", "sysvipc", "thread-self", "uptime", "version"),
+    }
 )
 
 
@@ -69,22 +39,26 @@ def build_root(plan: RootPlan, place: str, copied: Sequence[str], user: int | No
     Needs a mount namespace of our own; nothing propagates out of it.
 
     Args:
-        plan: What is in it.
-        place: An empty folder.
         copied: Folders whose files are to be the jails' own there, so that overlays can copy them.
         user: The user of the jails, where that is not this process's own.
     """
-    mount("none", "/", "none", MS_REC | MS_PRIVATE)
+    kernel.mount("none", "/", "none", kernel.MS_REC | kernel.MS_PRIVATE)
     # Before the new root is mounted, which may itself lie below one of the trees.
     own = {} if user is None else _take_for(user, root_plan.outermost(copied))
     shown = root_plan.outermost((*plan.trees, *plan.roots))
     trees = _take((path for path in shown if path not in own), _READ_ONLY)
-    trees |= _take(plan.devices, ATTR_NOSUID | ATTR_NOEXEC)
+    trees |= _take(plan.devices, kernel.ATTR_NOSUID | kernel.ATTR_NOEXEC)
     # A new proc may be mounted only where an unmasked one is in sight, so bring the old along.
     trees |= _take(("/proc",), 0)
-    files = {path: _content(path) for path in plan.copies}
+    files = {path: Path(path).read_bytes() for path in plan.copies}
     files |= {path: text.encode() for path, text in plan.texts.items()}
-    mount("sandbox", place, "tmpfs", MS_NOSUID | MS_NODEV, "size=4m,nr_inodes=4096,mode=755")
+    kernel.mount(
+        "sandbox",
+        place,
+        "tmpfs",
+        _PLAIN,
+        "size=4m,nr_inodes=4096,mode=755",
+    )
     for path in plan.folders:
         os.makedirs(place + path, 0o755, exist_ok=True)
     _put(trees | own, place)  # in this order: one of the latter may lie in one of the former
@@ -98,9 +72,9 @@ def _take(paths: Iterable[str], attributes: int) -> dict[str, int]:
     """Path to a detached copy of what is there."""
     trees = {}
     for path in paths:
-        trees[path] = clone_tree(path)
+        trees[path] = kernel.clone_tree(path)
         if attributes:
-            restrict_tree(trees[path], attributes)
+            kernel.restrict_tree(trees[path], attributes)
     return trees
 
 
@@ -112,7 +86,7 @@ def _take_for(user: int, paths: Iterable[str]) -> dict[str, int]:
         for path in paths:
             trees |= _take([path], _READ_ONLY)
             try:
-                restrict_tree(trees[path], ATTR_IDMAP, userns=users)
+                kernel.restrict_tree(trees[path], kernel.ATTR_IDMAP, userns=users)
             except OSError:  # this file system cannot
                 os.close(trees.pop(path))
         os.close(users)
@@ -122,27 +96,18 @@ def _take_for(user: int, paths: Iterable[str]) -> dict[str, int]:
 def _put(trees: Mapping[str, int], place: str = "") -> None:
     """Attach each copy where it was taken, below ``place``."""
     for path, tree in trees.items():
-        _attach(tree, place + path, os.path.isdir(f"/proc/self/fd/{tree}"))
+        target = place + path
+        if os.path.isdir(f"/proc/self/fd/{tree}"):
+            os.makedirs(target, 0o755, exist_ok=True)
+        elif not os.path.exists(target):
+            _write(target, b"")
+        kernel.attach_tree(tree, target)
         os.close(tree)
-
-
-def _content(path: str) -> bytes:
-    with open(path, "rb") as file:
-        return file.read()
-
-
-def _attach(tree: int, target: str, folder: bool) -> None:
-    if folder:
-        os.makedirs(target, 0o755, exist_ok=True)
-    elif not os.path.exists(target):
-        _write(target, b"")
-    attach_tree(tree, target)
 
 
 def _write(path: str, content: bytes) -> None:
     os.makedirs(os.path.dirname(path), 0o755, exist_ok=True)
-    with open(path, "wb") as file:
-        file.write(content)
+    Path(path).write_bytes(content)
 
 
 def _link(path: str, target: str) -> None:
@@ -156,15 +121,15 @@ def enter_root(plan: RootPlan, place: str, copied: Sequence[str], user: int | No
     """Make ``place`` a root with what ``plan`` says, enter it and detach the old one."""
     build_root(plan, place, copied, user)
     os.chdir(place)
-    pivot_root(".", ".")
-    unmount(".")
+    kernel.pivot_root(".", ".")
+    kernel.unmount(".")
     os.chdir("/")
-    restrict_mount("/", ATTR_RDONLY)
+    kernel.restrict_mount("/", kernel.ATTR_RDONLY)
 
 
 def mount_proc() -> None:
     """A /proc of our own pid namespace, over whatever is there."""
-    mount("proc", "/proc", "proc", MS_NOSUID | MS_NODEV | MS_NOEXEC)
+    kernel.mount("proc", "/proc", "proc", _PLAIN | kernel.MS_NOEXEC)
 
 
 def proc_to_cover() -> tuple[list[str], list[str]]:
@@ -189,8 +154,8 @@ def cover_proc(files: Sequence[str], folders: Sequence[str]) -> None:
 
 
 def _bind(source: str, target: str) -> None:
-    tree = clone_tree(source)
-    attach_tree(tree, target)
+    tree = kernel.clone_tree(source)
+    kernel.attach_tree(tree, target)
     os.close(tree)
 
 
@@ -211,9 +176,9 @@ def mount_skeleton(packages: str) -> None:
 
     The shared folders are read-only and perhaps another user's, and so they would be in a view.
     """
-    mount("skeleton", _SKELETON, "tmpfs", MS_NOSUID | MS_NODEV, "mode=755")
+    kernel.mount("skeleton", _SKELETON, "tmpfs", _PLAIN, "mode=755")
     _mirror_folders(packages, f"{_SKELETON}/packages")
-    restrict_mount(_SKELETON, ATTR_RDONLY)
+    kernel.restrict_mount(_SKELETON, kernel.ATTR_RDONLY)
 
 
 def mount_jail(
@@ -230,30 +195,33 @@ def mount_jail(
     Args:
         snapshot: Shown at this path; everything else below ``roots`` is hidden.
         packages: Folder of packages of its own, with a skeleton; or empty.
-        roots: Folders that snapshots lie in.
         trees: What the zygote's root shows (``RootPlan.trees``).
-        size: Bytes of the scratch, all of it together.
-        inodes: Files and folders in it.
     """
     hidden = [*roots, TEMPORARY, SHARED_MEMORY, HOME, WORK]
     buried = [path for path in trees if any(within(path, folder) for folder in hidden)]
     kept = _take((*buried, snapshot), 0)
     for folder in roots:
-        mount("hidden", folder, "tmpfs", MS_NOSUID | MS_NODEV, "size=64k,nr_inodes=64,mode=755")
+        kernel.mount(
+            "hidden",
+            folder,
+            "tmpfs",
+            _PLAIN,
+            "size=64k,nr_inodes=64,mode=755",
+        )
     _mount_scratch(size, inodes)
     _put(kept)
     for folder in roots:
         with contextlib.suppress(OSError):
-            restrict_mount(folder, ATTR_RDONLY)
+            kernel.restrict_mount(folder, kernel.ATTR_RDONLY)
     view = _mount_views(snapshot, packages)
-    unmount(_SCRATCH)
+    kernel.unmount(_SCRATCH)
     return view
 
 
 def _mount_scratch(size: int, inodes: int) -> None:
     """One tmpfs, so that home, temporary files and work share one quota."""
     options = f"size={size},nr_inodes={inodes},mode=700"
-    mount("scratch", _SCRATCH, "tmpfs", MS_NOSUID | MS_NODEV, options)
+    kernel.mount("scratch", _SCRATCH, "tmpfs", _PLAIN, options)
     for name, target in (("home", HOME), ("tmp", TEMPORARY), ("shm", SHARED_MEMORY)):
         os.mkdir(f"{_SCRATCH}/{name}", 0o700)
         _bind(f"{_SCRATCH}/{name}", target)
@@ -297,13 +265,10 @@ def mount_overlay(path: str, lower: Sequence[str], upper: str) -> None:
     """
     inner = f"{upper}-inner"
     os.mkdir(inner, 0o700)
-    folders = ":".join(map(_escaped, lower))
+    escaped = str.maketrans({"\\": "\\\\", ":": "\\:", ",": "\\,"})
+    folders = ":".join(path.translate(escaped) for path in lower)
     options = f"lowerdir={folders},upperdir={upper},workdir={inner},userxattr"
-    mount("copy-on-write", path, "overlay", MS_NOSUID | MS_NODEV, options)
-
-
-def _escaped(path: str) -> str:
-    return path.replace("\\", "\\\\").replace(":", "\\:").replace(",", "\\,")
+    kernel.mount("copy-on-write", path, "overlay", _PLAIN, options)
 
 
 def _mount_links(snapshot: str) -> None:

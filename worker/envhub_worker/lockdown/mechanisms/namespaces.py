@@ -11,19 +11,8 @@ import socket
 import struct
 from collections.abc import Callable
 
-from envhub_worker.lockdown.mechanisms import process
-from envhub_worker.lockdown.mechanisms.kernel import (
-    CLONE_NEWCGROUP,
-    CLONE_NEWIPC,
-    CLONE_NEWNET,
-    CLONE_NEWNS,
-    CLONE_NEWPID,
-    CLONE_NEWUSER,
-    CLONE_NEWUTS,
-    setns,
-    unshare,
-)
-from envhub_worker.lockdown.report import LayerUnavailableError
+from envhub_worker.lockdown.layers import LayerUnavailableError
+from envhub_worker.lockdown.mechanisms import kernel, process
 from envhub_worker.protocol.shortages import shortage
 
 #: The user that a jail sees itself as. Not 0: programs treat that one specially.
@@ -42,16 +31,12 @@ _WEAKER = 'Or choose a weaker one by its name: profile "no-userns".'
 def enter_user_namespace(uid: int, gid: int) -> None:
     """Become ``INSIDE_UID`` of a new user namespace, with every capability over it.
 
-    Args:
-        uid: This process's user, as it is seen now.
-        gid: This process's group.
-
     Raises:
         LayerUnavailableError: The host forbids it; the fix is for this host.
     """
     try:
-        unshare(CLONE_NEWUSER)
-        # Without this the kernel lets nobody write gid_map: a group may also take rights away.
+        kernel.unshare(kernel.CLONE_NEWUSER)
+        # Without this the kernel refuses to write gid_map: a group may also take rights away.
         _write("/proc/self/setgroups", "deny")
         _write("/proc/self/uid_map", f"{INSIDE_UID} {uid} 1")
         _write("/proc/self/gid_map", f"{INSIDE_UID} {gid} 1")
@@ -71,7 +56,7 @@ def mapped_to(user: int) -> int:
     if pid == 0:
         process.die_with_parent(parent)
         with contextlib.suppress(OSError):
-            unshare(CLONE_NEWUSER)
+            kernel.unshare(kernel.CLONE_NEWUSER)
         signal.raise_signal(signal.SIGSTOP)
     try:
         os.waitpid(pid, os.WUNTRACED)
@@ -85,20 +70,20 @@ def mapped_to(user: int) -> int:
 
 def unshare_for_zygote(network: str) -> None:
     """What all jails of a zygote have in common: their ancestors' namespaces."""
-    flags = CLONE_NEWNS | CLONE_NEWPID | CLONE_NEWIPC | CLONE_NEWUTS
-    _unshare(flags | (0 if network == "host" else CLONE_NEWNET))
+    flags = kernel.CLONE_NEWNS | kernel.CLONE_NEWPID | kernel.CLONE_NEWIPC | kernel.CLONE_NEWUTS
+    _unshare(flags | (0 if network == "host" else kernel.CLONE_NEWNET))
     socket.sethostname("sandbox")
 
 
 def unshare_for_jail(network: str) -> None:
     """What each jail has for itself; ``fork_in_new_pid_namespace`` made its pid namespace."""
-    flags = CLONE_NEWNS | CLONE_NEWIPC | CLONE_NEWCGROUP
-    _unshare(flags | (0 if network == "host" else CLONE_NEWNET))
+    flags = kernel.CLONE_NEWNS | kernel.CLONE_NEWIPC | kernel.CLONE_NEWCGROUP
+    _unshare(flags | (0 if network == "host" else kernel.CLONE_NEWNET))
 
 
 def _unshare(flags: int) -> None:
     try:
-        unshare(flags)
+        kernel.unshare(flags)
     except OSError as error:
         reason = f"unshare({flags:#x}) answers {os.strerror(error.errno or 0)}"
         raise LayerUnavailableError("namespaces", reason, _WEAKER) from error
@@ -109,17 +94,17 @@ def fork_in_new_pid_namespace() -> int:
 
     The zygote must own its own pid namespace: only then may it return to it.
     """
-    unshare(CLONE_NEWPID)
+    kernel.unshare(kernel.CLONE_NEWPID)
     pid = os.fork()
     if pid:
         back = os.pidfd_open(os.getpid())
-        setns(back, CLONE_NEWPID)
+        kernel.setns(back, kernel.CLONE_NEWPID)
         os.close(back)
     return pid
 
 
 def forbid_what_is_counted() -> None:
-    """Let nobody below ours make a namespace or watch a file, should the filter let it by.
+    """Let no process below ours make a namespace or watch a file, should the filter let it by.
 
     The kernel counts these for each user, in each user namespace and all above it; so the user's
     other programs keep their share.
@@ -150,7 +135,6 @@ def user_namespace_unavailable(
     """Why this host refused a user namespace, and what to do about it here.
 
     Args:
-        error: What the kernel answered.
         read: Gives the text of a sysctl file, or None where there is none.
     """
     read = read or _read

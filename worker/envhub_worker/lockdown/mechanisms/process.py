@@ -1,4 +1,7 @@
-"""What a process sets about itself: its parent's death, signals, descriptors, privileges."""
+"""What a process sets about itself: its parent's death, signals, descriptors, privileges.
+
+A jail that keeps a capability remounts /usr writable, so all of them go.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ import os
 import signal
 from collections.abc import Iterable
 
-from envhub_worker.lockdown.mechanisms.kernel import prctl, syscall
+from envhub_worker.lockdown.mechanisms.kernel import capget, capset, prctl, syscall
 from envhub_worker.lockdown.seccomp.syscalls import number
 
 _PR_SET_PDEATHSIG = 1
@@ -15,6 +18,9 @@ _PR_SET_DUMPABLE = 4
 _PR_SET_CHILD_SUBREAPER = 36
 _PR_SET_NO_NEW_PRIVS = 38
 _PR_GET_NO_NEW_PRIVS = 39
+_PR_CAPBSET_DROP = 24
+_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL = 47, 4
+_CAP_SETPCAP = 8
 
 _LAST_FD = 2**31 - 1
 
@@ -48,6 +54,32 @@ def set_no_new_privileges() -> None:
 def has_no_new_privileges() -> bool:
     """Whether ``set_no_new_privileges`` holds for this thread."""
     return prctl(_PR_GET_NO_NEW_PRIVS) == 1
+
+
+def drop_capabilities() -> None:
+    """Empty the bounding, ambient, inheritable, permitted and effective sets."""
+    empty_the_bounding_set()
+    prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL)
+    capset(0, 0, 0)
+
+
+def held_capabilities() -> int:
+    """Mask of what this thread has, may have or may pass on."""
+    effective, permitted, inheritable = capget()
+    return effective | permitted | inheritable
+
+
+def empty_the_bounding_set() -> None:
+    """Let no later ``execve`` bring a capability in. Nothing happens without the right to."""
+    if not capget()[0] >> _CAP_SETPCAP & 1:
+        return
+    for capability in range(64):
+        try:
+            prctl(_PR_CAPBSET_DROP, capability)
+        except OSError as error:
+            if error.errno != errno.EINVAL:
+                raise
+            return  # the first that this kernel does not know
 
 
 def close_all_but(keep: Iterable[int]) -> None:

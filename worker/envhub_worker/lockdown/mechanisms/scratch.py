@@ -16,8 +16,6 @@ class Scratch:
     """Absolute paths of one jail's writable folders.
 
     Attributes:
-        home: The private home.
-        temporary: For temporary files.
         work: The working directory: shows the snapshot's files, takes new ones.
         shared_memory: Where ``shm_open`` puts its files, or None for nowhere.
     """
@@ -38,7 +36,7 @@ class Scratch:
         return cls(f"{folder}/home", f"{folder}/tmp", f"{folder}/work", shared_memory)
 
     def create(self, snapshot: str, owner: int | None) -> None:
-        """Make the folders, readable by nobody else, and link the snapshot into ``work``.
+        """Make the folders, readable by their owner alone, and link the snapshot into ``work``.
 
         Args:
             snapshot: Its top-level entries appear as symbolic links.
@@ -78,7 +76,8 @@ def _empty(root: int) -> None:
     pending = _unlink_files(root)
     while pending:
         name = pending.pop()
-        folder = _open_folder(name, root)
+        os.chmod(name, 0o700, dir_fd=root)
+        folder = os.open(name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=root)
         for child in _unlink_files(folder):
             # Renaming a folder into another one rewrites its "..", so it must be writable.
             os.chmod(child, 0o700, dir_fd=folder)
@@ -87,11 +86,6 @@ def _empty(root: int) -> None:
             pending.append(f"{prefix}-{moved}")
         os.close(folder)
         os.rmdir(name, dir_fd=root)
-
-
-def _open_folder(name: str, root: int) -> int:
-    os.chmod(name, 0o700, dir_fd=root)
-    return os.open(name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=root)
 
 
 def _unlink_files(folder: int) -> list[str]:

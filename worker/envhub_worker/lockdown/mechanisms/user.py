@@ -7,8 +7,8 @@ import os
 import pwd
 import random
 
-from envhub_worker.lockdown.mechanisms import capabilities, kernel, process
-from envhub_worker.lockdown.report import LayerUnavailableError
+from envhub_worker.lockdown.layers import LayerUnavailableError
+from envhub_worker.lockdown.mechanisms import kernel, process, procfs
 
 CAP_CHOWN, CAP_SETGID, CAP_SETUID = 0, 6, 7
 
@@ -63,19 +63,18 @@ def _mapped() -> tuple[int, int]:
 
 
 def _unused(candidates: range) -> int:
-    running = set(_running_uids())
+    running = _running_uids()
     while True:
         uid = random.SystemRandom().choice(candidates)
         if uid not in running and not _has_name(uid):
             return uid
 
 
-def _running_uids() -> list[int]:
-    uids = []
-    for name in os.listdir("/proc"):
-        if name.isdigit():
-            with contextlib.suppress(OSError):
-                uids.append(os.stat(f"/proc/{name}").st_uid)
+def _running_uids() -> set[int]:
+    uids = set()
+    for pid in procfs.pids():
+        with contextlib.suppress(OSError):
+            uids.add(os.stat(f"/proc/{pid}").st_uid)
     return uids
 
 
@@ -87,9 +86,9 @@ def _has_name(uid: int) -> bool:
 
 def become(uid: int) -> None:
     """Become ``uid`` with that group only, for good. ``die_with_parent`` must be armed again."""
-    capabilities.empty_the_bounding_set()
+    process.empty_the_bounding_set()
     os.setgroups([])
     os.setresgid(uid, uid, uid)
     os.setresuid(uid, uid, uid)
-    # The change made /proc/self root's; without this nobody could write our user map.
+    # The change made /proc/self root's; without this our user map could not be written.
     process.set_dumpable(True)

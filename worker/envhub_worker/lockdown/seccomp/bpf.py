@@ -42,6 +42,11 @@ class Branch:
     if_true: str | None = None
     if_false: str | None = None
 
+    @property
+    def targets(self) -> list[str]:
+        """The labels that it names."""
+        return [target for target in (self.if_true, self.if_false) if target is not None]
+
 
 @dataclass(frozen=True)
 class Instruction:
@@ -56,23 +61,6 @@ class Instruction:
 Item = Label | Do | Branch
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """Where each item starts, where each label is, and which branches are written long."""
-
-    places: list[int]
-    labels: dict[str, int]
-    far: set[int]
-
-    def offset(self, source: int, target: str | None) -> int:
-        """Instructions to skip from position ``source``, which is the one after the jump."""
-        if target is None:
-            return 0
-        if self.labels[target] < source:
-            raise ValueError(f"label {target!r} lies behind its branch")
-        return self.labels[target] - source
-
-
 def assemble(items: Sequence[Item]) -> list[Instruction]:
     """Resolve the labels. A jump over more than 255 instructions becomes a pair.
 
@@ -80,20 +68,31 @@ def assemble(items: Sequence[Item]) -> list[Instruction]:
         KeyError: A label is missing.
         ValueError: A label lies behind its branch, or the program is too long.
     """
-    far: set[int] = set()
+    branches = {index: item for index, item in enumerate(items) if isinstance(item, Branch)}
+    far: set[int] = set()  # branches that are written long; which moves what follows them
     while True:
-        layout = _lay_out(items, far)
-        more = {index for index in range(len(items)) if not _fits(items, index, layout)}
+        places, labels = _lay_out(items, far)
+        skips = {
+            i: [labels[to] - places[i] - 1 for to in one.targets] for i, one in branches.items()
+        }
+        more = {index for index, skip in skips.items() if max(skip, default=0) > 255} - far
         if not more:
             break
         far |= more
-    program = [one for index in range(len(items)) for one in _encode(items[index], index, layout)]
+    for index, branch in branches.items():
+        for target, skip in zip(branch.targets, skips[index], strict=True):
+            if skip < 0:
+                raise ValueError(f"label {target!r} lies behind its branch")
+    program: list[Instruction] = []
+    for index, item in enumerate(items):
+        program += _encode(item, places[index], labels, far=index in far)
     if len(program) > _MAX_INSTRUCTIONS:
         raise ValueError(f"{len(program)} instructions are over {_MAX_INSTRUCTIONS}")
     return program
 
 
-def _lay_out(items: Sequence[Item], far: set[int]) -> _Layout:
+def _lay_out(items: Sequence[Item], far: set[int]) -> tuple[list[int], dict[str, int]]:
+    """Where each item starts, and where each label is."""
     places: list[int] = []
     labels: dict[str, int] = {}
     position = 0
@@ -101,47 +100,31 @@ def _lay_out(items: Sequence[Item], far: set[int]) -> _Layout:
         places.append(position)
         if isinstance(item, Label):
             labels[item.name] = position
-        position += _room(item, index in far)
-    return _Layout(places, labels, far)
+        else:
+            position += 1
+        if isinstance(item, Branch) and index in far:
+            position += len(item.targets)
+    return places, labels
 
 
-def _room(item: Item, far: bool) -> int:
-    if isinstance(item, Label):
-        return 0
-    if isinstance(item, Do) or not far:
-        return 1
-    return 1 + sum(target is not None for target in (item.if_true, item.if_false))
-
-
-def _fits(items: Sequence[Item], index: int, layout: _Layout) -> bool:
-    item = items[index]
-    if not isinstance(item, Branch) or index in layout.far:
-        return True
-    source = layout.places[index] + 1
-    return all(layout.offset(source, target) <= 255 for target in (item.if_true, item.if_false))
-
-
-def _encode(item: Item, index: int, layout: _Layout) -> list[Instruction]:
+def _encode(item: Item, place: int, labels: dict[str, int], *, far: bool) -> list[Instruction]:
     if isinstance(item, Label):
         return []
     if isinstance(item, Do):
         return [Instruction(item.code, 0, 0, item.k)]
-    place = layout.places[index]
-    if index in layout.far:
-        return _encode_far(item, place, layout)
-    if_true, if_false = (layout.offset(place + 1, t) for t in (item.if_true, item.if_false))
-    return [Instruction(item.code, if_true, if_false, item.k)]
-
-
-def _encode_far(item: Branch, place: int, layout: _Layout) -> list[Instruction]:
-    """The comparison skips to one of up to two unconditional jumps, or over them."""
-    targets = [target for target in (item.if_true, item.if_false) if target is not None]
+    if not far:
+        ends = (item.if_true, item.if_false)
+        if_true, if_false = (0 if end is None else labels[end] - place - 1 for end in ends)
+        return [Instruction(item.code, if_true, if_false, item.k)]
+    # the comparison skips to one of up to two unconditional jumps, or over them
+    targets = item.targets
     skip_true = len(targets) if item.if_true is None else 0
     skip_false = len(targets) if item.if_false is None else len(targets) - 1
-    program = [Instruction(item.code, skip_true, skip_false, item.k)]
-    for slot, target in enumerate(targets):
-        program.append(Instruction(_JUMP, 0, 0, layout.offset(place + 2 + slot, target)))
-    return program
+    jumps = [
+        Instruction(_JUMP, 0, 0, labels[target] - place - 2 - slot)
+        for slot, target in enumerate(targets)
+    ]
+    return [Instruction(item.code, skip_true, skip_false, item.k), *jumps]
 
 
 def to_bytes(program: Sequence[Instruction]) -> bytes:

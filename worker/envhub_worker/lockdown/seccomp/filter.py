@@ -7,8 +7,8 @@ import errno
 import os
 from collections.abc import Mapping
 
+from envhub_worker.lockdown.layers import LayerUnavailableError, no_system_calls
 from envhub_worker.lockdown.mechanisms.kernel import prctl, syscall
-from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp import bpf
 from envhub_worker.lockdown.seccomp.bpf import Branch, Do, Item, Label
 from envhub_worker.lockdown.seccomp.policy import (
@@ -53,13 +53,8 @@ def compile_filter(
     Raises:
         LayerUnavailableError: No table for this machine.
     """
-    verdicts = table(
-        namespaced=namespaced,
-        network=network,
-        brokered=brokered,
-        measured=measured,
-        scoped=scoped,
-    )
+    conditions = {"brokered": brokered, "measured": measured, "scoped": scoped}
+    verdicts = table(namespaced=namespaced, network=network, **conditions)
     if record:
         verdicts = recorded(verdicts, NUMBERS.get(machine, ()))
     return bpf.to_bytes(program(machine, verdicts))
@@ -68,11 +63,7 @@ def compile_filter(
 def program(machine: str, verdicts: Mapping[str, Verdict]) -> list[bpf.Instruction]:
     """Architecture first, then a balanced tree over the numbers, then the argument checks."""
     if machine not in NUMBERS:
-        raise LayerUnavailableError(
-            "seccomp",
-            f"no system call table for {machine}",
-            "Run on x86-64 or aarch64, or in a container on such a host.",
-        )
+        raise no_system_calls(machine)
     numbers = NUMBERS[machine]
     highest = max(numbers.values())
     by_number = {numbers[name]: verdict for name, verdict in verdicts.items() if name in numbers}
@@ -88,8 +79,12 @@ def program(machine: str, verdicts: Mapping[str, Verdict]) -> list[bpf.Instructi
     labels = [
         _label(n, by_number.get(n, EPERM if n in known else ENOSYS)) for n in range(highest + 1)
     ]
-    items += _tree(_segments(labels))
-    items += _argument_blocks(by_number)
+    # (first number, label) of each run of equal labels
+    starts = [n for n, label in enumerate(labels) if n == 0 or labels[n - 1] != label]
+    items += _tree([(n, labels[n]) for n in starts])
+    for call, verdict in sorted(by_number.items()):
+        if isinstance(verdict, ByArguments):
+            items += _argument_block(_label(call, verdict), verdict)
     return bpf.assemble(items + _returns(items))
 
 
@@ -99,12 +94,6 @@ def _label(call: int, verdict: Verdict) -> str:
 
 def _returning(verdict: int) -> str:
     return f"return-{verdict:#x}"
-
-
-def _segments(labels: list[str]) -> list[tuple[int, str]]:
-    """(first number, label) of each run of equal labels."""
-    starts = [n for n, label in enumerate(labels) if n == 0 or labels[n - 1] != label]
-    return [(n, labels[n]) for n in starts]
 
 
 def _tree(segments: list[tuple[int, str]]) -> list[Item]:
@@ -125,14 +114,6 @@ def _entry(segments: list[tuple[int, str]]) -> str:
     if len(segments) == 1:
         return segments[0][1]
     return f"tree-{segments[0][0]}-{segments[-1][0]}"
-
-
-def _argument_blocks(by_number: Mapping[int, Verdict]) -> list[Item]:
-    items: list[Item] = []
-    for call, verdict in sorted(by_number.items()):
-        if isinstance(verdict, ByArguments):
-            items += _argument_block(_label(call, verdict), verdict)
-    return items
 
 
 def _argument_block(label: str, verdict: ByArguments) -> list[Item]:
@@ -164,8 +145,8 @@ def _returns(items: list[Item]) -> list[Item]:
         target
         for item in items
         if isinstance(item, Branch)
-        for target in (item.if_true, item.if_false)
-        if target is not None and target.startswith("return-")
+        for target in item.targets
+        if target.startswith("return-")
     }
     return [
         item
@@ -182,7 +163,7 @@ def install(compiled: bytes, *, brokered: bool = False) -> int:
     """Filter this thread and its descendants for good. ``no_new_privs`` must be set.
 
     Returns:
-        Where the calls that ask arrive if ``brokered``, else -1. Whoever holds it decides.
+        Where the calls that ask arrive if ``brokered``, else -1. Its holder decides.
 
     Raises:
         LayerUnavailableError: The kernel refuses.

@@ -3,7 +3,7 @@
 The filter hands ``kill``, ``tkill`` and ``tgkill`` to init, which sends the signal when the
 target is a process of the jail. All of their arguments are numbers in registers, so nothing can
 change between the check and the act; a target is held by a pidfd before it is looked at, so no
-other process can take its pid. What a process sends to itself the kernel is told to go on with:
+other process can take its pid. The kernel goes on with what a process sends to itself:
 sent by init, it would interrupt the very call that waits for the answer.
 """
 
@@ -20,7 +20,7 @@ import struct
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
-from envhub_worker.lockdown.mechanisms import reap
+from envhub_worker.lockdown.mechanisms import procfs
 from envhub_worker.lockdown.mechanisms.kernel import syscall
 from envhub_worker.lockdown.seccomp.policy import refusal
 from envhub_worker.lockdown.seccomp.syscalls import c_int, name_of, number
@@ -44,7 +44,6 @@ class Request:
     Attributes:
         thread: The calling thread.
         caller: Its process.
-        call: The call's number.
         arguments: The first three, as the C integers that the kernel reads.
         words: All six, as the registers are.
         still_waits: Raises OSError where the caller has gone since.
@@ -78,14 +77,12 @@ def serve(
     permitted: Collection[str],
     note: Callable[[Request], None],
 ) -> bool:
-    """Answer one request that waits at ``listener``; False when nobody is left to ask.
+    """Answer one request that waits at ``listener``; False when no caller is left.
 
     Args:
-        listener: Where calls arrive.
         permitted: Calls that the policy allows whatever their arguments, and that only ask so that
             they are seen: the kernel goes on with them. What is neither one of these nor a signal
             is denied.
-        note: Is told of each.
     """
     buffer = bytearray(_REQUEST.size)
     try:
@@ -99,14 +96,14 @@ def serve(
     def still_waits() -> object:
         return fcntl.ioctl(listener, _STILL_WAITS, struct.pack("=Q", identity))
 
-    caller = reap.process_of(thread)
+    caller = procfs.process_of(thread)
     request = Request(thread, caller, call, (first, second, third), tuple(words), still_waits)
-    note(request)  # told before the caller goes on, so that nobody can look too early
+    note(request)  # before the caller goes on: what it did is known when it is looked for
     name = name_of(request.call)
     if name in permitted:
         answer = _PROCEED
     elif name in _SIGNALS:
-        answer = decide(request, lambda: reap.descendants(os.getpid()))
+        answer = decide(request, lambda: procfs.descendants(os.getpid()))
     else:
         answer = Answer(refusal(name))
     flags = _CONTINUE if answer.proceed else 0
@@ -116,7 +113,7 @@ def serve(
 
 
 MOST_DENIALS = 64
-"""Different ones that are told of a jail."""
+"""Different ones that are reported of a jail."""
 MOST_FILES = 32
 """Of these, files: a flood of names hides no other attempt."""
 
@@ -152,7 +149,6 @@ def decide(request: Request, inside: _Inside) -> Answer:
     """Send the signal that ``request`` asks for, where that is permitted.
 
     Args:
-        request: The call.
         inside: Gives the pids of the jail's processes, without init.
     """
     first, second, third = request.arguments
@@ -163,7 +159,7 @@ def decide(request: Request, inside: _Inside) -> Answer:
     if request.call == number("tkill"):
         if first == request.thread:
             return _PROCEED
-        return _send_to_thread(reap.process_of(first), first, second, inside)
+        return _send_to_thread(procfs.process_of(first), first, second, inside)
     if first == request.caller:
         return _PROCEED
     return _send_to_thread(first, second, third, inside)
@@ -172,7 +168,7 @@ def decide(request: Request, inside: _Inside) -> Answer:
 def _kill(caller: int, target: int, signum: int, inside: _Inside) -> Answer:
     group = _group_of(caller)
     if group < 0:
-        return Answer(errno.ESRCH)  # it has gone since, and nobody waits for the answer
+        return Answer(errno.ESRCH)  # it has gone since: no caller waits for the answer
     # A process is alone with the jail in its own group: the host has a session of its own.
     if target in (caller, 0, -group):
         return _PROCEED

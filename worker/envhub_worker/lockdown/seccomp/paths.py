@@ -1,8 +1,8 @@
 """Which files a call asks for, as far as its caller's memory says so a moment later.
 
-The kernel is always told to go on with such a call: whether it may is decided by it, by mounts and
-Landlock, and nothing here can make it another. What is read is a stranger's memory, which another
-thread may have changed since, so that it is evidence of an attempt and proof of nothing.
+The kernel always goes on with such a call: whether it may is decided by it, by mounts and Landlock,
+and nothing here can make it another. What is read is a stranger's memory, which another thread may
+have changed since, so that it is evidence of an attempt and proof of nothing.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _PRIVATE = re.compile(
     r"|/proc/\d+(/task/\d+)?/(environ|mem|maps|smaps|auxv|io|fd|fdinfo|root|cwd|ns)(/.*)?",
     re.DOTALL,
 )
-"""What nobody reads by chance; libraries look for a configuration in many another place."""
+"""What is not read by chance; libraries look for a configuration in many another place."""
 _DOORS = re.compile(r"/proc/(?:self|thread-self|\d+)(?:/task/\d+)?/(root|cwd|fd/\d+)")
 """Below a process's own entries one is somewhere else."""
 _MOST_STEPS = 128
@@ -69,7 +69,7 @@ _HARMLESS = ("/var/run/nscd/socket", "/run/nscd/socket")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Own:
+class OwnPaths:
     """What a jail's processes may do by name.
 
     Attributes:
@@ -87,7 +87,7 @@ def asked(
     call: str,
     words: Sequence[int],
     thread: int,
-    own: Own,
+    own: OwnPaths,
     still_waits: Callable[[], object],
 ) -> list[tuple[str, str]]:
     """What a waiting call asks for and is not its own: what it would do, and each path, shown.
@@ -95,8 +95,6 @@ def asked(
     Args:
         call: Its name, one of ``NAMED``.
         words: Its arguments, as the registers are.
-        thread: Who calls.
-        own: What it may have.
         still_waits: Raises OSError where the caller has gone: its number may be another's now.
     """
     with contextlib.suppress(OSError, ValueError, OverflowError):
@@ -130,7 +128,7 @@ def _named(
     memory: BinaryIO,
     thread: int,
     words: Sequence[int],
-    own: Own,
+    own: OwnPaths,
     last: bool,
     folder: int | None,
     path: int,
@@ -155,7 +153,7 @@ def _text(memory: BinaryIO, place: int) -> bytes:
     return text if end and len(text) < _LONGEST_PATH else b""
 
 
-def _absolute(thread: int, base: str, text: bytes, own: Own, *, last: bool) -> str:
+def _absolute(thread: int, base: str, text: bytes, own: OwnPaths, *, last: bool) -> str:
     """Where a path leads from where its caller stands; a base that is no folder makes none.
 
     What its own folders have of links is followed, at the end only where ``last``; what they lead
@@ -178,10 +176,10 @@ def _absolute(thread: int, base: str, text: bytes, own: Own, *, last: bool) -> s
                 pending += leads.split("/")[::-1]
         if not pending:
             return f"/{'/'.join(done)}"
-    return f"/...{path}" if path.startswith("/") else ""  # wherever that is: nobody's own
+    return f"/...{path}" if path.startswith("/") else ""  # wherever that is: not its own
 
 
-def _leads(thread: int, path: str, own: Own, pending: Sequence[str], *, last: bool) -> str:
+def _leads(thread: int, path: str, own: OwnPaths, pending: Sequence[str], *, last: bool) -> str:
     """What stands instead of an entry of a process, or of a link in a folder of its own.
 
     Raises:
@@ -217,7 +215,7 @@ def _link(thread: int, folder: str, names: Sequence[str]) -> str:
         os.close(place)
 
 
-def _addressed(memory: BinaryIO, place: int, size: int, thread: int, own: Own) -> str:
+def _addressed(memory: BinaryIO, place: int, size: int, thread: int, own: OwnPaths) -> str:
     """The socket's file; one without a name in the file system is the jail's own network's."""
     address = os.pread(memory.fileno(), min(size & 0xFFFFFFFF, _SOCKET_ADDRESS), place)
     text = address[2:].partition(b"\0")[0]
@@ -226,7 +224,7 @@ def _addressed(memory: BinaryIO, place: int, size: int, thread: int, own: Own) -
     return _absolute(thread, "cwd", text, own, last=True)
 
 
-def _may(deed: str, path: str, own: Own) -> bool:
+def _may(deed: str, path: str, own: OwnPaths) -> bool:
     if deed == "read":
         is_private = _PRIVATE.fullmatch(path) is not None or never_was(path)
         return not is_private or _is_within(path, own.read)

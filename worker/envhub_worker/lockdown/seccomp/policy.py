@@ -119,7 +119,7 @@ _FCNTLS = (*range(8), 9, 11, 16, 36, 37, 38, 1025, 1027, 1028, 1030, 1032, 1033,
 _F_SETOWN, _F_SETSIG, _F_SETOWN_EX, _F_SETLEASE, _F_NOTIFY = 8, 10, 15, 1024, 1026
 _F_SETPIPE_SZ, _F_SET_RW_HINT, _F_SET_FILE_RW_HINT, _F_SETDELEG = 1031, 1036, 1038, 1040
 _MAP_SHARED, _MAP_ANONYMOUS, _MAP_HUGETLB = 0x1, 0x20, 0x40000
-# Huge pages that the administrator set aside are nobody's memory in any account.
+# Huge pages that the administrator set aside are in no process's account.
 _HUGE = (((Check(3, _MAP_HUGETLB, _MAP_HUGETLB),), _ENOMEM),)
 _SOL_SOCKET = 1
 _SO_SNDBUF, _SO_RCVBUF, _SO_SNDBUFFORCE, _SO_RCVBUFFORCE = 7, 8, 32, 33
@@ -147,7 +147,6 @@ def table(
     Args:
         namespaced: A mount, pid and IPC namespace hold the jail, so that paths, processes and
             IPC objects of the host are out of reach anyway.
-        network: ``"none"``, ``"loopback"`` or ``"host"``.
         brokered: Init sends the jail's signals: see ``notify``.
         measured: No control group counts the jail's memory: see ``watchdog``.
         scoped: Landlock keeps the abstract sockets of the network namespace out of reach.
@@ -176,12 +175,11 @@ def recorded(verdicts: Mapping[str, Verdict], names: Iterable[str]) -> dict[str,
     and so is what names a process, which may be another's.
 
     Args:
-        verdicts: Of ``table``.
         names: Every call that there is.
     """
     denied = {name: _asking(name, verdicts.get(name, EPERM)) for name in names}
     seen: dict[str, Verdict] = dict.fromkeys(watched(verdicts), ASK)
-    if "sendto" in seen:  # what is connected names nobody
+    if "sendto" in seen:  # a connected socket names no other
         seen["sendto"] = ByArguments((((Check(4, 0, wide=True),), ALLOW),), ASK)
     return denied | {name: verdict for name, verdict in seen.items() if name in denied}
 
@@ -203,7 +201,7 @@ def _asking(name: str, verdict: Verdict) -> Verdict:
 
 
 def refusal(call: str) -> int:
-    """The errno with which a call that is denied answers, whoever gives it; 0: it seems to work."""
+    """The errno with which a call that is denied answers; 0: it seems to work."""
     if call in PRETENDED:
         return 0
     return errno.EAFNOSUPPORT if call in ("socket", "socketpair") else errno.EPERM
@@ -284,7 +282,7 @@ def _ioctls() -> tuple[tuple[tuple[Check, ...], int], ...]:
 
 
 def _sockets(local: bool, network: str) -> dict[str, Verdict]:
-    """Local sockets by name only where nobody but the jail has such names (``local``)."""
+    """Local sockets by name only where no other process has such names (``local``)."""
     internet = network != "none"
     verdicts: dict[str, Verdict] = {
         "socket": ByArguments(_families(local, internet), _EAFNOSUPPORT),
@@ -317,7 +315,7 @@ def _pairs(local: bool) -> tuple[tuple[tuple[Check, ...], int], ...]:
 
 
 def _utimensat() -> ByArguments:
-    # Whoever touches a path takes a success for a file that is there, and does not create it.
+    # What touches a path takes a success for a file that is there, and does not create it.
     touched = ((Check(1, 0, wide=True),), PRETEND), ((Check(2, 0, wide=True),), EPERM)
     return ByArguments(touched, PRETEND)
 

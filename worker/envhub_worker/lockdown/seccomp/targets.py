@@ -10,7 +10,7 @@ import os
 import re
 from collections.abc import Sequence
 
-from envhub_worker.lockdown.mechanisms import reap
+from envhub_worker.lockdown.mechanisms import procfs
 
 _PRETENDED = "sched_setscheduler sched_setparam sched_setattr sched_setaffinity"
 _WHICH = {"setpriority": 0, "ioprio_set": 1}  # and what says there that a process is meant
@@ -19,7 +19,7 @@ _SIGNUM = {"kill": 1, "tkill": 1, "tgkill": 2, "rt_sigqueueinfo": 1, "rt_tgsigqu
 PRETENDED = frozenset(_PRETENDED.split())
 #: Calls that name a process, and which of their arguments does.
 NAMING = dict.fromkeys((*_SIGNUM, "pidfd_open", *PRETENDED), 0) | dict.fromkeys(_WHICH, 1)
-#: What is told of a call that names another.
+#: The detail of a call that names another process.
 OTHER = "OTHER_PROCESS"
 
 _FIRST = 1
@@ -32,8 +32,6 @@ def is_another(call: str, arguments: Sequence[int], caller: int, init: int) -> b
     Args:
         call: Its name, one of ``NAMING``.
         arguments: Its first three, as C integers.
-        caller: The process that calls.
-        init: The first process of the jail.
     """
     if call in _WHICH and arguments[0] != _WHICH[call]:
         return False
@@ -48,17 +46,17 @@ def is_another(call: str, arguments: Sequence[int], caller: int, init: int) -> b
 
 
 def never_was(path: str) -> bool:
-    """Whether a path is below the entry of a process that nobody in the jail can have met."""
+    """Whether a path is below the entry of a process that the jail cannot have met."""
     entry = _ENTRY.fullmatch(path)
     return entry is not None and _never_was(int(entry[1]))
 
 
 def _is_outside(number: int, caller: int, init: int) -> bool:
-    """A number that is nobody's now may have been a child's: then nothing is said of it."""
-    process = reap.process_of(number)
+    """A number without a process may have been a child's: then nothing is said of it."""
+    process = procfs.process_of(number)
     if process == 0:
         return _never_was(number)
-    return process == init or (process != caller and not reap.is_below(process, init))
+    return process == init or (process != caller and not procfs.is_below(process, init))
 
 
 def _never_was(number: int) -> bool:

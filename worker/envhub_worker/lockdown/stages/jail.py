@@ -8,10 +8,10 @@ import os
 import signal
 
 from envhub_worker.lockdown.context import Common
-from envhub_worker.lockdown.mechanisms import capabilities, mounts, namespaces, process
+from envhub_worker.lockdown.layers import Layer, LayerUnavailableError
+from envhub_worker.lockdown.mechanisms import mounts, namespaces, process, procfs
 from envhub_worker.lockdown.mechanisms.mounts import View
 from envhub_worker.lockdown.mechanisms.scratch import Scratch
-from envhub_worker.lockdown.report import Layer, LayerUnavailableError
 from envhub_worker.lockdown.root_plan import SHARED_MEMORY, within
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.confinement import Limits
@@ -21,8 +21,6 @@ def enter(spec: JailSpec, common: Common, folder: str) -> tuple[Scratch, View]:
     """Confine this init as far as all of its runners are.
 
     Args:
-        spec: The jail.
-        common: What the zygote gives.
         folder: A private folder of the host for a jail without a mount namespace.
 
     Returns:
@@ -71,10 +69,8 @@ def _mount(spec: JailSpec, common: Common) -> View:
 
 def _unmountable(error: OSError, spec: JailSpec, common: Common) -> LayerUnavailableError:
     where = f" at {error.filename}" if error.filename else ""
-    for what, path in (
-        ("the snapshot", spec.snapshot),
-        ("the folder of packages", common.config.packages),
-    ):
+    shared = {"the snapshot": spec.snapshot, "the folder of packages": common.config.packages}
+    for what, path in shared.items():
         if path and not _has_content(path):
             return LayerUnavailableError(
                 "mount-namespace",
@@ -138,10 +134,10 @@ def process_limit(limits: Limits, namespaced: bool) -> int:
 
 def _threads_of(uid: int) -> int:
     threads = 0
-    for name in os.listdir("/proc"):
+    for pid in procfs.pids():
         with contextlib.suppress(OSError):
-            if name.isdigit() and os.stat(f"/proc/{name}").st_uid == uid:
-                threads += len(os.listdir(f"/proc/{name}/task"))
+            if os.stat(f"/proc/{pid}").st_uid == uid:
+                threads += len(os.listdir(f"/proc/{pid}/task"))
     return threads
 
 
@@ -149,7 +145,7 @@ def _leave_the_zygote() -> None:
     """Own no namespace any more: the next user namespace is below the one that owns them."""
     namespaces.enter_user_namespace(namespaces.INSIDE_UID, namespaces.INSIDE_UID)
     namespaces.forbid_what_is_counted()
-    capabilities.drop_all()
+    process.drop_capabilities()
     process.set_no_new_privileges()
     process.set_dumpable(False)
     # The change of credentials disarmed it.

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+import resource
+from collections.abc import Callable, Iterable, Mapping
 
 from envhub_worker.lockdown.context import JailContext
-from envhub_worker.lockdown.limits import rlimits
-from envhub_worker.lockdown.mechanisms import capabilities, landlock, process
+from envhub_worker.lockdown.mechanisms import landlock, process
 from envhub_worker.lockdown.mechanisms.landlock import DEVICE, READ, READ_DIR, WRITE, Rule
 from envhub_worker.lockdown.seccomp import filter
-from envhub_worker.lockdown.seccomp.paths import Own
+from envhub_worker.lockdown.seccomp.paths import OwnPaths
 from envhub_worker.lockdown.stages import selftest
+from envhub_worker.protocol.confinement import Limits
 
 # What the C library and numerical libraries read; nothing here is about a person.
 _HOST_FILES = (
@@ -41,6 +42,14 @@ _OWN_FILES = """
     oom_score_adj smaps smaps_rollup stat statm status
 """
 
+# Signals in the queue and armed timers: the kernel counts them per user, and answers the user's
+# other programs EAGAIN at their own limit, some tens of thousands.
+_SIGNALS = 512
+
+# The kernel sends SIGXCPU at the soft limit and SIGKILL at the hard one; the second in between
+# lets the process print where it was.
+_CPU_GRACE_S = 1
+
 
 def enter(
     jail: JailContext, descriptors: Iterable[int], give_to_init: Callable[[int], None]
@@ -48,41 +57,40 @@ def enter(
     """Confine this single-threaded process for good, and test that it holds.
 
     Args:
-        jail: The jail that it belongs to.
         descriptors: Every descriptor that may be open.
         give_to_init: Takes the broker's listener, if there is one, before the descriptor is closed.
 
     Raises:
         LayerUnavailableError: A layer cannot be had, or a denial does not hold.
     """
-    # Init is not; but then a process may not even open its own files in /proc.
+    # In this order. Dumpable comes first: init is not, but a process that is not may not even open
+    # its own files in /proc, which the next line does. Limits come before the capabilities go that
+    # could raise them, and the capabilities before no_new_privs, which Landlock and seccomp need
+    # from a process without privileges. Landlock needs system calls that the filter denies, so the
+    # filter is last: from then on each call is judged, the self-test's own included. The self-test
+    # sees what a stranger's code would see, for nothing is given up after it.
     process.set_dumpable(True)
-    _be_killed_first()
-    rlimits.apply(rlimits.wanted(jail.spec.confinement.limits, jail.processes))
-    capabilities.drop_all()
+    # when the whole host runs out of memory, the kernel should end a jail, not its client
+    with open("/proc/self/oom_score_adj", "w") as file:
+        file.write("1000")
+    _apply(resource_limits(jail.spec.confinement.limits, jail.processes))
+    process.drop_capabilities()
     process.set_no_new_privileges()
-    if jail.plan.landlock:
+    if jail.common.landlock_abi:
         wanted = landlock.ruleset(jail.common.landlock_abi, jail.common.config.network)
         landlock.restrict(wanted, rules(jail, os.getpid()))
-    program = jail.common.programs[jail.plan.measured]
+    program = jail.common.programs[jail.measured]
     listener = filter.install(program, brokered=jail.common.asks)
     if listener >= 0:
         give_to_init(listener)
-        os.close(listener)  # whoever holds it may permit anything
+        os.close(listener)  # its holder may permit anything
     selftest.run(jail, descriptors)
-
-
-def _be_killed_first() -> None:
-    """When the whole host runs out of memory, the kernel should end a jail, not its client."""
-    with open("/proc/self/oom_score_adj", "w") as file:
-        file.write("1000")
 
 
 def rules(jail: JailContext, pid: int) -> list[Rule]:
     """What Landlock permits a runner; everything else it denies.
 
     Args:
-        jail: The jail.
         pid: The runner's own: without a pid namespace it may read only its own ``/proc`` folder.
     """
     common = jail.common
@@ -105,11 +113,44 @@ def _writable(jail: JailContext) -> list[str]:
     return [scratch.home, scratch.temporary, scratch.work, *shared, *jail.view.shared]
 
 
-def own(jail: JailContext, pid: int, thread: int) -> Own:
+def own(jail: JailContext, pid: int, thread: int) -> OwnPaths:
     """What a process may change and read, by the names that it has for it."""
     streams = ("/dev/fd", "/dev/stdin", "/dev/stdout", "/dev/stderr")
     itself = ("/proc/self", "/proc/thread-self", f"/proc/{pid}", f"/proc/{thread}")
     scratch = tuple(_writable(jail))
     changed = (*scratch, *jail.common.devices, *streams, *itself)
     read = (*jail.common.trees, jail.spec.snapshot, *changed)
-    return Own(changed=changed, read=read, scratch=scratch)
+    return OwnPaths(changed=changed, read=read, scratch=scratch)
+
+
+def resource_limits(limits: Limits, processes: int | None) -> dict[int, tuple[int, int]]:
+    """Resource number to (soft, hard).
+
+    Args:
+        processes: Cap for ``RLIMIT_NPROC``, or None where it would count strangers.
+    """
+    file_bytes = limits.disk_bytes if limits.file_bytes is None else limits.file_bytes
+    rules = {
+        resource.RLIMIT_CORE: (0, 0),
+        resource.RLIMIT_FSIZE: (file_bytes, file_bytes),
+        resource.RLIMIT_NOFILE: (limits.open_files, limits.open_files),
+        resource.RLIMIT_MEMLOCK: (64 * 1024, 64 * 1024),
+        resource.RLIMIT_MSGQUEUE: (0, 0),
+        resource.RLIMIT_NICE: (0, 0),
+        resource.RLIMIT_SIGPENDING: (_SIGNALS, _SIGNALS),
+        resource.RLIMIT_RTPRIO: (0, 0),
+    }
+    if processes is not None:
+        rules[resource.RLIMIT_NPROC] = (processes, processes)
+    if limits.cpu_s is not None:
+        rules[resource.RLIMIT_CPU] = (limits.cpu_s, limits.cpu_s + _CPU_GRACE_S)
+    return rules
+
+
+def _apply(rules: Mapping[int, tuple[int, int]]) -> None:
+    """Set each limit, never above the hard limit that already holds."""
+    for number, (soft, hard) in rules.items():
+        ceiling = resource.getrlimit(number)[1]
+        if ceiling != resource.RLIM_INFINITY:
+            soft, hard = min(soft, ceiling), min(hard, ceiling)
+        resource.setrlimit(number, (soft, hard))

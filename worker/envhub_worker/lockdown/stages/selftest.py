@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterable
 from functools import partial
 
 from envhub_worker.lockdown.context import JailContext
-from envhub_worker.lockdown.mechanisms import capabilities, process
+from envhub_worker.lockdown.layers import LayerUnavailableError
+from envhub_worker.lockdown.mechanisms import process
 from envhub_worker.lockdown.mechanisms.kernel import CLONE_NEWUSER, mount, syscall, unshare
-from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp import filter
 from envhub_worker.lockdown.seccomp.syscalls import number
 
@@ -26,12 +26,13 @@ def run(jail: JailContext, descriptors: Iterable[int]) -> None:
     Raises:
         LayerUnavailableError: Layer ``self-test``: one of them does not hold.
     """
-    _hold("no capability is left", capabilities.held() == 0)
+    _hold("no capability is left", process.held_capabilities() == 0)
     _hold("no_new_privs is set", process.has_no_new_privileges())
     _hold("a system call filter is installed", filter.installed())
     for path, shared in jail.view.shared.items():
         _hold(f"what is written to {path} stays in the jail", _stays_inside(path, shared))
-    _hold("only named descriptors are open", _open_descriptors() <= set(descriptors))
+    listed = {fd for fd in map(int, os.listdir("/proc/self/fd")) if _is_open(fd)}
+    _hold("only named descriptors are open", listed <= set(descriptors))
     for claim, attempt in _denials(jail).items():
         _hold(claim, _denied(attempt))
 
@@ -51,7 +52,7 @@ def _denials(jail: JailContext) -> dict[str, Callable[[], object]]:
         denials["the snapshot cannot be written"] = lambda: os.open(entry, os.O_WRONLY)
     for path in jail.view.refused:
         denials[f"{path} cannot be written"] = partial(_make_unnamed, path)
-    if jail.plan.landlock or jail.common.namespaced:
+    if jail.common.landlock_abi or jail.common.namespaced:
         canary = jail.common.config.canary
         denials["files outside cannot be read"] = lambda: os.open(canary, os.O_RDONLY)
     if jail.common.landlock_abi >= 6 or jail.common.brokered:
@@ -93,10 +94,6 @@ def _denied(attempt: Callable[[], object]) -> bool:
     except OSError:
         return True
     return False
-
-
-def _open_descriptors() -> set[int]:
-    return {fd for fd in map(int, os.listdir("/proc/self/fd")) if _is_open(fd)}
 
 
 def _is_open(fd: int) -> bool:

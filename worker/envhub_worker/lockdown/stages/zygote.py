@@ -19,10 +19,10 @@ from functools import partial
 import envhub_worker
 from envhub_worker.lockdown import gpus, root_plan
 from envhub_worker.lockdown.context import Common, ZygoteConfig
+from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import landlock, mounts, namespaces, process, user
 from envhub_worker.lockdown.mechanisms.kernel import CLONE_NEWNS, unshare
 from envhub_worker.lockdown.plan import needs_broker
-from envhub_worker.lockdown.report import LayerUnavailableError
 from envhub_worker.lockdown.seccomp.filter import compile_filter
 from envhub_worker.lockdown.seccomp.policy import table, watched
 
@@ -35,6 +35,11 @@ def enter(config: ZygoteConfig) -> Common:
     Raises:
         LayerUnavailableError: The host lacks a layer that the profile names.
     """
+    # In this order: the root is planned while the host's files are still in sight. Under ``strict``
+    # the namespaces come next, with the change of user among them (see ``_enter_namespaces``);
+    # elsewhere that change alone, and only then can be tried what the new user may read. The
+    # skeleton of the packages is mounted before the first fork, so that all jails share it. The
+    # filters are compiled last, once, and installed by none but the runners: an init must mount.
     if config.refusal is not None:
         raise LayerUnavailableError(**config.refusal)
     namespaced = config.profile == "strict"
@@ -67,6 +72,9 @@ def enter(config: ZygoteConfig) -> Common:
         )
         for measured in (False, True)
     )
+    seen: frozenset[str] = frozenset()
+    if config.record:  # the same for both filters: memory makes no difference to files and signals
+        seen = watched(table(namespaced=namespaced, network=config.network, brokered=brokered))
     return Common(
         config=config,
         pid=0 if namespaced else os.getpid(),
@@ -78,36 +86,26 @@ def enter(config: ZygoteConfig) -> Common:
         landlock_abi=abi,
         brokered=brokered,
         asks=brokered or config.record,
-        watched=_watched(config, brokered=brokered) if config.record else frozenset(),
+        watched=seen,
         programs=programs,
     )
-
-
-def _watched(config: ZygoteConfig, *, brokered: bool) -> frozenset[str]:
-    """The same for both filters: what measures memory makes no difference to files and signals."""
-    namespaced = config.profile == "strict"
-    return watched(table(namespaced=namespaced, network=config.network, brokered=brokered))
 
 
 def _plan_root(config: ZygoteConfig) -> root_plan.RootPlan:
     host = root_plan.real_host()
     gpu = gpus.granted(config.gpu, host)
+    homes = []
+    with contextlib.suppress(KeyError):  # HOME is not ours to ask: our environment is built
+        homes = [pwd.getpwuid(os.getuid()).pw_dir]
     return root_plan.plan_root(
         interpreter_paths(),
         (*config.readable, *gpu.folders, *([config.packages] if config.packages else [])),
         config.roots,
-        private=[*_homes(), config.place],
+        private=[*homes, config.place],
         devices=gpu.devices,
         network=config.network,
         host=host,
     )
-
-
-def _homes() -> list[str]:
-    # HOME is not ours to ask: the zygote's environment is built.
-    with contextlib.suppress(KeyError):
-        return [pwd.getpwuid(os.getuid()).pw_dir]
-    return []
 
 
 def interpreter_paths() -> list[str]:
@@ -128,6 +126,11 @@ def _mapped_folders() -> Iterable[str]:
 def _enter_namespaces(config: ZygoteConfig, plan: root_plan.RootPlan) -> None:
     copied = [*plan.roots, *([config.packages] if config.packages else [])]
     enter_root = partial(mounts.enter_root, plan, config.place, copied, config.user)
+    # As root the private root is entered before the change of user, while folders like /root can
+    # still be crossed; that needs no user namespace. Then, or as a plain user first of all, comes
+    # the user namespace, which gives the right to the others. The fork makes us the first process
+    # of the new pid namespace; its /proc can be mounted only from inside, while the old one is in
+    # sight.
     try:
         if config.user is not None:
             unshare(CLONE_NEWNS)
@@ -140,7 +143,10 @@ def _enter_namespaces(config: ZygoteConfig, plan: root_plan.RootPlan) -> None:
         _be_the_first_process()
         mounts.mount_proc()
     except OSError as error:
-        raise _mounts_unavailable(error) from error
+        where = f"mounting at {error.filename}: " if error.filename else ""
+        cause = namespaces.user_namespace_unavailable(error)
+        why = LayerUnavailableError("mount-namespace", where + cause.reason, cause.fix)
+        raise why from error
 
 
 def _become(config: ZygoteConfig, at_parents_death: int) -> None:
@@ -162,7 +168,7 @@ def _check_interpreter() -> None:
 
 
 def _check_packages(folder: str) -> None:
-    """What lies deeper is told when it is imported: that it is there, and closed."""
+    """Of the top level; of what lies deeper the import says that it is there, and closed."""
     try:
         names = os.listdir(folder)
     except OSError as error:
@@ -192,9 +198,3 @@ def _be_the_first_process() -> None:
         os._exit(code if code >= 0 else 128 - code)
     # The parent lives outside, where its pid means nothing to us: 0 stands for it.
     process.die_with_parent(0, signal.SIGKILL)
-
-
-def _mounts_unavailable(error: OSError) -> LayerUnavailableError:
-    where = f"mounting at {error.filename}: " if error.filename else ""
-    cause = namespaces.user_namespace_unavailable(error)
-    return LayerUnavailableError("mount-namespace", where + cause.reason, cause.fix)

@@ -1,0 +1,63 @@
+"""What a server writes down for the commands of its machine, and who is believed."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from envhub_worker.cli import state_folder, status
+from envhub_worker.cli.state_folder import Note, ServerNote
+
+A = ServerNote("tcp://127.0.0.1:1", "insecure", "/a key")
+B = ServerNote("tcp://127.0.0.1:2", "insecure", "/b")
+
+_WRITER = """
+import os, signal, sys
+from pathlib import Path
+from envhub_worker.cli.state_folder import Note, ServerNote
+Note(Path(sys.argv[1]), ServerNote("tcp://127.0.0.1:1", "insecure", "/a"))
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_it_is_there_as_long_as_its_server(tmp_path: Path) -> None:
+    """And says what was written."""
+    assert state_folder.read_note(tmp_path) is None
+    ours = Note(tmp_path, A)
+    assert state_folder.read_note(tmp_path) == A
+    ours.remove()
+    assert state_folder.read_note(tmp_path) is None
+    assert os.listdir(tmp_path) == []
+
+
+def test_that_of_a_server_that_was_killed_is_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """``status`` says at once that nobody is there, ``health`` looks on, ``listen`` replaces it."""
+    tmp_path.chmod(0o700)
+    worker = Path(state_folder.__file__).parents[2]
+    environment = {**os.environ, "PYTHONPATH": str(worker)}
+    subprocess.run([sys.executable, "-c", _WRITER, str(tmp_path)], env=environment, timeout=120)
+    assert (tmp_path / "endpoint").exists()
+    assert state_folder.read_note(tmp_path) is None
+    assert status.is_healthy(tmp_path) is None
+    asked = argparse.Namespace(state_dir=tmp_path, endpoint=None, json=False)
+    assert status.run(asked) == 1
+    assert "is running here" in capsys.readouterr().err
+    ours = Note(tmp_path, B)
+    assert state_folder.read_note(tmp_path) == B
+    ours.remove()
+
+
+def test_a_server_removes_its_own(tmp_path: Path) -> None:
+    """Not that of another, which has replaced it."""
+    first, second = Note(tmp_path, A), Note(tmp_path, B)
+    first.remove()
+    assert state_folder.read_note(tmp_path) == B
+    second.remove()
+    assert state_folder.read_note(tmp_path) is None

@@ -1,0 +1,110 @@
+"""The BPF assembler, judged by an interpreter."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from envhub_worker.lockdown.seccomp.bpf import (
+    JUMP_EQUAL,
+    JUMP_GREATER,
+    LOAD,
+    RETURN,
+    Branch,
+    Do,
+    Instruction,
+    Label,
+    assemble,
+    listing,
+    to_bytes,
+)
+from tests.unit.worker.lockdown.seccomp.bpf_machine import run
+
+
+def test_branch_skips_to_its_labels() -> None:
+    """Offsets count the instructions between the branch and its target."""
+    program = assemble(
+        [
+            Do(LOAD, 0),
+            Branch(JUMP_EQUAL, 7, "seven", None),
+            Do(RETURN, 1),
+            Label("seven"),
+            Do(RETURN, 2),
+        ]
+    )
+    assert program == [
+        Instruction(LOAD, 0, 0, 0),
+        Instruction(JUMP_EQUAL, 1, 0, 7),
+        Instruction(RETURN, 0, 0, 1),
+        Instruction(RETURN, 0, 0, 2),
+    ]
+
+
+def test_bytes_are_the_kernels_structure() -> None:
+    """code u16, jt u8, jf u8, k u32, in this machine's order."""
+    assert to_bytes([Instruction(0x15, 1, 2, 0x04030201)]) == bytes([0x15, 0, 1, 2, 1, 2, 3, 4])
+
+
+def test_listing_names_absolute_targets() -> None:
+    """Golden files are read by people."""
+    program = [Instruction(LOAD, 0, 0, 4), Instruction(JUMP_GREATER, 0, 3, 9)]
+    assert listing(program) == "   0 load 0x4\n   1 greater 0x9 ? 2 : 5\n"
+
+
+@pytest.mark.parametrize("both", [True, False])
+def test_far_branch_becomes_a_pair_of_jumps(both: bool) -> None:
+    """Beyond 255 instructions the comparison selects an unconditional jump."""
+    padding = [Do(LOAD, 0)] * 300
+    program = assemble(
+        [
+            Do(LOAD, 0),
+            Branch(JUMP_EQUAL, 7, "far", "further" if both else None),
+            Do(RETURN, 1),
+            *padding,
+            Label("far"),
+            Do(RETURN, 2),
+            *padding,
+            Label("further"),
+            Do(RETURN, 3),
+        ]
+    )
+    assert all(one.if_true < 256 and one.if_false < 256 for one in program)
+    assert run(program, 0, 7) == 2
+    assert run(program, 0, 8) == (3 if both else 1)
+
+
+def test_label_behind_its_branch_is_refused() -> None:
+    """The kernel would refuse a backward jump; we say which."""
+    with pytest.raises(ValueError, match="'back' lies behind"):
+        assemble([Label("back"), Do(LOAD, 0), Branch(JUMP_EQUAL, 1, "back", None)])
+
+
+def test_missing_label_is_refused() -> None:
+    """A typo is no jump to nowhere."""
+    with pytest.raises(KeyError, match="nowhere"):
+        assemble([Branch(JUMP_EQUAL, 1, "nowhere", None), Do(RETURN, 0)])
+
+
+def test_overlong_program_is_refused() -> None:
+    """The kernel takes 4096 instructions."""
+    with pytest.raises(ValueError, match="4097"):
+        assemble([Do(LOAD, 0)] * 4097)
+
+
+@given(
+    targets=st.lists(st.integers(0, 40), min_size=1, max_size=60),
+    padding=st.integers(0, 40),
+    number=st.integers(0, 70),
+)
+def test_chain_of_comparisons_finds_its_label(
+    targets: list[int], padding: int, number: int
+) -> None:
+    """Whatever the distances, comparison n leads to the label that it names."""
+    items: list[object] = [Do(LOAD, 0)]
+    items += [Branch(JUMP_EQUAL, n, f"l{target}", None) for n, target in enumerate(targets)]
+    items.append(Do(RETURN, 999))
+    for label in range(41):
+        items += [Label(f"l{label}"), Do(RETURN, label), *[Do(LOAD, 0)] * padding]
+    program = assemble(items)  # type: ignore[arg-type]
+    assert run(program, 0, number) == (targets[number] if number < len(targets) else 999)

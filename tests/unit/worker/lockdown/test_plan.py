@@ -1,0 +1,218 @@
+"""From policy and host to layers, by exact output."""
+
+from __future__ import annotations
+
+import resource
+from dataclasses import replace
+
+import pytest
+
+from envhub_worker.lockdown.layers import LayerUnavailableError
+from envhub_worker.lockdown.mechanisms import landlock
+from envhub_worker.lockdown.mechanisms.landlock import Ruleset
+from envhub_worker.lockdown.mechanisms.namespaces import user_namespace_unavailable
+from envhub_worker.lockdown.plan import HostFacts, plan
+from envhub_worker.lockdown.stages.runner import resource_limits
+from envhub_worker.protocol.confinement import GIB, MIB, Confinement, Limits
+
+USER = HostFacts(machine="x86_64", root=False, landlock_abi=7, memory="watchdog")
+STRICT = Confinement(limits=Limits(memory_bytes=GIB, disk_bytes=64 * MIB, disk_files=10))
+
+
+def layers(confinement: Confinement, facts: HostFacts) -> list[tuple[str, bool, str]]:
+    """The plan as tuples."""
+    made = plan(confinement, facts)
+    return [(layer.layer, layer.enforced, layer.detail) for layer in made]
+
+
+def test_strict_as_a_user_has_every_layer() -> None:
+    """In the order in which they are entered."""
+    assert layers(STRICT, USER) == [
+        ("user-namespace", True, "one user, and no capability over any other"),
+        ("pid-namespace", True, "sees, signals and outlives no process but its own"),
+        ("mount-namespace", True, "a private read-only root; other files do not exist"),
+        ("scratch", True, "one tmpfs of 64 MiB and 10 files"),
+        ("network-namespace", True, "no device that is up"),
+        ("ipc-namespace", True, "its own System V and POSIX objects"),
+        ("uts-namespace", True, "a host name that says nothing"),
+        ("cgroup-namespace", True, "does not see where it is counted"),
+        ("capabilities", True, "none in any set"),
+        ("no-new-privileges", True, "set-user-id programs gain nothing"),
+        ("landlock", True, "ABI 7: files, TCP, signals and abstract sockets"),
+        ("seccomp", True, "allow-list for x86_64"),
+        ("rlimits", True, "512 processes, 1024 open files, no core dumps"),
+        (
+            "memory",
+            True,
+            "1024 MiB, measured by the jail's init; bursts between two looks overshoot; "
+            "not counted: file locks, epoll watches",
+        ),
+        (
+            "user-quotas",
+            False,
+            "shared with this user's programs: pages of pipes, descriptors under way in sockets, "
+            "epoll watches",
+        ),
+    ]
+
+
+def test_root_becomes_somebody_else_first() -> None:
+    """The first layer as root; memory by control group where there is one."""
+    made = layers(STRICT, replace(USER, root=True, memory="cgroup-v1"))
+    assert made[0] == ("unprivileged-user", True, "a user id that owns and runs nothing")
+    assert made[-2:] == [
+        ("memory", True, "1024 MiB, counted by the kernel (cgroup v1); not counted: file locks"),
+        ("user-quotas", True, "its own: no other program runs as this user"),
+    ]
+
+
+def test_memory_that_nobody_counts_is_named() -> None:
+    """It depends on who counts, and on what else there is."""
+    for profile, network, names in (
+        ("strict", "host", "file locks, epoll watches, buffers of network connections"),
+        ("no-userns", "none", "file locks, epoll watches, sockets that wait in sockets"),
+    ):
+        made = layers(replace(STRICT, profile=profile, network=network), USER)
+        [detail] = [detail for layer, _, detail in made if layer == "memory"]
+        assert detail.endswith(f"not counted: {names}")
+
+
+def test_weaker_profile_lists_what_it_goes_without() -> None:
+    """What is not enforced is said, with what stays possible."""
+    made = layers(replace(STRICT, profile="no-userns"), USER)
+    why = "the profile no-userns goes without"
+    assert made[:3] == [
+        ("pid-namespace", False, f"{why}: processes of the host are visible"),
+        ("mount-namespace", False, f"{why}: names and sizes of the host's files are visible"),
+        ("network", True, "no socket can be made but connected local pairs"),
+    ]
+    assert made[-1] == ("scratch", True, "64 MiB, measured by the jail's init")
+
+
+@pytest.mark.parametrize("gpu", [True, (0,)])
+def test_what_a_gpu_keeps_from_being_counted_is_told(gpu: bool | tuple[int, ...]) -> None:
+    """Its driver's memory, whoever counts; what it shares, where init does."""
+    for memory, more in (("cgroup-v2", ""), ("watchdog", ", epoll watches, memfds and shared")):
+        made = layers(replace(STRICT, gpu=gpu), replace(USER, memory=memory))
+        [detail] = [detail for layer, _, detail in made if layer == "memory"]
+        assert f"; not counted: file locks, memory of the GPU's driver{more}" in detail
+
+
+def test_network_is_reported_as_chosen() -> None:
+    """The host's network is a layer that is not enforced."""
+    for network, enforced, detail in (
+        ("loopback", True, "only a loopback device"),
+        ("host", False, "the host's network, by explicit choice"),
+    ):
+        made = layers(replace(STRICT, network=network), USER)
+        assert ("network-namespace", enforced, detail) in made
+
+
+@pytest.mark.parametrize(
+    ("confinement", "facts", "layer"),
+    [
+        (STRICT, replace(USER, landlock_abi=0), "landlock"),
+        (replace(STRICT, profile="no-userns"), replace(USER, landlock_abi=2), "landlock"),
+        (replace(STRICT, profile="no-userns", network="loopback"), USER, "network-namespace"),
+        (replace(STRICT, profile="container", network="loopback"), USER, "network-namespace"),
+        (STRICT, replace(USER, machine="riscv64"), "seccomp"),
+        (replace(STRICT, profile="lax"), USER, "profile"),
+        (replace(STRICT, network="lan"), USER, "network"),
+    ],
+)
+def test_missing_layer_is_an_error_with_a_fix(
+    confinement: Confinement, facts: HostFacts, layer: str
+) -> None:
+    """Nothing degrades silently."""
+    with pytest.raises(LayerUnavailableError) as raised:
+        plan(confinement, facts)
+    assert raised.value.layer == layer
+    assert raised.value.reason
+    assert raised.value.fix
+
+
+def test_signals_are_a_layer_where_init_must_send_them() -> None:
+    """Before Landlock ABI 6 and without a pid namespace."""
+    bare = replace(STRICT, profile="no-userns")
+    signals = ("signals", True, "sent by the jail's init, to processes of the jail only")
+    assert signals in layers(bare, replace(USER, landlock_abi=4))
+    assert signals not in layers(bare, replace(USER, landlock_abi=6))
+    assert signals not in layers(STRICT, replace(USER, landlock_abi=4))
+
+
+def test_container_without_landlock_says_so() -> None:
+    """Its own outer layers hold; this one is reported as missing."""
+    container = replace(STRICT, profile="container")
+    assert ("landlock", False, "this kernel or container has none") in layers(
+        container, replace(USER, landlock_abi=0)
+    )
+
+
+@pytest.mark.parametrize(
+    ("abi", "network", "wanted"),
+    [
+        (1, "none", Ruleset(2**13 - 1, 0, 0)),
+        (2, "none", Ruleset(2**14 - 1, 0, 0)),
+        (3, "none", Ruleset(2**15 - 1, 0, 0)),
+        (4, "none", Ruleset(2**15 - 1, 3, 0)),
+        (5, "none", Ruleset(2**16 - 1, 3, 0)),
+        (6, "none", Ruleset(2**16 - 1, 3, 3)),
+        (9, "none", Ruleset(2**16 - 1, 3, 3)),
+        (7, "loopback", Ruleset(2**16 - 1, 0, 3)),
+        (7, "host", Ruleset(2**16 - 1, 0, 3)),
+    ],
+)
+def test_landlock_asks_for_what_the_abi_knows(abi: int, network: str, wanted: Ruleset) -> None:
+    """An unknown bit would be EINVAL; a newer kernel than we know gets all we know."""
+    assert landlock.ruleset(abi, network) == wanted
+
+
+def test_landlock_write_includes_neither_devices_nor_more_than_abi_one_to_five() -> None:
+    """Scratch takes files, folders, links, fifos and sockets; never a device node."""
+    assert landlock.WRITE & (landlock.MAKE_CHAR | landlock.MAKE_BLOCK | landlock.IOCTL_DEV) == 0
+    assert landlock.WRITE < 2**16
+    assert landlock.READ == landlock.EXECUTE | landlock.READ_FILE | landlock.READ_DIR
+
+
+def test_rlimits_follow_the_limits() -> None:
+    """Exactly these; a file may not be larger than the disk."""
+    limits = Limits(open_files=9, disk_bytes=77, cpu_s=5)
+    assert resource_limits(limits, 12) == {
+        resource.RLIMIT_CORE: (0, 0),
+        resource.RLIMIT_FSIZE: (77, 77),
+        resource.RLIMIT_NOFILE: (9, 9),
+        resource.RLIMIT_MEMLOCK: (65536, 65536),
+        resource.RLIMIT_MSGQUEUE: (0, 0),
+        resource.RLIMIT_NICE: (0, 0),
+        resource.RLIMIT_RTPRIO: (0, 0),
+        resource.RLIMIT_SIGPENDING: (512, 512),
+        resource.RLIMIT_NPROC: (12, 12),
+        resource.RLIMIT_CPU: (5, 6),
+    }
+
+
+@pytest.mark.parametrize(
+    ("files", "reason", "fix"),
+    [
+        ({"/proc/sys/user/max_user_namespaces": "0"}, "is 0", "user.max_user_namespaces=15000"),
+        (
+            {"/proc/sys/kernel/unprivileged_userns_clone": "0"},
+            "unprivileged_userns_clone is 0",
+            "sudo sysctl kernel.unprivileged_userns_clone=1",
+        ),
+        (
+            {"/proc/sys/kernel/apparmor_restrict_unprivileged_userns": "1"},
+            "AppArmor",
+            "sudo sysctl kernel.apparmor_restrict_unprivileged_userns=0",
+        ),
+        ({"/.dockerenv": ""}, "container's seccomp profile", 'profile "container"'),
+        ({}, "EPERM", "administrator"),
+    ],
+)
+def test_refused_user_namespace_is_explained(files: dict[str, str], reason: str, fix: str) -> None:
+    """The fix is for this host; the weaker profile is always named."""
+    error = user_namespace_unavailable(PermissionError(1, "no"), files.get)
+    assert error.layer == "user-namespace"
+    assert reason in error.reason
+    assert fix in error.fix
+    assert 'by its name: profile "no-userns"' in error.fix

@@ -1,0 +1,353 @@
+"""The server's side of zygote, inits and runners, against real processes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from envhub_worker import bootstrap
+from envhub_worker.lockdown.mechanisms.procfs import descendants
+from envhub_worker.protocol.confinement import LACKS_PACKAGES, Confinement, Limits
+from envhub_worker.protocol.runtime import Runtime
+from envhub_worker.spawn.spawner import Spawner, ZygoteDied
+from envhub_worker.spawn.zygote_process import ZygoteProcess
+from tests.integration.confinement_kit import (
+    Cell,
+    JailExited,
+    RunnerExited,
+    RunnerStarted,
+    cell_in,
+    make_snapshot,
+    new_cell,
+    open_folder,
+    spawner_in,
+    wait_until,
+)
+from tests.support import inside
+from tests.support.interpreter import profiles
+from tests.support.processes import eventually
+
+
+@pytest.fixture(params=profiles("strict", "no-userns"))
+def confinement(request: pytest.FixtureRequest) -> Confinement:
+    """Both structures: with a pid namespace that ends everything, and without."""
+    return Confinement(profile=request.param, environment={"GRANTED": "yes"})
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """A folder that a jail's user may cross."""
+    with open_folder() as folder:
+        yield folder
+
+
+@pytest.fixture
+def cell(folder: Path, confinement: Confinement) -> Iterator[Cell]:
+    """A jail with one runner."""
+    with cell_in(folder, confinement) as cell:
+        yield cell
+
+
+def processes_that_mention(text: str) -> list[int]:
+    """Pids of other processes with ``text`` in their command line."""
+    found = []
+    for name in os.listdir("/proc"):
+        if name.isdigit() and int(name) != os.getpid():
+            try:
+                command = Path(f"/proc/{name}/cmdline").read_bytes()
+            except OSError:
+                continue
+            if text.encode() in command:
+                found.append(int(name))
+    return found
+
+
+def test_runner_runs_code_and_is_announced_with_its_layers(cell: Cell) -> None:
+    """RunnerStarted with a report, and the stream reaches the runner."""
+    assert cell.run("result = 6 * 7") == {"result": 42}
+    started = cell.wait_for(RunnerStarted)
+    assert started.runner == 1
+    assert {"no-new-privileges", "rlimits"} <= {layer["layer"] for layer in started.report}
+    assert all(layer["enforced"] in (True, False) for layer in started.report)
+
+
+def test_runner_sees_only_the_built_environment(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing of the server's environment arrives; what is granted does."""
+    names = cell.run("import os; result = sorted(os.environ)")["result"]
+    assert "GRANTED" in names
+    assert "PYTEST_CURRENT_TEST" not in names
+    raw = cell.run("result = open('/proc/self/environ').read()")["result"]
+    assert "PYTEST_CURRENT_TEST" not in raw
+
+
+def test_runner_holds_only_the_named_descriptors(folder: Path, confinement: Confinement) -> None:
+    """Standard streams, its stream and what was passed through; stdin is empty."""
+    source = "import os, sys; result = [len(os.listdir('/proc/self/fd')), sys.stdin.read()]"
+    read, write = os.pipe()
+    with spawner_in(folder, confinement) as spawner:
+        cell = new_cell(spawner, make_snapshot(folder), confinement)
+        cell.start((write,))
+        # 0, 1, 2, the stream, the passed pipe, and the listing's own descriptor.
+        assert cell.run(source) == {"result": [6, ""]}
+        assert cell.run(
+            "import os, sys; k = sys._getframe(1).f_globals; result = os.write(k['FDS'][0], b'x')"
+        ) == {"result": 1}
+        assert os.read(read, 10) == b"x"
+    os.close(read)
+    os.close(write)
+
+
+def test_runner_has_private_home_and_shows_the_snapshot(cell: Cell) -> None:
+    """HOME, TMPDIR and the working directory are the jail's own; the snapshot shows through."""
+    source = """
+import os, tempfile
+open('new.txt', 'w').write('x')
+home = os.path.expanduser('~')
+open(home + '/.config-file', 'w').write('x')
+result = [os.listdir(home), tempfile.gettempdir() == os.environ['TMPDIR'],
+          open('assets/a.txt').read(), open('env.py').read()]
+"""
+    result = cell.run(source)["result"]
+    assert result == [[".config-file"], True, "asset", "VALUE = 7\n"]
+    assert not (Path(cell.jail.spec.snapshot) / "new.txt").exists()
+
+
+def test_runners_draw_different_random_numbers(cell: Cell) -> None:
+    """A fork copies the generators' state: each runner is reseeded."""
+    second = cell.start()
+    source = "import random, numpy; result = [random.random(), float(numpy.random.rand())]"
+    first_draw, second_draw = cell.run(source), cell.run(source, second)
+    assert first_draw["result"][0] != second_draw["result"][0]
+    assert first_draw["result"][1] != second_draw["result"][1]
+
+
+def test_output_of_all_runners_arrives(cell: Cell) -> None:
+    """Python's and C's output, stdout and stderr, of children too."""
+    cell.run("import os, sys; os.write(1, b'one\\n'); os.write(2, b'two\\n'); print('three')")
+    cell.run("import subprocess; subprocess.run(['/bin/echo', 'four'])")
+    cell.hang_up()  # flushes what Python still buffers
+    for text in (b"one", b"two", b"three", b"four"):
+        cell.wait_for_output(text)
+
+
+@pytest.mark.parametrize(
+    ("ends", "how"),
+    [
+        ("os._exit(7)", (7, None, "exit")),
+        ("os.kill(os.getpid(), 11)", (None, signal.SIGSEGV, "signal")),
+    ],
+)
+def test_how_a_runner_ended_is_reported(cell: Cell, ends: str, how: tuple[Any, ...]) -> None:
+    """With its code; a crash is a signal, not a code."""
+    cell.run(f"import os; {ends}")
+    exited = cell.wait_for(RunnerExited)
+    assert (exited.code, exited.signal, exited.reason) == how
+
+
+def test_killed_runner_takes_its_children_along(cell: Cell, folder: Path) -> None:
+    """kill_runner ends the runner and a child in a session of its own; others go on."""
+    second = cell.start()
+    mark = str(folder / "mark")
+    child = f"['/bin/sh', '-c', 'sleep 1000; : {mark}']"
+    cell.run(f"import subprocess; subprocess.Popen({child}, start_new_session=True)")
+    wait_until(lambda: processes_that_mention(mark), "the child never came")
+    cell.jail.kill_runner(1)
+    exited = cell.wait_for(RunnerExited)
+    assert (exited.runner, exited.reason) == (1, "killed")
+    wait_until(lambda: not processes_that_mention(mark), "the child lived on")
+    assert cell.run("result = 1", second) == {"result": 1}
+
+
+DAEMON = """
+import os, time
+if os.fork() == 0:
+    os.setsid()
+    if os.fork() == 0:
+        os.execv('/bin/sh', ['/bin/sh', '-c', 'sleep 1000; : {mark}'])
+    os._exit(0)
+"""
+
+
+def test_killed_jail_leaves_no_daemon(cell: Cell, folder: Path) -> None:
+    """A double-forked daemon in its own session dies with its jail, and its files go."""
+    mark = str(folder / "mark")
+    cell.run(DAEMON.format(mark=mark))
+    wait_until(lambda: processes_that_mention(mark), "the daemon never came")
+    cell.jail.kill()
+    cell.jail.kill()
+    cell.wait_for(JailExited)
+    wait_until(lambda: not processes_that_mention(mark), "the daemon lived on")
+
+
+def test_last_runner_takes_daemons_along(cell: Cell, folder: Path) -> None:
+    """When no runner is left, nothing else of the jail runs on."""
+    mark = str(folder / "mark")
+    cell.run(DAEMON.format(mark=mark))
+    wait_until(lambda: processes_that_mention(mark), "the daemon never came")
+    cell.hang_up()
+    cell.wait_for(RunnerExited)
+    wait_until(lambda: not processes_that_mention(mark), "the daemon lived on")
+
+
+def test_jail_can_start_runners_after_its_last_one_ended(cell: Cell) -> None:
+    """A new runner in the same jail replaces one that died."""
+    cell.run("import os; os._exit(1)")
+    cell.wait_for(RunnerExited)
+    second = cell.start()
+    assert cell.run("result = 'again'", second) == {"result": "again"}
+
+
+def test_close_leaves_no_process_and_no_file(folder: Path, confinement: Confinement) -> None:
+    """After close, no process mentions the runtime folder and nothing is left in it."""
+    runtime = folder / "runtime"
+    runtime.mkdir()
+    with spawner_in(runtime, confinement, readable_roots=[str(folder)]) as spawner:
+        cell = new_cell(spawner, make_snapshot(folder), confinement)
+        cell.start()
+        assert cell.run("result = 1") == {"result": 1}
+        zygote = inside.zygote_pid(spawner)
+    assert not os.path.exists(f"/proc/{zygote}")
+    assert list(runtime.iterdir()) == []
+
+
+def test_a_process_that_started_ahead_is_used(folder: Path, confinement: Confinement) -> None:
+    """It becomes the zygote, and what it has imported serves a jail that is as confined."""
+    ahead = ZygoteProcess.ahead(folder)
+    with spawner_in(folder, confinement, ahead=ahead) as spawner:
+        cell = new_cell(spawner, make_snapshot(folder), confinement)
+        cell.start()
+        assert cell.run("import sys; result = 'gymnasium' in sys.modules") == {"result": True}
+        assert inside.zygote_pid(spawner) == ahead.pid
+        layers = {
+            layer["layer"] for layer in cell.wait_for(RunnerStarted).report if layer["enforced"]
+        }
+        assert {"self-test", "seccomp"} <= layers
+    assert not os.path.exists(f"/proc/{ahead.pid}")
+
+
+def test_a_process_of_another_interpreter_is_not(folder: Path, confinement: Confinement) -> None:
+    """It ends at once, and leaves nothing."""
+    ahead = ZygoteProcess.ahead(folder)
+    other = folder / "python"
+    other.symlink_to(sys.executable)
+    spawner = Spawner(
+        confinement, runtime_dir=folder, readable_roots=[], runtime=Runtime(str(other)), ahead=ahead
+    )
+    assert inside.zygote_pid(spawner) != ahead.pid
+    assert not os.path.exists(f"/proc/{ahead.pid}")
+    assert not ahead.folder.exists()
+    spawner.close()
+
+
+def test_a_process_that_nobody_uses_ends_with_its_server(folder: Path) -> None:
+    """However soon that is, and also if it cannot say so."""
+    for ending in (signal.SIGTERM, signal.SIGKILL):
+        runtime = folder / ending.name
+        serve = ["serve", "--endpoint", f"ipc://{folder}/{ending.name}.sock", "--ahead"]
+        command = bootstrap.command(sys.executable, "worker", *serve, "--runtime-dir", str(runtime))
+        ready, tells = os.pipe()
+        server = subprocess.Popen([*command, "--ready-fd", str(tells)], pass_fds=[tells])
+        os.close(tells)
+        assert os.read(ready, 16)
+        os.close(ready)
+        [zygote] = psutil.Process(server.pid).children()
+        server.send_signal(ending)
+        server.wait(60)
+        assert eventually(lambda: not zygote.is_running())  # noqa: B023 - asked at once
+        assert runtime.exists() == (ending is signal.SIGKILL)
+
+
+def test_dead_zygote_is_told_with_its_log(folder: Path, confinement: Confinement) -> None:
+    """An interpreter without numpy ends the zygote; the log says why."""
+    bare = folder / "bare"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(bare)], check=True)
+    spawner = Spawner(
+        confinement,
+        runtime_dir=folder,
+        readable_roots=[],
+        runtime=Runtime(str(bare / "bin/python")),
+    )
+    seen: list[Any] = []
+    wait_until(lambda: bool(seen.extend(spawner.poll()) or seen), "it lives")
+    [died] = seen
+    assert isinstance(died, ZygoteDied)
+    assert "ModuleNotFoundError" in died.log
+    assert "pip install cloudpickle gymnasium msgpack numpy pyzmq" in died.log
+    assert "Traceback" not in died.log
+    assert died.code == LACKS_PACKAGES
+    spawner.close()
+
+
+SERVER = """
+import sys, time
+sys.path.insert(0, {kit!r})
+from pathlib import Path
+from typing import Any
+from confinement_kit import *
+from envhub_worker.protocol.confinement import Confinement
+confinement = Confinement(profile={profile!r})
+with spawner_in(Path({folder!r}), confinement) as spawner:
+    cell = new_cell(spawner, make_snapshot(Path({folder!r})), confinement)
+    cell.start()
+    cell.run({daemon!r})
+    print("up", flush=True)
+    time.sleep(1000)
+"""
+
+
+def test_killed_server_leaves_no_process(folder: Path, confinement: Confinement) -> None:
+    """SIGKILL of the server ends zygote, init, runner and a daemon of the jail."""
+    mark = str(folder / "mark")
+    kit = str(Path(__file__).parents[3] / "integration")
+    daemon = DAEMON.format(mark=mark)
+    profile = confinement.profile
+    source = SERVER.format(kit=kit, folder=str(folder), profile=profile, daemon=daemon)
+    server = subprocess.Popen([sys.executable, "-c", source], stdout=subprocess.PIPE)
+    assert server.stdout is not None
+    assert server.stdout.readline() == b"up\n"
+    below = descendants(server.pid)
+    assert len(below) >= 3
+    # the server mentions it too
+    wait_until(lambda: {*processes_that_mention(mark)} - {server.pid}, "the daemon never came")
+    server.kill()
+    server.wait()
+    server.stdout.close()
+    wait_until(lambda: not any(map(alive, below)), "a process lived on")
+    wait_until(lambda: not processes_that_mention(mark), "the daemon lived on")
+
+
+def alive(pid: int) -> bool:
+    """Whether the process exists and is no zombie."""
+    try:
+        return ") Z " not in Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return False
+
+
+def test_cpu_limit_is_told(folder: Path, confinement: Confinement) -> None:
+    """A runner that burns its CPU seconds ends with the reason cpu-limit."""
+    confinement = replace(confinement, limits=Limits(cpu_s=1))
+    with cell_in(folder, confinement) as cell:
+        cell.run("while True: pass")
+        assert cell.wait_for(RunnerExited).reason == "cpu-limit"
+
+
+def test_requests_wait_for_the_zygote(folder: Path, confinement: Confinement) -> None:
+    """Many jails asked for before the zygote is up all come."""
+    with spawner_in(folder, confinement) as spawner:
+        snapshot = make_snapshot(folder)
+        cells = [new_cell(spawner, snapshot, confinement) for _ in range(5)]
+        for cell in cells:
+            cell.start()
+        assert [cell.run("result = 1") for cell in cells] == [{"result": 1}] * 5

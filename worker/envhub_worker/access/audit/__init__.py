@@ -1,0 +1,1 @@
+"""What an operator reads: lines of a log, and figures."""

@@ -1,0 +1,176 @@
+"""A server's figures: its operator sees all of them, a client what concerns it.
+
+Plain values, made on the server's own thread and never changed afterwards, so that another may read
+them. Clients go by name, and what is counted by a word of theirs has a fixed list of words.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+import shutil
+import time
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from envhub_worker import __version__
+from envhub_worker.access.audit.usage import Usage
+from envhub_worker.access.quotas import Permissions, Quotas
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.text import printable
+from envhub_worker.supervisor.records import JailEntry
+
+MAX_CLIENTS = 256
+"""Names that are kept apart; what comes after them is one."""
+OTHERS = "(others)"
+OPERATIONS = ("make_env", "reset", "step", "call", "get_attr", "set_attr", "render", "close")
+"""What requests are counted by; a client may call its own anything."""
+REFUSALS = (
+    *("sessions", "jails", "runners", "memory", "inflight", "draining", "packages"),
+    *("PolicyError", "SandboxUnavailableError", "SnapshotIntegrityError", "VersionMismatchError"),
+    *("LocalProtocolError", "WorkerError", "WorkerDiedError", "HelloError"),
+)
+"""Quotas first, then names of errors."""
+_OTHER = "other"
+_NAME_CHARS = 64
+
+
+@dataclass
+class Tally:
+    """What has happened since the start."""
+
+    refusals: Counter[str] = field(default_factory=Counter)
+    requests: dict[str, Counter[str]] = field(default_factory=dict)
+    opened: Counter[str] = field(default_factory=Counter)
+
+    def refused(self, error: str, quota: str) -> None:
+        """A request was not carried out; ``quota`` where that was for want of room."""
+        word = quota if quota in REFUSALS else error
+        self.refusals[word if word in REFUSALS else _OTHER] += 1
+
+    def asked(self, client: str, operation: str) -> None:
+        """A client has asked something of its runners."""
+        word = operation if operation in OPERATIONS else _OTHER
+        self.requests.setdefault(self._known(client), Counter())[word] += 1
+
+    def open(self, client: str) -> None:
+        """A client's jail has come up."""
+        self.opened[self._known(client)] += 1
+
+    def _known(self, client: str) -> str:
+        many = len(self.requests.keys() | self.opened.keys()) >= MAX_CLIENTS
+        return OTHERS if many and client not in (*self.requests, *self.opened) else client
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServerFigures:
+    """What does not change while a server runs.
+
+    Attributes:
+        state: A path on the disk that keys and snapshots lie on.
+    """
+
+    profile: str
+    permissions: Permissions
+    quotas: Quotas
+    state: str
+    max_connections: int
+    started: float = field(default_factory=time.time)
+
+    def for_clients(self) -> dict[str, Any]:
+        """What a client may know."""
+        permitted = self.permissions
+        return {
+            "version": __version__,
+            "protocol": m.VERSION,
+            "python": platform.python_version(),
+            "profile": self.profile,
+            "weakest_profile": permitted.weakest_profile,
+            "network": permitted.network,
+            "gpu": permitted.gpu,
+            "dependencies": permitted.dependencies,
+            "quotas": asdict(self.quotas),
+        }
+
+    def for_operators(self) -> dict[str, Any]:
+        """What is the operator's own business."""
+        try:
+            disk = shutil.disk_usage(self.state)
+            size, free = disk.total, disk.free
+        except OSError:
+            size = free = 0
+        return {
+            "pid": os.getpid(),
+            "pid_namespace": pid_namespace(),
+            "started": self.started,
+            "max_connections": self.max_connections,
+            "disk": {"size_bytes": size, "free_bytes": free},
+        }
+
+
+def pid_namespace() -> str:
+    """Where our process numbers hold; empty if the kernel does not say."""
+    with contextlib.suppress(OSError):
+        return os.readlink("/proc/self/ns/pid")
+    return ""
+
+
+@dataclass
+class Client:
+    """One client's share, of all its keys that have this name."""
+
+    sessions: int = 0
+    jails: int = 0
+    runners: int = 0
+    memory_limit_bytes: int = 0
+    memory_bytes: int = 0
+    cpu_s: float = 0.0
+    upload_bytes: int = 0
+    inflight_bytes: int = 0
+    opened: int = 0
+    requests: dict[str, int] = field(default_factory=dict)
+
+    def add_jail(self, entry: JailEntry) -> None:
+        """Count an open jail."""
+        self.jails += 1
+        self.runners += len(entry.links)
+        self.memory_limit_bytes += entry.jail.spec.confinement.limits.memory_bytes
+
+
+class ClientFigures:
+    """The shares of all clients, by name, and of no more names than can be counted."""
+
+    def __init__(self) -> None:
+        self.shares: dict[str, Client] = {}
+
+    def of(self, name: str) -> Client:
+        """A client's share."""
+        if name not in self.shares and len(self.shares) >= MAX_CLIENTS:
+            name = OTHERS
+        return self.shares.setdefault(name, Client())
+
+    def add_past(self, tally: Tally, usage: Usage) -> None:
+        """What they have done, those that have gone included."""
+        for name, requests in tally.requests.items():
+            self.of(name).requests = dict(requests)
+        for name, opened in tally.opened.items():
+            self.of(name).opened = opened
+        for name, spent in usage.cpu_s.items():
+            self.of(name).cpu_s += spent
+        for name, memory in usage.memory_bytes.items():
+            self.of(name).memory_bytes += memory
+
+    def plain(self, name: str | None = None) -> Mapping[str, Any]:
+        """As plain values: of everybody, or of one."""
+        chosen = self.shares if name is None else {name: self.of(name)}
+        return {one: asdict(share) for one, share in chosen.items()}
+
+
+def client_name(name: str | None, insecure: bool) -> str:
+    """What a key's owner is called in figures; the list that names it is the operator's."""
+    if name is None:
+        return "anybody" if insecure else "operator"
+    return printable(" ".join(name[:_NAME_CHARS].split()))

@@ -1,1 +1,0 @@
-"""What an operator is told: lines of a log, and figures."""

@@ -1,0 +1,164 @@
+"""The options of ``listen``."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from envhub_worker.access.audit.log import FORMS, LEVELS
+from envhub_worker.access.packages import MAKE_S
+from envhub_worker.access.port.connection_limit import MAX_CONNECTIONS
+from envhub_worker.access.quotas import Quotas
+from envhub_worker.lockdown.mechanisms import landlock
+from envhub_worker.protocol.confinement import PROFILES
+from envhub_worker.protocol.text import parse_size, size_text
+
+DEFAULT_BIND = "tcp://127.0.0.1:5555"
+_IDLE_S = 120
+_CONTAINER_MARKS = ("/.dockerenv", "/run/.containerenv")
+# field of Quotas: the option's names, what it counts, and the unit of a bare number of bytes
+_QUOTAS: dict[str, tuple[tuple[str, ...], str, str]] = {
+    "jails": (("--max-jails",), "open jails", ""),
+    "runners": (("--max-runners", "--max-hosts"), "processes of environments", ""),
+    "sessions": (("--max-sessions",), "client processes", ""),
+    "upload_files": (("--max-upload-files",), "files of a snapshot", ""),
+    "memory_bytes": (("--max-memory",), "memory limits of jails", "GiB"),
+    "upload_bytes": (("--max-upload",), "snapshots", "MiB"),
+    "packages_bytes": (("--max-packages",), "installed packages", "MiB"),
+    "inflight_bytes": (("--max-inflight",), "unanswered requests", "MiB"),
+}
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of ``listen``."""
+    parser.add_argument(
+        "--max-connections",
+        type=_count,
+        default=MAX_CONNECTIONS,
+        help=f"of everybody together, strangers included (default: {MAX_CONNECTIONS})",
+    )
+    parser.add_argument(
+        "--bind",
+        default=DEFAULT_BIND,
+        metavar="tcp://HOST:PORT",
+        help=f"where to listen (default: {DEFAULT_BIND})",
+    )
+    parser.add_argument("--key", type=Path, help="the server's secret key (see keygen)")
+    parser.add_argument(
+        "--authorized-clients",
+        type=Path,
+        metavar="FILE",
+        help="clients' public keys, one a line; without it one is made and printed",
+    )
+    parser.add_argument("--insecure-loopback", action="store_true", help="no keys; loopback only")
+    parser.add_argument("--state-dir", type=Path, help="keys and snapshots; private, writable")
+    parser.add_argument(
+        "--idle-s",
+        type=_seconds,
+        default=_IDLE_S,
+        help=f"end jails of clients that are silent for so long; 0: never (default: {_IDLE_S})",
+    )
+    parser.add_argument(
+        "--metrics",
+        metavar="[ADDRESS:]PORT",
+        help="answer GET /metrics, /healthz and /readyz there, over plain HTTP and without keys; "
+        "on 127.0.0.1, unless another address is given",
+    )
+    parser.add_argument(
+        "--drain-s",
+        type=_seconds,
+        default=0,
+        help="after SIGTERM let nothing new in, and give open jails so long; a second SIGTERM ends "
+        "at once (default: 0, the first one does)",
+    )
+    parser.add_argument(
+        "--weakest-profile",
+        choices=PROFILES,
+        default=_weakest_profile(),
+        help="that a policy may ask for (default here: %(default)s)",
+    )
+    parser.add_argument("--allow-network", action="store_true", help="permit network='host'")
+    parser.add_argument("--allow-gpu", action="store_true", help="permit gpu=True")
+    parser.add_argument(
+        "--dependencies",
+        action="store_true",
+        help="install the packages that repositories declare; needs envhub-sandbox beside this",
+    )
+    parser.add_argument(
+        "--packages-s",
+        type=_count,
+        default=int(MAKE_S),
+        metavar="SECONDS",
+        help=f"for so long an order of them may be at work (default: {MAKE_S:.0f})",
+    )
+    parser.add_argument(
+        "--log-format",
+        choices=tuple(FORMS),
+        default="text",
+        help="of the log, which goes to stderr, a line an event (default: text)",
+    )
+    parser.add_argument(
+        "--log-level",
+        choices=LEVELS,
+        default="info",
+        help="what is less important is left out (default: info)",
+    )
+    _add_quotas(parser)
+
+
+def _add_quotas(parser: argparse.ArgumentParser) -> None:
+    for field, (names, what, unit) in _QUOTAS.items():
+        default: int = getattr(Quotas(), field)
+        shown, more = str(default), ""
+        how: dict[str, Any] = {"type": _count}
+        if unit:
+            shown, more = size_text(default), f", as in 16G; in {unit} without a unit"
+            how = {"type": partial(_size, unit), "metavar": "SIZE"}
+        text = f"of one key: {what}{more} (default: {shown})"
+        parser.add_argument(*names, default=default, help=text, **how)
+
+
+def quotas_of(arguments: argparse.Namespace) -> Quotas:
+    """The quotas that were chosen."""
+    option = {
+        field: names[0].lstrip("-").replace("-", "_") for field, (names, *_) in _QUOTAS.items()
+    }
+    return Quotas(**{field: getattr(arguments, name) for field, name in option.items()})
+
+
+def _count(text: str) -> int:
+    return _at_least(1, text)
+
+
+def _size(unit: str, text: str) -> int:
+    try:
+        size = parse_size(text, unit[0].lower())
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{error}, and {text!r} is none") from None
+    if size < 1:
+        raise argparse.ArgumentTypeError(f"takes a size above 0, not {text!r}")
+    return size
+
+
+def _seconds(text: str) -> int:
+    return _at_least(0, text)
+
+
+def _at_least(least: int, text: str) -> int:
+    with contextlib.suppress(ValueError):
+        if int(text) >= least:
+            return int(text)
+    raise argparse.ArgumentTypeError(f"takes a whole number, {least} or more, not {text!r}")
+
+
+def _weakest_profile() -> str:
+    """In a container the container is the outer layer, and the others are often not to be had.
+
+    But a jail of that profile is our user: without Landlock it would read our keys and all stores.
+    """
+    contained = any(map(os.path.exists, _CONTAINER_MARKS)) and landlock.version() >= 1
+    return "container" if contained else "strict"

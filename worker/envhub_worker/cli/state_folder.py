@@ -1,0 +1,129 @@
+"""The folder with a ``listen``'s keys and snapshots, and its note for the commands of its machine.
+
+The note is locked for as long as the server lives: one that is ended by SIGKILL leaves the file
+behind, but the kernel takes the lock back.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import stat
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from envhub_worker.lockdown.mechanisms.locked_folder import LockedFolder
+
+_NAME = "endpoint"
+
+
+@contextlib.contextmanager
+def state_folder(chosen: Path | None) -> Iterator[Path]:
+    """The state folder; one that cannot be found again is removed."""
+    folder = state_dir(chosen, create=True)
+    if folder is not None:
+        yield folder
+        return
+    made = LockedFolder("envhub-state-")
+    try:
+        yield made.path
+    finally:
+        made.remove()
+
+
+def state_dir(chosen: Path | None, *, create: bool) -> Path | None:
+    """Where keys and snapshots lie: the same for ``listen``, ``health`` and ``status``.
+
+    ``chosen``, or ``envhub-worker`` in the user's state folder, or a folder of the temporary one
+    where that cannot be written (a read-only container); None if not even that can be had.
+
+    Raises:
+        OSError: ``chosen`` cannot be had.
+    """
+    if chosen is not None:
+        if create:
+            _make_private(chosen)
+        return chosen.absolute()  # jails are made elsewhere, and get the path of their snapshot
+    home = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
+    temporary = Path(tempfile.gettempdir()) / f"envhub-worker-{os.getuid()}"
+    for candidate in (Path(home) / "envhub-worker", temporary):
+        with contextlib.suppress(OSError):
+            if create:
+                _make_private(candidate)
+            if _is_ours(candidate):
+                return candidate
+    return None
+
+
+def _make_private(folder: Path) -> None:
+    # Root's jails run as another user, who must get through to the snapshots, and no further.
+    folder.mkdir(mode=0o711 if os.getuid() == 0 else 0o700, parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(f"{folder} cannot be written")
+    found = folder.stat()
+    if found.st_uid != os.getuid() or found.st_mode & 0o022:
+        raise PermissionError(
+            f"the state folder {folder} holds keys, and others can change what is in it: it "
+            f"belongs to uid {found.st_uid} and has mode {stat.S_IMODE(found.st_mode):04o}. Give "
+            f"it to uid {os.getuid()} and chmod go-w it, or let --state-dir name a new one"
+        )
+
+
+def _is_ours(folder: Path) -> bool:
+    """Whether no other user can have put it there: the temporary folder is for all.
+
+    One that we own and cannot write is a read-only container's, and no server's.
+    """
+    found = folder.lstat()
+    ours = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid()
+    return ours and not found.st_mode & 0o022 and os.access(folder, os.W_OK)
+
+
+class ServerNote(NamedTuple):
+    """Where a server listens, its public key as text or ``insecure``, its secret key's file."""
+
+    endpoint: str
+    public: str
+    key_file: str
+
+
+class Note:
+    """A server's own note. Another server on the same state folder replaces it."""
+
+    def __init__(self, state: Path, noted: ServerNote) -> None:
+        self._path = state / _NAME
+        new = state / f".{_NAME}-{os.getpid()}"
+        self._file = os.open(new, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        with contextlib.suppress(OSError):  # not every file system has locks: see ``read_note``
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.write(self._file, f"{' '.join(noted)}\n".encode())
+        os.rename(new, self._path)  # whole and locked, or not there
+
+    def remove(self) -> None:
+        """Remove it, unless it is another server's by now."""
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(self._path.stat(), os.fstat(self._file)):
+                self._path.unlink()
+        os.close(self._file)
+
+
+def read_note(state: Path) -> ServerNote | None:
+    """What the server that runs on a state folder has written down; None if there is none.
+
+    Raises:
+        OSError: It may not be read.
+        ValueError: Something else lies there.
+    """
+    try:
+        file = os.open(state / _NAME, os.O_RDONLY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return None
+    with open(file, encoding="utf-8") as note:
+        # refused while its writer lives, and where the file system has no locks
+        with contextlib.suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            return None
+        return ServerNote(*note.read().rstrip("\n").split(" ", 2))

@@ -1,0 +1,91 @@
+"""Why a file could not be read or written: closed to this process, or not there at all.
+
+The import system calls both missing; and what a jail shares with others it only reads.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+import sys
+
+_REFUSALS = (errno.EACCES, errno.EPERM, errno.EROFS)
+
+
+def why_hidden(module: str) -> str:
+    """Why a module that was not found may be there all the same; empty if nothing hides it.
+
+    Args:
+        module: Its dotted name, as in ``ModuleNotFoundError.name``.
+    """
+    parent, _, last = module.rpartition(".")
+    package = sys.modules.get(parent) if parent else None
+    folders = sys.path if package is None else getattr(package, "__path__", ())
+    steps = module.split(".") if package is None else [last]
+    for folder in folders:
+        depths = range(len(steps) + 1)
+        places = [os.path.join(str(folder) or ".", *steps[:depth]) for depth in depths]
+        for place in (*places, *(f"{place}.py" for place in places[1:])):
+            closed = _closed(place)
+            if closed:
+                return closed
+    return ""
+
+
+def _closed(path: str) -> str:
+    """What keeps this process from reading a path, with its owner and mode; empty for nothing."""
+    try:
+        status = os.stat(path)
+    except PermissionError:
+        above = os.path.dirname(path)
+        return _closed(above) or f"{path} may not be read by uid {os.geteuid()}"
+    except OSError:
+        return ""
+    wanted = os.R_OK | os.X_OK if stat.S_ISDIR(status.st_mode) else os.R_OK
+    if os.access(path, wanted):
+        return ""
+    return (
+        f"{path} may not be read by uid {os.geteuid()}: it belongs to uid {status.st_uid} and has "
+        f"mode {stat.S_IMODE(status.st_mode):04o}. What is missing may be installed there; if all "
+        f"users may read it: chmod -R a+rX {path}"
+    )
+
+
+def why_unwritable(error: BaseException, root: str) -> str:
+    """A sentence for an error whose file lies among what a jail shares; empty for any other."""
+    name = getattr(error, "filename", None)
+    if not isinstance(error, OSError) or error.errno not in _REFUSALS or type(name) is not str:
+        return ""
+    path = os.path.abspath(name)
+    place = _place(path, root)
+    if not place or os.access(path, os.W_OK):
+        return ""
+    if os.path.exists(path) and not _is_read_only(path):
+        return (
+            f"{path} is shared and has mode {os.stat(path).st_mode & 0o777:04o}. os.replace() puts "
+            "another file there, and os.chmod(path, 0o644) makes it this jail's own"
+        )
+    return (
+        f"{path} lies in {place}, which this jail only reads. Write to tempfile.mkdtemp(), or use "
+        'the profile "strict" on Linux 5.11 or later, where a jail writes to a copy of the '
+        "repository and of the packages of its own (dependencies=); `envhub doctor` says what this "
+        "host lacks"
+    )
+
+
+def _place(path: str, root: str) -> str:
+    if root and _within(path, root):
+        return "the repository"
+    return "the packages" if any(_within(path, folder) for folder in sys.path if folder) else ""
+
+
+def _within(path: str, folder: str) -> bool:
+    return path.startswith(os.path.abspath(folder).rstrip(os.sep) + os.sep)
+
+
+def _is_read_only(path: str) -> bool:
+    """Whether nothing in the file's folder can be made or removed."""
+    folder = os.path.dirname(path)
+    read_only = os.statvfs(folder).f_flag & os.ST_RDONLY
+    return bool(read_only) or not os.access(folder, os.W_OK | os.X_OK)

@@ -1,0 +1,48 @@
+"""How lockdown speaks of its layers: what holds, and what this host cannot give."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from envhub_worker.protocol.records import dataclass
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One layer that was enforced or deliberately was not."""
+
+    layer: str
+    enforced: bool
+    detail: str
+
+    def to_wire(self) -> dict[str, Any]:
+        """Plain data: ``{"layer", "enforced", "detail"}``."""
+        return asdict(self)
+
+
+class LayerUnavailableError(Exception):
+    """A layer that the profile names cannot be had on this host. Nothing may run.
+
+    Attributes:
+        fix: What the user can do, by exact command where there is one.
+    """
+
+    def __init__(self, layer: str, reason: str, fix: str) -> None:
+        super().__init__(f"{layer}: {reason}. {fix}")
+        self.layer = layer
+        self.reason = reason
+        self.fix = fix
+
+    def to_wire(self) -> dict[str, str]:
+        """Plain data: ``{"layer", "reason", "fix"}``."""
+        return {"layer": self.layer, "reason": self.reason, "fix": self.fix}
+
+
+def no_system_calls(machine: str) -> LayerUnavailableError:
+    """There is no table of system calls for ``machine``."""
+    return LayerUnavailableError(
+        "seccomp",
+        f"no system call table for {machine}",
+        "Run on x86-64 or aarch64, or in a container on such a host.",
+    )

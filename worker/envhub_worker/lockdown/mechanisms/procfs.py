@@ -1,0 +1,96 @@
+"""What the kernel says of processes: the one place that reads ``/proc/PID``."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Collection, Mapping, Sequence
+
+Children = Mapping[int, Sequence[int]]
+"""The children of every process that has some."""
+
+
+def pids() -> list[int]:
+    """Every process of this pid namespace."""
+    return [int(name) for name in os.listdir("/proc") if name.isdigit()]
+
+
+def stat(pid: int) -> list[bytes]:
+    """The words of ``/proc/PID/stat`` (proc(5)) from the state on; raises OSError."""
+    with open(f"/proc/{pid}/stat", "rb") as file:
+        # The command may hold anything, parentheses and blanks included.
+        return file.read().rpartition(b")")[2].split()
+
+
+def content(path: str) -> bytes:
+    """A file of ``/proc``; empty when its process has gone."""
+    try:
+        with open(path, "rb") as file:
+            return file.read()
+    except (FileNotFoundError, ProcessLookupError):
+        return b""
+
+
+def numbers(path: str) -> dict[bytes, int]:
+    """The lines ``Name:   123 kB`` (then in bytes) and ``Name:   123``."""
+    found: dict[bytes, int] = {}
+    for line in content(path).splitlines():
+        words = line.split()
+        if len(words) > 1 and words[1].isdigit():
+            found[words[0][:-1]] = int(words[1]) * (1024 if words[-1] == b"kB" else 1)
+    return found
+
+
+def process_of(thread: int) -> int:
+    """The pid of the process that ``thread`` belongs to; 0 when it has gone."""
+    with contextlib.suppress(OSError):
+        return numbers(f"/proc/{thread}/status").get(b"Tgid", 0)
+    return 0
+
+
+def descriptors(pid: int) -> int:
+    """How many files a process has open; 0 where it has gone, or may not be looked at."""
+    with contextlib.suppress(OSError):
+        return len(os.listdir(f"/proc/{pid}/fd"))
+    return 0
+
+
+def all_children() -> Children:
+    """The children of each process on this machine; takes some 0.1 ms a process."""
+    children: dict[int, list[int]] = {}
+    for pid in pids():
+        with contextlib.suppress(OSError):
+            children.setdefault(_parent(pid), []).append(pid)
+    return children
+
+
+def descendants(
+    root: int, keep: Collection[int] = (), children: Children | None = None
+) -> list[int]:
+    """Pids below ``root``, without those in ``keep`` and what is below them.
+
+    Args:
+        children: What ``all_children`` gave a moment ago; looked up by default.
+    """
+    children = all_children() if children is None else children
+    found: list[int] = []
+    pending = [root]
+    while pending:
+        below = [pid for pid in children.get(pending.pop(), ()) if pid not in keep]
+        found += below
+        pending += below
+    return found
+
+
+def is_below(pid: int, root: int) -> bool:
+    """Whether ``root`` is above ``pid``; also True of one that goes meanwhile."""
+    try:
+        while pid > 1 and pid != root:
+            pid = _parent(pid)
+    except OSError:
+        return True
+    return pid == root
+
+
+def _parent(pid: int) -> int:
+    return int(stat(pid)[1])

@@ -1,0 +1,157 @@
+"""Stand-ins for Gymnasium's vector classes while a repository's ``make_env`` runs.
+
+``SyncVectorEnv(...)`` and ``AsyncVectorEnv(...)`` then only write down their arguments. The runner
+builds the sub-environments that it needs and drives them itself, so a suite of many tasks costs
+nothing before it is used. The object is a real instance of its class: a look into it (by a
+wrapper, the repository itself) makes it build itself after all, and it is driven as it is.
+
+Its end is no look: what was never built has nothing to close. Gymnasium's ``__del__`` asks for
+attributes, and would build all processes of every task that was not used, only to end them.
+
+Followed: ``gymnasium.vector.SyncVectorEnv.__init__`` and ``AsyncVectorEnv.__init__`` (0.26 to 1.4).
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
+
+from envhub_worker.protocol.records import dataclass
+from envhub_worker.runner import gymnasium_compat as compat
+
+_KEY = "_envhub_recording"
+_ANSWERED = frozenset({"unwrapped", "spec", "closed", "close", "num_envs"})
+# arguments that change what the class does in ways the worker's own loop does not follow
+_FOREIGN_ARGUMENTS = frozenset({"worker", "observation_space", "action_space"})
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The arguments of a vector environment that has not been built.
+
+    Attributes:
+        autoreset_mode: ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``.
+        arguments: All arguments, for building it after all.
+    """
+
+    env_fns: list[Callable[[], gym.Env[Any, Any]]]
+    sync: bool
+    autoreset_mode: str
+    arguments: dict[str, Any]
+
+
+def recording(env: object) -> Recording | None:
+    """The recording of a vector environment that was neither looked into nor closed, else None."""
+    own = object.__getattribute__(env, "__dict__") if type(env) in _LAZY.values() else {}
+    found = None if own.get("closed") else own.get(_KEY)
+    return found if isinstance(found, Recording) else None
+
+
+@contextmanager
+def standing_in() -> Iterator[None]:
+    """While it lasts, the two classes record instead of building."""
+    for cls, recorder in _RECORDERS.items():
+        cls.__init__ = recorder
+    try:
+        yield
+    finally:
+        for cls, real in _REAL_INIT.items():
+            cls.__init__ = real
+
+
+def _recorder(cls: type[VectorEnv[Any, Any, Any]], lazy: type) -> Callable[..., None]:
+    real = _REAL_INIT[cls]
+    signature = inspect.signature(real)
+
+    def __init__(self: Any, *args: Any, **kwargs: Any) -> None:
+        made = _record(cls, signature, self, args, kwargs) if type(self) is cls else None
+        if made is None:
+            real(self, *args, **kwargs)
+            return
+        self.__dict__[_KEY] = made
+        self.__dict__["num_envs"] = len(made.env_fns)
+        self.__class__ = lazy
+
+    return __init__
+
+
+def _record(
+    cls: type, signature: inspect.Signature, self: Any, args: Any, kwargs: Any
+) -> Recording | None:
+    try:
+        bound = signature.bind(self, *args, **kwargs)
+    except TypeError:
+        return None  # the real __init__ says it better
+    arguments = dict(bound.arguments)
+    arguments.pop("self", None)
+    if any(arguments.get(name) is not None for name in _FOREIGN_ARGUMENTS):
+        return None
+    if arguments.get("observation_mode", "same") != "same":
+        return (
+            None  # the sub-environments' spaces differ, and only all of them make the batched one
+        )
+    env_fns = arguments["env_fns"] = list(arguments["env_fns"])
+    return Recording(
+        env_fns=env_fns,
+        sync=cls is SyncVectorEnv,
+        autoreset_mode=compat.mode_named(arguments.get("autoreset_mode", compat.DEFAULT_MODE)),
+        arguments=arguments,
+    )
+
+
+def _build_after_all(env: Any, cls: type) -> None:
+    kept = dict(object.__getattribute__(env, "__dict__"))
+    made, closed = kept.pop(_KEY), kept.pop("closed", False)
+    env.__class__ = cls
+    del env.__dict__[_KEY]
+    env.__dict__.pop("closed", None)
+    _REAL_INIT[cls](env, **made.arguments)
+    env.__dict__.update(kept)
+    if closed:  # and looked into only then
+        env.close()
+
+
+def _lazy_class(cls: type[VectorEnv[Any, Any, Any]]) -> type:
+    def __getattribute__(self: Any, name: str) -> Any:
+        own = object.__getattribute__(self, "__dict__")
+        # what Python itself asks for, by names of its own, is no look either
+        if not name.startswith("__") and name not in _ANSWERED and name not in own:
+            _build_after_all(self, cls)
+            return getattr(self, name)
+        return object.__getattribute__(self, name)
+
+    def __reduce_ex__(self: Any, protocol: Any) -> Any:
+        made: Recording = self.__dict__[_KEY]
+        return partial(cls, **made.arguments), ()  # a copy is the same call once more
+
+    body: dict[str, Any] = {
+        "__getattribute__": __getattribute__,
+        "__reduce_ex__": __reduce_ex__,
+        "__del__": _end,
+        "close": _close,
+        "__doc__": cls.__doc__,
+        "__module__": __name__,
+    }
+    return type(cls.__name__, (cls,), body)
+
+
+def _end(self: Any) -> None:
+    """Nothing of it was ever started."""
+
+
+def _close(self: Any, **kwargs: Any) -> None:
+    """As Gymnasium's ``close``, of what has nothing to close."""
+    self.__dict__["closed"] = True
+
+
+_CLASSES: tuple[Any, ...] = (SyncVectorEnv, AsyncVectorEnv)
+_LAZY: dict[Any, type] = {cls: _lazy_class(cls) for cls in _CLASSES}
+_REAL_INIT: dict[Any, Callable[..., None]] = {cls: cls.__init__ for cls in _LAZY}
+# here, where a zygote makes them once: what a signature is takes its time
+_RECORDERS = {cls: _recorder(cls, lazy) for cls, lazy in _LAZY.items()}

@@ -1,0 +1,236 @@
+"""The server's handle on one jail, and the events that it gives."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from envhub_worker.lockdown.limits.cgroups import Group
+from envhub_worker.lockdown.mechanisms import process
+from envhub_worker.lockdown.mechanisms.scratch import Scratch, remove_tree
+from envhub_worker.lockdown.spec import JailSpec
+from envhub_worker.protocol.confinement import Reason
+from envhub_worker.protocol.records import dataclass
+from envhub_worker.spawn.channel import Channel, close_fds
+
+
+@dataclass(frozen=True)
+class JailFailed:
+    """A layer that the profile names cannot be had here; the jail ends, nothing has run."""
+
+    layer: str
+    reason: str
+    fix: str
+
+
+@dataclass(frozen=True)
+class RunnerStarted:
+    """A runner is confined, has tested its denials, and now enters ``runner.main``.
+
+    Attributes:
+        pid: Its pid as this process sees it; 0 or less when it has already ended.
+        report: Every layer that holds for it, the jail's own first.
+    """
+
+    runner: int
+    pid: int
+    report: list[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class RunnerExited:
+    """A runner has ended, with an exit code or by a signal.
+
+    Attributes:
+        detail: The numbers, where a limit was the reason.
+    """
+
+    runner: int
+    code: int | None
+    signal: int | None
+    reason: Reason
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class CallDenied:
+    """Something in the jail tried a system call that the policy denies, for the first time.
+
+    Attributes:
+        call: Its name; of what is asked of a file also "read" or "write".
+        detail: What is known of its arguments: a family of sockets, a path, or nothing.
+    """
+
+    call: str
+    detail: str
+
+
+JailEvent = JailFailed | RunnerStarted | RunnerExited | CallDenied
+# by the names that ``jail_init`` gives them; the other fields of its messages are theirs
+_EVENTS: dict[str, type[JailFailed | RunnerExited | CallDenied]] = {
+    "failed": JailFailed,
+    "runner_exited": RunnerExited,
+    "denied": CallDenied,
+}
+
+
+class Jail:
+    """One jail: its init's control channel and its output. Made by ``Spawner.spawn``.
+
+    After ``JailExited``, ``poll`` once more for its last events and close ``output``.
+
+    Attributes:
+        output: Read end of the pipe that holds the jail's stdout and stderr; non-blocking.
+        theirs: The other ends, for init; ``Spawner`` closes them.
+        pidfd: Of the jail's init; -1 before it is known and after it has gone.
+    """
+
+    def __init__(self, spec: JailSpec, folder: Path | None, owner: int | None) -> None:
+        self.spec = spec
+        self.pidfd = -1
+        self.output, output = os.pipe2(os.O_CLOEXEC)
+        os.set_blocking(self.output, False)
+        self._folder = folder
+        self._group: Group | None = None
+        self._count = 0
+        self._runner_pidfds: dict[int, int] = {}
+        self._killed = False
+        self._report: list[dict[str, Any]] = []
+        self._channel, control = Channel.pair()
+        self.theirs = (control.detach(), output)
+        if folder is not None:
+            Scratch.on_host(str(folder)).create(spec.snapshot, owner)
+
+    def describe(self, group: Group | None) -> None:
+        """Send init its specification, on the channel that only the two of us hold."""
+        self._group = group
+        message = {
+            "spec": self.spec.to_wire(),
+            "scratch": str(self._folder),
+            "cgroup": group and group.kind,
+        }
+        fds = group.open() if group else []
+        self._channel.send(message, fds)
+        close_fds(fds)
+
+    def give_up(self) -> None:
+        """Undo the making of a jail that no zygote was asked for."""
+        os.close(self.output)
+        close_fds(self.theirs)
+        self._channel.close()
+        self.release()
+
+    def attach(self, pidfd: int) -> None:
+        """The zygote has forked the jail's init."""
+        self.pidfd = pidfd
+        if self._killed:
+            self._signal_init()
+
+    @property
+    def pid(self) -> int:
+        """The number of the jail's init, as seen from here; below 1 before and after its life."""
+        try:
+            return process.pid_of(self.pidfd)
+        except OSError:
+            return -1
+
+    def runner_pids(self) -> list[int]:
+        """The numbers of its runners that live, as seen from here."""
+        pids = map(process.pid_of, self._runner_pidfds.values())
+        return [pid for pid in pids if pid > 0]
+
+    def refused_processes(self) -> bool:
+        """Whether its control group, if it has one, has refused it any."""
+        return self._group is not None and self._group.refused()
+
+    def runner_pidfd(self, runner: int) -> int:
+        """A pidfd of a runner, or -1 before it has started and after it has gone."""
+        return self._runner_pidfds.get(runner, -1)
+
+    def fileno(self) -> int:
+        """Readable when ``poll`` has something to say; -1 once the jail has gone."""
+        return self._channel.fileno()
+
+    def poll(self) -> list[JailEvent]:
+        """What has happened in the jail since the last call."""
+        if self._channel.fileno() < 0:
+            return []
+        self._channel.flush()
+        messages, ended = self._channel.drain()
+        events = [event for message, fds in messages for event in self._translate(message, fds)]
+        if ended:
+            self._channel.close()
+            self._close_pidfds(list(self._runner_pidfds))
+        return events
+
+    def _translate(self, message: dict[str, Any], fds: list[int]) -> list[JailEvent]:
+        kind = message.pop("event")
+        if kind == "ready":
+            self._report = message["report"]
+            return []
+        if kind == "runner_started":
+            runner, report = message["runner"], self._report + message["report"]
+            self._runner_pidfds[runner] = fds[0]
+            return [RunnerStarted(runner, process.pid_of(fds[0]), report)]
+        if kind == "runner_exited":
+            self._close_pidfds([message["runner"]])
+        return [_EVENTS[kind](**message)]
+
+    def _close_pidfds(self, runners: Sequence[int]) -> None:
+        known = self._runner_pidfds
+        close_fds([known.pop(runner) for runner in runners if runner in known])
+
+    def start_runner(self, fds: Sequence[int] = ()) -> tuple[int, socket.socket]:
+        """Ask for a runner in this jail; it starts once the jail is ready.
+
+        Args:
+            fds: Passed through to ``runner.main``; they stay the caller's.
+
+        Returns:
+            The runner's id and the server's end of its stream (``AF_UNIX``, ``SOCK_STREAM``).
+            When the jail or the runner dies, the stream ends.
+        """
+        self._count += 1
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        with theirs:
+            message = {"op": "start", "runner": self._count}
+            if self._channel.fileno() >= 0:
+                self._channel.send(message, [theirs.fileno(), *fds])
+        return self._count, ours
+
+    def kill_runner(self, runner: int) -> None:
+        """End a runner and what it started. ``RunnerExited`` follows."""
+        if self._channel.fileno() >= 0:
+            self._channel.send({"op": "kill", "runner": runner})
+
+    def kill(self) -> None:
+        """End every process of the jail for certain. ``JailExited`` follows. Idempotent."""
+        self._killed = True
+        self._channel.close()
+        self._signal_init()
+
+    def _signal_init(self) -> None:
+        if self.pidfd >= 0:
+            # Without a pid namespace, init must itself end what it started.
+            signum = signal.SIGTERM if self._folder else signal.SIGKILL
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(self.pidfd, signum)
+
+    def release(self) -> None:
+        """Everything in the jail is dead: give back its files and the handle on its init.
+
+        ``output`` and the events not yet polled stay the caller's to read to their end.
+        """
+        if self.pidfd >= 0:
+            os.close(self.pidfd)
+            self.pidfd = -1
+        self._close_pidfds(list(self._runner_pidfds))
+        if self._group is not None:
+            self._group.remove()
+        if self._folder is not None:
+            remove_tree(str(self._folder))
