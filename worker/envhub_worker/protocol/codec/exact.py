@@ -8,17 +8,14 @@ limits, all of it is pickled. Only from client to worker: nothing that comes bac
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from envhub_worker.protocol.codec.arrays import MAX_DIMENSIONS
+from envhub_worker.protocol.codec.encoder import Pickled, Pickler
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
 from envhub_worker.protocol.limits import WireLimits
-
-Data = bytes | memoryview
-Pickler = Callable[[object], Data]
 
 _DEPTH = 16
 """Containers in containers; a message's own count towards the wire's limit, too."""
@@ -31,13 +28,6 @@ _SCALARS = frozenset(np.dtype(char).type for char in "?bBhHiIlLqQefdFDmM")
 _ARRAYS = frozenset("?bBhHiIlLqQefdFDmMS")
 """Characters of dtypes whose bytes are all there is to them."""
 _MAX_UNIT_COUNT = 2**24 - 1
-
-
-@dataclass(frozen=True, slots=True)
-class Pickled:
-    """A value that travels pickled. A ``memoryview`` becomes a frame of its own."""
-
-    data: Data
 
 
 def handed_over(value: object, pickler: Pickler, limits: WireLimits) -> object:
