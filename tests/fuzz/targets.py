@@ -34,8 +34,8 @@ from envhub_worker.protocol.codec.codec import decode, encode
 from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.manifest.manifest import decode_env, decode_manifest
-from envhub_worker.protocol.messages import warned
 from envhub_worker.protocol.messages.compression import pack_frames, unpack_frames
+from envhub_worker.protocol.messages.prefix import MAX_TEXT
 from envhub_worker.protocol.shared_memory import columns
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import OpaqueSpace, encode_space
@@ -401,7 +401,7 @@ def warnings(dice: Dice) -> None:
     demand(len(heard.unshown) <= MOST + 1, "a flood")
     for one in heard.unshown:
         demand(tuple(map(type, one)) == (str, str), "no text")
-        demand(max(map(len, one)) <= warned.MAX_TEXT, "a giant")
+        demand(max(map(len, one)) <= MAX_TEXT, "a giant")
 
 
 def spoiled_message(dice: Dice, message: m.Message) -> m.Message:

@@ -47,7 +47,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.lifecycle import Lifecycle, State
 from envhub_worker.protocol.manifest.manifest import EnvManifest
-from envhub_worker.protocol.messages import packing, warned
+from envhub_worker.protocol.messages import packing, prefix
 from envhub_worker.spawn.spawner import Spawner
 
 Spot = tuple[Any, str]
@@ -260,7 +260,7 @@ DECODING: Spot = (packing, "_decode")
 """What makes a message of a document that has no form yet."""
 FORMS: tuple[Spot, Spot] = ((packing, "_OUTGOING"), (packing, "_INCOMING"))
 """What is remembered of the shape of messages, each way."""
-CHECK_OF_WARNINGS: Spot = (warned, "_checked")
+CHECK_OF_WARNINGS: Spot = (prefix.WARNINGS, "_check")
 """What looks at each warning of a worker's."""
 IDLE_CONTAINERS: Spot = (sandbox, "_IDLE")
 """Where a container is that nobody uses."""
