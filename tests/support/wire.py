@@ -13,6 +13,7 @@ from envhub_sandbox.transport.lane import RelayLane, Request
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
+from envhub_worker.protocol.spaces.reader import Space, SpaceReader
 
 
 def message(document: bytes, tail: bytes = b"", *frames: bytes) -> list[Buffer]:
@@ -23,6 +24,11 @@ def message(document: bytes, tail: bytes = b"", *frames: bytes) -> list[Buffer]:
 def value(document: bytes) -> list[Buffer]:
     """A ``Value``, the answer to a call, around a hand-made msgpack document."""
     return message(b"\x92" + msgpack.packb(m.Value.kind) + document)
+
+
+def decode_space(value: object, *, max_elements: int) -> Space:
+    """The space that ``encode_space`` described."""
+    return SpaceReader(max_elements).space(value)
 
 
 def ext(code: int, payload: bytes = b"") -> msgpack.ExtType:

@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from envhub_worker.protocol.spaces.opaque import OneOf
+from envhub_worker.protocol.spaces.opaque import ARRAY_SPACES, OneOf
 
 Space = gym.Space[Any]
 States = list[Any]
@@ -27,7 +27,6 @@ _BIT_GENERATORS = (
     np.random.Philox,
     np.random.SFC64,
 )
-_ARRAYS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 
 def nodes(space: Space) -> Iterator[Space]:
@@ -76,7 +75,9 @@ def _children(space: Space) -> tuple[Space, ...]:
 
 def _may_be_batched(space: Space) -> bool:
     """Whether the generators of its batch are seeded only if it is."""
-    return isinstance(space, (*_ARRAYS, spaces.Dict, spaces.Tuple)) or _state(space) is not None
+    return (
+        isinstance(space, (*ARRAY_SPACES, spaces.Dict, spaces.Tuple)) or _state(space) is not None
+    )
 
 
 def _state(space: Space) -> Any:
