@@ -50,7 +50,8 @@ class _Head:
 class Decoder:
     """Rebuilds one value; msgpack calls its hooks in the order of the document.
 
-    The arguments are those of ``codec.decode``, and the parts those of ``frames.split``.
+    The arguments are those of ``codec.decode``, with the parts of ``frames.split``; ``arrays``
+    stands in for the ``ArrayReader`` of these.
     """
 
     __slots__ = (
@@ -67,10 +68,11 @@ class Decoder:
         tensors: TensorMaker | None,
         things: ThingReader | None = None,
         copy: bool = True,
+        arrays: Any = None,
     ) -> None:
         self._tail, self._buffers, self.limits, self._copy = tail, buffers, limits, copy
         self.unpickler, self.tensors, self.things = unpickler, tensors, things
-        self._arrays: ArrayReader | None = None
+        self._arrays: ArrayReader | None = arrays
         self._make: Callable[[int, object], object] | None = None
         self._heads = self._hashed_keys = 0
 
@@ -197,7 +199,7 @@ def _is_hashable(key: object) -> bool:
 
 
 def _read_scalar(decoder: Decoder, payload: bytes) -> object:
-    from envhub_worker.protocol.codec.arrays import read_scalar
+    from envhub_worker.protocol.codec.numpy_forms import read_scalar
 
     return read_scalar(payload)
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from envhub_worker.protocol.codec.arrays import MAX_DIMENSIONS
+from envhub_worker.protocol.codec.arrays import MAX_DIMENSIONS, MAX_UNIT_COUNT
 from envhub_worker.protocol.codec.encoder import Pickled, Pickler
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
 from envhub_worker.protocol.limits import WireLimits
@@ -27,7 +27,6 @@ _ATOMS = frozenset({type(None), bool, float, complex})
 _SCALARS = frozenset(np.dtype(char).type for char in "?bBhHiIlLqQefdFDmM")
 _ARRAYS = frozenset("?bBhHiIlLqQefdFDmMS")
 """Characters of dtypes whose bytes are all there is to them."""
-_MAX_UNIT_COUNT = 2**24 - 1
 
 
 def handed_over(value: object, pickler: Pickler, limits: WireLimits) -> object:
@@ -113,7 +112,7 @@ class _Judge:
 
 
 def _is_unit(dtype: np.dtype[Any]) -> bool:
-    return dtype.kind not in "mM" or np.datetime_data(dtype)[1] <= _MAX_UNIT_COUNT
+    return dtype.kind not in "mM" or np.datetime_data(dtype)[1] <= MAX_UNIT_COUNT
 
 
 def _always(judge: _Judge, value: Any, depth: int) -> bool:

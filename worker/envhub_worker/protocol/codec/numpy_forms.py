@@ -11,7 +11,15 @@ import msgpack  # type: ignore[import-untyped]
 import numpy as np
 
 from envhub_worker.protocol.codec import kinds
-from envhub_worker.protocol.codec.arrays import Array, pack_shape, unpack_shape, write_scalar
+from envhub_worker.protocol.codec.arrays import (
+    Array,
+    check_content,
+    describe_dtype,
+    native,
+    pack_shape,
+    read_dtype,
+    unpack_shape,
+)
 from envhub_worker.protocol.errors import RemoteProtocolError
 
 Encoder = Any
@@ -26,7 +34,9 @@ def _write_array(encoder: Encoder, array: Array) -> object:
 
 
 def _write_scalar(encoder: Encoder, scalar: np.generic) -> object:
-    return msgpack.ExtType(kinds.SCALAR, write_scalar(scalar))
+    """Dtype code, parameter, value."""
+    array = native(np.asarray(scalar))
+    return msgpack.ExtType(kinds.SCALAR, describe_dtype(array.dtype) + array.tobytes())
 
 
 def _write_text_scalar(encoder: Encoder, value: np.str_ | np.bytes_) -> object:
@@ -70,6 +80,24 @@ WRITERS: dict[type, Callable[[Encoder, Any], object]] = {
     **{np.dtype(char).type: _write_scalar for char in "?bBhHiIlLqQefdFDmM"},
 }
 """By the exact type."""
+
+
+def read_scalar(data: bytes) -> np.generic:
+    """A numpy scalar. Trust: input from the worker.
+
+    Raises:
+        RemoteProtocolError: It is none.
+    """
+    if not data:
+        raise RemoteProtocolError("A numpy scalar is empty.")
+    dtype, offset = read_dtype(data[0], data, 1)
+    if len(data) != offset + dtype.itemsize:
+        raise RemoteProtocolError("A numpy scalar has a wrong number of bytes.")
+    flat = np.frombuffer(data, dtype, 1, offset)
+    if dtype.kind in "bUM":
+        check_content(flat)
+    scalar: np.generic = flat[0]
+    return scalar
 
 
 def _build_objects(payload: bytes, items: list[Any], tensors: Tensors) -> object:
