@@ -15,17 +15,14 @@ from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Frames, RelayLane, Request
-from envhub_sandbox.transport.pace import Pace
+from envhub_sandbox.transport.pace import Pace, PaceMeter
 from envhub_sandbox.transport.replies import typed
 from envhub_sandbox.transport.results import Results, StepResult
-from envhub_sandbox.transport.shared_memory.affinity import CPUS, Cores
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
 from envhub_sandbox.transport.shared_memory.doorbell import sleep_for
 from envhub_sandbox.transport.shared_memory.observations import RING, ObservationSlab
-from envhub_sandbox.transport.shared_memory.pacing import Pacing
 from envhub_sandbox.transport.shared_memory.shard import LaneShard, Outcome
-from envhub_sandbox.transport.shared_memory.sharding import awake_shards
-from envhub_sandbox.transport.shared_memory.sizes import step_bytes
+from envhub_sandbox.transport.shared_memory.sharding import CPUS, Cores, awake_shards
 from envhub_sandbox.transport.shared_memory.spin import SpinChooser
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
@@ -90,7 +87,7 @@ class SharedMemoryLane:
         self._owed = _BY_SERVER
         self._told = _NOTHING
         self._steps = 0
-        self._step_bytes = step_bytes(manifest)
+        self._step_bytes = sum(one.action_bytes for one in layouts), observed.batch_bytes
         may_spin = _ORDERED_STORES and len(CPUS) > 1
         self._spin = self._step_spin = SpinChooser(may_spin)
         self._talk_spin = SpinChooser(may_spin)  # messages take another time than steps
@@ -100,7 +97,7 @@ class SharedMemoryLane:
         # on the client's while it sleeps: so it waits for those first, and for the others awake.
         self._awake = awake_shards(len(self.shards))
         self._cores = Cores(len(self.shards), self._awake)
-        self._pacing = Pacing([stop - start for start, stop in self._bounds], self._awake)
+        self._meter = PaceMeter([one.count for one in layouts], self._awake)
         self._sleepers = self.shards[self._awake :]
         self._wakers = self.shards[: self._awake]
 
@@ -186,7 +183,7 @@ class SharedMemoryLane:
             self.shards[0].ask(leaves, slot, spin_ns)
             return
         if not self.shards[0].sequence % _SAMPLE_EVERY:
-            self._pacing.sample(self.shards, self._slept_ns, self.elapsed_ns)
+            self._meter.sample(self._busy_ns(), self._slept_ns, self.elapsed_ns)
         cpus = self._cores.of_shards()
         for index, (shard, (start, stop)) in enumerate(zip(self.shards, self._bounds, strict=True)):
             rows = [leaf[start:stop] for leaf in leaves]
@@ -396,7 +393,11 @@ class SharedMemoryLane:
 
     def pace(self) -> Pace | None:
         """See ``Lane``."""
-        return self._pacing.pace(self.shards)
+        return self._meter.pace(self.shards[0].sequence, self._busy_ns())
+
+    def _busy_ns(self) -> list[int]:
+        """What the last measured step took each runner. Trust: they say so themselves."""
+        return [shard.busy_ns for shard in self.shards]
 
     def traffic(self) -> tuple[int, int, int]:
         """See ``Lane``; of what lies in shared memory, infos and messages are left out."""

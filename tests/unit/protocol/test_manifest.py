@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 from gymnasium import spaces
-from gymnasium.vector.utils import batch_space
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -24,6 +23,7 @@ from envhub_worker.protocol.manifest.manifest import (
     encode_manifest,
 )
 from envhub_worker.protocol.manifest.names import MAX_NAME, MAX_NAMES
+from tests.support.wire import env_manifest
 
 ELEMENTS = 40_000
 OBSERVATION = spaces.Dict({"b": spaces.Box(-1, 1, (3,)), "a": spaces.Text(4)})
@@ -32,24 +32,14 @@ ACTION = spaces.Discrete(3, start=1)
 
 def an_env(**changed: Any) -> EnvManifest:
     """A manifest of one environment, with some fields changed."""
-    fields: dict[str, Any] = {
+    facts: dict[str, Any] = {
         "suite": "libero",
-        "task": 0,
-        "num_envs": 2,
-        "shardable": True,
-        "sync": False,
-        "single_observation_space": OBSERVATION,
-        "single_action_space": ACTION,
-        "observation_space": batch_space(OBSERVATION, 2),
-        "action_space": batch_space(ACTION, 2),
-        "autoreset_mode": "NextStep",
         "metadata": {"render_fps": 30, "render_modes": ["rgb_array"]},
         "render_mode": "rgb_array",
         "spec": {"id": "X-v0", "max_episode_steps": 5},
         "attributes": ("hub_config", "task"),
-        "type_name": "gymnasium.vector.AsyncVectorEnv",
     }
-    return EnvManifest(**{**fields, **changed})
+    return env_manifest(OBSERVATION, ACTION, 2, **(facts | changed))
 
 
 def a_manifest(*envs: EnvManifest) -> Manifest:
