@@ -17,8 +17,7 @@ import numpy as np
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_sandbox.transport.shared_memory.doorbell import OwnBell, RunnerBell
 from envhub_sandbox.transport.shared_memory.memfd import SEAL_FUTURE_WRITE, slab
-from envhub_sandbox.transport.values.described import Described
-from envhub_sandbox.transport.values.tensors import to_tensor
+from envhub_sandbox.transport.values.described import unpacked
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.shared_memory.columns import Column, columns_of
@@ -165,9 +164,7 @@ class LaneShard:
         if not length:
             return kind, None
         start = self.layout.infos
-        message = m.unpack(
-            [self._reply[start : start + length]], tensors=to_tensor, things=Described
-        )
+        message = unpacked([self._reply[start : start + length]])
         if isinstance(message, m.Value) and type(message.value) is dict:
             with UNTRUSTED:
                 self._learn(message.value)
@@ -185,7 +182,7 @@ class LaneShard:
         start = self.layout.answer
         with UNTRUSTED:
             packet = read_packet(self._reply[start : start + length])
-        return _unpacked(packet.frames)
+        return unpacked(packet.frames)
 
     def _learn(self, infos: dict[Any, Any]) -> None:
         start = self.layout.infos
@@ -206,8 +203,3 @@ class LaneShard:
         self._asks.release()
         self._tells.release()
         # the maps go with the last array over them
-
-
-def _unpacked(frames: Sequence[Any]) -> m.Message:
-    """A runner's message. Trust: input from the worker."""
-    return m.unpack(frames, tensors=to_tensor, things=Described)

@@ -6,14 +6,17 @@ is fields of a fixed form, each held against what such a thing can have.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_sandbox.transport.values.generators import generator
 from envhub_sandbox.transport.values.specs import spec_of
+from envhub_sandbox.transport.values.tensors import to_tensor
+from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject, one_line
-from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
-from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC, Buffer
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.manifest.facts import read_spec
 from envhub_worker.protocol.spaces.reader import (
     ELEMENT_BYTES,
@@ -21,6 +24,16 @@ from envhub_worker.protocol.spaces.reader import (
     SPACE_BYTES,
     SpaceReader,
 )
+
+
+def unpacked(frames: Sequence[Buffer], limits: WireLimits = DEFAULT_LIMITS) -> m.Message:
+    """A runner's message, with what it describes. Trust: input from the worker.
+
+    Raises:
+        RemoteProtocolError: It is none.
+    """
+    return m.unpack(frames, limits=limits, tensors=to_tensor, things=Described)
+
 
 _SPEC_TYPE = "gymnasium.envs.registration.EnvSpec"
 _SHOWN = 200

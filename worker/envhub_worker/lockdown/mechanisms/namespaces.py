@@ -24,7 +24,7 @@ from envhub_worker.lockdown.mechanisms.kernel import (
     unshare,
 )
 from envhub_worker.lockdown.report import LayerUnavailableError
-from envhub_worker.protocol.shortages import shortage
+from envhub_worker.protocol.text import shortage
 
 #: The user that a jail sees itself as. Not 0: programs treat that one specially.
 INSIDE_UID = 1000

@@ -49,7 +49,6 @@ class _Judge:
         self._arrays_left = _MOST_ARRAYS
 
     def holds(self, value: Any, depth: int) -> bool:
-        """Whether it is, and all that is in it."""
         kind = type(value)
         self._left -= 1
         if kind in _ATOMS:
@@ -60,11 +59,9 @@ class _Judge:
         )
 
     def all(self, values: Any, depth: int) -> bool:
-        """Whether all of these are."""
         return all(self.holds(value, depth + 1) for value in values)
 
     def number(self, value: int, depth: int) -> bool:
-        """An integer."""
         return value.bit_length() // 8 < self._limits.int_bytes
 
     def text(self, value: str, depth: int) -> bool:
@@ -77,12 +74,10 @@ class _Judge:
             return False
 
     def bytes(self, value: Any, depth: int) -> bool:
-        """What stands in the header."""
         self._bytes_left -= len(value)
         return self._bytes_left >= 0 and len(value) <= self._limits.text_bytes
 
     def mapping(self, value: dict[Any, Any], depth: int) -> bool:
-        """A dict."""
         plain = len(value) <= _FEW or set(map(type, value)) == {str}
         return plain and self.all(value, depth) and self.all(value.values(), depth)
 
@@ -91,7 +86,6 @@ class _Judge:
         return len(value) <= _FEW and self.all(value, depth)
 
     def bounds(self, value: Any, depth: int) -> bool:
-        """A range or a slice."""
         return self.all((value.start, value.stop, value.step), depth)
 
     def array(self, value: Any, depth: int) -> bool:
@@ -107,7 +101,6 @@ class _Judge:
         return dtype.char in _ARRAYS and _is_unit(dtype)
 
     def scalar(self, value: Any, depth: int) -> bool:
-        """A number of numpy's."""
         return _is_unit(value.dtype)
 
 

@@ -20,7 +20,7 @@ Space = gym.Space[Any]
 States = list[Any]
 _CHANCE_BITS = 64
 """The entropy of a seed; what the operating system gives has twice as many bits."""
-_BIT_GENERATORS = (
+BIT_GENERATORS = (
     np.random.PCG64,
     np.random.PCG64DXSM,
     np.random.MT19937,
@@ -86,7 +86,7 @@ def _state(space: Space) -> Any:
     if type(generator) is not np.random.Generator:
         return None
     bits = generator.bit_generator
-    if type(bits) not in _BIT_GENERATORS:
+    if type(bits) not in BIT_GENERATORS:
         return None
     sequence = getattr(bits, "seed_seq", None) or getattr(bits, "_seed_seq", None)
     entropy = getattr(sequence, "entropy", None)
