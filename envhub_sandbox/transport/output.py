@@ -171,7 +171,7 @@ class OutputFollower:
 
 
 def _write_to_stderr(text: str) -> None:
-    """Whichever it is now: a notebook's, for instance. One that takes nothing is nobody's fault."""
+    """To today's stderr, which may be a notebook's; one that takes nothing is no error."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         sys.stderr.write(text)
         sys.stderr.flush()

@@ -202,7 +202,7 @@ def raised(reply: m.Raised) -> EnvHubError:
 
 
 def _harmless(reply: m.Raised) -> m.Raised:
-    """The same without what a terminal would obey, and no longer than anybody reads."""
+    """The same without what a terminal would obey, and bounded."""
     return m.Raised(
         reply.builtin,
         one_line(reply.type_name, 512),

@@ -19,7 +19,6 @@ from envhub_sandbox.transport.pace import Pace, PaceMeter
 from envhub_sandbox.transport.replies import typed
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
-from envhub_sandbox.transport.shared_memory.doorbell import sleep_for
 from envhub_sandbox.transport.shared_memory.observations import RING, ObservationSlab
 from envhub_sandbox.transport.shared_memory.shard import LaneShard, Outcome
 from envhub_sandbox.transport.shared_memory.sharding import CPUS, Cores, awake_shards
@@ -85,7 +84,7 @@ class SharedMemoryLane:
         leaves = layouts[0].actions
         self._flat_actions = len(leaves) == 1 and not leaves[0].path
         self._owed = _BY_SERVER
-        self._told = _NOTHING
+        self._answers = _NOTHING
         self._steps = 0
         self._step_bytes = sum(one.action_bytes for one in layouts), observed.batch_bytes
         may_spin = _ORDERED_STORES and len(CPUS) > 1
@@ -129,13 +128,12 @@ class SharedMemoryLane:
             attachment.close()
             return None
         lane = cls(relay, results, observed, known, attachment)
+        agreed = False
         try:
             agreed = lane._attach(range(len(known)), deadline)
-        except BaseException:
-            lane.close()
-            raise
-        if not agreed:
-            lane.close()
+        finally:
+            if not agreed:
+                lane.close()
         return lane if agreed else None
 
     def renew(self, dead: Sequence[int], fresh: Sequence[int], deadline: Deadline) -> None:
@@ -192,16 +190,16 @@ class SharedMemoryLane:
     def wait(self, deadline: Deadline) -> None:
         """See ``Lane``."""
         outcomes = self._outcomes(deadline)
-        self._told = self._with_fetched(outcomes, deadline) if outcomes else _NOTHING
+        self._answers = self._with_fetched(outcomes, deadline) if outcomes else _NOTHING
 
     def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
         """See ``Lane``. Trust: input from the worker."""
         if infos is None:
-            infos = self._results.infos(self._infos()) if self._told else {}
+            infos = self._results.infos(self._infos()) if self._answers else {}
         return (self.observations.take(), *self.observations.results(), infos)
 
     def _infos(self) -> list[dict[Any, Any]]:
-        shards = zip(self.shards, self._told, strict=True)
+        shards = zip(self.shards, self._answers, strict=True)
         return [infos_of(shard, outcome, self._results) for shard, outcome in shards]
 
     def _outcomes(self, deadline: Deadline) -> list[Outcome]:
@@ -316,7 +314,7 @@ class SharedMemoryLane:
             _RunnerGoneError: A runner ended first.
         """
         for shard in self._sleepers:
-            if not sleep_for(self._watch, shard, deadline):
+            if not shard.answered_before_death(self._watch, deadline):
                 raise _RunnerGoneError
         budget_ns = self._spin.budget_ns
         now_ns = perf_counter_ns()
@@ -326,7 +324,7 @@ class SharedMemoryLane:
             if not budget_ns or not shard.answered_until(until_ns):
                 if budget_ns:
                     self._spin.missed()
-                if not sleep_for(self._watch, shard, deadline):
+                if not shard.answered_before_death(self._watch, deadline):
                     raise _RunnerGoneError
         self.elapsed_ns = perf_counter_ns() - self._asked_ns
         self._spin.measured(self.elapsed_ns)
@@ -360,12 +358,12 @@ class SharedMemoryLane:
 
         Who dies before his infos are fetched is added to the deaths. Trust: input from the worker.
         """
-        told: dict[int, Outcome] = {}
+        living: dict[int, Outcome] = {}
         for index, shard in enumerate(self.shards):
             if index in deaths:
                 continue
             try:
-                [told[index]] = self._one_fetched(index, shard.outcome(), deadline)
+                [living[index]] = self._one_fetched(index, shard.outcome(), deadline)
             except RunnersDiedError as error:
                 deaths[index] = error.first
             except WorkerDiedError as error:
@@ -373,7 +371,7 @@ class SharedMemoryLane:
         replies: list[m.Message | None] = [None] * len(self.shards)
         with UNTRUSTED:
             parts, flags = self._observations(), self.observations.results()
-            for index, outcome in told.items():
+            for index, outcome in living.items():
                 replies[index] = self._stepped(index, outcome, parts[index], flags)
         return RunnersDiedError(replies, deaths)
 

@@ -67,7 +67,7 @@ class Described:
 
 
 def _spec(value: object) -> Any:
-    """An id that this Gymnasium cannot read is only told."""
+    """A spec; a description of one whose id this Gymnasium cannot read."""
     facts = read_spec(value)
     made = spec_of(facts)
     return RemoteObject(_SPEC_TYPE, one_line(str(facts), _SHOWN)) if made is None else made

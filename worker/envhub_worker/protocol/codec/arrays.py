@@ -58,7 +58,7 @@ class ArrayWriter:
     Attributes:
         tail: Bytes of small arrays, in order.
         frames: Zero-copy views of large contiguous arrays (copies of others), in order. They
-            alias the arrays: nobody may write those until the frames are sent.
+            alias the arrays, which must not be written until the frames are sent.
     """
 
     __slots__ = ("_tail_bytes", "frames", "tail")

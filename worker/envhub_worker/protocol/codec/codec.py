@@ -40,8 +40,8 @@ def encode(
         describer: Describes what the receiver can make again. Worker to client only.
 
     Returns:
-        Frames to be sent in this order. Large contiguous arrays are not copied: nobody may
-        write them until the frames are sent.
+        Frames to be sent in this order. Large contiguous arrays are not copied, and must
+        not be written until the frames are sent.
 
     Raises:
         LocalProtocolError: The value is cyclic, too deep, too large, or holds a dtype that

@@ -1,8 +1,8 @@
 """Generators of seeded spaces: which of them travel with a description, in which order.
 
 A space that its author has seeded draws the same samples in each run, and so must its copy in the
-client. One that nobody seeded starts anywhere: its state does not travel, for a description that is
-remembered would make every run start at the same place.
+client. One that was not seeded starts anywhere: its state does not travel, for a remembered
+description would make every run start at the same place.
 """
 
 from __future__ import annotations
