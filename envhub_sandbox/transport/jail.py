@@ -20,7 +20,7 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import RemoteWarnings
 from envhub_sandbox.transport.replies import check, death, expect, typed
 from envhub_sandbox.transport.values import pickles
-from envhub_sandbox.transport.values.described import unpacked
+from envhub_sandbox.transport.values.descriptions import unpacked
 from envhub_sandbox.transport.watched_values import WatchedValues
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer

@@ -256,8 +256,8 @@ CONTAINER_MARKS: Spot = (listen, "_CONTAINER_MARKS")
 """The files by which a container is told."""
 CGROUP_WRITE: Spot = (cgroups, "_write")
 """What writes a file of a control group."""
-DECODING: Spot = (packing, "_decode")
-"""What makes a message of a document that has no form yet."""
+DECODING: Spot = (packing, "_checked")
+"""What makes a message of a decoded document that has no form yet."""
 FORMS: tuple[Spot, Spot] = ((packing, "_OUTGOING"), (packing, "_INCOMING"))
 """What is remembered of the shape of messages, each way."""
 CHECK_OF_WARNINGS: Spot = (prefix.WARNINGS, "_check")

@@ -18,7 +18,7 @@ from envhub_sandbox.errors import RemoteProtocolError, WorkerTimeoutError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.shared_memory.doorbell import OwnBell, RunnerBell, Watch
 from envhub_sandbox.transport.shared_memory.memfd import SEAL_FUTURE_WRITE, slab
-from envhub_sandbox.transport.values.described import unpacked
+from envhub_sandbox.transport.values.descriptions import unpacked
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.shared_memory.columns import Column, columns_of

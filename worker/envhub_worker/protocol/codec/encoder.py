@@ -30,7 +30,7 @@ Pickler = Callable[[object], Buffer]
 
 
 @dataclass(frozen=True)
-class Pickled:
+class PickledValue:
     """A value that travels pickled. A ``memoryview`` becomes a frame of its own."""
 
     data: Buffer
@@ -90,7 +90,7 @@ class Encoder:
         except Exception as error:
             text = f"{type(value).__name__} cannot be pickled: {error}"
             raise LocalProtocolError(text) from error
-        return _write_pickled(self, Pickled(data))
+        return _write_pickled(self, PickledValue(data))
 
 
 def _write_integer(encoder: Encoder, value: int) -> object:
@@ -104,7 +104,7 @@ def _write_complex(encoder: Encoder, value: complex) -> object:
     return msgpack.ExtType(kinds.COMPLEX, kinds.COMPLEX_BYTES.pack(value.real, value.imag))
 
 
-def _write_pickled(encoder: Encoder, pickled: Pickled) -> object:
+def _write_pickled(encoder: Encoder, pickled: PickledValue) -> object:
     data = pickled.data
     if type(data) is bytes:
         return msgpack.ExtType(kinds.PICKLE, data)
@@ -167,7 +167,7 @@ _WRITERS: dict[type, Callable[[Encoder, Any], object]] = {
     complex: _write_complex,
     range: _bounds(kinds.RANGE),
     slice: _bounds(kinds.SLICE),
-    Pickled: _write_pickled,
+    PickledValue: _write_pickled,
     RemoteObject: _write_remote,
     RemoteEnum: _write_remote_enum,
 }

@@ -14,7 +14,7 @@ import struct
 from collections.abc import Sequence
 from typing import Any
 
-from envhub_worker.protocol.codec import templates
+from envhub_worker.protocol.codec import forms
 from envhub_worker.protocol.codec.codec import encode
 from envhub_worker.protocol.codec.decoder import Decoder, TensorMaker, ThingReader, Unpickler
 from envhub_worker.protocol.codec.encoder import Describer, Pickler
@@ -28,8 +28,8 @@ from envhub_worker.protocol.untrusted import UNTRUSTED
 _NUMBER = struct.Struct(">Q")
 """The id in front of a header between client and server. 0 stands before ``Packed`` alone."""
 _MOST = (1 << 63) - 1
-_OUTGOING: templates.Forms[Any, templates.Outgoing] = templates.Forms()
-_INCOMING: templates.Forms[bytes, templates.Incoming[Message]] = templates.Forms()
+_OUTGOING: forms.Forms[Any, forms.Outgoing] = forms.Forms()
+_INCOMING: forms.Forms[bytes, forms.Incoming[Message]] = forms.Forms()
 
 
 def pack(
@@ -50,7 +50,7 @@ def pack(
     values = values_of(message)
     if pickler is not None and cls.HANDED:
         values = _handed(message, values, pickler, limits)
-    found = templates.outline(values)
+    found = forms.outline(values)
     if found is None:
         return _encoded(message, values, pickler, limits, describer)
     outline, arrays = found
@@ -58,7 +58,7 @@ def pack(
     if form is not None and form.limits is limits:
         return form.frames(arrays)
     frames = _encoded(message, values, pickler, limits)
-    _OUTGOING.met((cls, outline), lambda: templates.Outgoing(frames, arrays, limits))
+    _OUTGOING.met((cls, outline), lambda: forms.Outgoing(frames, arrays, limits))
     return frames
 
 
@@ -66,8 +66,8 @@ def _handed(
     message: Message, values: list[Any], pickler: Pickler, limits: WireLimits
 ) -> list[object]:
     """The fields as they are sent."""
-    from envhub_worker.protocol.codec.exact import handed_over
     from envhub_worker.protocol.codec.explain import unpicklable
+    from envhub_worker.protocol.codec.handed_over import handed_over
 
     sent = list(values)
     for index, name in enumerate(message.FIELDS):
@@ -123,8 +123,8 @@ def unpack(
             return form.message(tail, buffers)
         decoder = Decoder(tail, buffers, limits, unpickler, tensors, things)
         message = _checked(decoder.value(document))
-        if len(document) <= templates.MAX_DOCUMENT_BYTES:
-            _INCOMING.met(document, lambda: templates.Incoming(document, type(message), limits))
+        if len(document) <= forms.MAX_DOCUMENT_BYTES:
+            _INCOMING.met(document, lambda: forms.Incoming(document, type(message), limits))
         return message
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from envhub_worker.protocol.codec.arrays import MAX_DIMENSIONS, MAX_UNIT_COUNT
-from envhub_worker.protocol.codec.encoder import Pickled, Pickler
+from envhub_worker.protocol.codec.encoder import PickledValue, Pickler
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
 from envhub_worker.protocol.limits import WireLimits
 
@@ -31,7 +31,7 @@ _ARRAYS = frozenset("?bBhHiIlLqQefdFDmMS")
 
 def handed_over(value: object, pickler: Pickler, limits: WireLimits) -> object:
     """The value itself, if the wire carries exactly that, or else its pickle."""
-    return value if _Judge(limits).holds(value, 0) else Pickled(pickler(value))
+    return value if _Judge(limits).holds(value, 0) else PickledValue(pickler(value))
 
 
 class _Judge:

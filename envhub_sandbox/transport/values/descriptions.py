@@ -32,14 +32,14 @@ def unpacked(frames: Sequence[Buffer], limits: WireLimits = DEFAULT_LIMITS) -> m
     Raises:
         RemoteProtocolError: It is none.
     """
-    return m.unpack(frames, limits=limits, tensors=to_tensor, things=Described)
+    return m.unpack(frames, limits=limits, tensors=to_tensor, things=DescriptionReader)
 
 
 _SPEC_TYPE = "gymnasium.envs.registration.EnvSpec"
 _SHOWN = 200
 
 
-class Described:
+class DescriptionReader:
     """What one message describes, out of one budget: all of it costs no more than its bytes may.
 
     Args:
