@@ -15,7 +15,7 @@ from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.messages.prefix import CHANGES, WATCHED_TYPES, Attribute
 
 
-class WatchedValues:
+class AttributeCache:
     """The values, by the number of the environment and the attribute's name."""
 
     def __init__(self) -> None:
