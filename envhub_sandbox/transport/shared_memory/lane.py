@@ -363,7 +363,10 @@ class SharedMemoryLane:
             if index in deaths:
                 continue
             try:
-                [living[index]] = self._one_fetched(index, shard.outcome(), deadline)
+                outcome = shard.outcome()
+                if outcome[0] == slabs.FETCH:
+                    outcome = slabs.DONE, self._fetch([index], deadline)[0]
+                living[index] = outcome
             except RunnersDiedError as error:
                 deaths[index] = error.first
             except WorkerDiedError as error:
@@ -371,14 +374,9 @@ class SharedMemoryLane:
         replies: list[m.Message | None] = [None] * len(self.shards)
         with UNTRUSTED:
             parts, flags = self._observations(), self.observations.results()
-            for index, outcome in living.items():
-                replies[index] = self._stepped(index, outcome, parts[index], flags)
+            for index, said in living.items():
+                replies[index] = self._stepped(index, said, parts[index], flags)
         return RunnersDiedError(replies, deaths)
-
-    def _one_fetched(self, index: int, outcome: Outcome, deadline: Deadline) -> list[Outcome]:
-        if outcome[0] != slabs.FETCH:
-            return [outcome]
-        return [(slabs.DONE, reply) for reply in self._fetch([index], deadline)]
 
     def _stepped(self, index: int, outcome: Outcome, observation: Any, flags: Any) -> m.Message:
         if isinstance(outcome[1], m.Raised):
