@@ -28,8 +28,8 @@ from envhub_sandbox.session.survival.restart_policy import Restarts
 from envhub_sandbox.session.turns import Turns
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RunnersDiedError
+from envhub_sandbox.transport.pace import PaceBook
 from envhub_sandbox.transport.results import Results
-from envhub_sandbox.transport.shared_memory.sharding import PaceBook
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 

@@ -23,8 +23,8 @@ from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.forks import Owner
 from envhub_sandbox.transport.lane import Lane
+from envhub_sandbox.transport.pace import PaceBook
 from envhub_sandbox.transport.results import Results
-from envhub_sandbox.transport.shared_memory.sharding import PaceBook
 from envhub_sandbox.transport.tcp import UnreachableError
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Lifecycle, State

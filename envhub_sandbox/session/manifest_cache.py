@@ -17,7 +17,7 @@ from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.policy import Policy
 from envhub_sandbox.system.files import write_whole
-from envhub_sandbox.transport.shared_memory.sharding import PaceBook
+from envhub_sandbox.transport.pace import PaceBook
 from envhub_sandbox.transport.values import pickles
 from envhub_sandbox.transport.values.generators import generator
 from envhub_worker import protocol

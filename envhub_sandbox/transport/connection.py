@@ -255,12 +255,12 @@ class WorkerClient:
         return _LOOK_MS if left is None else min(left, _LOOK_MS)
 
     def hold(self, jail: int) -> None:
-        """A jail on another host is ours: the server is told so while we live."""
+        """A jail on another host is ours: keep-alives name it."""
         if self._far is not None:
             self._far.held.add(jail)
 
     def let_go(self, jail: int) -> None:
-        """It no longer is; the server ends it, if it has not heard so already."""
+        """It no longer is; the server ends it."""
         if self._far is not None:
             self._far.held.discard(jail)
 

@@ -20,7 +20,7 @@ class Deadline:
     __slots__ = ("_at", "timeout_s")
 
     unasked = False
-    """Whether it is for something that nobody has asked for yet, or not any more."""
+    """Whether it is for work in advance, which no request waits for."""
 
     def __init__(self, timeout_s: float | None) -> None:
         self.timeout_s = timeout_s
@@ -49,7 +49,7 @@ class Deadline:
 class StepDeadline(Deadline):
     """A deadline that serves every step, and counts from its first wait.
 
-    Most replies are there before anybody has to sleep, and to make a deadline and read the clock
+    Most replies are there before a wait has to sleep, and to make a deadline and read the clock
     for it costs more than one per cent of a short step. How long a lane waits awake before it asks
     (a fraction of a millisecond) does not count.
 
@@ -95,6 +95,6 @@ class StartupDeadline(Deadline):
         self._at = 0.0
 
     def left_ms(self) -> int:
-        """Milliseconds until somebody should look again."""
+        """Milliseconds until the next look; at most ``_LOOK_AGAIN_MS``."""
         left = super().left_ms()
         return _LOOK_AGAIN_MS if left is None else min(left, _LOOK_AGAIN_MS)

@@ -47,4 +47,4 @@ def _named(number: int) -> str:
 def _culprit(number: int) -> str:
     if number != signal.SIGKILL:
         return ""
-    return ", by somebody or by the kernel, as where memory runs out (dmesg says so)"
+    return ", by another process or by the kernel, as where memory runs out (dmesg says so)"

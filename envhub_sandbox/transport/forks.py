@@ -22,7 +22,7 @@ class Owner:
 
 
 def foreign(owner: int | None = None) -> str:
-    """What is told to whoever uses an environment in a fork of its owner, whose number it is."""
+    """The text of the error of an environment that is used in a fork of its owner."""
     whose = "this environment belongs to another process"
     if owner is not None:
         whose = f"this environment belongs to process {owner}"

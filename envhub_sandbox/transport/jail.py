@@ -15,14 +15,13 @@ from envhub_sandbox.errors import (
     WorkerDiedError,
     WorkerError,
 )
+from envhub_sandbox.transport.attribute_cache import AttributeCache
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import RemoteWarnings
 from envhub_sandbox.transport.replies import check, death, expect, typed
 from envhub_sandbox.transport.values import pickles
-from envhub_sandbox.transport.values.described import Described
-from envhub_sandbox.transport.values.tensors import to_tensor
-from envhub_sandbox.transport.watched_values import WatchedValues
+from envhub_sandbox.transport.values.descriptions import unpacked
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.limits import WireLimits
@@ -89,7 +88,7 @@ class JailHandle:
         self.report = report
         self.before_end: Callable[[], None] = _nothing
         self.warnings = RemoteWarnings()
-        self.watched = WatchedValues()
+        self.watched = AttributeCache()
         self.limits = limits
         self._asked: dict[int, int] = {}  # how many runners, by request
 
@@ -178,7 +177,7 @@ class JailHandle:
     def _unpack(self, frames: Sequence[Buffer]) -> m.Message:
         if len(frames) > 1:  # with one frame there is nothing in front
             frames = self.warnings.take(self.watched.take(frames))
-        return m.unpack(frames, limits=self.limits, tensors=to_tensor, things=Described)
+        return unpacked(frames, self.limits)
 
     def exchange(
         self,

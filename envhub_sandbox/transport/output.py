@@ -1,7 +1,7 @@
 """What a jail prints, brought to a log or a file while it runs.
 
 A thread asks the server a few times a second, over a connection of its own: the steps do not
-notice. Only where somebody wants it: ``Policy(output=...)``, or DEBUG on
+notice. Only where it is asked for: ``Policy(output=...)``, or DEBUG on
 ``envhub_sandbox.worker.output``. Trust: the text is the jail's; it loses its control characters.
 """
 
@@ -90,16 +90,34 @@ class Bounded:
         self._write(f"{line}\n" if self._left > 0 else "[the rest is left out]\n")
 
 
-class OutputFile(Bounded):
-    """A file that takes lines, up to ``FILE_BYTES``."""
+class OutputSinks:
+    """Where a jail's lines go: a log, a file, stderr, several of these or nowhere.
 
-    def __init__(self, path: Path) -> None:
-        self._file: TextIO = open(path, "a", encoding="utf-8", buffering=1)  # noqa: SIM115
-        super().__init__(self._file.write, FILE_BYTES - self._file.tell())
+    Args:
+        label: What the log calls the jail.
+        path: The file, or None; it gets ``FILE_BYTES``, with what is in it.
+        stderr: Whether this program's stderr gets them, ``FILE_BYTES`` of them.
+
+    Raises:
+        PolicyError: The file cannot be written.
+    """
+
+    def __init__(self, label: str, path: Path | None, *, stderr: bool = False) -> None:
+        self.sinks: list[Sink] = [Bounded(_write_to_stderr, FILE_BYTES)] if stderr else []
+        self._file: TextIO | None = None
+        if path is not None:
+            try:
+                self._file = open(path, "a", encoding="utf-8", buffering=1)  # noqa: SIM115
+            except OSError as error:
+                raise PolicyError(f"policy: output {str(path)!r}: {error}") from error
+            self.sinks.append(Bounded(self._file.write, FILE_BYTES - self._file.tell()))
+        if OUTPUT.isEnabledFor(logging.DEBUG):
+            self.sinks.append(lambda line: OUTPUT.debug("%s: %s", label, line))
 
     def close(self) -> None:
-        """Close it."""
-        self._file.close()
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
 
 
 class OutputFollower:
@@ -108,12 +126,12 @@ class OutputFollower:
     Args:
         connect: Makes a connection to the server, for this thread alone.
         jail: The jail's number.
-        wanted: Where its lines go.
+        sinks: Where its lines go.
     """
 
-    def __init__(self, connect: Callable[[], WorkerClient], jail: int, wanted: Wanted) -> None:
-        self._connect, self._jail, self._wanted = connect, jail, wanted
-        self._lines = Lines(wanted.sinks)
+    def __init__(self, connect: Callable[[], WorkerClient], jail: int, sinks: OutputSinks) -> None:
+        self._connect, self._jail, self._sinks = connect, jail, sinks
+        self._lines = Lines(sinks.sinks)
         self._offset = 0
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="envhub-output", daemon=True)
@@ -139,7 +157,7 @@ class OutputFollower:
             pass  # the server has gone, or the jail was closed
         finally:
             self._lines.end()
-            self._wanted.close()
+            self._sinks.close()
 
     def _ask(self, client: WorkerClient) -> int:
         """Bring what there is; returns how many bytes that was."""
@@ -152,38 +170,8 @@ class OutputFollower:
         return len(reply.data)
 
 
-class Wanted:
-    """Where a jail's lines are to go: a log, a file, stderr, several of these or nowhere.
-
-    Args:
-        label: What the log calls the jail.
-        path: The file, or None.
-        stderr: Whether this program's stderr gets them, ``FILE_BYTES`` of them.
-
-    Raises:
-        PolicyError: The file cannot be written.
-    """
-
-    def __init__(self, label: str, path: Path | None, *, stderr: bool = False) -> None:
-        self.sinks: list[Sink] = [Bounded(_write_to_stderr, FILE_BYTES)] if stderr else []
-        self._file: OutputFile | None = None
-        if path is not None:
-            try:
-                self._file = OutputFile(path)
-            except OSError as error:
-                raise PolicyError(f"policy: output {str(path)!r}: {error}") from error
-            self.sinks.append(self._file)
-        if OUTPUT.isEnabledFor(logging.DEBUG):
-            self.sinks.append(lambda line: OUTPUT.debug("%s: %s", label, line))
-
-    def close(self) -> None:
-        """Close the file."""
-        if self._file is not None:
-            self._file.close()
-
-
 def _write_to_stderr(text: str) -> None:
-    """Whichever it is now: a notebook's, for instance. One that takes nothing is nobody's fault."""
+    """To today's stderr, which may be a notebook's; one that takes nothing is no error."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         sys.stderr.write(text)
         sys.stderr.flush()

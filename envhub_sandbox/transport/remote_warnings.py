@@ -14,9 +14,13 @@ from collections.abc import Sequence
 from envhub_sandbox.errors import RemoteEnvWarning
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.codec.inert import one_line
-from envhub_worker.protocol.messages import warned
+from envhub_worker.protocol.messages.prefix import (
+    MAX_CATEGORY,
+    MAX_TEXT,
+    WARNINGS,
+    RemoteWarning,
+)
 from envhub_worker.protocol.text import printable
-from envhub_worker.protocol.untrusted import UNTRUSTED
 
 MOST = 100
 """Different warnings of one repository that are shown."""
@@ -35,8 +39,8 @@ class RemoteWarnings:
     """
 
     def __init__(self) -> None:
-        self.unshown: deque[warned.Told] = deque()
-        self._known: set[warned.Told] = set()
+        self.unshown: deque[RemoteWarning] = deque()
+        self._known: set[RemoteWarning] = set()
 
     def take(self, frames: Sequence[Buffer]) -> Sequence[Buffer]:
         """A reply's own frames, without the warnings in front. Trust: input from the worker.
@@ -44,14 +48,12 @@ class RemoteWarnings:
         Raises:
             RemoteProtocolError: These are not what was agreed on.
         """
-        if not warned.stand_in_front(frames):
-            return frames
-        with UNTRUSTED:
-            for one in warned.read(frames[0]):
-                self._collect(one)
-        return frames[1:]
+        found, rest = WARNINGS.read(frames)
+        for one in found:
+            self._collect(one)
+        return rest
 
-    def _collect(self, one: warned.Told) -> None:
+    def _collect(self, one: RemoteWarning) -> None:
         known = self._known
         if one in known or len(known) > MOST:
             return
@@ -69,9 +71,8 @@ class RemoteWarnings:
                 category, text = self.unshown.popleft()
             except IndexError:  # another thread was faster
                 return
-            warning = RemoteEnvWarning(
-                label, one_line(category, warned.MAX_CATEGORY), printable(text, warned.MAX_TEXT)
-            )
+            words = one_line(category, MAX_CATEGORY), printable(text, MAX_TEXT)
+            warning = RemoteEnvWarning(label, *words)
             warnings.warn(warning, stacklevel=_level_of_the_caller())
 
 

@@ -51,15 +51,11 @@ def expect(reply: m.Message, kind: type[m.M]) -> m.M:
         WorkerDiedError: A process of the jail ended.
         RemoteProtocolError: It is another message.
     """
-    if isinstance(reply, kind):
-        return reply
-    if isinstance(reply, m.Refused):
+    if isinstance(reply, m.Refused) and kind is not m.Refused:
         raise refusal(reply)
-    if isinstance(reply, m.Died):
+    if isinstance(reply, m.Died) and kind is not m.Died:
         raise death(reply)
-    raise RemoteProtocolError(
-        f"the worker answered with {type(reply).__name__} where {kind.__name__} belongs"
-    )
+    return typed(reply, kind)
 
 
 def check(reply: m.Message) -> None:
@@ -81,13 +77,13 @@ def typed(reply: m.Message, kind: type[m.M] | tuple[type[m.M], ...]) -> m.M:
     Raises:
         RemoteProtocolError: It is another message.
     """
-    if not isinstance(reply, kind):
-        kinds = kind if isinstance(kind, tuple) else (kind,)
-        wanted = " or ".join(one.__name__ for one in kinds)
-        raise RemoteProtocolError(
-            f"the worker answered with {type(reply).__name__} where {wanted} belongs"
-        )
-    return reply
+    if isinstance(reply, kind):
+        return reply
+    kinds = kind if isinstance(kind, tuple) else (kind,)
+    wanted = " or ".join(one.__name__ for one in kinds)
+    raise RemoteProtocolError(
+        f"the worker answered with {type(reply).__name__} where {wanted} belongs"
+    )
 
 
 def all_of(replies: Sequence[m.Message], kind: type[m.M] | tuple[type[m.M], ...]) -> list[m.M]:
@@ -131,16 +127,12 @@ def refusal(reply: m.Refused) -> Exception:
 
 
 _REFUSALS: dict[str, type[Exception]] = {
-    "PolicyError": PolicyError,
-    "SnapshotIntegrityError": SnapshotIntegrityError,
-    "VersionMismatchError": VersionMismatchError,
-    "DependencyError": DependencyError,
-    "IndexUnavailableError": IndexUnavailableError,
-    "InterpreterUnavailableError": InterpreterUnavailableError,
-    "PackageIntegrityError": PackageIntegrityError,
-    "PackagesTooLargeError": PackagesTooLargeError,
-    "RequirementError": RequirementError,
-    "ResolutionError": ResolutionError,
+    kind.__name__: kind
+    for kind in (
+        *(PolicyError, SnapshotIntegrityError, VersionMismatchError, DependencyError),
+        *(IndexUnavailableError, InterpreterUnavailableError, PackageIntegrityError),
+        *(PackagesTooLargeError, RequirementError, ResolutionError),
+    )
 }
 
 
@@ -210,7 +202,7 @@ def raised(reply: m.Raised) -> EnvHubError:
 
 
 def _harmless(reply: m.Raised) -> m.Raised:
-    """The same without what a terminal would obey, and no longer than anybody reads."""
+    """The same without what a terminal would obey, and bounded."""
     return m.Raised(
         reply.builtin,
         one_line(reply.type_name, 512),

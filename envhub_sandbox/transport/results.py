@@ -153,7 +153,7 @@ def _own_infos(value: Any, size: int) -> Sequence[tuple[int, dict[Any, Any]]]:
         if type(pair) is not tuple or list(map(type, pair)) != [int, dict]:
             raise RemoteProtocolError("the worker's infos are not one mapping each")
         if not 0 <= pair[0] < size:
-            raise RemoteProtocolError("the worker's infos are of nobody")
+            raise RemoteProtocolError("the worker's infos are of no sub-environment")
     return cast("Sequence[tuple[int, dict[Any, Any]]]", pairs)
 
 

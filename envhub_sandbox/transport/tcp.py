@@ -1,6 +1,6 @@
 """A connection to a server on another host: its key, its heartbeat, and what became of it.
 
-libzmq reconnects for ever and says nothing: a wrong key, a port where nobody listens and a cable
+libzmq reconnects for ever and says nothing: a wrong key, a port without a listener and a cable
 that is out look alike. Its monitor knows; this turns what it says into errors.
 """
 
@@ -130,7 +130,7 @@ class Link:
     def _cut_off(self) -> None:
         """It ended a handshake: libzmq tries again, and so the second or third may succeed.
 
-        A server that stops does so as well, and whoever forwards a port to one that is not there.
+        A server that stops does so as well, and so does a forwarded port with none behind.
         """
         self._cut_since = self._cut_since or monotonic()
         if monotonic() - self._cut_since < _CUT_S:

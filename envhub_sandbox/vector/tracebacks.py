@@ -17,7 +17,7 @@ from typing import ParamSpec, TypeVar
 
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerError
 from envhub_sandbox.log import ERRORS
-from envhub_worker.protocol.shortages import shortage
+from envhub_worker.protocol.text import shortage
 
 _VARIABLE, _FULL = "ENVHUB_TRACEBACK", "full"
 _SHORT = 3

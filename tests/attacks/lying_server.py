@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 import zmq
 from gymnasium import spaces
-from gymnasium.vector.utils import batch_space
 
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
@@ -32,6 +31,7 @@ from envhub_worker.protocol.manifest.manifest import (
     encode_manifest,
 )
 from envhub_worker.protocol.runtime import OWN, Runtime
+from tests.support import wire
 
 Frames = list[Buffer]
 NUM_ENVS = 2
@@ -158,24 +158,8 @@ def lying() -> Iterator[LyingServer]:
 
 def env_manifest(**changes: Any) -> EnvManifest:
     """The honest description of the environment, changed."""
-    fields: dict[str, Any] = {
-        "suite": "env",
-        "task": 0,
-        "num_envs": NUM_ENVS,
-        "shardable": True,
-        "sync": True,
-        "single_observation_space": OBSERVATION,
-        "single_action_space": ACTION,
-        "observation_space": batch_space(OBSERVATION, NUM_ENVS),
-        "action_space": batch_space(ACTION, NUM_ENVS),
-        "autoreset_mode": "NextStep",
-        "metadata": {},
-        "render_mode": None,
-        "spec": None,
-        "attributes": (),
-        "type_name": "gymnasium.vector.SyncVectorEnv",
-    }
-    return EnvManifest(**(fields | changes))
+    honest = {"sync": True, "type_name": "gymnasium.vector.SyncVectorEnv"}
+    return wire.env_manifest(OBSERVATION, ACTION, NUM_ENVS, **(honest | changes))
 
 
 def manifest() -> dict[str, Any]:

@@ -27,7 +27,7 @@ from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import encode_env
 from envhub_worker.protocol.spaces.opaque import MAX_SPACE_DEPTH
-from envhub_worker.protocol.spaces.spaces import decode_space, encode_space
+from envhub_worker.protocol.spaces.spaces import encode_space
 from tests.attacks.lying_server import (
     NUM_ENVS,
     Asked,
@@ -41,7 +41,7 @@ from tests.attacks.lying_server import (
 )
 from tests.support import inside
 from tests.support.repositories import CARTPOLES, write_repository
-from tests.support.wire import deep, ext, packed, value
+from tests.support.wire import decode_space, deep, ext, packed, value
 
 MIB = 1 << 20
 GROWTH = 192 * MIB

@@ -23,10 +23,10 @@ from hypothesis import strategies as st
 
 from envhub_worker.protocol.codec.codec import Buffer, RemoteObject, decode, encode
 from envhub_worker.protocol.errors import RemoteProtocolError
-from envhub_worker.protocol.spaces.spaces import decode_space, encode_space
+from envhub_worker.protocol.spaces.spaces import encode_space
 from tests.attacks import decoder_bombs
 from tests.attacks.decoder_bombs import ACCEPTED, MIB, REFUSED
-from tests.support.wire import ext, message, packed
+from tests.support.wire import decode_space, ext, message, packed
 
 ROOT = Path(__file__).parents[2]
 FUZZ = settings(max_examples=500, deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -16,7 +16,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError, RemoteEnvWarning, RemoteProtocolError
 from envhub_sandbox.transport.remote_warnings import MOST
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.messages import warned
+from envhub_worker.protocol.messages.prefix import MAX_TEXT, WARNINGS
 from tests.attacks.lying_server import NUM_ENVS, Asked, Frames, LyingSandbox, lying, step_done
 from tests.attacks.test_terminal import ESCAPES, paints
 from tests.support.repositories import write_repository
@@ -87,9 +87,9 @@ def test_a_flood_of_warnings_is_small_plain_and_ours(home: Path, lane: str) -> N
 
 
 LIES: dict[str, object] = {
-    "too many": (("UserWarning", "x"),) * (warned.MOST_AT_ONCE + 1),
+    "too many": (("UserWarning", "x"),) * (WARNINGS.most + 1),
     "a giant": (("UserWarning", "x" * 4_000_000),),
-    "a long one": (("UserWarning", "x" * (warned.MAX_TEXT + 1)),),
+    "a long one": (("UserWarning", "x" * (MAX_TEXT + 1)),),
     "no text": (("UserWarning", 1),),
     "an array": (("UserWarning", np.zeros(10_000)),),
     "no pairs": ("UserWarning",),

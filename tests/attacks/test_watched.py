@@ -13,7 +13,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
-from envhub_worker.protocol.messages import changed
+from envhub_worker.protocol.messages.prefix import CHANGES
 from tests.attacks.lying_server import (
     NUM_ENVS,
     Asked,
@@ -70,7 +70,7 @@ def test_values_are_kept_while_nothing_is_said(liar: LyingServer, folder: str) -
 
 
 LIES: dict[str, m.Message] = {
-    "too many": m.Changed(((1, "task"),) * (changed.MOST + 1)),
+    "too many": m.Changed(((1, "task"),) * (CHANGES.most + 1)),
     "a giant": m.Changed(((1, "x" * 4_000_000),)),
     "no name": m.Changed(((1, 1),)),
     "no pairs": m.Changed(("task",)),

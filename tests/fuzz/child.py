@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.transport.values.described import Described
+from envhub_sandbox.transport.values.descriptions import DescriptionReader
 from envhub_worker.protocol import messages as m
 from tests.fuzz import bundle
 from tests.fuzz.controls import CONTROLS
@@ -57,7 +57,7 @@ def lie(name: str, number: int, seed: int, corpus: list[Frames], messages: list[
 
 def decoded(corpus: list[Frames]) -> list[m.Message]:
     """The messages of a recording."""
-    return [m.unpack(frames, things=Described) for frames in corpus]
+    return [m.unpack(frames, things=DescriptionReader) for frames in corpus]
 
 
 def run(job: dict[str, Any], say: Callable[[str], None], note: Callable[[str], None]) -> int:

@@ -25,8 +25,8 @@ from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError, open_jai
 from envhub_sandbox.transport.remote_warnings import MOST, RemoteWarnings
 from envhub_sandbox.transport.replies import check, death, expect, raised
 from envhub_sandbox.transport.results import Results
-from envhub_sandbox.transport.values import described, specs
-from envhub_sandbox.transport.values.described import Described
+from envhub_sandbox.transport.values import specs
+from envhub_sandbox.transport.values.descriptions import DescriptionReader
 from envhub_sandbox.transport.values.generators import generator
 from envhub_sandbox.vector import from_manifest
 from envhub_worker.protocol import messages as m
@@ -34,8 +34,8 @@ from envhub_worker.protocol.codec.codec import decode, encode
 from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.manifest.manifest import decode_env, decode_manifest
-from envhub_worker.protocol.messages import warned
 from envhub_worker.protocol.messages.compression import pack_frames, unpack_frames
+from envhub_worker.protocol.messages.prefix import MAX_TEXT
 from envhub_worker.protocol.shared_memory import columns
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import OpaqueSpace, encode_space
@@ -119,14 +119,14 @@ def unpack(dice: Dice) -> None:
         frames = [*map(bytes, m.pack(m.Value({spoiler.key(): spoiler.key()})))]
     for _ in range(dice.often()):
         frames = dice.spoiler.frames(frames, dice.corpus)
-    first = attempt(lambda: m.unpack(frames, things=Described))
+    first = attempt(lambda: m.unpack(frames, things=DescriptionReader))
     for _ in range(3):
-        again = attempt(lambda: m.unpack(frames, things=Described))
+        again = attempt(lambda: m.unpack(frames, things=DescriptionReader))
         demand(type(first) is type(again) or is_error(first) == is_error(again) == 1, "another end")
         demand(is_error(first) or alike(parts(first), parts(again)), "another message")
     if is_error(first):
         raise first
-    plain = decode(frames, things=Described)
+    plain = decode(frames, things=DescriptionReader)
     demand(alike(parts(first), plain[1:]), "not what the codec says")  # type: ignore[index]
     usable(parts(first))
     whole = [*map(bytes, encode([first.kind, *parts(first)]))]
@@ -298,7 +298,7 @@ def things(dice: Dice) -> None:
             (GENERATOR, dict(np.random.PCG64(7).state)),
         ]
     )
-    made = described.Described(_SMALL)(code, dice.spoiled(honest))
+    made = DescriptionReader(_SMALL)(code, dice.spoiled(honest))
     usable(made)
     if isinstance(made, gym.Space) and not isinstance(made, OpaqueSpace):
         made.sample()
@@ -401,7 +401,7 @@ def warnings(dice: Dice) -> None:
     demand(len(heard.unshown) <= MOST + 1, "a flood")
     for one in heard.unshown:
         demand(tuple(map(type, one)) == (str, str), "no text")
-        demand(max(map(len, one)) <= warned.MAX_TEXT, "a giant")
+        demand(max(map(len, one)) <= MAX_TEXT, "a giant")
 
 
 def spoiled_message(dice: Dice, message: m.Message) -> m.Message:

@@ -48,7 +48,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.lifecycle import Lifecycle, State
 from envhub_worker.protocol.manifest.manifest import EnvManifest
-from envhub_worker.protocol.messages import packing, warned
+from envhub_worker.protocol.messages import packing, prefix
 from envhub_worker.spawn.spawner import Spawner
 
 Spot = tuple[Any, str]
@@ -257,11 +257,11 @@ CONTAINER_MARKS: Spot = (listen_options, "_CONTAINER_MARKS")
 """The files by which a container is told."""
 CGROUP_WRITE: Spot = (cgroups, "_write")
 """What writes a file of a control group."""
-DECODING: Spot = (packing, "_decode")
-"""What makes a message of a document that has no form yet."""
+DECODING: Spot = (packing, "_checked")
+"""What makes a message of a decoded document that has no form yet."""
 FORMS: tuple[Spot, Spot] = ((packing, "_OUTGOING"), (packing, "_INCOMING"))
 """What is remembered of the shape of messages, each way."""
-CHECK_OF_WARNINGS: Spot = (warned, "_checked")
+CHECK_OF_WARNINGS: Spot = (prefix.WARNINGS, "_check")
 """What looks at each warning of a worker's."""
 IDLE_CONTAINERS: Spot = (sandbox, "_IDLE")
 """Where a container is that nobody uses."""

@@ -7,12 +7,15 @@ from typing import Any
 from unittest.mock import Mock
 
 import msgpack
+from gymnasium.vector.utils import batch_space
 
 from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.lane import RelayLane, Request
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
+from envhub_worker.protocol.manifest.manifest import EnvManifest
+from envhub_worker.protocol.spaces.reader import Space, SpaceReader
 
 
 def message(document: bytes, tail: bytes = b"", *frames: bytes) -> list[Buffer]:
@@ -23,6 +26,33 @@ def message(document: bytes, tail: bytes = b"", *frames: bytes) -> list[Buffer]:
 def value(document: bytes) -> list[Buffer]:
     """A ``Value``, the answer to a call, around a hand-made msgpack document."""
     return message(b"\x92" + msgpack.packb(m.Value.kind) + document)
+
+
+def decode_space(value: object, *, max_elements: int) -> Space:
+    """The space that ``encode_space`` described."""
+    return SpaceReader(max_elements).space(value)
+
+
+def env_manifest(observation: Space, action: Space, count: int, /, **changes: Any) -> EnvManifest:
+    """The description of an environment with these single spaces, with some fields changed."""
+    fields: dict[str, Any] = {
+        "suite": "env",
+        "task": 0,
+        "num_envs": count,
+        "shardable": True,
+        "sync": False,
+        "single_observation_space": observation,
+        "single_action_space": action,
+        "observation_space": batch_space(observation, count),
+        "action_space": batch_space(action, count),
+        "autoreset_mode": "NextStep",
+        "metadata": {},
+        "render_mode": None,
+        "spec": None,
+        "attributes": (),
+        "type_name": "gymnasium.vector.AsyncVectorEnv",
+    }
+    return EnvManifest(**(fields | changes))
 
 
 def ext(code: int, payload: bytes = b"") -> msgpack.ExtType:

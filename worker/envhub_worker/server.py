@@ -24,7 +24,7 @@ from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimits
 from envhub_worker.protocol.messages import compression
-from envhub_worker.protocol.shortages import shortage
+from envhub_worker.protocol.text import shortage
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from envhub_worker.supervisor.jails import Jails
 from envhub_worker.supervisor.records import AnsweredError, Asker, RefusedError

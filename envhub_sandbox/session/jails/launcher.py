@@ -31,7 +31,7 @@ from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, open_jail
-from envhub_sandbox.transport.output import OutputFollower, Wanted
+from envhub_sandbox.transport.output import OutputFollower, OutputSinks
 from envhub_sandbox.transport.replies import expect, typed
 from envhub_sandbox.transport.values.generators import generator
 from envhub_worker.protocol import messages as m
@@ -171,16 +171,16 @@ class Launcher:
         )
         return LoadedJail(jail, manifest, reply.manifest, {runner}, use, self.close)
 
-    def _wanted_output(self) -> Wanted:
+    def _wanted_output(self) -> OutputSinks:
         """Where the next jail's output goes: each has a file of its own."""
         output = self.repository.policy.output
         if output in ("stderr", "-"):
-            return Wanted(self.repository.label, None, stderr=True)
+            return OutputSinks(self.repository.label, None, stderr=True)
         path = None if output == "tail" else Path(output)
         number = next(self._jail_numbers)
         if path is not None and number > 1:
             path = path.with_name(f"{path.stem}-{number}{path.suffix}")
-        return Wanted(self.repository.label, path)
+        return OutputSinks(self.repository.label, path)
 
     def _connected(self, server: WorkerServer) -> WorkerClient:
         client = self._client(server)

@@ -10,7 +10,7 @@ from time import monotonic, sleep
 from envhub_sandbox.errors import WorkerDiedError
 from envhub_sandbox.transport.connection import SESSION
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.shared_memory.doorbell import Watch, sleep_for
+from envhub_sandbox.transport.shared_memory.doorbell import Watch
 from envhub_sandbox.transport.shared_memory.shard import LaneShard
 from envhub_worker.protocol import messages as m
 
@@ -65,12 +65,12 @@ class Attachment:
         self.watch.forget(shard.bell)
 
     def answers(self, index: int, shard: LaneShard, deadline: Deadline) -> bool:
-        """Whether a shard's answer comes before its runner's death; raises as ``sleep_for``."""
+        """Whether a shard's answer comes before its runner's death; raises as that."""
         watch = Watch()
         watch.bell(shard.bell)
         watch.death(self._pidfds[index])
         try:
-            return sleep_for(watch, shard, deadline)
+            return shard.answered_before_death(watch, deadline)
         finally:
             watch.close()
 

@@ -24,12 +24,7 @@ import io
 import os
 import select
 import socket
-from typing import Protocol
 
-from envhub_sandbox.errors import WorkerTimeoutError
-from envhub_sandbox.transport.deadline import Deadline
-
-_RECHECK_MS = 2
 _RING = (1).to_bytes(8, "little")  # as an eventfd takes it
 _EVENTS = 8
 """Events of one wait: what else has happened is still there for the next."""
@@ -58,7 +53,7 @@ class RunnerBell:
         try:
             self._send(_RING, _AT_ONCE)
         except OSError:
-            return  # full: it has been rung already; closed: whoever waits for the answer sees why
+            return  # full: it has been rung already; closed: the wait for the answer sees why
 
     def close(self) -> None:
         """Close both ends. Idempotent."""
@@ -115,37 +110,3 @@ class Watch:
     def close(self) -> None:
         """Stop watching."""
         self._epoll.close()
-
-
-class AnswerSource(Protocol):
-    """A shard, as far as its answer is waited for."""
-
-    def answered(self) -> bool:
-        """Whether its answer is there."""
-
-    def park(self, parked: int) -> None:
-        """Whether we sleep, for its runner to read."""
-
-
-def sleep_for(watch: Watch, shard: AnswerSource, deadline: Deadline) -> bool:
-    """Sleep until a shard answers, or a process dies; whether it has answered.
-
-    Raises:
-        WorkerTimeoutError: The deadline came first.
-    """
-    shard.park(1)
-    try:
-        # a ring may cross with our going to sleep: look again soon, once
-        timeout: int | None = _RECHECK_MS
-        while not shard.answered():
-            died = watch.wait(timeout)
-            if shard.answered():
-                return True
-            if died:
-                return False
-            if deadline.passed:
-                raise WorkerTimeoutError("the worker did not answer in time")
-            timeout = deadline.left_ms()
-        return True
-    finally:
-        shard.park(0)

@@ -15,17 +15,13 @@ from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Frames, RelayLane, Request
-from envhub_sandbox.transport.pace import Pace
+from envhub_sandbox.transport.pace import Pace, PaceMeter
 from envhub_sandbox.transport.replies import typed
 from envhub_sandbox.transport.results import Results, StepResult
-from envhub_sandbox.transport.shared_memory.affinity import CPUS, Cores
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
-from envhub_sandbox.transport.shared_memory.doorbell import sleep_for
 from envhub_sandbox.transport.shared_memory.observations import RING, ObservationSlab
-from envhub_sandbox.transport.shared_memory.pacing import Pacing
 from envhub_sandbox.transport.shared_memory.shard import LaneShard, Outcome
-from envhub_sandbox.transport.shared_memory.sharding import awake_shards
-from envhub_sandbox.transport.shared_memory.sizes import step_bytes
+from envhub_sandbox.transport.shared_memory.sharding import CPUS, Cores, awake_shards
 from envhub_sandbox.transport.shared_memory.spin import SpinChooser
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
@@ -88,9 +84,9 @@ class SharedMemoryLane:
         leaves = layouts[0].actions
         self._flat_actions = len(leaves) == 1 and not leaves[0].path
         self._owed = _BY_SERVER
-        self._told = _NOTHING
+        self._answers = _NOTHING
         self._steps = 0
-        self._step_bytes = step_bytes(manifest)
+        self._step_bytes = sum(one.action_bytes for one in layouts), observed.batch_bytes
         may_spin = _ORDERED_STORES and len(CPUS) > 1
         self._spin = self._step_spin = SpinChooser(may_spin)
         self._talk_spin = SpinChooser(may_spin)  # messages take another time than steps
@@ -100,7 +96,7 @@ class SharedMemoryLane:
         # on the client's while it sleeps: so it waits for those first, and for the others awake.
         self._awake = awake_shards(len(self.shards))
         self._cores = Cores(len(self.shards), self._awake)
-        self._pacing = Pacing([stop - start for start, stop in self._bounds], self._awake)
+        self._meter = PaceMeter([one.count for one in layouts], self._awake)
         self._sleepers = self.shards[self._awake :]
         self._wakers = self.shards[: self._awake]
 
@@ -132,13 +128,12 @@ class SharedMemoryLane:
             attachment.close()
             return None
         lane = cls(relay, results, observed, known, attachment)
+        agreed = False
         try:
             agreed = lane._attach(range(len(known)), deadline)
-        except BaseException:
-            lane.close()
-            raise
-        if not agreed:
-            lane.close()
+        finally:
+            if not agreed:
+                lane.close()
         return lane if agreed else None
 
     def renew(self, dead: Sequence[int], fresh: Sequence[int], deadline: Deadline) -> None:
@@ -186,7 +181,7 @@ class SharedMemoryLane:
             self.shards[0].ask(leaves, slot, spin_ns)
             return
         if not self.shards[0].sequence % _SAMPLE_EVERY:
-            self._pacing.sample(self.shards, self._slept_ns, self.elapsed_ns)
+            self._meter.sample(self._busy_ns(), self._slept_ns, self.elapsed_ns)
         cpus = self._cores.of_shards()
         for index, (shard, (start, stop)) in enumerate(zip(self.shards, self._bounds, strict=True)):
             rows = [leaf[start:stop] for leaf in leaves]
@@ -195,16 +190,16 @@ class SharedMemoryLane:
     def wait(self, deadline: Deadline) -> None:
         """See ``Lane``."""
         outcomes = self._outcomes(deadline)
-        self._told = self._with_fetched(outcomes, deadline) if outcomes else _NOTHING
+        self._answers = self._with_fetched(outcomes, deadline) if outcomes else _NOTHING
 
     def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
         """See ``Lane``. Trust: input from the worker."""
         if infos is None:
-            infos = self._results.infos(self._infos()) if self._told else {}
+            infos = self._results.infos(self._infos()) if self._answers else {}
         return (self.observations.take(), *self.observations.results(), infos)
 
     def _infos(self) -> list[dict[Any, Any]]:
-        shards = zip(self.shards, self._told, strict=True)
+        shards = zip(self.shards, self._answers, strict=True)
         return [infos_of(shard, outcome, self._results) for shard, outcome in shards]
 
     def _outcomes(self, deadline: Deadline) -> list[Outcome]:
@@ -319,7 +314,7 @@ class SharedMemoryLane:
             _RunnerGoneError: A runner ended first.
         """
         for shard in self._sleepers:
-            if not sleep_for(self._watch, shard, deadline):
+            if not shard.answered_before_death(self._watch, deadline):
                 raise _RunnerGoneError
         budget_ns = self._spin.budget_ns
         now_ns = perf_counter_ns()
@@ -329,7 +324,7 @@ class SharedMemoryLane:
             if not budget_ns or not shard.answered_until(until_ns):
                 if budget_ns:
                     self._spin.missed()
-                if not sleep_for(self._watch, shard, deadline):
+                if not shard.answered_before_death(self._watch, deadline):
                     raise _RunnerGoneError
         self.elapsed_ns = perf_counter_ns() - self._asked_ns
         self._spin.measured(self.elapsed_ns)
@@ -363,12 +358,15 @@ class SharedMemoryLane:
 
         Who dies before his infos are fetched is added to the deaths. Trust: input from the worker.
         """
-        told: dict[int, Outcome] = {}
+        living: dict[int, Outcome] = {}
         for index, shard in enumerate(self.shards):
             if index in deaths:
                 continue
             try:
-                [told[index]] = self._one_fetched(index, shard.outcome(), deadline)
+                outcome = shard.outcome()
+                if outcome[0] == slabs.FETCH:
+                    outcome = slabs.DONE, self._fetch([index], deadline)[0]
+                living[index] = outcome
             except RunnersDiedError as error:
                 deaths[index] = error.first
             except WorkerDiedError as error:
@@ -376,14 +374,9 @@ class SharedMemoryLane:
         replies: list[m.Message | None] = [None] * len(self.shards)
         with UNTRUSTED:
             parts, flags = self._observations(), self.observations.results()
-            for index, outcome in told.items():
-                replies[index] = self._stepped(index, outcome, parts[index], flags)
+            for index, said in living.items():
+                replies[index] = self._stepped(index, said, parts[index], flags)
         return RunnersDiedError(replies, deaths)
-
-    def _one_fetched(self, index: int, outcome: Outcome, deadline: Deadline) -> list[Outcome]:
-        if outcome[0] != slabs.FETCH:
-            return [outcome]
-        return [(slabs.DONE, reply) for reply in self._fetch([index], deadline)]
 
     def _stepped(self, index: int, outcome: Outcome, observation: Any, flags: Any) -> m.Message:
         if isinstance(outcome[1], m.Raised):
@@ -396,7 +389,11 @@ class SharedMemoryLane:
 
     def pace(self) -> Pace | None:
         """See ``Lane``."""
-        return self._pacing.pace(self.shards)
+        return self._meter.pace(self.shards[0].sequence, self._busy_ns())
+
+    def _busy_ns(self) -> list[int]:
+        """What the last measured step took each runner. Trust: they say so themselves."""
+        return [shard.busy_ns for shard in self.shards]
 
     def traffic(self) -> tuple[int, int, int]:
         """See ``Lane``; of what lies in shared memory, infos and messages are left out."""

@@ -11,7 +11,7 @@ import mmap
 import os
 
 SEAL_FUTURE_WRITE = 0x10
-"""``F_SEAL_FUTURE_WRITE``: nobody else maps it writable."""
+"""``F_SEAL_FUTURE_WRITE``: no other process maps it writable."""
 _ADD_SEALS = 1033
 _SIZE_SEALS = 0x1 | 0x2 | 0x4
 """``F_SEAL_SEAL``, ``F_SEAL_SHRINK`` and ``F_SEAL_GROW``, by number: systems without them import
@@ -22,7 +22,7 @@ def slab(name: str, size: int, further_seals: int = 0) -> tuple[mmap.mmap, io.Fi
     """A sealed memfd of a fixed size, mapped here, and its file.
 
     Without the seals a jail could cut the memory, and the next look at it would be a SIGBUS. It is
-    a file and no number, so that an interrupt leaves no descriptor open that nobody knows.
+    a file and no number, so that an interrupt leaves no descriptor open.
     """
     file = io.FileIO(os.memfd_create(f"envhub-{name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING), "r+")
     file.truncate(size)

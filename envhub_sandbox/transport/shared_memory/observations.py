@@ -1,7 +1,7 @@
 """Results out of shared memory: copies that the caller owns, or slots that it borrows.
 
 With one slot every batch is copied out. With a ring of slots (``copy=False``) a batch is handed
-out where it lies, and its slot is written again only when nobody holds an array of it any more:
+out where it lies, and its slot is written again only when no array of it is held any more:
 each slot is a map of its own, which is the base of every array over it, views of views included,
 so that its reference count tells. When all are held, the batch goes through the spare slot and is
 copied.
@@ -62,7 +62,7 @@ class ObservationSlab:
         self._rewards, self._flags = slabs.results(self._memory, layout)
 
     def choose(self) -> int:
-        """The slot for the next batch: the lowest that nobody holds, so that few stay hot."""
+        """The slot for the next batch: the lowest that is not held, so that few stay hot."""
         self.chosen = _SPARE
         for index in range(1, len(self._slots)):
             if sys.getrefcount(self._slots[index]) == self._unheld[index]:
@@ -71,7 +71,7 @@ class ObservationSlab:
         return self.chosen
 
     def leave(self) -> None:
-        """The next batch comes another way: the runners leave the slot that somebody may hold."""
+        """The next batch comes another way: the runners leave the slot that may be held."""
         self.chosen = _SPARE
 
     def take(self) -> Any:

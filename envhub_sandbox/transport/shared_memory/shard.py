@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from envhub_sandbox.errors import RemoteProtocolError
-from envhub_sandbox.transport.shared_memory.doorbell import OwnBell, RunnerBell
+from envhub_sandbox.errors import RemoteProtocolError, WorkerTimeoutError
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.shared_memory.doorbell import OwnBell, RunnerBell, Watch
 from envhub_sandbox.transport.shared_memory.memfd import SEAL_FUTURE_WRITE, slab
-from envhub_sandbox.transport.values.described import Described
-from envhub_sandbox.transport.values.tensors import to_tensor
+from envhub_sandbox.transport.values.descriptions import unpacked
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.shared_memory.columns import Column, columns_of
@@ -29,6 +29,7 @@ Outcome = tuple[int, m.Message | None]
 """``slabs.DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``, and what came encoded."""
 _OUTCOMES = frozenset({slabs.DONE, slabs.RAISED, slabs.FETCH, slabs.COLUMNS})
 _UNKNOWN = -1
+_RECHECK_MS = 2
 
 
 class LaneShard:
@@ -150,9 +151,28 @@ class LaneShard:
         """What the last measured step took the runner. Trust: it says so itself."""
         return self._tells[slabs.BUSY]
 
-    def park(self, parked: int) -> None:
-        """Say whether we sleep and want our doorbell rung."""
-        self._asks[slabs.PARKED] = parked
+    def answered_before_death(self, watch: Watch, deadline: Deadline) -> bool:
+        """Sleep until the reply is there, or a process dies; whether it is there.
+
+        Raises:
+            WorkerTimeoutError: The deadline came first.
+        """
+        self._asks[slabs.PARKED] = 1  # we want our doorbell rung
+        try:
+            # a ring may cross with our going to sleep: look again soon, once
+            timeout: int | None = _RECHECK_MS
+            while not self.answered():
+                died = watch.wait(timeout)
+                if self.answered():
+                    return True
+                if died:
+                    return False
+                if deadline.passed:
+                    raise WorkerTimeoutError("the worker did not answer in time")
+                timeout = deadline.left_ms()
+            return True
+        finally:
+            self._asks[slabs.PARKED] = 0
 
     def outcome(self) -> Outcome:
         """How the request went. Trust: input from the worker; the length is bounded here.
@@ -165,9 +185,7 @@ class LaneShard:
         if not length:
             return kind, None
         start = self.layout.infos
-        message = m.unpack(
-            [self._reply[start : start + length]], tensors=to_tensor, things=Described
-        )
+        message = unpacked([self._reply[start : start + length]])
         if isinstance(message, m.Value) and type(message.value) is dict:
             with UNTRUSTED:
                 self._learn(message.value)
@@ -185,7 +203,7 @@ class LaneShard:
         start = self.layout.answer
         with UNTRUSTED:
             packet = read_packet(self._reply[start : start + length])
-        return _unpacked(packet.frames)
+        return unpacked(packet.frames)
 
     def _learn(self, infos: dict[Any, Any]) -> None:
         start = self.layout.infos
@@ -206,8 +224,3 @@ class LaneShard:
         self._asks.release()
         self._tells.release()
         # the maps go with the last array over them
-
-
-def _unpacked(frames: Sequence[Any]) -> m.Message:
-    """A runner's message. Trust: input from the worker."""
-    return m.unpack(frames, tensors=to_tensor, things=Described)

@@ -1,8 +1,8 @@
 """Decides whether waiting awake pays, by measuring both.
 
 A wake-up costs some ten microseconds, so a reply that is nearly there is best waited for awake.
-With every core busy the same spinning takes the core from whoever computes the reply. So both
-ways are tried in turn, seldom, and the faster one is used; the interval between trials doubles
+With every core busy the same spinning takes the core from the runner that computes the reply. So
+both ways are tried in turn, seldom, and the faster one is used; the interval between trials doubles
 while the answer stays the same. One decision serves both sides: the client's wait for the reply
 and the runner's wait for the next request.
 """
@@ -54,7 +54,7 @@ class SpinChooser:
         self._decide()
 
     def missed(self) -> None:
-        """A wait used its whole budget up: somebody else has the core. A few in a row end it."""
+        """A wait used its whole budget up: another process has the core. A few in a row end it."""
         self._misses = self._misses + 1 if self._missed_at - self._left <= 1 else 1
         self._missed_at = self._left
         if self._misses >= _MISSES and self._spinning:

@@ -6,8 +6,9 @@ import importlib.util
 from functools import cache
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
+
+from envhub_worker.protocol.codec.numpy_forms import widened
 
 
 @cache
@@ -29,10 +30,6 @@ def to_tensor(array: npt.NDArray[Any], dtype: str) -> Any:
     """
     torch = _torch()
     if torch is None:
-        return _widened(array) if dtype == "bfloat16" else array
+        return widened(array) if dtype == "bfloat16" else array
     tensor = torch.from_numpy(array)
     return tensor.view(torch.bfloat16) if dtype == "bfloat16" else tensor
-
-
-def _widened(bits: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    return (bits.astype(np.uint32) << 16).view(np.float32)

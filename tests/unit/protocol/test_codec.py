@@ -128,11 +128,6 @@ def test_corner_values_arrive_with_their_types(value: object) -> None:
     assert_same(value, through(value))
 
 
-def test_order_of_a_dict_survives() -> None:
-    """Maps keep their order; infos and Dict observations depend on it."""
-    assert list(through({"b": 1, "a": 2, 3: 4})) == ["b", "a", 3]
-
-
 def test_elements_of_object_arrays_are_not_taken_apart() -> None:
     """Lists, arrays and 0-d arrays inside of an object array stay elements."""
     array = as_objects([[1, 2], np.zeros(3), np.array(5), (1,)])

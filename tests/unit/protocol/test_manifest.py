@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 from gymnasium import spaces
-from gymnasium.vector.utils import batch_space
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -24,6 +23,7 @@ from envhub_worker.protocol.manifest.manifest import (
     encode_manifest,
 )
 from envhub_worker.protocol.manifest.names import MAX_NAME, MAX_NAMES
+from tests.support.wire import env_manifest
 
 ELEMENTS = 40_000
 OBSERVATION = spaces.Dict({"b": spaces.Box(-1, 1, (3,)), "a": spaces.Text(4)})
@@ -32,24 +32,14 @@ ACTION = spaces.Discrete(3, start=1)
 
 def an_env(**changed: Any) -> EnvManifest:
     """A manifest of one environment, with some fields changed."""
-    fields: dict[str, Any] = {
+    facts: dict[str, Any] = {
         "suite": "libero",
-        "task": 0,
-        "num_envs": 2,
-        "shardable": True,
-        "sync": False,
-        "single_observation_space": OBSERVATION,
-        "single_action_space": ACTION,
-        "observation_space": batch_space(OBSERVATION, 2),
-        "action_space": batch_space(ACTION, 2),
-        "autoreset_mode": "NextStep",
         "metadata": {"render_fps": 30, "render_modes": ["rgb_array"]},
         "render_mode": "rgb_array",
         "spec": {"id": "X-v0", "max_episode_steps": 5},
         "attributes": ("hub_config", "task"),
-        "type_name": "gymnasium.vector.AsyncVectorEnv",
     }
-    return EnvManifest(**{**fields, **changed})
+    return env_manifest(OBSERVATION, ACTION, 2, **(facts | changed))
 
 
 def a_manifest(*envs: EnvManifest) -> Manifest:
@@ -169,16 +159,11 @@ def test_missing_and_unknown_fields_are_refused(name: str) -> None:
             read(lie)
 
 
-def test_a_manifest_without_environments_is_refused() -> None:
-    """There is always one."""
-    with pytest.raises(RemoteProtocolError, match="1 to 4096"):
-        read({**value_of(), "envs": ()})
-
-
-def test_more_environments_than_the_limit_are_refused() -> None:
+@pytest.mark.parametrize("envs", [(), (None,) * (MAX_ENVS + 1)], ids=["none", "too many"])
+def test_the_number_of_environments_is_bounded(envs: tuple[None, ...]) -> None:
     """Before any of them is looked at."""
     with pytest.raises(RemoteProtocolError, match="1 to 4096"):
-        read({**value_of(), "envs": (None,) * (MAX_ENVS + 1)})
+        read({**value_of(), "envs": envs})
 
 
 def test_a_task_named_twice_is_refused() -> None:

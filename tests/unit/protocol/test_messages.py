@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import envhub_worker
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import encode
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
@@ -260,3 +263,33 @@ def test_messages_are_made_like_dataclasses() -> None:
     for values, named in (((), {}), ((3, 4), {}), ((3,), {"jail": 3}), ((3,), {"other": 1})):
         with pytest.raises(TypeError, match="KeepJail"):
             m.KeepJail(*values, **named)
+
+
+OF_A_SERVER = ("Hello", "OpenJail", "JailOpened", "Relay", "Died")
+WITHOUT_NUMPY = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import envhub_worker.server
+import envhub_worker
+from envhub_worker.protocol import messages as m
+for golden in sys.argv[2:-1]:
+    for _ in range(3):
+        said = m.unpack([bytes.fromhex(golden)])
+        [frame] = m.pack(said)
+        assert frame.hex() == golden
+        [frame] = m.pack_header(said, 7)
+        assert m.unpack_header(frame) == (7, said)
+assert m.unpack(m.pack(m.Value({1, 2**70, 1j, "\\udc80"})))
+assert "numpy" not in sys.modules
+m.unpack([bytes.fromhex(sys.argv[-1])])
+assert "numpy" in sys.modules
+"""
+
+
+def test_a_server_does_without_numpy_until_it_is_sent_an_array() -> None:
+    """Its own conversation is the same bytes as with numpy."""
+    folder = envhub_worker.__file__.rsplit("/envhub_worker/", 1)[0]
+    golden = [(GOLDEN / f"{name}.hex").read_text().strip() for name in OF_A_SERVER]
+    array = bytes(m.pack(m.Value(np.zeros(2)))[0]).hex()
+    command = [sys.executable, "-I", "-c", WITHOUT_NUMPY, folder, *golden, array]
+    subprocess.run(command, capture_output=True, text=True, check=True)

@@ -111,3 +111,12 @@ def test_every_action_dtype_has_one_code() -> None:
     for code, dtype in enumerate(slabs.ACTION_DTYPES):
         assert slabs.DTYPE_CODES[dtype] == code
         assert dtype.itemsize <= 8
+
+
+def test_a_step_is_its_arrays() -> None:
+    """Actions there; observations, rewards and two flags back."""
+    layout, observed = slabs.layout_of(BOX, 4), slabs.observation_layout(NESTED, 4, 3)
+    assert layout is not None
+    assert observed is not None
+    assert layout.action_bytes == 4 * 3 * 4
+    assert observed.batch_bytes == 4 * (60 + 8 + 7 + 8 + 8 + 1 + 1)

@@ -20,8 +20,9 @@ from envhub_worker.protocol.codec.codec import decode, encode
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
 from envhub_worker.protocol.spaces.opaque import MAX_SPACE_DEPTH
 from envhub_worker.protocol.spaces.reader import ELEMENT_BYTES, SPACE_BYTES, SpaceReader
-from envhub_worker.protocol.spaces.spaces import OpaqueSpace, decode_space, encode_space
+from envhub_worker.protocol.spaces.spaces import OpaqueSpace, encode_space
 from tests.support.compare import assert_same
+from tests.support.wire import decode_space
 
 Space = gym.Space[Any]
 INF = float("inf")

@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
             from envhub_worker.lockdown.mechanisms.scratch import remove_tree
 
             remove_tree(str(arguments.runtime_dir))
-        from envhub_worker.protocol.shortages import shortage
+        from envhub_worker.protocol.text import shortage
 
         if short := shortage(error, "here"):
             sys.exit(short)

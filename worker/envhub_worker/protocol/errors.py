@@ -8,7 +8,7 @@ class EnvHubError(Exception):
 
     Attributes:
         denied: What the jail was denied that it ends, in the words of ``env.jail_denials()``; None
-            where nobody has recorded it, or no jail has ended.
+            where it is not recorded, or no jail has ended.
     """
 
     denied: tuple[str, ...] | None = None

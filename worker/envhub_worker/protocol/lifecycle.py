@@ -28,7 +28,7 @@ class Event(Enum):
     SUBMIT = "a request was sent"
     REPLY = "the reply came"
     TIMEOUT = "the deadline came first"
-    INTERRUPT = "whoever waited was interrupted"
+    INTERRUPT = "the wait was interrupted"
     LOSS = "what died is to be brought back"
     REVIVAL = "it is back"
     EXPIRY = "its jail was ended for being idle"

@@ -1,8 +1,8 @@
 """Whatever the handling of a peer's input raises is the peer's fault: said in one place.
 
-Readers check what somebody has thought of, and say what is wrong with it. What nobody has thought
-of, such as a key that cannot be hashed or a mask that is longer than its values, comes up as a
-``TypeError`` or an ``IndexError`` from somewhere below. ``UNTRUSTED`` stands around each place
+Readers check for known lies, and say what is wrong. An unknown one, such as a key that cannot be
+hashed or a mask that is longer than its values, comes up as a ``TypeError`` or an ``IndexError``
+from somewhere below. ``UNTRUSTED`` stands around each place
 where input is handled, and makes ``RemoteProtocolError`` of it, with the place in ``__cause__``.
 
 It must not stand around a wait: what a signal handler of the caller's raises there is his.
@@ -32,7 +32,7 @@ FAULTS: tuple[type[Exception], ...] = (
     ValueError,
     Warning,
 )
-"""What code raises about the values that it meets. No interrupt, and nobody's own classes."""
+"""What code raises about the values that it meets. No interrupt, no library's own."""
 _MAX_CHARS = 500
 
 

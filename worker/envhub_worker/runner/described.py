@@ -13,16 +13,10 @@ from gymnasium.envs.registration import EnvSpec
 
 from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
 from envhub_worker.protocol.errors import EnvHubError
+from envhub_worker.protocol.spaces.seeded import BIT_GENERATORS
 from envhub_worker.protocol.spaces.spaces import encode_space
 
 SPEC_FIELDS = ("id", "max_episode_steps", "reward_threshold", "nondeterministic")
-_BIT_GENERATORS = (
-    np.random.PCG64,
-    np.random.PCG64DXSM,
-    np.random.MT19937,
-    np.random.Philox,
-    np.random.SFC64,
-)
 
 
 def described(value: object) -> tuple[int, object] | None:
@@ -32,7 +26,7 @@ def described(value: object) -> tuple[int, object] | None:
             return SPACE, encode_space(value, seeded=True)
         if isinstance(value, EnvSpec):
             return SPEC, facts_of(value)
-        if type(value) is np.random.Generator and type(value.bit_generator) in _BIT_GENERATORS:
+        if type(value) is np.random.Generator and type(value.bit_generator) in BIT_GENERATORS:
             return GENERATOR, value.bit_generator.state
     except (AttributeError, TypeError, ValueError, EnvHubError):
         pass  # a subclass that is half of one: then its repr has to do

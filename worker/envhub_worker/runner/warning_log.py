@@ -13,7 +13,7 @@ from typing import Any
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.codec.inert import type_name
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
-from envhub_worker.protocol.messages import warned
+from envhub_worker.protocol.messages.prefix import MAX_TEXT, WARNINGS, RemoteWarning
 from envhub_worker.protocol.text import printable
 
 _MOST = 256
@@ -32,8 +32,8 @@ class WarningLog:
     """
 
     def __init__(self) -> None:
-        self.pending: list[warned.Told] = []
-        self._heard: set[warned.Told] = set()
+        self.pending: list[RemoteWarning] = []
+        self._heard: set[RemoteWarning] = set()
 
     def listen(self) -> None:
         """Hear whatever is shown from now on, in any thread."""
@@ -58,7 +58,7 @@ class WarningLog:
             return
         try:
             text = _COLORS.sub("", str(message)[:_KEPT])
-            one = (type_name(category), printable(text, _KEPT)[: warned.MAX_TEXT])
+            one = (type_name(category), printable(text, _KEPT)[:MAX_TEXT])
         except Exception:  # it has no text
             return
         if one not in self._heard:
@@ -69,6 +69,6 @@ class WarningLog:
         """A reply's frames, with what is pending in front of them."""
         if not self.pending or len(frames) >= DEFAULT_LIMITS.frames:
             return frames
-        some = self.pending[: warned.MOST_AT_ONCE]
+        some = self.pending[: WARNINGS.most]
         del self.pending[: len(some)]
-        return warned.in_front(some, frames)
+        return WARNINGS.put(some, frames)

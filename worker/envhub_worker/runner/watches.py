@@ -19,7 +19,12 @@ import gymnasium as gym
 
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
-from envhub_worker.protocol.messages import changed
+from envhub_worker.protocol.messages.prefix import (
+    CHANGES,
+    MAX_ATTRIBUTE,
+    WATCHED_TYPES,
+    Attribute,
+)
 from envhub_worker.runner.sync_envs import SubEnvs
 
 _SEARCHES: frozenset[Any] = frozenset(
@@ -54,15 +59,15 @@ class Watches:
 
     def __init__(self, alone: Callable[[], bool] = is_alone) -> None:
         self._alone = alone
-        self.readings: dict[changed.Attribute, list[_Reading]] = {}
-        self.changed: dict[changed.Attribute, None] = {}
+        self.readings: dict[Attribute, list[_Reading]] = {}
+        self.changed: dict[Attribute, None] = {}
 
     def begin(self, number: int, env: Any, name: str, values: Any) -> bool:
         """Watch an attribute whose values have just been read; whether that is possible."""
         key = (number, name)
         self.readings.pop(key, None)
         self.changed.pop(key, None)
-        if len(self.readings) >= changed.MOST or not self._alone():
+        if len(self.readings) >= CHANGES.most or not self._alone():
             return False
         if not _can_be_watched(env, name, values):
             return False
@@ -91,16 +96,16 @@ class Watches:
         """
         if not self.changed or len(frames) >= DEFAULT_LIMITS.frames:
             return frames
-        keys = list(self.changed)[: changed.MOST]
+        keys = list(self.changed)[: CHANGES.most]
         for key in keys:
             del self.changed[key]
-        return changed.in_front(keys, frames)
+        return CHANGES.put(keys, frames)
 
 
 def _can_be_watched(env: Any, name: str, values: Any) -> bool:
-    if not isinstance(env, SubEnvs) or len(name) > changed.MAX_NAME:
+    if not isinstance(env, SubEnvs) or len(name) > MAX_ATTRIBUTE:
         return False
-    if not all(type(value) in changed.WATCHED_TYPES for value in values):
+    if not all(type(value) in WATCHED_TYPES for value in values):
         return False
     try:
         return all(_is_plain(one, name) for one in env.envs)

@@ -15,7 +15,7 @@ from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError
 from envhub_sandbox.transport.results import Results
-from envhub_sandbox.transport.values.described import Described
+from envhub_sandbox.transport.values.descriptions import DescriptionReader
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
@@ -160,7 +160,7 @@ def test_a_shape_that_is_only_told_is_not_taken_for_rewards(shape: tuple[int, ..
     no = np.zeros(2, np.bool_)
     told = m.StepDone(np.zeros((2, 1)), OpaqueSpace("a.Space", "Space()", shape), no, no, {})
     frames = m.pack(told, describer=described)
-    said = m.unpack(frames, things=Described)
+    said = m.unpack(frames, things=DescriptionReader)
     assert isinstance(said, m.StepDone)
     assert getattr(said.rewards, "shape", None) == shape
     assert truncated(said, 2).rewards.shape == (2,)  # type: ignore[attr-defined]

@@ -28,10 +28,10 @@ def process(script: str) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
 @pytest.mark.parametrize(
     ("script", "says", "code"),
     [
-        ("kill -KILL $$", " by SIGKILL, by somebody or by the kernel", -9),
+        ("kill -KILL $$", " by SIGKILL, by another process or by the kernel", -9),
         ("kill -TERM $$", " by SIGTERM. The next", -15),
         ("exit 3", ", with exit code 3. The next", 3),
-        ("exit 137", " with its container, by SIGKILL, by somebody or by the kernel", 137),
+        ("exit 137", " with its container, by SIGKILL, by another process or by the kernel", 137),
         ("exit 143", " with its container, by SIGTERM. The next", 143),
     ],
 )

@@ -12,7 +12,7 @@ import pytest
 from envhub_sandbox.errors import RemoteEnvWarning
 from envhub_sandbox.transport.remote_warnings import MOST, RemoteWarnings
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.messages import warned
+from envhub_worker.protocol.messages.prefix import WARNINGS
 
 REPLY = m.pack(m.Value(1))
 
@@ -20,7 +20,7 @@ REPLY = m.pack(m.Value(1))
 def told(heard: RemoteWarnings, *some: tuple[str, str]) -> list[Any]:
     """What the caller is told after a reply with these."""
     if some:
-        assert heard.take(warned.in_front(some, REPLY)) == REPLY
+        assert heard.take(WARNINGS.put(some, REPLY)) == REPLY
     with warnings.catch_warnings(record=True) as shown:
         warnings.simplefilter("always")
         heard.show("a/b@c")
@@ -62,7 +62,7 @@ def test_a_flood_ends_with_a_word() -> None:
 def test_what_the_filters_raise_leaves_the_rest() -> None:
     """As an error it comes out; what follows is told the next time."""
     heard = RemoteWarnings()
-    heard.take(warned.in_front([("UserWarning", "one"), ("UserWarning", "two")], REPLY))
+    heard.take(WARNINGS.put([("UserWarning", "one"), ("UserWarning", "two")], REPLY))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(RemoteEnvWarning, match="one"):

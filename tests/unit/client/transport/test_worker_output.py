@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_sandbox.transport import output
-from envhub_sandbox.transport.output import Lines, OutputFile, Wanted
+from envhub_sandbox.transport.output import Lines, OutputSinks
 from envhub_worker.supervisor.output_tail import OutputTail
 
 
@@ -54,10 +54,11 @@ def test_a_file_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(output, "FILE_BYTES", 100)
     path = tmp_path / "out.log"
     path.write_text("before\n")
-    file = OutputFile(path)
+    sinks = OutputSinks("label", path)
+    [file] = sinks.sinks
     for number in range(50):
         file(f"line {number}")
-    file.close()
+    sinks.close()
     lines = path.read_text().splitlines()
     assert lines[:2] == ["before", "line 0"]
     assert lines[-1] == "[the rest is left out]"
@@ -67,7 +68,7 @@ def test_a_file_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_file_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     """Whoever asked for it hears of it before anything runs."""
     with pytest.raises(output.PolicyError, match="output"):
-        Wanted("label", tmp_path)
+        OutputSinks("label", tmp_path)
 
 
 @given(
@@ -105,7 +106,7 @@ def test_stderr_gets_lines_as_it_is_now(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A notebook puts another in its place; what takes nothing hurts nobody."""
-    [sink] = Wanted("repo", None, stderr=True).sinks
+    [sink] = OutputSinks("repo", None, stderr=True).sinks
     sink("hello")
     assert capsys.readouterr() == ("", "hello\n")
     with open(os.devnull) as unwritable:
@@ -121,7 +122,7 @@ def test_stderr_takes_no_more_than_a_file(
 ) -> None:
     """A worker may print for ever, and somebody keeps what our program prints."""
     monkeypatch.setattr(output, "FILE_BYTES", 20)
-    [sink] = Wanted("repo", None, stderr=True).sinks
+    [sink] = OutputSinks("repo", None, stderr=True).sinks
     for _ in range(5):
         sink("12345678")
     assert capsys.readouterr().err == "12345678\n12345678\n[the rest is left out]\n"

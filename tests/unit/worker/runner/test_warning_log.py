@@ -11,7 +11,7 @@ import gymnasium as gym
 import pytest
 
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.messages import warned
+from envhub_worker.protocol.messages.prefix import WARNINGS
 from envhub_worker.runner.warning_log import WarningLog
 
 REPLY = m.pack(m.Value(1))
@@ -77,8 +77,8 @@ def test_a_flood_is_bounded(heard: WarningLog) -> None:
     while heard.pending:
         frames = heard.in_front(REPLY)
         assert frames[1:] == REPLY
-        told.append(warned.read(frames[0]))
-    assert {len(some) for some in told} == {warned.MOST_AT_ONCE}
+        told.append(WARNINGS.read(frames)[0])
+    assert {len(some) for some in told} == {WARNINGS.most}
     assert len(told) < 100
     assert all(text.isprintable() or "\n" in text for some in told for _, text in some)
     assert heard.in_front(REPLY) == REPLY

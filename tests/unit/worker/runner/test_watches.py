@@ -12,7 +12,7 @@ import pytest
 
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
-from envhub_worker.protocol.messages import changed
+from envhub_worker.protocol.messages.prefix import CHANGES
 from envhub_worker.runner.sync_envs import SubEnvs
 from envhub_worker.runner.watches import Watches, is_alone
 
@@ -84,7 +84,7 @@ def noticed(watches: Watches) -> list[str]:
     if frames == REPLY:
         return []
     assert frames[1:] == REPLY
-    return [name for number, name in changed.read(frames[0]) if number == ENV]
+    return [name for number, name in CHANGES.read(frames)[0] if number == ENV]
 
 
 @pytest.mark.parametrize("name", ["task", "number", "nothing", "shared"])
@@ -173,11 +173,11 @@ def test_changes_of_other_kinds_are_noticed(change: Callable[[Any], None]) -> No
 def test_watches_are_few() -> None:
     """And whose environment is closed has none."""
     envs, watches = envs_of(), watching()
-    for number in range(2 * changed.MOST):
-        assert watches.begin(number, envs, "task", envs.call("task")) == (number < changed.MOST)
+    for number in range(2 * CHANGES.most):
+        assert watches.begin(number, envs, "task", envs.call("task")) == (number < CHANGES.most)
     envs.envs[0].task = "lift"
     watches.look()
-    for number in range(2 * changed.MOST):
+    for number in range(2 * CHANGES.most):
         watches.forget(number)
     assert (watches.readings, watches.changed) == ({}, {})
 

@@ -13,7 +13,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import KEY_BYTES, key_text
 from envhub_worker.protocol.messages import busy
 from envhub_worker.protocol.messages.busy import Busy
-from envhub_worker.protocol.shortages import shortage
+from envhub_worker.protocol.text import shortage
 from envhub_worker.supervisor.records import Asker, JailEntry
 from envhub_worker.supervisor.witness import Witness
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import kernel, process
-from envhub_worker.protocol.shortages import shortage
+from envhub_worker.protocol.text import shortage
 
 #: The user that a jail sees itself as. Not 0: programs treat that one specially.
 INSIDE_UID = 1000

@@ -39,24 +39,17 @@ _DTYPES: tuple[np.dtype[Any], ...] = tuple(np.dtype(text) for text in (*_FIXED, 
 _TEXT, _BYTES, _DATETIME, _TIMEDELTA = range(len(_DTYPES), len(_DTYPES) + 4)
 _SIZED = {"U": _TEXT, "S": _BYTES, "M": _DATETIME, "m": _TIMEDELTA}
 _UNITS = ("generic", "Y", "M", "W", "D", "h", "m", "s", "ms", "us", "ns", "ps", "fs", "as")
-_MAX_UNIT_COUNT = 2**24 - 1
+MAX_UNIT_COUNT = 2**24 - 1
 
 _OWN_FRAME = 0x80
 _PARAMETER = struct.Struct("<I")
 _SHAPES = tuple(struct.Struct(f"<{n}Q") for n in range(MAX_DIMENSIONS + 1))
 
 
-def _codes() -> dict[str, int]:
-    """dtype character to code; 'l' and 'q' are the same integer on most platforms."""
-    codes = {dtype.str[1:]: code for code, dtype in enumerate(_DTYPES)}
-    return {
-        char: codes[np.dtype(char).str[1:]]
-        for char in "?bBhHiIlLqQefdFD"
-        if np.dtype(char).str[1:] in codes
-    }
-
-
-_CODES = _codes()
+_CODES = {
+    char: _DTYPES.index(np.dtype(char)) for char in "?bBhHiIlLqQefdFD" if np.dtype(char) in _DTYPES
+}
+"""By the character of a dtype: "l" and "q" are the same integer on most platforms."""
 
 
 class ArrayWriter:
@@ -65,7 +58,7 @@ class ArrayWriter:
     Attributes:
         tail: Bytes of small arrays, in order.
         frames: Zero-copy views of large contiguous arrays (copies of others), in order. They
-            alias the arrays: nobody may write those until the frames are sent.
+            alias the arrays, which must not be written until the frames are sent.
     """
 
     __slots__ = ("_tail_bytes", "frames", "tail")
@@ -83,7 +76,7 @@ class ArrayWriter:
         """
         in_tail, in_frame, plain = _descriptors(array.dtype, array.shape)
         if not plain:
-            array = _native(array)
+            array = native(array)
         nbytes = array.nbytes
         if nbytes <= INLINE_BYTES and self._tail_bytes + nbytes <= MAX_TAIL_BYTES:
             self.tail.append(array.tobytes())
@@ -236,30 +229,6 @@ def _descriptors(dtype: np.dtype[Any], shape: tuple[int, ...]) -> tuple[bytes, b
     return in_tail, in_frame, plain
 
 
-def write_scalar(scalar: np.generic) -> bytes:
-    """Encodes a numpy scalar: code, parameter, value.
-
-    Raises:
-        LocalProtocolError: The dtype is not on the allow-list.
-    """
-    array = _native(np.asarray(scalar))
-    return describe_dtype(array.dtype) + array.tobytes()
-
-
-def read_scalar(data: bytes) -> np.generic:
-    """Decodes ``write_scalar``. Raises ``RemoteProtocolError`` for anything else."""
-    if not data:
-        raise RemoteProtocolError("A numpy scalar is empty.")
-    dtype, offset = read_dtype(data[0], data, 1)
-    if len(data) != offset + dtype.itemsize:
-        raise RemoteProtocolError("A numpy scalar has a wrong number of bytes.")
-    flat = np.frombuffer(data, dtype, 1, offset)
-    if dtype.kind in "bUM":
-        check_content(flat)
-    scalar: np.generic = flat[0]
-    return scalar
-
-
 def pack_shape(shape: tuple[int, ...]) -> bytes:
     """Encodes a shape. Raises ``LocalProtocolError`` beyond 32 dimensions."""
     if len(shape) > MAX_DIMENSIONS:
@@ -279,7 +248,7 @@ def unpack_shape(data: bytes) -> tuple[int, ...]:
     return shape
 
 
-def _native(array: Array) -> Array:
+def native(array: Array) -> Array:
     """Returns the array in native byte order, its text free of lone surrogates."""
     if not array.dtype.isnative:
         array = array.astype(array.dtype.newbyteorder("="))
@@ -314,7 +283,7 @@ def _parameter(dtype: np.dtype[Any]) -> int:
             raise LocalProtocolError(f"dtype {dtype} is over {MAX_STRING_ITEM_BYTES} bytes")
         return dtype.itemsize // (4 if dtype.kind == "U" else 1)
     unit, count = np.datetime_data(dtype)
-    if count > _MAX_UNIT_COUNT:
+    if count > MAX_UNIT_COUNT:
         raise LocalProtocolError(f"dtype {dtype} has no form on the wire")
     return count << 8 | _UNITS.index(unit)
 

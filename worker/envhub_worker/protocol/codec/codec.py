@@ -10,12 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from envhub_worker.protocol.codec import structure
-from envhub_worker.protocol.codec.arrays import ArrayReader
 from envhub_worker.protocol.codec.decoder import Decoder, TensorMaker, ThingReader, Unpickler
-from envhub_worker.protocol.codec.encoder import Describer, Encoder
-from envhub_worker.protocol.codec.exact import Pickler
-from envhub_worker.protocol.codec.explain import explain
+from envhub_worker.protocol.codec.encoder import Describer, Encoder, Pickler
 from envhub_worker.protocol.codec.frames import check_outgoing, split
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
 from envhub_worker.protocol.codec.kinds import Buffer
@@ -44,8 +40,8 @@ def encode(
         describer: Describes what the receiver can make again. Worker to client only.
 
     Returns:
-        Frames to be sent in this order. Large contiguous arrays are not copied: nobody may
-        write them until the frames are sent.
+        Frames to be sent in this order. Large contiguous arrays are not copied, and must
+        not be written until the frames are sent.
 
     Raises:
         LocalProtocolError: The value is cyclic, too deep, too large, or holds a dtype that
@@ -56,6 +52,8 @@ def encode(
         frames = encoder.frames(value)
     except Exception as error:
         # Objects' own code runs here (__array__, iteration): anything can come out of it.
+        from envhub_worker.protocol.codec.explain import explain
+
         raise LocalProtocolError(explain(value, error, limits, pickler, names)) from error
     check_outgoing(frames, limits)
     return frames
@@ -89,23 +87,5 @@ def decode(
         MessageTooLargeError: Over one of ``limits``.
         RemoteProtocolError: Malformed in any other way.
     """
-    return decode_parts(*split(frames, limits), limits, unpickler, tensors, things, copy)
-
-
-def decode_parts(
-    document: bytes,
-    tail: Buffer,
-    buffers: list[Buffer],
-    limits: WireLimits,
-    unpickler: Unpickler | None,
-    tensors: TensorMaker | None,
-    things: ThingReader | None,
-    copy: bool = True,
-) -> object:
-    """``decode`` for frames that ``split`` has taken apart."""
-    structure.check(document, limits)
-    reader = ArrayReader(tail, buffers, limits, copy)
-    decoder = Decoder(reader, limits, unpickler, tensors, things)
-    value = decoder.value(document)
-    reader.finish()
-    return value
+    document, tail, buffers = split(frames, limits)
+    return Decoder(tail, buffers, limits, unpickler, tensors, things, copy).value(document)

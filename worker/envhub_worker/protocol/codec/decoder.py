@@ -1,21 +1,15 @@
-"""One checked msgpack document, and the bytes of its arrays, to a value."""
+"""One msgpack document, and the bytes of its arrays, to a value. No numpy until an array comes."""
 
 from __future__ import annotations
 
-import math
+import sys
 from collections import Counter
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import msgpack  # type: ignore[import-untyped]
-import numpy as np
 
-from envhub_worker.protocol.codec.arrays import (
-    Array,
-    ArrayReader,
-    read_scalar,
-    unpack_shape,
-)
+from envhub_worker.protocol.codec import kinds, structure
 from envhub_worker.protocol.codec.inert import (
     MAX_NAME_CHARS,
     MAX_REPR_CHARS,
@@ -24,35 +18,15 @@ from envhub_worker.protocol.codec.inert import (
     describe,
     one_line,
 )
-from envhub_worker.protocol.codec.kinds import (
-    ARRAY,
-    COMPLEX,
-    COMPLEX_BYTES,
-    ENUM,
-    FROZENSET,
-    GENERATOR,
-    INTEGER,
-    OBJECTS,
-    PICKLE,
-    PICKLE_FRAME,
-    RANGE,
-    REMOTE,
-    SCALAR,
-    SET,
-    SLICE,
-    SPACE,
-    SPEC,
-    TENSOR,
-    TENSOR_DTYPES,
-    TEXT_SCALAR,
-    TUPLE,
-    Buffer,
-)
+from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.errors import MessageTooLargeError, ProtocolError, RemoteProtocolError
 from envhub_worker.protocol.limits import WireLimits
 
+if TYPE_CHECKING:
+    from envhub_worker.protocol.codec.arrays import Array, ArrayReader
+
 Unpickler = Callable[[Buffer], object]
-TensorMaker = Callable[[Array, str], object]
+TensorMaker = Callable[["Array", str], object]
 ThingReader = Callable[[WireLimits], Callable[[int, object], object]]
 """Begins the reading of one message: makes what makes a thing of its code and its description."""
 
@@ -60,8 +34,8 @@ ThingReader = Callable[[WireLimits], Callable[[int, object], object]]
 _FEW_KEYS = 64
 _MAX_SAME_HASH = 16
 _DESCRIBED = frozenset({RemoteObject, RemoteEnum})
-_LOSSY = _DESCRIBED | {tuple, frozenset, slice, np.ndarray}
-"""Classes that keys of different objects arrive as, or that Python cannot hash."""
+_LOSSY = _DESCRIBED | {tuple, frozenset, slice}
+"""Classes that keys of different objects arrive as, or that Python cannot hash; arrays too."""
 
 
 class _Head:
@@ -74,32 +48,42 @@ class _Head:
 
 
 class Decoder:
-    """Rebuilds one value; msgpack calls its hooks in the order of the document."""
+    """Rebuilds one value; msgpack calls its hooks in the order of the document.
+
+    The arguments are those of ``codec.decode``, with the parts of ``frames.split``; ``arrays``
+    stands in for the ``ArrayReader`` of these.
+    """
 
     __slots__ = (
-        *("_hashed_keys", "_heads", "_make", "limits", "reader", "tensors", "things", "unpickler"),
+        *("_arrays", "_buffers", "_copy", "_hashed_keys", "_heads", "_make", "_tail"),
+        *("limits", "tensors", "things", "unpickler"),
     )
 
     def __init__(
         self,
-        reader: ArrayReader,
+        tail: Buffer,
+        buffers: Sequence[Buffer],
         limits: WireLimits,
         unpickler: Unpickler | None,
         tensors: TensorMaker | None,
         things: ThingReader | None = None,
+        copy: bool = True,
+        arrays: Any = None,
     ) -> None:
-        self.reader, self.limits = reader, limits
+        self._tail, self._buffers, self.limits, self._copy = tail, buffers, limits, copy
         self.unpickler, self.tensors, self.things = unpickler, tensors, things
+        self._arrays: ArrayReader | None = arrays
         self._make: Callable[[int, object], object] | None = None
         self._heads = self._hashed_keys = 0
 
     def value(self, document: bytes) -> object:
-        """Decodes a document that ``structure.check`` let through.
+        """Decodes a document. Trust: input from the other side.
 
         Raises:
-            MessageTooLargeError: Over a limit that only decoding can tell.
+            MessageTooLargeError: Over a limit.
             RemoteProtocolError: Malformed in any way.
         """
+        structure.check(document, self.limits)
         try:
             value = msgpack.unpackb(
                 document,
@@ -117,6 +101,10 @@ class Decoder:
             raise RemoteProtocolError(f"The header cannot be decoded: {error}") from error
         if self._heads:
             raise RemoteProtocolError("An extension that heads an array stands elsewhere.")
+        if self._arrays is not None:
+            self._arrays.finish()
+        elif self._tail or self._buffers:
+            raise RemoteProtocolError("The message has array bytes that nothing describes.")
         return value
 
     def _extension(self, code: int, payload: bytes) -> object:
@@ -125,7 +113,7 @@ class Decoder:
             return read(self, payload)
         if code not in _BUILDERS:
             raise RemoteProtocolError(f"Unknown extension {code}.")
-        if payload and code not in (OBJECTS, TENSOR):
+        if payload and code not in (kinds.OBJECTS, kinds.TENSOR):
             raise RemoteProtocolError(f"Extension {code} has a payload.")
         self._heads += 1
         return _Head(code, payload)
@@ -136,7 +124,7 @@ class Decoder:
         # A head that is still counted when the document ends stood in a wrong place.
         self._heads -= 1
         head = items.pop(0)
-        return _BUILDERS[head.code](self, items, head.payload)
+        return _BUILDERS[head.code](self, head, items)
 
     def _map(self, pairs: list[tuple[Any, Any]]) -> object:
         if len(pairs) > _FEW_KEYS:
@@ -152,13 +140,21 @@ class Decoder:
             raise RemoteProtocolError("A map has a key twice.")
         return result
 
-    def make(self, code: int, items: list[Any]) -> object:
+    def take(self, descriptor: bytes) -> Array:
+        """The next array."""
+        if self._arrays is None:
+            from envhub_worker.protocol.codec.arrays import ArrayReader
+
+            self._arrays = ArrayReader(self._tail, self._buffers, self.limits, self._copy)
+        return self._arrays.take(descriptor)
+
+    def make(self, head: _Head, items: list[Any]) -> object:
         """What is described; all of one message share a budget."""
         if self.things is None or len(items) != 1:
             raise RemoteProtocolError("The message describes what is not made here.")
         if self._make is None:
             self._make = self.things(self.limits)
-        return self._make(code, items[0])
+        return self._make(head.code, items[0])
 
     def check_keys(self, keys: list[Any]) -> None:
         """Refuses keys chosen to collide, which would make a dict or set take quadratic time."""
@@ -182,8 +178,9 @@ def _distinct(keys: list[Any]) -> list[Any]:
     """
     seen: Counter[object] = Counter()
     made = []
+    lossy = _LOSSY | {getattr(sys.modules.get("numpy"), "ndarray", tuple)}
     for key in keys:
-        if key.__class__ in _LOSSY:
+        if key.__class__ in lossy:
             key = key if _is_hashable(key) else describe(key)
             seen[key] += 1
             if seen[key] > 1:
@@ -201,11 +198,9 @@ def _is_hashable(key: object) -> bool:
     return True
 
 
-def _read_array(decoder: Decoder, payload: bytes) -> object:
-    return decoder.reader.take(payload)
-
-
 def _read_scalar(decoder: Decoder, payload: bytes) -> object:
+    from envhub_worker.protocol.codec.numpy_forms import read_scalar
+
     return read_scalar(payload)
 
 
@@ -218,16 +213,16 @@ def _read_integer(decoder: Decoder, payload: bytes) -> object:
 
 
 def _read_complex(decoder: Decoder, payload: bytes) -> object:
-    if len(payload) != COMPLEX_BYTES.size:
+    if len(payload) != kinds.COMPLEX_BYTES.size:
         raise RemoteProtocolError("A complex number does not have 16 bytes.")
-    return complex(*COMPLEX_BYTES.unpack(payload))
+    return complex(*kinds.COMPLEX_BYTES.unpack(payload))
 
 
 def _read_pickle_frame(decoder: Decoder, payload: bytes) -> object:
     if decoder.unpickler is None:
         return _read_pickle(decoder, b"")
-    data = decoder.reader.take(payload)
-    if data.dtype != np.uint8 or data.ndim != 1:
+    data = decoder.take(payload)
+    if data.dtype.name != "uint8" or data.ndim != 1:
         raise RemoteProtocolError("A pickled object is not an array of bytes.")
     return _read_pickle(decoder, data.data)
 
@@ -247,11 +242,7 @@ def _read_pickle(decoder: Decoder, payload: Buffer) -> object:
         raise RemoteProtocolError(f"An object of the client cannot be loaded: {error}") from error
 
 
-def _build_tuple(decoder: Decoder, items: list[Any], payload: bytes) -> object:
-    return tuple(items)
-
-
-def _build_set(decoder: Decoder, items: list[Any], payload: bytes) -> set[object]:
+def _build_set(decoder: Decoder, head: _Head, items: list[Any]) -> set[object]:
     if len(items) > _FEW_KEYS:
         decoder.check_keys(items)
     try:
@@ -265,62 +256,31 @@ def _build_set(decoder: Decoder, items: list[Any], payload: bytes) -> set[object
     return result
 
 
-def _build_frozenset(decoder: Decoder, items: list[Any], payload: bytes) -> object:
-    return frozenset(_build_set(decoder, items, payload))
-
-
-def _build_range(decoder: Decoder, items: list[Any], payload: bytes) -> object:
+def _build_range(decoder: Decoder, head: _Head, items: list[Any]) -> object:
     if [type(item) for item in items] != [int, int, int] or not items[2]:
         raise RemoteProtocolError("A range is not made of three integers.")
     return range(*items)
 
 
-def _build_slice(decoder: Decoder, items: list[Any], payload: bytes) -> object:
+def _build_slice(decoder: Decoder, head: _Head, items: list[Any]) -> object:
     if len(items) != 3:
         raise RemoteProtocolError("A slice does not have three parts.")
     return slice(*items)
 
 
-def _build_objects(decoder: Decoder, items: list[Any], payload: bytes) -> object:
-    shape = unpack_shape(payload)
-    if math.prod(shape) != len(items):
-        raise RemoteProtocolError("An object array does not have as many elements as its shape.")
-    if not items:
-        return np.empty(shape, dtype=object)
-    array = np.empty(len(items), dtype=object)
-    # One by one: numpy would take apart elements that are sequences.
-    for index, item in enumerate(items):
-        array[index] = item
-    return array.reshape(shape)
+def _build_of_numpy(decoder: Decoder, head: _Head, items: list[Any]) -> object:
+    from envhub_worker.protocol.codec import numpy_forms
+
+    return numpy_forms.BUILDERS[head.code](head.payload, items, decoder.tensors)
 
 
-def _build_text_scalar(decoder: Decoder, items: list[Any], payload: bytes) -> object:
-    if len(items) == 1 and type(items[0]) is str:
-        return np.str_(items[0])
-    if len(items) == 1 and type(items[0]) is bytes:
-        return np.bytes_(items[0])
-    raise RemoteProtocolError("A numpy string is not made of one text.")
-
-
-def _build_tensor(decoder: Decoder, items: list[Any], payload: bytes) -> object:
-    name = payload.decode("ascii", "replace")
-    array = items[0] if len(items) == 1 else None
-    if not isinstance(array, np.ndarray) or array.dtype.name != TENSOR_DTYPES.get(name):
-        raise RemoteProtocolError("A tensor is not made of a fitting array.")
-    if decoder.tensors is not None:
-        return decoder.tensors(array, name)
-    if name == "bfloat16":
-        return (array.astype(np.uint32) << np.uint32(16)).view(np.float32)
-    return array
-
-
-def _build_enum(decoder: Decoder, items: list[Any], payload: bytes) -> object:
+def _build_enum(decoder: Decoder, head: _Head, items: list[Any]) -> object:
     if len(items) != 3:
         raise RemoteProtocolError("An enumeration's member does not have three parts.")
     return RemoteEnum(*_inert_texts(items[:2]), items[2])
 
 
-def _build_remote(decoder: Decoder, items: list[Any], payload: bytes) -> object:
+def _build_remote(decoder: Decoder, head: _Head, items: list[Any]) -> object:
     return RemoteObject(*_inert_texts(items))
 
 
@@ -330,38 +290,22 @@ def _inert_texts(items: list[Any]) -> tuple[str, str]:
     return one_line(items[0], MAX_NAME_CHARS), one_line(items[1], MAX_REPR_CHARS)
 
 
-def _build_space(decoder: Decoder, items: list[Any], payload: bytes) -> object:
-    return decoder.make(SPACE, items)
-
-
-def _build_spec(decoder: Decoder, items: list[Any], payload: bytes) -> object:
-    return decoder.make(SPEC, items)
-
-
-def _build_generator(decoder: Decoder, items: list[Any], payload: bytes) -> object:
-    return decoder.make(GENERATOR, items)
-
-
 _READERS: dict[int, Callable[[Decoder, bytes], object]] = {
-    ARRAY: _read_array,
-    SCALAR: _read_scalar,
-    INTEGER: _read_integer,
-    COMPLEX: _read_complex,
-    PICKLE: _read_pickle,
-    PICKLE_FRAME: _read_pickle_frame,
+    kinds.ARRAY: Decoder.take,
+    kinds.SCALAR: _read_scalar,
+    kinds.INTEGER: _read_integer,
+    kinds.COMPLEX: _read_complex,
+    kinds.PICKLE: _read_pickle,
+    kinds.PICKLE_FRAME: _read_pickle_frame,
 }
-_BUILDERS: dict[int, Callable[[Decoder, list[Any], bytes], object]] = {
-    TUPLE: _build_tuple,
-    SET: _build_set,
-    FROZENSET: _build_frozenset,
-    RANGE: _build_range,
-    SLICE: _build_slice,
-    OBJECTS: _build_objects,
-    TEXT_SCALAR: _build_text_scalar,
-    TENSOR: _build_tensor,
-    ENUM: _build_enum,
-    REMOTE: _build_remote,
-    SPACE: _build_space,
-    SPEC: _build_spec,
-    GENERATOR: _build_generator,
+_BUILDERS: dict[int, Callable[[Decoder, _Head, list[Any]], object]] = {
+    kinds.TUPLE: lambda decoder, head, items: tuple(items),
+    kinds.SET: _build_set,
+    kinds.FROZENSET: lambda decoder, head, items: frozenset(_build_set(decoder, head, items)),
+    kinds.RANGE: _build_range,
+    kinds.SLICE: _build_slice,
+    **dict.fromkeys((kinds.OBJECTS, kinds.TEXT_SCALAR, kinds.TENSOR), _build_of_numpy),
+    kinds.ENUM: _build_enum,
+    kinds.REMOTE: _build_remote,
+    **dict.fromkeys((kinds.SPACE, kinds.SPEC, kinds.GENERATOR), Decoder.make),
 }

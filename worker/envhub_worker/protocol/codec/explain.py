@@ -7,8 +7,7 @@ from enum import Enum
 
 import numpy as np
 
-from envhub_worker.protocol.codec.encoder import Encoder
-from envhub_worker.protocol.codec.exact import Pickler
+from envhub_worker.protocol.codec.encoder import Encoder, Pickler
 from envhub_worker.protocol.codec.inert import describe, one_line, type_name
 from envhub_worker.protocol.limits import WireLimits
 

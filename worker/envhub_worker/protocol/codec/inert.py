@@ -61,7 +61,7 @@ def one_line(text: str, max_chars: int = MAX_REPR_CHARS) -> str:
 def describe(value: object) -> RemoteObject:
     """Turns any object into its inert description. A ``__repr__`` that raises is reported."""
     try:
-        # Addresses tell nobody anything, and make equal things look different.
+        # Addresses make equal things look different.
         text = _ADDRESS.sub("", repr(value))
     except Exception as error:
         text = f"<repr failed with {type(error).__name__}>"

@@ -1,4 +1,4 @@
-"""What a manifest tells of an environment for people and wrappers: metadata, and its spec.
+"""What a manifest holds for people and wrappers: metadata, and facts of a spec.
 
 Trust: input from the worker. Keys on which Gymnasium acts are typed, and of a spec only the facts
 are taken: the rest of its fields are instructions.

@@ -39,8 +39,8 @@ PROBED = frozenset(
     }
 )
 """Names without an underscore that libraries look for in any object, found by having some forty
-convert, print, plot, log, copy and compare one that listens (``tests/support/curious.py``). Whoever
-means such an attribute asks for it by name: ``get_attr`` and ``get_wrapper_attr``."""
+convert, print, plot, log, copy and compare one that listens (``tests/support/curious.py``). Such
+an attribute can be had by name: ``get_attr`` and ``get_wrapper_attr``."""
 
 GYMNASIUMS = frozenset(dir(VectorEnv)) | {
     *getattr(VectorEnv, "__annotations__", ()),
@@ -48,7 +48,7 @@ GYMNASIUMS = frozenset(dir(VectorEnv)) | {
     *("single_observation_space", "single_action_space", "observation_space", "action_space"),
     *("metadata", "spec", "render_mode", "closed", "np_random", "np_random_seed"),
 }
-"""Names that mean something to Gymnasium: they are answered here, or by nobody."""
+"""Names that mean something to Gymnasium: they are answered here, or not at all."""
 
 
 def is_servable(name: str) -> bool:

@@ -87,7 +87,7 @@ def _check(header: m.Packed, bodies: Sequence[Buffer], limits: WireLimits) -> No
 def _unpacker(compression: str) -> Callable[[Buffer, int], bytes]:
     block = _lz4() if compression == "lz4" else None
     if block is None:
-        raise RemoteProtocolError(f"nobody agreed on the compression {compression[:20]!r}")
+        raise RemoteProtocolError(f"there is no agreement on the compression {compression[:20]!r}")
 
     def unpack(body: Buffer, size: int) -> bytes:
         try:

@@ -11,11 +11,13 @@ that a message that recurs is the same bytes again. Packets to a runner have ids
 from __future__ import annotations
 
 import struct
-import sys
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
-from envhub_worker.protocol.codec import plain, templates
+from envhub_worker.protocol.codec import forms
+from envhub_worker.protocol.codec.codec import encode
+from envhub_worker.protocol.codec.decoder import Decoder, TensorMaker, ThingReader, Unpickler
+from envhub_worker.protocol.codec.encoder import Describer, Pickler
 from envhub_worker.protocol.codec.frames import split
 from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
@@ -23,16 +25,11 @@ from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.messages.base import KINDS, Message, check_fields, values_of
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
-if TYPE_CHECKING:
-    from envhub_worker.protocol.codec.decoder import ThingReader, Unpickler
-    from envhub_worker.protocol.codec.encoder import Describer
-    from envhub_worker.protocol.codec.exact import Pickler
-
 _NUMBER = struct.Struct(">Q")
 """The id in front of a header between client and server. 0 stands before ``Packed`` alone."""
 _MOST = (1 << 63) - 1
-_OUTGOING: templates.Forms[Any, templates.Outgoing] = templates.Forms()
-_INCOMING: templates.Forms[bytes, templates.Incoming[Message]] = templates.Forms()
+_OUTGOING: forms.Forms[Any, forms.Outgoing] = forms.Forms()
+_INCOMING: forms.Forms[bytes, forms.Incoming[Message]] = forms.Forms()
 
 
 def pack(
@@ -53,7 +50,7 @@ def pack(
     values = values_of(message)
     if pickler is not None and cls.HANDED:
         values = _handed(message, values, pickler, limits)
-    found = templates.outline(values)
+    found = forms.outline(values)
     if found is None:
         return _encoded(message, values, pickler, limits, describer)
     outline, arrays = found
@@ -61,7 +58,7 @@ def pack(
     if form is not None and form.limits is limits:
         return form.frames(arrays)
     frames = _encoded(message, values, pickler, limits)
-    _OUTGOING.met((cls, outline), lambda: templates.Outgoing(frames, arrays, limits))
+    _OUTGOING.met((cls, outline), lambda: forms.Outgoing(frames, arrays, limits))
     return frames
 
 
@@ -69,8 +66,8 @@ def _handed(
     message: Message, values: list[Any], pickler: Pickler, limits: WireLimits
 ) -> list[object]:
     """The fields as they are sent."""
-    from envhub_worker.protocol.codec.exact import handed_over
     from envhub_worker.protocol.codec.explain import unpicklable
+    from envhub_worker.protocol.codec.handed_over import handed_over
 
     sent = list(values)
     for index, name in enumerate(message.FIELDS):
@@ -92,22 +89,10 @@ def _encoded(
     describer: Describer | None = None,
 ) -> list[Buffer]:
     value, names = [message.kind, *values], ("kind", *message.FIELDS)
-    if _without_numpy():
-        frame = plain.encode(value, limits)
-        if frame is not None:
-            return [frame]
-    from envhub_worker.protocol.codec.codec import encode
-
     try:
-        how: Any = {"limits": limits, "names": names, "describer": describer}
-        return encode(value, pickler=pickler, **how)
+        return encode(value, pickler=pickler, limits=limits, names=names, describer=describer)
     except LocalProtocolError as error:
         raise LocalProtocolError(f"{_asked(message)}{error}") from error.__cause__
-
-
-def _without_numpy() -> bool:
-    """A server does without until it has to handle an array; all others have it already."""
-    return "numpy" not in sys.modules
 
 
 def _asked(message: Message) -> str:
@@ -123,7 +108,7 @@ def unpack(
     *,
     limits: WireLimits = DEFAULT_LIMITS,
     unpickler: Unpickler | None = None,
-    tensors: Callable[[Any, str], object] | None = None,
+    tensors: TensorMaker | None = None,
     things: ThingReader | None = None,
 ) -> Message:
     """The message of some frames.
@@ -136,9 +121,10 @@ def unpack(
         form = _INCOMING.get(document)
         if form is not None and form.limits is limits:
             return form.message(tail, buffers)
-        message = _decode(document, tail, buffers, limits, unpickler, tensors, things)
-        if len(document) <= templates.MAX_DOCUMENT_BYTES:
-            _INCOMING.met(document, lambda: templates.Incoming(document, type(message), limits))
+        decoder = Decoder(tail, buffers, limits, unpickler, tensors, things)
+        message = _checked(decoder.value(document))
+        if len(document) <= forms.MAX_DOCUMENT_BYTES:
+            _INCOMING.met(document, lambda: forms.Incoming(document, type(message), limits))
         return message
 
 
@@ -176,22 +162,7 @@ def number_of(frame: Buffer) -> int | None:
     return _NUMBER.unpack_from(frame)[0] if len(frame) >= _NUMBER.size else None
 
 
-def _decode(
-    document: bytes,
-    tail: Buffer,
-    buffers: list[Buffer],
-    limits: WireLimits,
-    unpickler: Unpickler | None,
-    tensors: Callable[[Any, str], object] | None,
-    things: ThingReader | None,
-) -> Message:
-    value = plain.NOT_PLAIN
-    if _without_numpy() and not tail and not buffers:
-        value = plain.decode(document, limits)
-    if value is plain.NOT_PLAIN:
-        from envhub_worker.protocol.codec.codec import decode_parts
-
-        value = decode_parts(document, tail, buffers, limits, unpickler, tensors, things)
+def _checked(value: object) -> Message:
     if type(value) is not list or not value:
         raise RemoteProtocolError("a message is a list that starts with its kind")
     kind, *fields = value

@@ -278,7 +278,7 @@ class OutputBytes(Message, kind=29):
 class ExpireIdle(Message, kind=30):
     """End a jail whose runners do nothing for so many milliseconds. Reply: ``Done``, or ``Died``.
 
-    Whoever asks anything of it afterwards is told ``Died`` with the reason ``"idle"``.
+    Later requests to it are answered with ``Died``, whose reason is ``"idle"``.
     """
 
     jail: int
@@ -288,7 +288,7 @@ class ExpireIdle(Message, kind=30):
 class NeedPackages(Message, kind=31):
     """Ask a server on another host for a repository's packages. Reply: ``Packages`` or ``Refused``.
 
-    It makes them in its own time, and says at once how far it is: whoever wants them asks again.
+    It makes them in its own time, and says at once how far it is: the client asks again.
     ``requirements`` has pairs, a plain requirement and where it stands; ``supports`` are the
     versions of Python that the repository runs in, ``python`` the version that the caller asks for.
     Where ``always`` is not set, the server's own packages do if they meet all of it. ``guesses``

@@ -1,6 +1,6 @@
 """What a server in a container announces of its surroundings: the one message that is no frame.
 
-It is a line of JSON on stdout, before anybody can connect. The worker fills it in
+It is a line of JSON on stdout, before a client can connect. The worker fills it in
 (``lockdown/surroundings.py``), the client holds it against what it asked the engine for.
 """
 
@@ -51,7 +51,7 @@ class Surroundings:
     def read(cls, said: Mapping[str, Any]) -> Surroundings:
         """What was announced, each field as its type. Raises whatever the values lead to.
 
-        Profiles that nobody knows are left out. Trust: input from the worker.
+        Unknown profiles are left out. Trust: input from the worker.
         """
         fields = {name: _READERS[kind](said[name]) for name, kind in cls.__annotations__.items()}
         known = tuple(name for name in fields.pop("profiles") if name in PROFILES)

@@ -29,7 +29,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from envhub_worker.protocol.records import dataclass
-from envhub_worker.protocol.shared_memory.words import SEQUENCE as SEQUENCE
+from envhub_worker.protocol.shared_memory import SEQUENCE as SEQUENCE
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
 
 LINE = 64
@@ -81,6 +81,8 @@ LISTED = 32
 """Added to the code, it asks for numbers of Python in lists: the caller gave such."""
 DTYPE_CODES = {dtype: code for code, dtype in enumerate(ACTION_DTYPES)}
 _ACTION_ITEM_BYTES = 8
+_RESULT_BYTES = 8 + 1 + 1
+"""A reward and two flags."""
 
 Array = npt.NDArray[Any]
 
@@ -124,6 +126,11 @@ class Layout:
     answer: int
     reply_bytes: int
 
+    @property
+    def action_bytes(self) -> int:
+        """What one step sends."""
+        return _leaf_bytes(self.actions)
+
 
 @dataclass(frozen=True)
 class ObservationLayout:
@@ -144,6 +151,15 @@ class ObservationLayout:
     slot_bytes: int
     results: int
     total_bytes: int
+
+    @property
+    def batch_bytes(self) -> int:
+        """What one step brings, but for infos."""
+        return _leaf_bytes(self.leaves) + self.count * _RESULT_BYTES
+
+
+def _leaf_bytes(leaves: tuple[Leaf, ...]) -> int:
+    return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in leaves)
 
 
 def layout_of(action: gym.Space[Any], count: int) -> Layout | None:
@@ -168,7 +184,7 @@ def observation_layout(space: gym.Space[Any], count: int, slots: int) -> Observa
     if slots > 1:  # each slot is a map of its own in the client
         slot_bytes = -(-slot_bytes // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
     results = slot_bytes * slots
-    total_bytes = _aligned(results + count * (8 + 1 + 1))
+    total_bytes = _aligned(results + count * _RESULT_BYTES)
     if total_bytes > MAX_SLAB_BYTES:
         return None
     return ObservationLayout(count, placed, slots, slot_bytes, results, total_bytes)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from functools import singledispatch
 from typing import Any
 
 import gymnasium as gym
@@ -31,45 +30,29 @@ def even_bounds(count: int, parts: int) -> list[tuple[int, int]]:
     return list(itertools.pairwise(starts))
 
 
-@singledispatch
 def split(space: gym.Space[Any], batch: Any, bounds: Bounds) -> list[Any]:
     """The slices of a batch. Arrays are views."""
+    if isinstance(space, spaces.Dict):
+        named = {key: split(sub, batch[key], bounds) for key, sub in space.spaces.items()}
+        return [{key: part[index] for key, part in named.items()} for index in range(len(bounds))]
+    if isinstance(space, spaces.Tuple):
+        parts = [split(sub, item, bounds) for sub, item in zip(space.spaces, batch, strict=True)]
+        return [tuple(part[index] for part in parts) for index in range(len(bounds))]
     return [batch[start:stop] for start, stop in bounds]
 
 
-@split.register(spaces.Dict)
-def _split_dict(space: spaces.Dict, batch: Any, bounds: Bounds) -> list[Any]:
-    parts = {key: split(sub, batch[key], bounds) for key, sub in space.spaces.items()}
-    return [{key: part[index] for key, part in parts.items()} for index in range(len(bounds))]
-
-
-@split.register(spaces.Tuple)
-def _split_tuple(space: spaces.Tuple[Any], batch: Any, bounds: Bounds) -> list[Any]:
-    parts = [split(sub, item, bounds) for sub, item in zip(space.spaces, batch, strict=True)]
-    return [tuple(part[index] for part in parts) for index in range(len(bounds))]
-
-
-@singledispatch
 def join(space: gym.Space[Any], parts: Sequence[Any]) -> Any:
     """One batch out of the shards' slices, in order."""
     if isinstance(space, ARRAY_SPACES):
         return np.concatenate(parts)
+    if isinstance(space, spaces.Dict):
+        return {key: join(sub, [part[key] for part in parts]) for key, sub in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        members = enumerate(space.spaces)
+        return tuple(join(sub, [part[index] for part in parts]) for index, sub in members)
     return tuple(member for part in parts for member in part)
 
 
-@join.register(spaces.Dict)
-def _join_dict(space: spaces.Dict, parts: Sequence[Any]) -> Any:
-    return {key: join(sub, [part[key] for part in parts]) for key, sub in space.spaces.items()}
-
-
-@join.register(spaces.Tuple)
-def _join_tuple(space: spaces.Tuple[Any], parts: Sequence[Any]) -> Any:
-    return tuple(
-        join(sub, [part[index] for part in parts]) for index, sub in enumerate(space.spaces)
-    )
-
-
-@singledispatch
 def conforms(space: gym.Space[Any], batch: Any, count: int) -> bool:
     """Whether a batch of ``count`` members has the structure, shapes and dtypes of the space.
 
@@ -78,19 +61,15 @@ def conforms(space: gym.Space[Any], batch: Any, count: int) -> bool:
     if isinstance(space, ARRAY_SPACES):
         shape = (count, *(space.shape or ()))
         return type(batch) is np.ndarray and batch.dtype == space.dtype and batch.shape == shape
-    return type(batch) is tuple and len(batch) == count
-
-
-@conforms.register(spaces.Dict)
-def _conforms_dict(space: spaces.Dict, batch: Any, count: int) -> bool:
-    if type(batch) is not dict or batch.keys() != space.spaces.keys():
+    if isinstance(space, spaces.Dict):
+        if type(batch) is not dict or batch.keys() != space.spaces.keys():
+            return False
+        return all(conforms(sub, batch[key], count) for key, sub in space.spaces.items())
+    if type(batch) is not tuple:
         return False
-    return all(conforms(sub, batch[key], count) for key, sub in space.spaces.items())
-
-
-@conforms.register(spaces.Tuple)
-def _conforms_tuple(space: spaces.Tuple[Any], batch: Any, count: int) -> bool:
-    if type(batch) is not tuple or len(batch) != len(space.spaces):
+    if not isinstance(space, spaces.Tuple):
+        return len(batch) == count
+    if len(batch) != len(space.spaces):
         return False
     return all(conforms(sub, item, count) for sub, item in zip(space.spaces, batch, strict=True))
 
@@ -236,72 +215,35 @@ def restores(space: gym.Space[Any]) -> bool:
     return isinstance(inner, gym.Space) and restores(inner)
 
 
-@singledispatch
 def restore_batch(space: gym.Space[Any], batch: Any) -> Any:
-    """A batch with the classes that Gymnasium gives its members."""
-    if isinstance(batch, tuple):
-        return tuple(restore(space, member) for member in batch)
-    return batch
+    """A batch that ``conforms``, with the classes that Gymnasium gives its members."""
+    if isinstance(space, spaces.Dict):
+        return {key: restore_batch(sub, batch[key]) for key, sub in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        pairs = zip(space.spaces, batch, strict=True)
+        return tuple(restore_batch(sub, item) for sub, item in pairs)
+    return tuple(restore(space, member) for member in batch) if isinstance(batch, tuple) else batch
 
 
-@restore_batch.register(spaces.Dict)
-def _restore_batch_dict(space: spaces.Dict, batch: Any) -> Any:
-    return {key: restore_batch(sub, batch[key]) for key, sub in space.spaces.items()}
-
-
-@restore_batch.register(spaces.Tuple)
-def _restore_batch_tuple(space: spaces.Tuple[Any], batch: Any) -> Any:
-    pairs = zip(space.spaces, batch, strict=True)
-    return tuple(restore_batch(sub, item) for sub, item in pairs)
-
-
-@singledispatch
-def restore(space: gym.Space[Any], member: Any) -> Any:
-    """One member with the class that Gymnasium gives it."""
+def restore(space: Any, member: Any) -> Any:
+    """One member with the class that Gymnasium gives it; what does not fit the space as it is."""
+    if isinstance(space, spaces.Dict) and isinstance(member, dict):
+        known = space.spaces
+        return {k: restore(known[k], item) if k in known else item for k, item in member.items()}
+    if not isinstance(member, tuple):
+        return member
+    if isinstance(space, spaces.Graph) and len(member) == len(GraphInstance._fields):
+        return GraphInstance(*member)
+    if isinstance(space, spaces.Tuple) and len(member) == len(space.spaces):
+        return tuple(map(restore, space.spaces, member))
+    if OneOf is not None and isinstance(space, OneOf):
+        try:
+            index, chosen = member
+            return (index, restore(space.spaces[index], chosen))
+        except FAULTS:
+            return member
+    if isinstance(space, spaces.Sequence):
+        if space.stack:
+            return restore_batch(space.feature_space, member)
+        return tuple(restore(space.feature_space, item) for item in member)
     return member
-
-
-@restore.register(spaces.Graph)
-def _restore_graph(space: spaces.Graph, member: Any) -> Any:
-    is_graph = isinstance(member, tuple) and len(member) == len(GraphInstance._fields)
-    return GraphInstance(*member) if is_graph else member
-
-
-@restore.register(spaces.Dict)
-def _restore_dict(space: spaces.Dict, member: Any) -> Any:
-    if not isinstance(member, dict):
-        return member
-    return {
-        key: restore(space[key], item) if key in space.spaces else item
-        for key, item in member.items()
-    }
-
-
-@restore.register(spaces.Tuple)
-def _restore_tuple(space: spaces.Tuple[Any], member: Any) -> Any:
-    if not isinstance(member, tuple) or len(member) != len(space.spaces):
-        return member
-    return tuple(restore(sub, item) for sub, item in zip(space.spaces, member, strict=True))
-
-
-def _restore_one_of(space: Any, member: Any) -> Any:
-    if not isinstance(member, tuple):
-        return member
-    try:
-        index, chosen = member
-        return (index, restore(space.spaces[index], chosen))
-    except FAULTS:
-        return member
-
-
-if OneOf is not None:  # since 1.0
-    restore.register(OneOf, _restore_one_of)
-
-
-@restore.register(spaces.Sequence)
-def _restore_sequence(space: spaces.Sequence, member: Any) -> Any:
-    if not isinstance(member, tuple):
-        return member
-    if space.stack:
-        return restore_batch(space.feature_space, member)
-    return tuple(restore(space.feature_space, item) for item in member)

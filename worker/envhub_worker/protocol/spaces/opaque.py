@@ -17,6 +17,23 @@ _DTYPE_CODES = ("?", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4",
 BOX_DTYPES = {np.dtype(code).name: np.dtype(code) for code in _DTYPE_CODES}
 INTEGER_DTYPES = {name: dtype for name, dtype in BOX_DTYPES.items() if dtype.kind in "iu"}
 
+ARRAY_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+"""Whose members are arrays or numbers, and whose batches are one array."""
+FIELDS = {
+    "opaque": ("type", "text", "shape", "dtype"),
+    "box": ("dtype", "shape", "low", "high", "bounded_below", "bounded_above"),
+    "discrete": ("n", "start", "dtype"),
+    "multi_discrete": ("dtype", "shape", "nvec", "start"),
+    "multi_binary": ("n",),
+    "text": ("min_length", "max_length", "characters"),
+    "dict": ("keys", "spaces", "sort_keys"),
+    "tuple": ("spaces",),
+    "one_of": ("spaces",),
+    "sequence": ("space", "stack"),
+    "graph": ("node", "edge"),
+}
+"""By the kind of a space: what describes it, beside the kind."""
+
 # Gymnasium 0.29 has none.
 OneOf: Any = getattr(spaces, "OneOf", None)
 

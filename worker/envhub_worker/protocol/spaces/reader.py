@@ -17,6 +17,7 @@ from envhub_worker.protocol.codec.inert import MAX_NAME_CHARS, one_line
 from envhub_worker.protocol.errors import EnvHubError, RemoteProtocolError
 from envhub_worker.protocol.spaces.opaque import (
     BOX_DTYPES,
+    FIELDS,
     INTEGER_DTYPES,
     MAX_SPACE_DEPTH,
     OneOf,
@@ -51,21 +52,6 @@ Space = gym.Space[Any]
 GeneratorMaker = Callable[[object], np.random.Generator]
 
 
-def decode_space(value: object, *, max_elements: int) -> Space:
-    """Builds the space that ``encode_space`` described.
-
-    Trust: input from the worker.
-
-    Args:
-        value: What the wire brought.
-        max_elements: What all spaces in it may cost together, as ``SpaceReader`` counts it.
-
-    Raises:
-        RemoteProtocolError: Malformed, contradictory, or over ``max_elements``.
-    """
-    return SpaceReader(max_elements).space(value)
-
-
 class SpaceReader:
     """Builds spaces out of one budget of bytes, which is asked before anything is built.
 
@@ -78,7 +64,7 @@ class SpaceReader:
         generator: Makes a generator of a state, which it checks. Without it there may be none.
     """
 
-    __slots__ = ("_boxes", "_check", "_generator", "_left", "_max_elements", "_twice")
+    __slots__ = ("_boxes", "_check", "_depth", "_generator", "_left", "_max_elements", "_twice")
 
     def __init__(
         self,
@@ -90,18 +76,19 @@ class SpaceReader:
         self._left, self._max_elements = max_elements * ELEMENT_BYTES, max_elements
         self._check = check
         self._boxes: dict[tuple[object, ...], spaces.Box] = {}
-        self._twice = False
+        self._depth, self._twice = 0, False
 
     def space(self, value: object) -> Space:
         """The next space. Trust: input from the worker.
 
         Raises:
-            RemoteProtocolError: As ``decode_space``.
+            RemoteProtocolError: Malformed, contradictory, or over ``max_elements``.
         """
+        self._depth, self._twice = 0, False
         try:
             if self._generator is None or type(value) is not dict or GENERATORS not in value:
-                return self.read(value, 0)
-            space = self.read({k: part for k, part in value.items() if k != GENERATORS}, 0)
+                return self.read(value)
+            space = self.read({k: part for k, part in value.items() if k != GENERATORS})
             self._start(space, value[GENERATORS], self._generator)
             return space
         except EnvHubError:
@@ -123,31 +110,43 @@ class SpaceReader:
                 self.spend(GENERATOR_BYTES)
                 part._np_random = generator(state)
 
-    def read(self, value: object, depth: int) -> Space:
-        """One space and all that is in it, at a depth."""
+    def read(self, value: object) -> Space:
+        """One space and all that is in it."""
         if self._check is not None:
             self._check()
         self.spend(SPACE_BYTES)
         if type(value) is not dict or type(value.get("kind")) is not str:
             raise RemoteProtocolError("A space is not described by a map with a kind.")
-        names, build = _KINDS.get(value["kind"], ((), None))
+        build, names = _BUILDERS.get(value["kind"]), FIELDS.get(value["kind"], ())
         if build is None:
             raise RemoteProtocolError("A space is of an unknown kind.")
         if value.keys() != {"kind", *names}:
             raise RemoteProtocolError(f"A space of kind {value['kind']} has wrong attributes.")
-        return build(self, depth, *(value[name] for name in names))
+        return build(self, *(value[name] for name in names))
 
-    def child(self, value: object, depth: int) -> Space:
-        """What a space at this depth holds."""
-        if depth == MAX_SPACE_DEPTH:
+    def child(self, value: object) -> Space:
+        """What the space that is being read holds."""
+        if self._depth == MAX_SPACE_DEPTH:
             raise RemoteProtocolError(f"Spaces are nested deeper than {MAX_SPACE_DEPTH}.")
-        return self.read(value, depth + 1)
+        self._depth += 1
+        space = self.read(value)
+        self._depth -= 1
+        return space
 
-    def children(self, value: object, depth: int) -> list[Space]:
-        """All that a space at this depth holds."""
+    def children(self, value: object) -> list[Space]:
+        """All that the space that is being read holds."""
         if type(value) is not list or len(value) > MAX_CHILDREN:
             raise RemoteProtocolError("A space's parts are not a list of sane length.")
-        return [self.child(part, depth) for part in value]
+        return list(map(self.child, value))
+
+    def child_twice(self, value: object) -> Space:
+        """A space of which Gymnasium keeps a batch of one besides; pays for both."""
+        before, within = self._left, self._twice
+        self._twice = True  # that batch has bounds of its own
+        space = self.child(value)
+        self._twice = within
+        self.spend(before - self._left)
+        return space
 
     def spend(self, size: int) -> None:
         """Raises ``RemoteProtocolError`` when this many bytes are too many."""
@@ -182,7 +181,7 @@ class SpaceReader:
 
 
 def _read_opaque(
-    reader: SpaceReader, depth: int, name: object, text: object, shape: object, dtype: object
+    reader: SpaceReader, name: object, text: object, shape: object, dtype: object
 ) -> Space:
     if not (type(name) is type(text) is type(dtype) is str):
         raise RemoteProtocolError("A custom space is not described by text.")
@@ -195,7 +194,6 @@ def _read_opaque(
 
 def _read_box(
     reader: SpaceReader,
-    depth: int,
     name: object,
     shape: object,
     low: object,
@@ -234,9 +232,7 @@ def _box_key(name: object, shape: object, *arrays: object) -> tuple[object, ...]
     return (*known, shape)
 
 
-def _read_discrete(
-    reader: SpaceReader, depth: int, n: object, start: object, name: object
-) -> Space:
+def _read_discrete(reader: SpaceReader, n: object, start: object, name: object) -> Space:
     dtype = _dtype(name, INTEGER_DTYPES)
     least, most = _integer_range(dtype)
     count, first = _integer(n, 1, most), _integer(start, least, most)
@@ -248,7 +244,7 @@ def _read_discrete(
 
 
 def _read_multi_discrete(
-    reader: SpaceReader, depth: int, name: object, shape: object, nvec: object, start: object
+    reader: SpaceReader, name: object, shape: object, nvec: object, start: object
 ) -> Space:
     dtype = _dtype(name, INTEGER_DTYPES)
     # its bounds; a sample takes as much once more
@@ -257,7 +253,7 @@ def _read_multi_discrete(
     return spaces.MultiDiscrete(counts.copy(), dtype=dtype.type, start=first.copy())
 
 
-def _read_multi_binary(reader: SpaceReader, depth: int, n: object) -> Space:
+def _read_multi_binary(reader: SpaceReader, n: object) -> Space:
     if isinstance(n, tuple):
         return spaces.MultiBinary(list(reader.shape(n, ELEMENT_BYTES)))
     size = _integer(n, 1, MAX_INT64)
@@ -265,9 +261,7 @@ def _read_multi_binary(reader: SpaceReader, depth: int, n: object) -> Space:
     return spaces.MultiBinary(size)
 
 
-def _read_text(
-    reader: SpaceReader, depth: int, shortest: object, longest: object, characters: object
-) -> Space:
+def _read_text(reader: SpaceReader, shortest: object, longest: object, characters: object) -> Space:
     if type(characters) is not str or not is_charset(characters):
         raise RemoteProtocolError("A Text space's characters are not distinct characters.")
     reader.spend(CHARACTER_BYTES * len(characters))
@@ -280,12 +274,10 @@ def _read_text(
     )
 
 
-def _read_dict(
-    reader: SpaceReader, depth: int, keys: object, parts: object, sort_keys: object
-) -> Space:
+def _read_dict(reader: SpaceReader, keys: object, parts: object, sort_keys: object) -> Space:
     if type(keys) is not list or len(keys) > MAX_KEYS or type(sort_keys) is not bool:
         raise RemoteProtocolError("A Dict space's keys are not a list of sane length.")
-    children = reader.children(parts, depth)
+    children = reader.children(parts)
     if not len(set(keys)) == len(keys) == len(children):
         raise RemoteProtocolError("A Dict space has a key twice, or not one key per part.")
     # Pairs keep their order; Gymnasium sorts plain mappings.
@@ -295,54 +287,38 @@ def _read_dict(
     return space
 
 
-def _read_tuple(reader: SpaceReader, depth: int, parts: object) -> Space:
-    return spaces.Tuple(reader.children(parts, depth))
-
-
-def _read_one_of(reader: SpaceReader, depth: int, parts: object) -> Space:
-    children = reader.children(parts, depth)
+def _read_one_of(reader: SpaceReader, parts: object) -> Space:
+    children = reader.children(parts)
     if OneOf is None:
         return OpaqueSpace("gymnasium.spaces.OneOf", one_line(f"OneOf({children})"))
     space: Space = OneOf(children)
     return space
 
 
-def _read_sequence(reader: SpaceReader, depth: int, part: object, stack: object) -> Space:
+def _read_sequence(reader: SpaceReader, part: object, stack: object) -> Space:
     if type(stack) is not bool:
         raise RemoteProtocolError("A Sequence space's stack flag is not a boolean.")
-    return spaces.Sequence(_read_twice(reader, part, depth), stack=stack)
+    return spaces.Sequence(reader.child_twice(part), stack=stack)
 
 
-def _read_graph(reader: SpaceReader, depth: int, node: object, edge: object) -> Space:
-    nodes: Any = _read_twice(reader, node, depth)
-    edges: Any = None if edge is None else _read_twice(reader, edge, depth)
+def _read_graph(reader: SpaceReader, node: object, edge: object) -> Space:
+    nodes: Any = reader.child_twice(node)
+    edges: Any = None if edge is None else reader.child_twice(edge)
     return spaces.Graph(nodes, edges)
 
 
-def _read_twice(reader: SpaceReader, part: object, depth: int) -> Space:
-    """Reads a space of which Gymnasium keeps a batch of one besides, and pays for both."""
-    before, within = reader._left, reader._twice
-    reader._twice = True  # that batch has bounds of its own
-    try:
-        space = reader.child(part, depth)
-    finally:
-        reader._twice = within
-    reader.spend(before - reader._left)
-    return space
-
-
-_KINDS: dict[str, tuple[tuple[str, ...], Callable[..., Space]]] = {
-    "opaque": (("type", "text", "shape", "dtype"), _read_opaque),
-    "box": (("dtype", "shape", "low", "high", "bounded_below", "bounded_above"), _read_box),
-    "discrete": (("n", "start", "dtype"), _read_discrete),
-    "multi_discrete": (("dtype", "shape", "nvec", "start"), _read_multi_discrete),
-    "multi_binary": (("n",), _read_multi_binary),
-    "text": (("min_length", "max_length", "characters"), _read_text),
-    "dict": (("keys", "spaces", "sort_keys"), _read_dict),
-    "tuple": (("spaces",), _read_tuple),
-    "one_of": (("spaces",), _read_one_of),
-    "sequence": (("space", "stack"), _read_sequence),
-    "graph": (("node", "edge"), _read_graph),
+_BUILDERS: dict[str, Callable[..., Space]] = {
+    "opaque": _read_opaque,
+    "box": _read_box,
+    "discrete": _read_discrete,
+    "multi_discrete": _read_multi_discrete,
+    "multi_binary": _read_multi_binary,
+    "text": _read_text,
+    "dict": _read_dict,
+    "tuple": lambda reader, parts: spaces.Tuple(reader.children(parts)),
+    "one_of": _read_one_of,
+    "sequence": _read_sequence,
+    "graph": _read_graph,
 }
 
 

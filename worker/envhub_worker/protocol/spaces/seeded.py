@@ -1,8 +1,8 @@
 """Generators of seeded spaces: which of them travel with a description, in which order.
 
 A space that its author has seeded draws the same samples in each run, and so must its copy in the
-client. One that nobody seeded starts anywhere: its state does not travel, for a description that is
-remembered would make every run start at the same place.
+client. One that was not seeded starts anywhere: its state does not travel, for a remembered
+description would make every run start at the same place.
 """
 
 from __future__ import annotations
@@ -14,20 +14,19 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from envhub_worker.protocol.spaces.opaque import OneOf
+from envhub_worker.protocol.spaces.opaque import ARRAY_SPACES, OneOf
 
 Space = gym.Space[Any]
 States = list[Any]
 _CHANCE_BITS = 64
 """The entropy of a seed; what the operating system gives has twice as many bits."""
-_BIT_GENERATORS = (
+BIT_GENERATORS = (
     np.random.PCG64,
     np.random.PCG64DXSM,
     np.random.MT19937,
     np.random.Philox,
     np.random.SFC64,
 )
-_ARRAYS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 
 def nodes(space: Space) -> Iterator[Space]:
@@ -76,7 +75,9 @@ def _children(space: Space) -> tuple[Space, ...]:
 
 def _may_be_batched(space: Space) -> bool:
     """Whether the generators of its batch are seeded only if it is."""
-    return isinstance(space, (*_ARRAYS, spaces.Dict, spaces.Tuple)) or _state(space) is not None
+    return (
+        isinstance(space, (*ARRAY_SPACES, spaces.Dict, spaces.Tuple)) or _state(space) is not None
+    )
 
 
 def _state(space: Space) -> Any:
@@ -85,7 +86,7 @@ def _state(space: Space) -> Any:
     if type(generator) is not np.random.Generator:
         return None
     bits = generator.bit_generator
-    if type(bits) not in _BIT_GENERATORS:
+    if type(bits) not in BIT_GENERATORS:
         return None
     sequence = getattr(bits, "seed_seq", None) or getattr(bits, "_seed_seq", None)
     entropy = getattr(sequence, "entropy", None)

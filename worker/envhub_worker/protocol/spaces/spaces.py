@@ -17,21 +17,21 @@ from numpy.typing import NDArray
 from envhub_worker.protocol.codec.inert import MAX_NAME_CHARS, describe, one_line
 from envhub_worker.protocol.errors import LocalProtocolError
 from envhub_worker.protocol.spaces.opaque import (
+    ARRAY_SPACES,
     BOX_DTYPES,
+    FIELDS,
     MAX_SPACE_DEPTH,
     OneOf,
     OpaqueSpace,
     is_charset,
     is_shape,
 )
-from envhub_worker.protocol.spaces.reader import GENERATORS, decode_space
+from envhub_worker.protocol.spaces.reader import GENERATORS
 from envhub_worker.protocol.spaces.seeded import states_of
 
-__all__ = ["ARRAY_SPACES", "OpaqueSpace", "decode_space", "encode_space"]
+__all__ = ["ARRAY_SPACES", "OpaqueSpace", "encode_space"]
 
 Space = gym.Space[Any]
-ARRAY_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
-"""Whose members are arrays or numbers, and whose batches are one array."""
 
 
 def encode_space(
@@ -55,126 +55,88 @@ def encode_space(
     return described if states is None else {**described, GENERATORS: states}
 
 
-@singledispatch
 def _encode(space: Any, depth: int) -> dict[str, object]:
+    kind, *values = _fields(space, depth)
+    return {"kind": kind, **dict(zip(FIELDS[kind], values, strict=True))}
+
+
+@singledispatch
+def _fields(space: Any, depth: int) -> tuple[Any, ...]:
+    """The kind of a space, and the values of that kind's ``FIELDS``."""
     about = describe(space)
     shape = getattr(space, "shape", None)
     dtype = getattr(space, "dtype", None)
-    return {
-        "kind": "opaque",
-        "type": about.type_name,
-        "text": about.text,
-        "shape": shape if is_shape(shape) else None,
-        "dtype": "" if dtype is None else one_line(str(dtype), MAX_NAME_CHARS),
-    }
+    dtype_text = "" if dtype is None else one_line(str(dtype), MAX_NAME_CHARS)
+    shape = shape if is_shape(shape) else None
+    return "opaque", about.type_name, about.text, shape, dtype_text
 
 
-@_encode.register
-def _(space: OpaqueSpace, depth: int) -> dict[str, object]:
-    return {
-        "kind": "opaque",
-        "type": space.type_name,
-        "text": space.text,
-        "shape": space.shape,
-        "dtype": space.dtype_text,
-    }
+_opaque_fields = _fields.dispatch(object)
 
 
-@_encode.register
-def _(space: spaces.Box, depth: int) -> dict[str, object]:
+@_fields.register
+def _(space: OpaqueSpace, depth: int) -> tuple[Any, ...]:
+    return "opaque", space.type_name, space.text, space.shape, space.dtype_text
+
+
+@_fields.register
+def _(space: spaces.Box, depth: int) -> tuple[Any, ...]:
     if space.dtype.name not in BOX_DTYPES:
-        return _encode.dispatch(object)(space, depth)
-    return {
-        "kind": "box",
-        "dtype": space.dtype.name,
-        "shape": space.shape,
-        "low": _compact(space.low),
-        "high": _compact(space.high),
-        "bounded_below": _compact(space.bounded_below),
-        "bounded_above": _compact(space.bounded_above),
-    }
+        return _opaque_fields(space, depth)
+    arrays = (space.low, space.high, space.bounded_below, space.bounded_above)
+    return "box", space.dtype.name, space.shape, *map(_compact, arrays)
 
 
-@_encode.register
-def _(space: spaces.Discrete, depth: int) -> dict[str, object]:
-    return {
-        "kind": "discrete",
-        "n": int(space.n),
-        "start": int(space.start),
-        "dtype": np.dtype(space.dtype).name,
-    }
+@_fields.register
+def _(space: spaces.Discrete, depth: int) -> tuple[Any, ...]:
+    return "discrete", int(space.n), int(space.start), np.dtype(space.dtype).name
 
 
-@_encode.register
-def _(space: spaces.MultiDiscrete, depth: int) -> dict[str, object]:
-    return {
-        "kind": "multi_discrete",
-        "dtype": np.dtype(space.dtype).name,
-        "shape": space.nvec.shape,
-        "nvec": _compact(space.nvec),
-        "start": _compact(space.start),
-    }
+@_fields.register
+def _(space: spaces.MultiDiscrete, depth: int) -> tuple[Any, ...]:
+    name, shape = np.dtype(space.dtype).name, space.nvec.shape
+    return "multi_discrete", name, shape, _compact(space.nvec), _compact(space.start)
 
 
-@_encode.register
-def _(space: spaces.MultiBinary, depth: int) -> dict[str, object]:
+@_fields.register
+def _(space: spaces.MultiBinary, depth: int) -> tuple[Any, ...]:
     n = space.n
-    return {"kind": "multi_binary", "n": tuple(map(int, n)) if isinstance(n, tuple) else int(n)}
+    return "multi_binary", tuple(map(int, n)) if isinstance(n, tuple) else int(n)
 
 
-@_encode.register
-def _(space: spaces.Text, depth: int) -> dict[str, object]:
+@_fields.register
+def _(space: spaces.Text, depth: int) -> tuple[Any, ...]:
     characters = "".join(dict.fromkeys(space.character_list))
     if not is_charset(characters) or len(characters) != len(space.character_set):
-        return _encode.dispatch(object)(space, depth)
-    return {
-        "kind": "text",
-        "min_length": int(space.min_length),
-        "max_length": int(space.max_length),
-        "characters": characters,
-    }
+        return _opaque_fields(space, depth)
+    return "text", int(space.min_length), int(space.max_length), characters
 
 
-@_encode.register
-def _(space: spaces.Dict, depth: int) -> dict[str, object]:
-    return {
-        "kind": "dict",
-        "keys": list(space.spaces),
-        "spaces": _encode_all(space.spaces.values(), depth),
-        "sort_keys": bool(getattr(space, "sort_keys", True)),
-    }
+@_fields.register
+def _(space: spaces.Dict, depth: int) -> tuple[Any, ...]:
+    parts = _encode_all(space.spaces.values(), depth)
+    return "dict", list(space.spaces), parts, bool(getattr(space, "sort_keys", True))
 
 
-@_encode.register(spaces.Tuple)
-def _(space: spaces.Tuple[Any], depth: int) -> dict[str, object]:
-    return {"kind": "tuple", "spaces": _encode_all(space.spaces, depth)}
+@_fields.register(spaces.Tuple)
+def _(space: spaces.Tuple[Any], depth: int) -> tuple[Any, ...]:
+    return "tuple", _encode_all(space.spaces, depth)
 
 
-@_encode.register
-def _(space: spaces.Sequence, depth: int) -> dict[str, object]:
-    return {
-        "kind": "sequence",
-        "space": _encode_child(space.feature_space, depth),
-        "stack": bool(space.stack),
-    }
+@_fields.register
+def _(space: spaces.Sequence, depth: int) -> tuple[Any, ...]:
+    return "sequence", _encode_child(space.feature_space, depth), bool(space.stack)
 
 
-@_encode.register
-def _(space: spaces.Graph, depth: int) -> dict[str, object]:
+@_fields.register
+def _(space: spaces.Graph, depth: int) -> tuple[Any, ...]:
     edge = space.edge_space
-    return {
-        "kind": "graph",
-        "node": _encode_child(space.node_space, depth),
-        "edge": None if edge is None else _encode_child(edge, depth),
-    }
-
-
-def _encode_one_of(space: Any, depth: int) -> dict[str, object]:
-    return {"kind": "one_of", "spaces": _encode_all(space.spaces, depth)}
+    node = _encode_child(space.node_space, depth)
+    return "graph", node, None if edge is None else _encode_child(edge, depth)
 
 
 if OneOf is not None:
-    _encode.register(OneOf, _encode_one_of)
+    _fields.register(OneOf, lambda space, depth: ("one_of", _encode_all(space.spaces, depth)))
 
 
 def _encode_child(space: Space, depth: int) -> dict[str, object]:

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec import templates
+from envhub_worker.protocol.codec import forms
 from envhub_worker.protocol.codec.arrays import ArrayReader
 from envhub_worker.protocol.codec.codec import RemoteEnum, RemoteObject, decode, encode
 from envhub_worker.protocol.errors import (
@@ -76,7 +76,7 @@ OUTGOING, INCOMING = inside.FORMS
 def no_forms(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever other tests have sent."""
     for spot in (OUTGOING, INCOMING):
-        monkeypatch.setattr(*spot, templates.Forms())
+        monkeypatch.setattr(*spot, forms.Forms())
 
 
 def alike(one: Any, other: Any) -> bool:
@@ -151,7 +151,7 @@ def test_a_form_that_cannot_be_made_is_none(monkeypatch: pytest.MonkeyPatch) -> 
         raise RuntimeError
 
     for name in ("Outgoing", "Incoming"):
-        monkeypatch.setattr(templates, name, failing)
+        monkeypatch.setattr(forms, name, failing)
     for _ in range(5):
         assert m.unpack(m.pack(m.Value({"a": 1}))) == m.Value({"a": 1})
 

@@ -8,17 +8,14 @@ limits, all of it is pickled. Only from client to worker: nothing that comes bac
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from envhub_worker.protocol.codec.arrays import MAX_DIMENSIONS
+from envhub_worker.protocol.codec.arrays import MAX_DIMENSIONS, MAX_UNIT_COUNT
+from envhub_worker.protocol.codec.encoder import PickledValue, Pickler
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
 from envhub_worker.protocol.limits import WireLimits
-
-Data = bytes | memoryview
-Pickler = Callable[[object], Data]
 
 _DEPTH = 16
 """Containers in containers; a message's own count towards the wire's limit, too."""
@@ -30,19 +27,11 @@ _ATOMS = frozenset({type(None), bool, float, complex})
 _SCALARS = frozenset(np.dtype(char).type for char in "?bBhHiIlLqQefdFDmM")
 _ARRAYS = frozenset("?bBhHiIlLqQefdFDmMS")
 """Characters of dtypes whose bytes are all there is to them."""
-_MAX_UNIT_COUNT = 2**24 - 1
-
-
-@dataclass(frozen=True, slots=True)
-class Pickled:
-    """A value that travels pickled. A ``memoryview`` becomes a frame of its own."""
-
-    data: Data
 
 
 def handed_over(value: object, pickler: Pickler, limits: WireLimits) -> object:
     """The value itself, if the wire carries exactly that, or else its pickle."""
-    return value if _Judge(limits).holds(value, 0) else Pickled(pickler(value))
+    return value if _Judge(limits).holds(value, 0) else PickledValue(pickler(value))
 
 
 class _Judge:
@@ -60,7 +49,6 @@ class _Judge:
         self._arrays_left = _MOST_ARRAYS
 
     def holds(self, value: Any, depth: int) -> bool:
-        """Whether it is, and all that is in it."""
         kind = type(value)
         self._left -= 1
         if kind in _ATOMS:
@@ -71,11 +59,9 @@ class _Judge:
         )
 
     def all(self, values: Any, depth: int) -> bool:
-        """Whether all of these are."""
         return all(self.holds(value, depth + 1) for value in values)
 
     def number(self, value: int, depth: int) -> bool:
-        """An integer."""
         return value.bit_length() // 8 < self._limits.int_bytes
 
     def text(self, value: str, depth: int) -> bool:
@@ -88,12 +74,10 @@ class _Judge:
             return False
 
     def bytes(self, value: Any, depth: int) -> bool:
-        """What stands in the header."""
         self._bytes_left -= len(value)
         return self._bytes_left >= 0 and len(value) <= self._limits.text_bytes
 
     def mapping(self, value: dict[Any, Any], depth: int) -> bool:
-        """A dict."""
         plain = len(value) <= _FEW or set(map(type, value)) == {str}
         return plain and self.all(value, depth) and self.all(value.values(), depth)
 
@@ -102,7 +86,6 @@ class _Judge:
         return len(value) <= _FEW and self.all(value, depth)
 
     def bounds(self, value: Any, depth: int) -> bool:
-        """A range or a slice."""
         return self.all((value.start, value.stop, value.step), depth)
 
     def array(self, value: Any, depth: int) -> bool:
@@ -118,12 +101,11 @@ class _Judge:
         return dtype.char in _ARRAYS and _is_unit(dtype)
 
     def scalar(self, value: Any, depth: int) -> bool:
-        """A number of numpy's."""
         return _is_unit(value.dtype)
 
 
 def _is_unit(dtype: np.dtype[Any]) -> bool:
-    return dtype.kind not in "mM" or np.datetime_data(dtype)[1] <= _MAX_UNIT_COUNT
+    return dtype.kind not in "mM" or np.datetime_data(dtype)[1] <= MAX_UNIT_COUNT
 
 
 def _always(judge: _Judge, value: Any, depth: int) -> bool:

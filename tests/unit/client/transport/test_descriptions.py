@@ -14,7 +14,7 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
 from envhub_sandbox.errors import RemoteProtocolError
-from envhub_sandbox.transport.values.described import Described
+from envhub_sandbox.transport.values.descriptions import DescriptionReader
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject
 from envhub_worker.protocol.limits import WireLimits
@@ -39,7 +39,7 @@ BITS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
 def arrived(value: object) -> Any:
     """What a client makes of a worker's answer."""
     frames = m.pack(m.Value(value), describer=described)
-    message = m.unpack(frames, things=Described)
+    message = m.unpack(frames, things=DescriptionReader)
     assert isinstance(message, m.Value)
     return message.value
 
@@ -105,16 +105,16 @@ def test_a_message_has_one_budget() -> None:
     for values, fits in (((space,), True), ((space, spaces.Box(0, 2, (3000,)), space), False)):
         frames = m.pack(m.Value(values), describer=described)
         if fits:
-            assert m.unpack(frames, limits=limits, things=Described) == m.Value(values)
+            assert m.unpack(frames, limits=limits, things=DescriptionReader) == m.Value(values)
             continue
         with pytest.raises(RemoteProtocolError, match="cost more"):
-            m.unpack(frames, limits=limits, things=Described)
+            m.unpack(frames, limits=limits, things=DescriptionReader)
 
 
 def test_nobody_else_makes_anything_of_descriptions() -> None:
     """Whoever was not given what makes them refuses them: a server, a runner, an older client."""
     with pytest.raises(RemoteProtocolError, match="not made here"):
         m.unpack(m.pack(m.Value(spaces.Discrete(2)), describer=described))
-    plain = m.unpack(m.pack(m.Value(spaces.Discrete(2))), things=Described)
+    plain = m.unpack(m.pack(m.Value(spaces.Discrete(2))), things=DescriptionReader)
     assert isinstance(plain, m.Value)
     assert isinstance(plain.value, RemoteObject)

@@ -12,19 +12,18 @@ from typing import Any
 
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
-from envhub_worker.protocol.messages import changed
-from envhub_worker.protocol.untrusted import UNTRUSTED
+from envhub_worker.protocol.messages.prefix import CHANGES, WATCHED_TYPES, Attribute
 
 
-class WatchedValues:
+class AttributeCache:
     """The values, by the number of the environment and the attribute's name."""
 
     def __init__(self) -> None:
-        self._values: dict[changed.Attribute, tuple[Any, ...]] = {}
+        self._values: dict[Attribute, tuple[Any, ...]] = {}
 
     def note(self, number: int, name: str, values: tuple[Any, ...]) -> bool:
         """Keep values that were read. Returns whether they can be kept."""
-        if not all(type(value) in changed.WATCHED_TYPES for value in values):
+        if not all(type(value) in WATCHED_TYPES for value in values):
             return False
         self._values[number, name] = values
         return True
@@ -45,9 +44,7 @@ class WatchedValues:
         """
         if len(frames) >= DEFAULT_LIMITS.frames:  # there was no room in front
             self.forget()
-        if not changed.stand_in_front(frames):
-            return frames
-        with UNTRUSTED:
-            for attribute in changed.read(frames[0]):
-                self._values.pop(attribute, None)
-        return frames[1:]
+        changed, rest = CHANGES.read(frames)
+        for attribute in changed:
+            self._values.pop(attribute, None)
+        return rest

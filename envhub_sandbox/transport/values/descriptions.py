@@ -6,14 +6,17 @@ is fields of a fixed form, each held against what such a thing can have.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_sandbox.transport.values.generators import generator
 from envhub_sandbox.transport.values.specs import spec_of
+from envhub_sandbox.transport.values.tensors import to_tensor
+from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject, one_line
-from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
-from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC, Buffer
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.manifest.facts import read_spec
 from envhub_worker.protocol.spaces.reader import (
     ELEMENT_BYTES,
@@ -22,11 +25,21 @@ from envhub_worker.protocol.spaces.reader import (
     SpaceReader,
 )
 
+
+def unpacked(frames: Sequence[Buffer], limits: WireLimits = DEFAULT_LIMITS) -> m.Message:
+    """A runner's message, with what it describes. Trust: input from the worker.
+
+    Raises:
+        RemoteProtocolError: It is none.
+    """
+    return m.unpack(frames, limits=limits, tensors=to_tensor, things=DescriptionReader)
+
+
 _SPEC_TYPE = "gymnasium.envs.registration.EnvSpec"
 _SHOWN = 200
 
 
-class Described:
+class DescriptionReader:
     """What one message describes, out of one budget: all of it costs no more than its bytes may.
 
     Args:
@@ -54,7 +67,7 @@ class Described:
 
 
 def _spec(value: object) -> Any:
-    """An id that this Gymnasium cannot read is only told."""
+    """A spec; a description of one whose id this Gymnasium cannot read."""
     facts = read_spec(value)
     made = spec_of(facts)
     return RemoteObject(_SPEC_TYPE, one_line(str(facts), _SHOWN)) if made is None else made

@@ -12,12 +12,11 @@ from __future__ import annotations
 import struct
 import sys
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
-import msgpack  # type: ignore[import-untyped]
-
+from envhub_worker.protocol.codec.decoder import Decoder
 from envhub_worker.protocol.codec.frames import check_outgoing, split
-from envhub_worker.protocol.codec.kinds import ARRAY, DOCUMENT_BYTES, TUPLE, Buffer
+from envhub_worker.protocol.codec.kinds import DOCUMENT_BYTES, Buffer
 from envhub_worker.protocol.errors import MessageTooLargeError
 from envhub_worker.protocol.limits import WireLimits
 
@@ -124,29 +123,29 @@ class Incoming(Generic[T]):
         limits: For which it was decoded, and holds.
 
     Raises:
-        Exception: There is no form for it: a key cannot be hashed, say, in the plain form that is
-            read here, though what the codec makes of it can.
+        Exception: There is no form for it: it holds more than constants, numeric arrays, tuples,
+            lists and dicts.
     """
 
     __slots__ = (
-        *("_descriptors", "_make", "_message", "_own", "_shape", "_tail_bytes", "_views"),
+        *("_descriptors", "_fields", "_make", "_message", "_own", "_tail_bytes", "_views"),
         "limits",
     )
 
     def __init__(self, document: bytes, make: Callable[..., T], limits: WireLimits) -> None:
+        self.limits = limits
         self._make = make
         self._message: T | None = None
-        self._shape: list[Any] = []
         self._descriptors: list[bytes] = []
         self._views: list[tuple[np.dtype[Any], tuple[int, ...], slice]] = []
         self._tail_bytes: int | None = 0
-        self.limits = limits
-        # as tuples: what is a key has to be hashed, and was before in another form
-        fields = msgpack.unpackb(document, strict_map_key=False, use_list=False)
-        _, *self._shape = _shaped(fields, self._descriptors)
+        places = _Places(self._descriptors)
+        value: Any = Decoder(b"", (), limits, None, None, arrays=places).value(document)
+        fields = value[1:]
+        self._fields = _maker(tuple(fields))
         self._lay_out()
-        if all(map(_is_constant, self._shape)):
-            self._message = make(*self._shape)
+        if self._fields is None:
+            self._message = make(*fields)
 
     def _lay_out(self) -> None:
         """Where each array lies, if all lie in the tail of the header and hold numbers."""
@@ -177,12 +176,9 @@ class Incoming(Generic[T]):
             from envhub_worker.protocol.codec.arrays import ArrayReader
 
             arrays = self._read(ArrayReader(tail, buffers, self.limits, copy=True))
-        if self._message is not None:
-            return self._message
-        take = iter(arrays).__next__
-        return self._make(
-            *[take() if type(shape) is _Place else _fill(shape, take) for shape in self._shape]
-        )
+        if self._fields is None:
+            return cast("T", self._message)
+        return self._make(*self._fields(iter(arrays).__next__))
 
     def _read(self, reader: ArrayReader) -> list[Array]:
         try:
@@ -199,51 +195,46 @@ class _Place:
     __slots__ = ()
 
 
-_PLACE = _Place()
+class _Places:
+    """Has places for arrays, and takes note of what the document says of these."""
+
+    def __init__(self, descriptors: list[bytes]) -> None:
+        self._descriptors = descriptors
+
+    def take(self, descriptor: bytes) -> Any:
+        """The next place."""
+        self._descriptors.append(descriptor)
+        return _Place()
+
+    def finish(self) -> None:
+        """Whether there are as many arrays is seen when they come."""
 
 
 class _IrregularError(Exception):
     """There is no form for this."""
 
 
-def _shaped(value: Any, descriptors: list[bytes]) -> Any:
-    """A value with places for its arrays, and what the document says of those, in its order."""
+Take = Callable[[], "Array"]
+
+
+def _maker(value: Any) -> Callable[[Take], Any] | None:
+    """Makes a fresh value like this one with other arrays; None where it is always the same."""
     kind = type(value)
-    if kind is msgpack.ExtType:
-        if value.code != ARRAY:
-            raise _IrregularError
-        descriptors.append(value.data)
-        return _PLACE
-    if kind is dict:
-        if set(map(type, value)) - {str}:
-            raise _IrregularError
-        return {key: _shaped(item, descriptors) for key, item in value.items()}
-    if kind is tuple:  # either sort of sequence: a real tuple has a head
-        if value and type(value[0]) is msgpack.ExtType and value[0].code == TUPLE:
-            return tuple([_shaped(item, descriptors) for item in value[1:]])
-        return [_shaped(item, descriptors) for item in value]
-    return value
-
-
-def _is_constant(shape: Any) -> bool:
-    """Whether every message of this shape is the same object, as far as anybody can tell."""
-    if type(shape) is tuple:
-        return all(map(_is_constant, shape))
-    return type(shape) not in (_Place, dict, list)
-
-
-def _fill(shape: Any, take: Callable[[], Array]) -> Any:
-    """A fresh value of a shape; ``take`` gives the arrays, in their order."""
-    kind = type(shape)
     if kind is _Place:
-        return take()
-    if kind is dict:
-        return {key: _fill(item, take) for key, item in shape.items()}
-    if kind is tuple:
-        return tuple([_fill(item, take) for item in shape])
+        return lambda take: take()
+    if kind in _CONSTANTS or kind is float:
+        return None
+    if kind is dict and not set(map(type, value)) - {str}:
+        named = [(key, item, _maker(item)) for key, item in value.items()]
+        return lambda take: {key: make(take) if make else item for key, item, make in named}
+    if kind is not tuple and kind is not list:
+        raise _IrregularError
+    parts = [(item, _maker(item)) for item in value]
     if kind is list:
-        return [_fill(item, take) for item in shape]
-    return shape
+        return lambda take: [make(take) if make else item for item, make in parts]
+    if all(make is None for _, make in parts):
+        return None
+    return lambda take: tuple([make(take) if make else item for item, make in parts])
 
 
 def outline(values: list[Any]) -> tuple[Any, list[Array]] | None:

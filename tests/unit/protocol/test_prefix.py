@@ -1,0 +1,96 @@
+"""Warnings and changes in front of a reply: found, bounded, and nothing else."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
+from envhub_worker.protocol.messages.prefix import (
+    CHANGES,
+    MAX_ATTRIBUTE,
+    MAX_CATEGORY,
+    MAX_TEXT,
+    WARNINGS,
+    Prefix,
+)
+
+REPLY = m.pack(m.Value(1))
+WARNING = ("UserWarning", "slow")
+CHANGE = (1, "task")
+
+
+def warned(*things: object) -> Buffer:
+    """What stands in front of a reply, whatever it holds."""
+    return m.pack(m.Warned(tuple(things)))[0]
+
+
+def changed(*things: object) -> Buffer:
+    """The same of changes."""
+    return m.pack(m.Changed(tuple(things)))[0]
+
+
+def test_what_was_put_in_front_is_read() -> None:
+    """Changes in front of warnings; the reply's frames are as they were."""
+    frames = CHANGES.put([CHANGE, (2, "x")], WARNINGS.put([WARNING, WARNING], REPLY))
+    changes, rest = CHANGES.read(frames)
+    assert changes == [CHANGE, (2, "x")]
+    assert CHANGES.read(rest) == ([], rest)
+    assert WARNINGS.read(rest) == ([WARNING, WARNING], REPLY)
+
+
+@pytest.mark.parametrize("prefix", [WARNINGS, CHANGES])
+@pytest.mark.parametrize(
+    "frames",
+    [REPLY, [*REPLY, b""], [*REPLY, *REPLY], [b"", b""], [warned(WARNING)], [changed(CHANGE)]],
+    ids=["a reply", "with arrays", "two replies", "nothing", "only warnings", "only changes"],
+)
+def test_other_frames_are_a_reply(prefix: Prefix[Any], frames: list[Buffer]) -> None:
+    """Only a prefix with something behind it stands in front of a reply."""
+    assert prefix.read(frames) == ([], frames)
+
+
+@pytest.mark.parametrize(
+    "lie",
+    [
+        warned(*[WARNING] * (WARNINGS.most + 1)),
+        warned("slow"),
+        warned(("UserWarning",)),
+        warned(("UserWarning", 1)),
+        warned((None, "slow")),
+        warned(["UserWarning", "slow"]),
+        warned(("x" * (MAX_CATEGORY + 1), "slow")),
+        warned(("UserWarning", "x" * (MAX_TEXT + 1))),
+        warned()[:-1],
+        changed(*[CHANGE] * (CHANGES.most + 1)),
+        changed("task"),
+        changed((1,)),
+        changed((1, 2)),
+        changed(("1", "task")),
+        changed((True, "task")),
+        changed([1, "task"]),
+        changed()[:-1],
+    ],
+)
+def test_anything_else_is_refused(lie: Buffer) -> None:
+    """Too many, too long, of other types, cut off."""
+    with pytest.raises(RemoteProtocolError):
+        WARNINGS.read(CHANGES.read([lie, *REPLY])[1])
+
+
+@pytest.mark.parametrize(
+    ("prefix", "largest"),
+    [
+        (WARNINGS, ("é" * MAX_CATEGORY, "é" * MAX_TEXT)),
+        (CHANGES, (2**62, "é" * MAX_ATTRIBUTE)),
+    ],
+)
+def test_a_giant_is_refused_unread(prefix: Prefix[Any], largest: Any) -> None:
+    """By its size, before anything of it is decoded."""
+    frames = prefix.put([largest] * prefix.most, REPLY)
+    assert prefix.read(frames) == ([largest] * prefix.most, REPLY)
+    with pytest.raises(MessageTooLargeError):
+        prefix.read([bytes(frames[0]) + bytes(1 << 20), *REPLY])

@@ -1,0 +1,108 @@
+"""What a runner says in front of a reply: a message in the first frame, the reply in the others.
+
+Where there is something to say, a reply has at least two frames, and the kind of the first says
+what it is. Where there is nothing to say, nothing is sent: a reply without ``CHANGES`` says that
+all watched attributes are as they were.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Generic, TypeVar
+
+from envhub_worker.protocol.codec.kinds import Buffer
+from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
+from envhub_worker.protocol.messages.base import Message, values_of
+from envhub_worker.protocol.messages.packing import pack, unpack
+from envhub_worker.protocol.messages.runner import Changed, Warned
+from envhub_worker.protocol.untrusted import UNTRUSTED
+
+MAX_CATEGORY = 256
+MAX_TEXT = 2048
+"""Characters of a warning."""
+MAX_ATTRIBUTE = 256
+"""Characters of a watched attribute's name."""
+WATCHED_TYPES = frozenset({str, bytes, int, bool, type(None)})
+"""Values that cannot change from within, and that are the same if they are equal. Floats are not:
+``0.0 == -0.0``."""
+
+RemoteWarning = tuple[str, str]
+"""The category's name, and the text."""
+Attribute = tuple[int, str]
+"""The number of the environment, and the name."""
+T = TypeVar("T")
+
+_LENGTH_BYTES = 4
+"""The length of the document."""
+_LIST = 0x90
+"""The head of a short list of msgpack; a message is one of its kind and its fields."""
+
+
+class Prefix(Generic[T]):
+    """One kind of message in front of replies, with one field: a tuple of things.
+
+    Args:
+        kind: The message.
+        item_bytes: The most that one thing takes.
+        check: Makes a thing of a decoded value, or raises ``RemoteProtocolError``.
+
+    Attributes:
+        most: Things in front of one reply.
+    """
+
+    most = 16
+
+    def __init__(self, kind: type[Message], item_bytes: int, check: Callable[[object], T]) -> None:
+        self._kind, self._check = kind, check
+        self._max_bytes = self.most * item_bytes + 1024
+        self._head = bytes([_LIST + 1 + len(kind.FIELDS), kind.kind])
+
+    def put(self, things: Sequence[T], frames: Sequence[Buffer]) -> list[Buffer]:
+        """A reply's frames with these things in front of them."""
+        return [*pack(self._kind(tuple(things))), *frames]
+
+    def read(self, frames: Sequence[Buffer]) -> tuple[list[T], Sequence[Buffer]]:
+        """The things in front of a reply, and its own frames. Trust: input from the worker.
+
+        Raises:
+            RemoteProtocolError: They are too many or too large, or something else.
+        """
+        end = _LENGTH_BYTES + len(self._head)
+        if len(frames) < 2 or memoryview(frames[0]).cast("B")[_LENGTH_BYTES:end] != self._head:
+            return [], frames
+        with UNTRUSTED:
+            return list(map(self._check, self._things(frames[0]))), frames[1:]
+
+    def _things(self, frame: Buffer) -> tuple[object, ...]:
+        """Bounded before it is decoded."""
+        size, name = memoryview(frame).nbytes, self._kind.__name__
+        if size > self._max_bytes:
+            text = f"{size} bytes of {name} are over the limit of {self._max_bytes}."
+            raise MessageTooLargeError(text)
+        message = unpack([frame])
+        things = values_of(message)[0] if type(message) is self._kind else None
+        if type(things) is not tuple or len(things) > self.most:
+            raise RemoteProtocolError(f"the worker says {name} in another way than was agreed on")
+        return things
+
+
+def _warning(value: object) -> RemoteWarning:
+    if type(value) is not tuple or list(map(type, value)) != [str, str]:
+        raise RemoteProtocolError("a warning of the worker is not a category and a text")
+    category, text = value
+    if len(category) > MAX_CATEGORY or len(text) > MAX_TEXT:
+        raise RemoteProtocolError("a warning of the worker is too long")
+    return category, text
+
+
+def _attribute(value: object) -> Attribute:
+    if type(value) is not tuple or list(map(type, value)) != [int, str]:
+        raise RemoteProtocolError("the worker reports a change of something that is no attribute")
+    number, name = value
+    return number, name
+
+
+WARNINGS = Prefix(Warned, 4 * (MAX_CATEGORY + MAX_TEXT), _warning)
+"""What the repository has warned of."""
+CHANGES = Prefix(Changed, 4 * MAX_ATTRIBUTE, _attribute)
+"""Attributes that have another value than the client was last given. They are watched no more."""
