@@ -67,7 +67,7 @@ def _rows(wanted: Sequence[Wanted]) -> tuple[tuple[str, str], ...]:
     return tuple((str(one), one.where) for one in wanted)
 
 
-def bring(
+def request_packages(
     order: m.NeedPackages,
     client: WorkerClient,
     deadline: Deadline,
