@@ -10,6 +10,7 @@ from pathlib import Path
 
 from envhub_sandbox.sandboxes.pool import WorkerServer
 from envhub_sandbox.sandboxes.runtime_folder import RuntimeFolder
+from envhub_sandbox.system.processes import has_ended
 from envhub_sandbox.transport.forks import Owner
 
 
@@ -81,7 +82,7 @@ class LocalServer(WorkerServer):
         for: it takes no requests any more. Nor can anyone connect to one whose sockets a cleaner
         of temporary files has removed; who is connected already goes on.
         """
-        alive = self.process.poll() is None and not _has_ended(self.process.pid)
+        alive = self.process.poll() is None and not has_ended(self.process.pid)
         return alive and self._runtime.has_sockets(*self._sockets)
 
     def stop(self) -> None:
@@ -105,12 +106,3 @@ class LocalServer(WorkerServer):
 
     def __del__(self) -> None:
         self.stop()  # a start that was interrupted before it was noted
-
-
-def _has_ended(pid: int) -> bool:
-    try:
-        stat = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace")
-    except OSError:
-        return True
-    # the command may hold anything, parentheses and blanks included
-    return stat.rpartition(")")[2].split()[0] in "ZX"

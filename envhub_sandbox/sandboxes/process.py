@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import envhub_worker.protocol
-from envhub_sandbox import parent
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.log import WORKER
 from envhub_sandbox.option_names import option_name
@@ -24,6 +23,7 @@ from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.base import Sandbox
 from envhub_sandbox.sandboxes.local_server import LocalServer
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse
+from envhub_sandbox.system import processes
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def _execute(
         *("--readable-root", str(store)),
         *("--ahead", "--python", runtime.python, "--packages", runtime.packages),
     ]
-    with (server.folder / "server.log").open("wb") as log, parent.pidfd() as ourselves:
+    with (server.folder / "server.log").open("wb") as log, processes.pidfd() as ourselves:
         return subprocess.Popen(
             [*arguments, "--ready-fd", str(ready), "--client-pidfd", str(ourselves)],
             stdin=subprocess.DEVNULL,

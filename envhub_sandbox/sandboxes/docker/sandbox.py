@@ -20,7 +20,6 @@ from functools import partial
 from pathlib import Path
 from typing import cast
 
-from envhub_sandbox import parent
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy
@@ -38,6 +37,7 @@ from envhub_sandbox.sandboxes.docker.engines import (
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.local_server import LocalServer
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
+from envhub_sandbox.system import processes
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import messages as m
@@ -227,7 +227,7 @@ class RepositoryContainer(Sandbox):
 
     def _execute(self, server: ContainerServer, ready: int) -> subprocess.Popen[bytes]:
         server.wanted = wanted = self._wanted(server.folder)
-        with parent.pidfd() as ourselves:
+        with processes.pidfd() as ourselves:
             return subprocess.Popen(
                 [
                     *(sys.executable, "-I", "-S", str(_MONITOR), str(ourselves), str(ready)),
