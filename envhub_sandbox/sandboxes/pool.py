@@ -3,15 +3,15 @@
 A server that nobody uses is ended, or kept for a while if its last user asked for that: a caller
 who closes one environment often opens another.
 
-Interrupts, finalizers, threads and forks come between any two statements here. The rules:
+Interrupts, finalizers, threads and forks come between any two statements (interruption.md):
 
-- Who uses a server is read off the uses that live. There is no count that a Ctrl-C could falsify:
-  a use that was taken and noted nowhere is given back by its own finalizer.
-- A use is given back under the lock first (``live``), and is ``done`` last. Each step between the
-  two may be repeated without harm, so ``release`` can be called until it comes through.
+- Who uses a server is read off the uses that live. There is no count that a Ctrl-C could falsify
+  (rule 8). A use that was taken and noted nowhere is given back by its own finalizer (rule 5).
+- A use that is given back is not ``live`` first, and ``done`` last. Each step between the two may
+  be repeated without harm, so ``release`` can be called until it comes through (rule 7).
 - The lock is reentrant: the garbage collector may close an environment in the middle of
-  ``acquire``, and a signal handler in the middle of anything.
-- A server is ended outside of the lock, so that nobody waits for an end who wants a fresh one.
+  ``acquire``, and a signal handler in the middle of anything (rule 12).
+- A server is ended outside of the lock, so that a caller who wants a fresh one does not wait.
 - A fork sees its parent's servers under another pid, and leaves them alone.
 """
 
