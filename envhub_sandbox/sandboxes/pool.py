@@ -1,6 +1,6 @@
 """The worker servers of this process: started for the first user, given up by the last.
 
-A server that nobody uses is ended, or kept for a while if its last user asked for that: a caller
+An unused server is ended, or kept for a while if its last user asked for that: a caller
 who closes one environment often opens another.
 
 Interrupts, finalizers, threads and forks come between any two statements (interruption.md):
@@ -90,7 +90,7 @@ class _Entry(Generic[S_co]):
 
 
 class ServerUse(Generic[S_co]):
-    """One use of a server, which ends once: given back, or when nobody has it any more.
+    """One use of a server, which ends once: given back, or when nothing refers to it any more.
 
     Attributes:
         server: The server.
@@ -104,7 +104,7 @@ class ServerUse(Generic[S_co]):
         self.server = entry.server
         self.live = True
         self._done = False
-        entry.add(self)  # from here on nobody may end the server
+        entry.add(self)  # from here on the server may not be ended
 
     def users(self) -> int:
         """How many uses of the server there are."""
@@ -153,7 +153,7 @@ class ServerPool(Generic[S]):
             start: Starts it.
             idle_s: For how long it is kept if this use is the last; 0 ends it, None keeps it until
                 the end of this process.
-            group: Who shares it. One of another group gets it only while nobody uses it.
+            group: Who shares it. One of another group gets it only while it is unused.
         """
         place = os.getpid(), key, group
         with self._changed:
@@ -282,7 +282,7 @@ _pools: weakref.WeakSet[ServerPool[Any]] = weakref.WeakSet()
 
 
 def stop_idle() -> None:
-    """End the servers of this process that nobody uses, of every kind."""
+    """End the unused servers of this process, of every kind."""
     with contextlib.ExitStack() as stack:
         for pool in list(_pools):
             stack.callback(pool.stop_idle)

@@ -1,7 +1,7 @@
 """``sandbox="tcp://host:5555"``: the worker on another host, over ZeroMQ with CURVE keys.
 
 There ``envhub-worker listen`` runs. The repository's files travel from here, by content, so the
-server needs neither the Hub nor a token. A thread of ours tells it that we live; a client that
+server needs neither the Hub nor a token. A thread of ours says that we live; a client that
 has gone loses its jails.
 """
 
@@ -271,7 +271,7 @@ class RemoteServer(WorkerServer):
                     every_s = min(_KEEP_ALIVE_S, client.patience_s / 4 or _KEEP_ALIVE_S)
                 client.request(m.KeepAlive(tuple(self.far.held)), deadline=Deadline(_KEEP_ALIVE_S))
             except Exception as error:  # of any kind: too few descriptors are a ZMQError
-                WORKER.debug("%s was not told that this client lives: %s", self.endpoint, error)
+                WORKER.debug("%s has not heard that this client lives: %s", self.endpoint, error)
                 _close(client)
                 client = None
         _close(client)

@@ -88,7 +88,7 @@ def is_held(path: Path) -> bool:
 
     Raises:
         FileNotFoundError: There is no such file.
-        OSError: That cannot be told.
+        OSError: That cannot be known.
     """
     with unheld(path) as free:
         return not free
@@ -96,7 +96,7 @@ def is_held(path: Path) -> bool:
 
 @contextlib.contextmanager
 def unheld(path: Path) -> Iterator[bool]:
-    """The opposite of ``is_held``; in this context nobody takes the lock. Raises likewise."""
+    """The opposite of ``is_held``; in this context the lock is not taken. Raises likewise."""
     descriptor = os.open(path, _READ)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -182,7 +182,7 @@ class RepositoryContainer(Sandbox):
     ) -> ServerUse[ContainerServer]:
         """The repository's container, started if there is none.
 
-        Its limits are for one ``make_env`` alone, so only one that nobody uses changes hands.
+        Its limits are for one ``make_env`` alone, so only an unused one changes hands.
         """
         return _POOL.acquire(self._key, self._start, idle_s, group=self)
 

@@ -30,8 +30,8 @@ class ExpectedManifest:
 class LoadedJail:
     """An open jail whose first runner has called ``make_env``.
 
-    It has to be given back. Where a Ctrl-C comes between its taking and its noting, so that nobody
-    has it who could, its own end does.
+    It has to be given back. Where a Ctrl-C comes between its taking and its noting, its
+    finalizer does.
 
     Attributes:
         jail: The jail.
