@@ -100,7 +100,8 @@ class RemoteSandbox(Sandbox):
         """
         check_policy(policy, runtime)
         order = self._orders[runtime.packages] if runtime.packages else None
-        return RemoteRepository(self, snapshot, policy, order, runtime.packages)
+        given = self.endpoint, self.far(), snapshot, self.retry_s
+        return RemoteRepository(*given, order, runtime.packages)
 
     def package_target(self) -> RemoteSandbox:
         """The server makes packages itself."""
@@ -119,8 +120,7 @@ class RemoteSandbox(Sandbox):
             ServerBusyError: Others of the same key are at it.
         """
         order = remote_packages.order_of(request)
-        where = (self.endpoint, self.far())
-        use = SERVERS.acquire(where, partial(RemoteServer, *where))
+        use = _use_of(self.endpoint, self.far())
         server = use.server
         try:
             client = WorkerClient(self.endpoint, server.process_fd, far=server.far)
@@ -173,59 +173,52 @@ def check_policy(policy: Policy, runtime: Runtime) -> None:
 # --- servers ---------------------------------------------------------------------------------
 
 
+@dataclass(eq=False)
 class RemoteRepository(Sandbox):
     """The sandbox of one repository: its files on the other host.
 
-    Args:
+    Attributes:
         order: What the packages were made of that the server has made for it; None without any.
         packages: What the server called them.
     """
 
     name = "remote"
-
-    def __init__(
-        self,
-        sandbox: RemoteSandbox,
-        snapshot: Path,
-        policy: Policy,
-        order: m.NeedPackages | None = None,
-        packages: str = "",
-    ) -> None:
-        self.retry_s = sandbox.retry_s
-        self._where = sandbox.endpoint, sandbox.far()
-        self._snapshot, self._policy = snapshot, policy
-        self._order, self._packages = order, packages
-        self._files: tuple[upload.Sent, ...] = ()
+    endpoint: str
+    far: Far
+    snapshot: Path
+    retry_s: float
+    order: m.NeedPackages | None
+    packages: str
+    _files: tuple[upload.Sent, ...] = ()
 
     def runs_on(self, runtime: Runtime) -> Runtime:
         """The server, by its key, and the packages there."""
-        endpoint, far = self._where
-        key = "" if far.server_key is None else far.server_key.hex()
-        return Runtime(f"{endpoint} {key}{self._packages and f' {self._packages}'}")
+        key = "" if self.far.server_key is None else self.far.server_key.hex()
+        return Runtime(f"{self.endpoint} {key}{self.packages and f' {self.packages}'}")
 
     def acquire(
         self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
     ) -> ServerUse[RemoteServer]:
         """The server, which runs anyway; nothing is sent before a jail is opened."""
-        return SERVERS.acquire(self._where, partial(RemoteServer, *self._where))
+        return _use_of(self.endpoint, self.far)
 
     def prepare(
         self, order: m.OpenJail, server: WorkerServer, client: WorkerClient, deadline: Deadline
     ) -> m.OpenJail:
         """Bring the files there, and see that the packages are. One of our threads at a time."""
         with cast("RemoteServer", server).uploading:
-            if self._order is not None:
-                self._check_packages(self._order, client, deadline)
-            self._files = self._files or upload.listing(self._snapshot)
-            snapshot, _ = upload.upload(client, self._snapshot, self._files, deadline)
-        return m.replace(order, snapshot=snapshot, python="", packages=self._packages)
+            if self.order is not None:
+                self._check_packages(self.order, client, deadline)
+            self._files = self._files or upload.listing(self.snapshot)
+            snapshot, _ = upload.upload(client, self.snapshot, self._files, deadline)
+        return m.replace(order, snapshot=snapshot, python="", packages=self.packages)
 
     def _check_packages(
         self, order: m.NeedPackages, client: WorkerClient, deadline: Deadline
     ) -> None:
         """The server may have been replaced, or have needed the room; it may make them again."""
         made = remote_packages.request_packages(order, client, deadline)
-        if made is None or made.packages != self._packages:
+        if made is None or made.packages != self.packages:
             raise DependencyError(
                 "the server has lost the packages that it had made, and would make others now: "
                 "make the environment again"
@@ -322,3 +315,7 @@ def _close(client: WorkerClient | None) -> None:
 
 SERVERS: ServerPool[RemoteServer] = ServerPool()
 """Those that this process uses, each once for an endpoint and its keys."""
+
+
+def _use_of(endpoint: str, far: Far) -> ServerUse[RemoteServer]:
+    return SERVERS.acquire((endpoint, far), partial(RemoteServer, endpoint, far))

@@ -153,29 +153,22 @@ class ContainerServer(LocalServer):
 _POOL: ServerPool[ContainerServer] = ServerPool()
 
 
+@dataclass(eq=False)
 class RepositoryContainer(Sandbox):
     """The sandbox of one repository: one container, which its environments share."""
 
     name = "docker"
-
-    def __init__(
-        self,
-        options: DockerSandbox,
-        engine: Engine,
-        image: str,
-        snapshot: Path,
-        policy: Policy,
-        packages: str = "",
-    ) -> None:
-        self._packages = packages
-        self._options, self._engine, self._image = options, engine, image
-        self._snapshot, self._policy = snapshot, policy
-        self._key = repr((options, engine, image, str(snapshot), policy, packages))
+    options: DockerSandbox
+    engine: Engine
+    image: str
+    snapshot: Path
+    policy: Policy
+    packages: str = ""
 
     def runs_on(self, runtime: Runtime) -> Runtime:
         """The image, by its id."""
-        packages = f" with {self._packages}" if self._packages else ""
-        return Runtime(f"{self._image} in {self._engine.kind}{packages}")
+        packages = f" with {self.packages}" if self.packages else ""
+        return Runtime(f"{self.image} in {self.engine.kind}{packages}")
 
     def acquire(
         self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
@@ -184,7 +177,7 @@ class RepositoryContainer(Sandbox):
 
         Its limits are for one ``make_env`` alone, so only an unused one changes hands.
         """
-        return _POOL.acquire(self._key, self._start, idle_s, group=self)
+        return _POOL.acquire(repr(self), self._start, idle_s, group=self)
 
     def prepare(
         self, order: m.OpenJail, server: WorkerServer, client: WorkerClient, deadline: Deadline
@@ -195,8 +188,8 @@ class RepositoryContainer(Sandbox):
             order,
             snapshot=run_arguments.SNAPSHOT,
             # with packages of its own it has no use for those of another environment in the image
-            python="" if self._packages else container.python,
-            packages=run_arguments.PACKAGES if self._packages else "",
+            python="" if self.packages else container.python,
+            packages=run_arguments.PACKAGES if self.packages else "",
             confinement={**order.confinement, "profile": container.profile},
         )
 
@@ -204,24 +197,24 @@ class RepositoryContainer(Sandbox):
         server = ContainerServer()
         with server.starting(partial(self._execute, server)) as ready:
             answer, wanted = _answer(ready), server.wanted
-            _check_started(self._engine, wanted, answer)
+            _check_started(self.engine, wanted, answer)
             found = attestation.parse(answer)
             if not Path(server.fd_path).is_socket():
                 raise SandboxUnavailableError(
-                    f"{self._engine.kind} started a container that shares no socket with this "
+                    f"{self.engine.kind} started a container that shares no socket with this "
                     "process: an engine in a virtual machine, or a runtime with a kernel of its "
                     "own. Run the worker there, and connect to it with "
                     f"{option_name('sandbox', 'tcp://HOST:PORT')}"
                 )
             server.layers = attestation.layers(wanted, found, self._title(wanted))
-            server.profile = attestation.profile_for(self._policy.profile, found)
+            server.profile = attestation.profile_for(self.policy.profile, found)
             server.python = found.python
         return server
 
     def _title(self, wanted: Container) -> str:
-        engine, options = self._engine, self._options
+        engine, options = self.engine, self.options
         return (
-            f"{engine.kind} {engine.version}, image {options.image} ({self._image[:19]}), "
+            f"{engine.kind} {engine.version}, image {options.image} ({self.image[:19]}), "
             f"runtime {options.runtime or 'default'}, {wanted.name}"
         )
 
@@ -231,8 +224,8 @@ class RepositoryContainer(Sandbox):
             return subprocess.Popen(
                 [
                     *(sys.executable, "-I", "-S", str(_MONITOR), str(ourselves), str(ready)),
-                    *(str(server.folder), wanted.name, "--", self._engine.command),
-                    *run_arguments.run_arguments(self._engine, wanted),
+                    *(str(server.folder), wanted.name, "--", self.engine.command),
+                    *run_arguments.run_arguments(self.engine, wanted),
                 ],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
@@ -244,7 +237,7 @@ class RepositoryContainer(Sandbox):
             )
 
     def _wanted(self, folder: Path) -> Container:
-        options, policy = self._options, self._policy
+        options, policy = self.options, self.policy
         user, group = _user()
         sockets = folder / "sockets"
         sockets.mkdir(mode=0o700)
@@ -260,15 +253,15 @@ class RepositoryContainer(Sandbox):
         memory, pids, cpus = limits if options.cgroups else (None, None, None)
         return Container(
             name=f"envhub-{secrets.token_hex(6)}",
-            image=self._image,
+            image=self.image,
             labels={
                 run_arguments.CLIENT_LABEL: str(os.getpid()),
                 run_arguments.FOLDER_LABEL: str(folder),
                 run_arguments.USER_LABEL: str(os.geteuid()),
             },
             sockets=str(sockets),
-            snapshot=str(self._snapshot),
-            packages=self._packages,
+            snapshot=str(self.snapshot),
+            packages=self.packages,
             readable=policy.readable,
             seccomp=str(folder / "seccomp.json"),
             user=(user, group),
@@ -279,7 +272,7 @@ class RepositoryContainer(Sandbox):
             scratch=run_arguments.scratch_for(policy),
             runtime=options.runtime,
             gpus=(options.gpus or "all") if policy.gpu else None,
-            ulimits=own_limits(self._engine),
+            ulimits=own_limits(self.engine),
         )
 
 
