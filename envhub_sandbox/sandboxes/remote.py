@@ -100,8 +100,8 @@ class RemoteSandbox(Sandbox):
         """
         check_policy(policy, runtime)
         order = self._orders[runtime.packages] if runtime.packages else None
-        given = self.endpoint, self.far(), snapshot, self.retry_s
-        return RemoteRepository(*given, order, runtime.packages)
+        given = self.endpoint, self.far(), snapshot, order, runtime.packages
+        return RemoteRepository(*given, self.retry_s)
 
     def package_target(self) -> RemoteSandbox:
         """The server makes packages itself."""
@@ -186,9 +186,9 @@ class RemoteRepository(Sandbox):
     endpoint: str
     far: Far
     snapshot: Path
-    retry_s: float
     order: m.NeedPackages | None
     packages: str
+    retry_s: float = 0.0
     _files: tuple[upload.Sent, ...] = ()
 
     def runs_on(self, runtime: Runtime) -> Runtime:
