@@ -7,7 +7,7 @@ from typing import Any
 
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.option_names import option_name
-from envhub_sandbox.sandboxes.base import Sandbox
+from envhub_sandbox.sandboxes.sandbox import Sandbox
 
 
 def reference_of(cfg: Any) -> tuple[str, Any]:

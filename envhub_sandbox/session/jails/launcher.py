@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
@@ -11,8 +12,8 @@ from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, LoadError, WorkerTimeoutError
 from envhub_sandbox.log import WORKER
-from envhub_sandbox.sandboxes.base import Sandbox
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
+from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.session.jails import denials
 from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
 from envhub_sandbox.session.jails.server_hold import ServerHold
@@ -288,15 +289,8 @@ class Launcher:
             error.denied = self.denials(server, jail)
 
     def _status(self, server: WorkerServer, jail: int, deadline: Deadline) -> dict[str, Any]:
-        client = self._client(server)
         try:
-            client.hello(deadline)
-            status, _ = client.request(m.GetStatus(), deadline=deadline)
-        except EnvHubError:
-            return {}
-        finally:
-            client.close()
-        try:
+            status = self._ask(server, m.GetStatus(), deadline)
             with UNTRUSTED:
                 jails = [one for one in expect(status, m.Status).jails if isinstance(one, dict)]
                 return next((one for one in jails if one.get("jail") == jail), {})
@@ -306,13 +300,14 @@ class Launcher:
     def interrupt(self, loaded: LoadedJail) -> None:
         """End a jail over a connection of its own, while another thread waits on the first."""
         loaded.jail.before_end()
-        client = self._client(loaded.server)
-        deadline = Deadline(_CLOSE_S)
+        with contextlib.suppress(EnvHubError):  # the server has gone, and the jail with it
+            self._ask(loaded.server, m.CloseJail(loaded.jail.number), Deadline(_CLOSE_S))
+
+    def _ask(self, server: WorkerServer, message: m.Message, deadline: Deadline) -> m.Message:
+        client = self._client(server)
         try:
             client.hello(deadline)
-            client.request(m.CloseJail(loaded.jail.number), deadline=deadline)
-        except EnvHubError:
-            pass  # the server has gone, and the jail with it
+            return client.request(message, deadline=deadline)[0]
         finally:
             client.close()
 

@@ -9,7 +9,7 @@ from typing import Any, cast
 import pytest
 
 from envhub_sandbox.errors import WorkerDiedError, WorkerStartupError
-from envhub_sandbox.sandboxes.base import Sandbox
+from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.session.jails import launcher as launcher_module
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.jails.loaded import LoadedJail
