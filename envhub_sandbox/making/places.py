@@ -43,7 +43,7 @@ def sandbox_of(sandbox: str | Sandbox, server_key: str | None) -> Sandbox:
             "RemoteSandbox has its own"
         )
     if not isinstance(sandbox, str):
-        if not callable(getattr(sandbox, "acquire", None)):
+        if not callable(getattr(sandbox, "for_repository", None)):
             raise _unknown(sandbox)
         return sandbox
     if sandbox == "process":
