@@ -69,7 +69,7 @@ S_co = TypeVar("S_co", bound=WorkerServer, covariant=True)
 
 
 class _Entry(Generic[S_co]):
-    """A server, who uses it, and until when it is kept after them; None for as long as we live."""
+    """A server, its uses, and until when it is kept after them; None until this process ends."""
 
     def __init__(self, key: Hashable, server: S_co) -> None:
         self.pid = os.getpid()
@@ -219,7 +219,7 @@ class ServerPool(Generic[S]):
         if self._thread is None and self._earliest() is not None:
             thread = threading.Thread(target=self._run, name="envhub-idle", daemon=True)
             thread.start()
-            self._thread = thread  # only now: one that never started can be neither had nor joined
+            self._thread = thread  # only now: a thread that a Ctrl-C kept from starting cannot be joined
 
     # --- their ends ----------------------------------------------------------------------------
 
