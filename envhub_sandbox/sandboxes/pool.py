@@ -219,7 +219,7 @@ class ServerPool(Generic[S]):
         if self._thread is None and self._earliest() is not None:
             thread = threading.Thread(target=self._run, name="envhub-idle", daemon=True)
             thread.start()
-            self._thread = thread  # only now: a thread that a Ctrl-C kept from starting cannot be joined
+            self._thread = thread  # only now: one that a Ctrl-C kept from starting is not joined
 
     # --- their ends ----------------------------------------------------------------------------
 
