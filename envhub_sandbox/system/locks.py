@@ -11,10 +11,14 @@ import contextlib
 import fcntl
 import os
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 _POLL_S = 0.1
+_COMMAND_CHARS = 80
+_LOOKS = 5
+"""The kernel gives the list of locks a page at a time, and skips some where others change it."""
 _READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
 _WRITE = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
 
@@ -84,7 +88,7 @@ def is_held(path: Path) -> bool:
 
     Raises:
         FileNotFoundError: There is no such file.
-        OSError: That cannot be told.
+        OSError: That cannot be known.
     """
     with unheld(path) as free:
         return not free
@@ -92,7 +96,7 @@ def is_held(path: Path) -> bool:
 
 @contextlib.contextmanager
 def unheld(path: Path) -> Iterator[bool]:
-    """The opposite of ``is_held``; in this context nobody takes the lock. Raises likewise."""
+    """The opposite of ``is_held``; in this context the lock is not taken. Raises likewise."""
     descriptor = os.open(path, _READ)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -108,11 +112,27 @@ def unheld(path: Path) -> Iterator[bool]:
         os.close(descriptor)
 
 
-class LifeLock:
-    """A new file whose lock this process holds for as long as it lives, or until ``release``.
+class _HeldLock:
+    """A lock that this process holds until ``release``, or until nothing refers to this object.
 
-    Under its name nobody sees the file without its lock. Where the file system has no locks,
-    ``is_held`` cannot tell, and says so. A fork does not hold it.
+    A fork does not hold it.
+    """
+
+    def __init__(self) -> None:
+        self._held: list[int] = []
+        _locks.add(self)
+        # what a Ctrl-C keeps ``release`` from, this does, which is called whatever became of that
+        weakref.finalize(self, _close, self._held).atexit = False
+
+    def release(self) -> None:
+        """Give it back. Idempotent, and nothing in a fork."""
+        _close(self._held)
+
+
+class LifeLock(_HeldLock):
+    """A new file whose lock this process holds: under its name it is never seen without.
+
+    Where the file system has no locks, ``is_held`` cannot tell, and says so.
 
     Args:
         path: The file.
@@ -120,30 +140,63 @@ class LifeLock:
     """
 
     def __init__(self, path: Path, content: str = "") -> None:
+        super().__init__()
         new = path.with_name(f".{path.name}")
-        self._descriptor = os.open(new, _WRITE | os.O_EXCL, 0o600)
-        _held_for_life.add(self._descriptor)
+        self._held.append(os.open(new, _WRITE | os.O_EXCL, 0o600))
         with contextlib.suppress(OSError):
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX)
-        os.write(self._descriptor, content.encode())
+            fcntl.flock(self._held[0], fcntl.LOCK_EX)
+        os.write(self._held[0], content.encode())
         os.rename(new, path)
 
-    def release(self) -> None:
-        """Give it back. Idempotent, and nothing in a fork."""
-        if self._descriptor in _held_for_life:
-            _held_for_life.discard(self._descriptor)
-            os.close(self._descriptor)
-        self._descriptor = -1
+
+class SharedLock(_HeldLock):
+    """A file's lock that this process shares with others who use the file; see ``sharers``.
+
+    Nothing is held where there is no such file, or another has it alone.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        with contextlib.suppress(OSError):
+            self._held.append(os.open(path, _READ))
+            fcntl.flock(self._held[0], fcntl.LOCK_SH | fcntl.LOCK_NB)
 
 
-_held_for_life: set[int] = set()
+def sharers(path: Path) -> dict[int, str]:
+    """The processes that hold the lock of a file, as far as they are seen from here.
+
+    Returns:
+        Pid to the first words of the command line.
+    """
+    status = path.stat()
+    device = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
+    held: set[int] = set()
+    for _ in range(_LOOKS):
+        rows = [row.split() for row in Path("/proc/locks").read_text().splitlines()]
+        held = {int(row[4]) for row in rows if row[1] == "FLOCK" and row[5] == device}
+        if held:
+            break
+    return {pid: _command(pid) for pid in sorted(held) if pid > 0}
+
+
+def _command(pid: int) -> str:
+    with contextlib.suppress(OSError):
+        words = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ")
+        return words.decode("utf-8", "replace").strip()[:_COMMAND_CHARS]
+    return ""
+
+
+def _close(held: list[int]) -> None:
+    while held:
+        os.close(held.pop())
+
+
+_locks: weakref.WeakSet[_HeldLock] = weakref.WeakSet()
 
 
 def _forked() -> None:
-    for descriptor in _held_for_life:
-        with contextlib.suppress(OSError):
-            os.close(descriptor)
-    _held_for_life.clear()
+    for lock in _locks:
+        lock.release()
 
 
 os.register_at_fork(after_in_child=_forked)

@@ -18,7 +18,6 @@ from typing import Any
 
 import zmq
 
-from envhub_sandbox import folders
 from envhub_sandbox.check.play import denials
 from envhub_sandbox.crash import writer
 from envhub_sandbox.dependencies import environments, guesses, interpreters, resolutions
@@ -33,6 +32,7 @@ from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.recipe import Recipe
 from envhub_sandbox.session.repository import Repository
+from envhub_sandbox.system import folders
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle
@@ -155,6 +155,11 @@ def server(env: Any) -> Any:
     return _running(env).server
 
 
+def users(env: Any) -> int:
+    """How many uses of its worker server there are."""
+    return _running(env).use.users()
+
+
 def pids(env: Any) -> list[int]:
     """The processes of its jail, as its server knows them."""
     status, _ = client(env).request(m.GetStatus(), deadline=Deadline(60))
@@ -196,9 +201,9 @@ def hold_server(env: Any, release: Callable[[], None]) -> None:
     session(env).lease._release_server = release
 
 
-def order(known: Launcher, of: Any) -> Any:
-    """What is asked of a server for a jail of this repository."""
-    return known._order(of, 1)
+def order(known: Launcher) -> Any:
+    """What is asked of a server of this machine for a jail of this repository."""
+    return known._order(1)
 
 
 def _running(env: Any) -> LoadedJail:
@@ -235,7 +240,7 @@ def link_losses(found: Any) -> int:
 
 def fall_silent(env: Any) -> None:
     """End the thread that tells the server that this client lives."""
-    server(env).host._stop.set()
+    server(env)._stop.set()
 
 
 def send_half(connection: WorkerClient, frames: Sequence[Buffer]) -> None:
@@ -263,8 +268,8 @@ FORMS: tuple[Spot, Spot] = ((packing, "_OUTGOING"), (packing, "_INCOMING"))
 """What is remembered of the shape of messages, each way."""
 CHECK_OF_WARNINGS: Spot = (prefix.WARNINGS, "_check")
 """What looks at each warning of a worker's."""
-IDLE_CONTAINERS: Spot = (sandbox, "_IDLE")
-"""Where a container is that nobody uses."""
+CONTAINERS: Spot = (sandbox, "_POOL")
+"""The containers of this process."""
 CONTAINER_STARTS: Spot = (sandbox.RepositoryContainer, "_start")
 """What starts one."""
 

@@ -9,12 +9,14 @@ from typing import Any, cast
 import pytest
 
 from envhub_sandbox.errors import WorkerDiedError, WorkerStartupError
-from envhub_sandbox.sandboxes.base import Sandbox
+from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.session.jails import launcher as launcher_module
-from envhub_sandbox.session.jails.launcher import Launcher
+from envhub_sandbox.session.jails.launcher import Launcher, read_denials
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_worker.protocol import messages as m
 from tests.support.fake_lane import FakeLane, session_over
+
+_SERVER: Any = SimpleNamespace(endpoint="", process_fd=0, far=None)
 
 
 class _Client:
@@ -53,8 +55,7 @@ class _Place(Sandbox):
         """A use of it."""
         if self.fails:
             raise WorkerStartupError("it did not come up")
-        server = SimpleNamespace(endpoint="", process_fd=0)
-        return SimpleNamespace(shared=server, live=False, release=self.release)
+        return SimpleNamespace(server=_SERVER, live=False, release=self.release)
 
     def release(self) -> None:
         """One use less."""
@@ -157,7 +158,7 @@ def test_denials_are_asked_for_where_the_server_can_know(
     client.status = ({"jail": 7, "denied": ("ptrace",)},)
     error = WorkerDiedError("it died", reason=reason)
     for _ in range(2):
-        launcher.note_denied(error, cast("Any", SimpleNamespace(endpoint="", process_fd=0)), 7)
+        launcher.note_denied(error, _SERVER, 7)
     launcher.note_denied(KeyboardInterrupt(), cast("Any", None), 7)
     assert len(client.asked) == asked
     assert error.denied == (("ptrace",) if asked else None)
@@ -169,3 +170,17 @@ def test_no_server_no_use(launcher: Launcher, place: _Place) -> None:
     with pytest.raises(WorkerStartupError):
         launcher.hold()
     assert place.released == 0
+
+
+@pytest.mark.parametrize("said", [None, "ptrace", ["ptrace"], {"ptrace": 1}, 7])
+def test_denials_that_are_no_list_of_texts_are_none(said: Any) -> None:
+    """As where none are recorded."""
+    assert read_denials(said) is None
+
+
+def test_a_denial_that_is_no_attempt_is_left_out() -> None:
+    """Only forms that there are; nothing that a terminal would obey, nothing long, and not many."""
+    good = ("ptrace", "socket AF_INET", "write /home/other/x\\x1b")
+    bad = (b"ptrace", 7, None, ("ptrace",), "Ptrace", "read x", "read /\x1b[2J", "a" * 41)
+    assert read_denials((*bad, *good, "read /" + "x" * 401)) == good
+    assert len(read_denials(("ptrace",) * 100_000) or ()) == 64

@@ -1,0 +1,89 @@
+"""A place for workers: what ``make_env`` asks of each, with what most of them answer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from envhub_sandbox.errors import SandboxUnavailableError
+from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
+from envhub_worker.protocol.runtime import OWN, Runtime
+
+if TYPE_CHECKING:
+    from envhub_sandbox.dependencies.pipeline import PackageTarget
+    from envhub_sandbox.policy import Policy
+    from envhub_sandbox.transport.connection import WorkerClient
+    from envhub_sandbox.transport.deadline import Deadline
+    from envhub_worker.protocol.messages import OpenJail
+
+
+class Sandbox:
+    """A place for workers. Each overrides ``acquire`` or ``for_repository``, and what differs.
+
+    Attributes:
+        name: How errors call it.
+        retry_s: For how long to wait for room in a place that others use, too.
+    """
+
+    name: str
+    retry_s: float = 0.0
+
+    def for_repository(self, snapshot: Path, policy: Policy, runtime: Runtime) -> Sandbox:
+        """The place for one repository, where each gets a server that sees no other's files.
+
+        Starts nothing, and connects to nothing.
+
+        Args:
+            snapshot: The verified files.
+            policy: What the jails may do.
+            runtime: The interpreter that the caller named, or none, and the repository's packages.
+
+        Raises:
+            PolicyError: The place cannot permit what the policy does.
+            SandboxUnavailableError: There is no such place here.
+        """
+        return self
+
+    def runs_on(self, runtime: Runtime) -> Runtime:
+        """What runs the repository there; a remembered manifest holds for this only."""
+        return runtime
+
+    def package_target(self) -> PackageTarget | None:
+        """Makes a repository's own packages for what runs there; None where nothing can.
+
+        Asks the place nothing before it has to make some.
+        """
+        return None
+
+    def acquire(
+        self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
+    ) -> ServerUse[WorkerServer]:
+        """Use a server that may show snapshots below ``store`` to jails. Servers are shared.
+
+        Args:
+            store: The folder.
+            runtime: What its first jail runs on. A hint: others may run on something else.
+            idle_s: For how long the server is kept for the next user, where this use is its last;
+                0 ends it at once, None keeps it for as long as this process lives.
+
+        Raises:
+            SandboxUnavailableError: There is no such place here.
+            WorkerStartupError: The server did not come up.
+        """
+        raise SandboxUnavailableError(f"{self.name}: a server is started for one repository only")
+
+    def prepare(
+        self, order: OpenJail, server: WorkerServer, client: WorkerClient, deadline: Deadline
+    ) -> OpenJail:
+        """The order for a jail as a server of this place understands it.
+
+        Args:
+            order: In terms of this machine.
+            server: One that ``acquire`` gave.
+            client: A connection to it.
+            deadline: For what has to be brought there first.
+
+        Raises:
+            WorkerError: The server does not take it.
+        """
+        return order
