@@ -12,7 +12,7 @@ import gymnasium
 import pytest
 from hypothesis import HealthCheck, settings
 
-from envhub_sandbox import folders
+from envhub_sandbox.system import folders
 
 pytest_plugins = [
     *("tests.hub.fixtures", "tests.support.selection", "tests.support.skips"),

@@ -31,11 +31,11 @@ from typing import Any
 
 import numpy as np
 
-from envhub_sandbox import folders
 from envhub_sandbox.crash.history import Recording, Requested, Steps, encoded
 from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.policy import Policy, Timeouts
+from envhub_sandbox.system import folders
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.codec.inert import describe, one_line

@@ -32,15 +32,14 @@ from pathlib import Path
 from typing import Any
 
 import envhub_worker.protocol
-from envhub_sandbox import folders
 from envhub_sandbox.dependencies import index, uv, uv_cache
 from envhub_sandbox.dependencies.bounds import Bounds, Watch, checked, walk
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.resolve import Lock
 from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.hub.store import CACHE_VARIABLE, cache_root, remove_tree
-from envhub_sandbox.system import locks
-from envhub_sandbox.system.shared_lock import sharers
+from envhub_sandbox.system import folders, locks
+from envhub_sandbox.system.locks import sharers
 from envhub_worker.protocol.runtime import RECORD
 
 _FORMAT = 1

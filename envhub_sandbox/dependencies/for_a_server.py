@@ -29,7 +29,6 @@ from typing import Any
 
 from packaging.utils import canonicalize_name
 
-from envhub_sandbox import parent
 from envhub_sandbox.dependencies import bounds, environments, interpreters, pipeline, uv
 from envhub_sandbox.dependencies.choice import DATE
 from envhub_sandbox.dependencies.declared import Wanted, parse_requirement
@@ -37,6 +36,7 @@ from envhub_sandbox.dependencies.guesses import Guess
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import DependencyError, PackagesTooLargeError, RequirementError
 from envhub_sandbox.hub.store import CACHE_VARIABLE, remove_tree
+from envhub_sandbox.system import processes
 from envhub_worker.protocol.text import printable
 
 BLOCK_BYTES = 4096
@@ -89,7 +89,7 @@ def _say(what: Mapping[str, Any]) -> None:
 
 def _made(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
     if ended is not None:
-        parent.end_with(ended, 0.0)  # uv is in our group, too
+        processes.end_with(ended, 0.0)  # uv is in our group, too
     os.nice(_NICE)
     _, most = resource.getrlimit(resource.RLIMIT_FSIZE)  # which a plain user cannot raise
     bound = order["bytes"] if most == resource.RLIM_INFINITY else min(order["bytes"], most)
@@ -158,7 +158,7 @@ def _watched(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
     """Have it made, within bounds; empty where whoever made it has said what there is to say."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     if ended is not None:
-        parent.end_with(ended, _CLEANING_S)
+        processes.end_with(ended, _CLEANING_S)
     with _alone(Path(order["folder"])) as held:
         unfinished = Path(order["folder"], "unfinished")
         if unfinished.exists():
@@ -180,7 +180,7 @@ def _watched(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
 def _worked(order: Mapping[str, Any], held: int) -> bool:
     """Whether it has come to an end that leaves nothing half-made."""
     program = [sys.executable, "-I", "-m", "envhub_sandbox.dependencies.for_a_server"]
-    with parent.pidfd() as ourselves:
+    with processes.pidfd() as ourselves:
         process = subprocess.Popen(
             [*program, "make", f"{_PIDFD}{ourselves}"],
             stdin=subprocess.PIPE,

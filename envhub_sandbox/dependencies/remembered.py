@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 
-from envhub_sandbox import folders
+from envhub_sandbox.system import folders
 from envhub_sandbox.system.files import write_whole
 
 _MAX_BYTES = 16 * 1024 * 1024

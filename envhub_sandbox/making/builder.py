@@ -17,7 +17,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox import parent
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerTimeoutError
 from envhub_sandbox.hub import store
 from envhub_sandbox.hub.snapshot import local
@@ -28,6 +27,7 @@ from envhub_sandbox.sandboxes.process import PROCESS
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.recipe import Recipe, pinned
 from envhub_sandbox.session.repository import LoadArguments, Repository
+from envhub_sandbox.system import processes
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.runtime import Runtime
 
@@ -36,7 +36,7 @@ _PIECE = 16 * 2**20
 
 def main(folder: Path, ended: int) -> int:
     """Carry out the order that lies in a folder."""
-    parent.end_with(ended, 10.0)
+    processes.end_with(ended, 10.0)
     order = json.loads((folder / "order.json").read_text())
     os.environ[store.CACHE_VARIABLE] = str(folder / "cache")  # it goes with the folder
     try:

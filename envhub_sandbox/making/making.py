@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from envhub_sandbox import std_streams
 from envhub_sandbox.dependencies.choice import Choice, chosen
 from envhub_sandbox.dependencies.missing_module import MissingModule
 from envhub_sandbox.dependencies.pipeline import HERE, PackageSet, packages_for
@@ -27,6 +26,7 @@ from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.provenance import provenance_of
 from envhub_sandbox.session.recipe import Recipe, pinned
 from envhub_sandbox.session.repository import LoadArguments, Repository
+from envhub_sandbox.system import processes
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.runtime import Runtime
@@ -47,7 +47,7 @@ def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSui
     options = given.checked()
     if options.sandbox is None:
         return _make_here(reference, config, options)
-    std_streams.occupy()  # before anything of ours is opened
+    processes.occupy_streams()  # before anything of ours is opened
     wanted = _wanted(options.sandbox, options)
     snapshot = _snapshot(reference, options)
     packages = _packages(snapshot, wanted, options)

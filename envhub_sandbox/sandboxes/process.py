@@ -16,7 +16,6 @@ from functools import partial
 from pathlib import Path
 
 import envhub_worker.protocol
-from envhub_sandbox import parent
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.log import WORKER
 from envhub_sandbox.option_names import option_name
@@ -24,7 +23,7 @@ from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.lingering import Lingering
 from envhub_sandbox.sandboxes.refcount import Sharing, Use, Uses
 from envhub_sandbox.sandboxes.runtime_folder import RuntimeFolder
-from envhub_sandbox.system import procfs
+from envhub_sandbox.system import processes
 from envhub_sandbox.transport.forks import Owner
 from envhub_worker.protocol.runtime import OWN, Runtime
 
@@ -64,7 +63,7 @@ class ProcessServer:
         for: it takes no requests any more. Nor can anyone connect to one whose sockets a cleaner
         of temporary files has removed; who is connected already goes on.
         """
-        alive = self.process.poll() is None and not procfs.has_ended(self.process.pid)
+        alive = self.process.poll() is None and not processes.has_ended(self.process.pid)
         return alive and self.runtime.has_sockets("server", "fds")
 
     def stop(self) -> None:
@@ -150,7 +149,7 @@ def _execute(
         *("--readable-root", str(store)),
         *("--ahead", "--python", runtime.python, "--packages", runtime.packages),
     ]
-    with (folder / "server.log").open("wb") as log, parent.pidfd() as ourselves:
+    with (folder / "server.log").open("wb") as log, processes.pidfd() as ourselves:
         return subprocess.Popen(
             [*arguments, "--ready-fd", str(ready), "--client-pidfd", str(ourselves)],
             stdin=subprocess.DEVNULL,

@@ -12,10 +12,10 @@ import os
 import sys
 from pathlib import Path
 
-from envhub_sandbox import folders
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.policy import Policy
+from envhub_sandbox.system import folders
 from envhub_sandbox.system.files import write_whole
 from envhub_sandbox.transport.shared_memory.sharding import PaceBook
 from envhub_sandbox.transport.values import pickles

@@ -29,7 +29,7 @@ from envhub_sandbox.session.author_lines import point_out
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.provenance import provenance_of
 from envhub_sandbox.session.recipe import Recipe
-from envhub_sandbox.system.shared_lock import SharedLock
+from envhub_sandbox.system.locks import SharedLock
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import RemoteWarnings
 from envhub_worker.protocol import messages as m

@@ -1,1 +1,1 @@
-"""What several packages ask of the operating system: locks, whole files, facts of ``/proc``."""
+"""What several packages ask of the operating system: locks, files, folders, processes."""

@@ -11,10 +11,14 @@ import contextlib
 import fcntl
 import os
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 _POLL_S = 0.1
+_COMMAND_CHARS = 80
+_LOOKS = 5
+"""The kernel gives the list of locks a page at a time, and skips some where others change it."""
 _READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
 _WRITE = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
 
@@ -136,7 +140,59 @@ class LifeLock:
         self._descriptor = -1
 
 
+class SharedLock:
+    """A file's lock that this process shares until ``release``, or until nobody has this object.
+
+    A fork does not hold it. Nothing is held where there is no such file, or another has it alone.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._held: list[int] = []
+        _shared.add(self)
+        # what a Ctrl-C keeps ``release`` from, this does, which is called whatever became of that
+        weakref.finalize(self, _close, self._held).atexit = False
+        with contextlib.suppress(OSError):
+            self._held.append(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC))
+            fcntl.flock(self._held[0], fcntl.LOCK_SH | fcntl.LOCK_NB)
+
+    def release(self) -> None:
+        """Give it back. Idempotent, and nothing in a fork."""
+        _close(self._held)
+
+
+def sharers(path: Path) -> dict[int, str]:
+    """The processes that hold the lock of a file, as far as they are seen from here.
+
+    Returns:
+        Pid to the first words of the command line.
+    """
+    status = path.stat()
+    device = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
+    held: set[int] = set()
+    for _ in range(_LOOKS):
+        rows = [row.split() for row in Path("/proc/locks").read_text().splitlines()]
+        held = {int(row[4]) for row in rows if row[1] == "FLOCK" and row[5] == device}
+        if held:
+            break
+    return {pid: _command(pid) for pid in sorted(held) if pid > 0}
+
+
+def _command(pid: int) -> str:
+    with contextlib.suppress(OSError):
+        words = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ")
+        return words.decode("utf-8", "replace").strip()[:_COMMAND_CHARS]
+    return ""
+
+
+def _close(held: list[int]) -> None:
+    while held:
+        os.close(held.pop())
+
+
+# --- forks --------------------------------------------------------------------------------------
+
 _held_for_life: set[int] = set()
+_shared: weakref.WeakSet[SharedLock] = weakref.WeakSet()
 
 
 def _forked() -> None:
@@ -144,6 +200,8 @@ def _forked() -> None:
         with contextlib.suppress(OSError):
             os.close(descriptor)
     _held_for_life.clear()
+    for lock in _shared:
+        lock.release()
 
 
 os.register_at_fork(after_in_child=_forked)

@@ -18,7 +18,6 @@ from typing import Any
 
 import zmq
 
-from envhub_sandbox import folders
 from envhub_sandbox.check.play import denials
 from envhub_sandbox.crash import writer
 from envhub_sandbox.dependencies import environments, guesses, interpreters, resolutions
@@ -33,6 +32,7 @@ from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.recipe import Recipe
 from envhub_sandbox.session.repository import Repository
+from envhub_sandbox.system import folders
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from envhub_sandbox import parent
 from envhub_sandbox.errors import WorkerStartupError
+from envhub_sandbox.system import processes
 from envhub_worker.protocol.text import printable, size_text
 
 _TICK_S = 0.1
@@ -65,7 +65,7 @@ class _Running(Generic[T]):
         with (
             self._file("out").open("xb") as out,
             self._file("err").open("xb") as err,
-            parent.pidfd() as ourselves,
+            processes.pidfd() as ourselves,
         ):
             self._process = _started(
                 command(order, folder, ourselves),

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import sys
 
-from envhub_sandbox import parent
 from envhub_sandbox.check.many.running import PATIENCE_S
+from envhub_sandbox.system import processes
 
 
 def main() -> None:
     """Run the command line; never returns."""
-    parent.end_with(int(sys.argv.pop(1)), PATIENCE_S)
+    processes.end_with(int(sys.argv.pop(1)), PATIENCE_S)
     from envhub_sandbox.cli import main as command_line
 
     command_line()

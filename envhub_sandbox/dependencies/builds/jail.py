@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox import errors, parent
+from envhub_sandbox import errors
 from envhub_sandbox.dependencies.builds.project import Project
 from envhub_sandbox.dependencies.builds.wheels import MAX_BYTES
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.errors import DependencyError
+from envhub_sandbox.system import processes
 from envhub_worker.protocol.text import printable
 
 PROFILE_VARIABLE = "ENVHUB_BUILD_PROFILE"
@@ -89,7 +90,7 @@ def _run(order: Order, folder: Path) -> dict[str, Any]:
         "profile": os.environ.get(PROFILE_VARIABLE) or "strict",
     }
     (folder / "order.json").write_text(json.dumps(told))
-    with parent.pidfd() as ourselves:
+    with processes.pidfd() as ourselves:
         done = subprocess.run(
             [sys.executable, "-I", "-m", _PROGRAM, str(folder), str(ourselves)],
             stdin=subprocess.DEVNULL,

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from envhub_sandbox import folders
 from envhub_sandbox.errors import PackageIntegrityError, PackagesTooLargeError, SnapshotError
 from envhub_sandbox.hub.listing import FileRecord, check_names
+from envhub_sandbox.system import folders
 from envhub_worker.protocol.text import size_text
 
 MAX_BYTES = 2 * 2**30

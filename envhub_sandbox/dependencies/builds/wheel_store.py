@@ -19,10 +19,10 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from envhub_sandbox import folders
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.hub.store import cache_root, remove_tree
+from envhub_sandbox.system import folders
 
 FORMAT = 1
 """Of what is kept, and of how it is built: another one is built again."""

@@ -20,7 +20,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox import parent
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy
@@ -39,6 +38,7 @@ from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.lingering import Lingering
 from envhub_sandbox.sandboxes.refcount import Sharing, Use, Uses
 from envhub_sandbox.sandboxes.runtime_folder import RuntimeFolder
+from envhub_sandbox.system import processes
 from envhub_sandbox.transport.forks import Owner
 from envhub_worker.protocol.runtime import OWN, Runtime
 
@@ -325,7 +325,7 @@ def _user() -> tuple[int, int]:
 def _execute(
     engine: Engine, wanted: Container, folder: Path, ready: int
 ) -> subprocess.Popen[bytes]:
-    with parent.pidfd() as ourselves:
+    with processes.pidfd() as ourselves:
         return subprocess.Popen(
             [
                 *(sys.executable, "-I", "-S", str(_MONITOR), str(ourselves), str(ready)),

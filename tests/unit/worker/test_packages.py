@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.hub.store import remove_tree
-from envhub_sandbox.system.locks import held
-from envhub_sandbox.system.shared_lock import sharers
+from envhub_sandbox.system.locks import held, sharers
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.runtime import RECORD, Runtime
 from envhub_worker.spawn.spawner import RUNNER_TARGET, Failed, RunnerExited

@@ -29,7 +29,7 @@ from envhub_sandbox.errors import (
     PackagesTooLargeError,
 )
 from envhub_sandbox.hub.snapshot import local
-from envhub_sandbox.system.shared_lock import SharedLock
+from envhub_sandbox.system.locks import SharedLock
 from envhub_worker.protocol.runtime import RECORD
 from tests.support import inside
 from tests.support.processes import eventually

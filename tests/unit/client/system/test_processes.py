@@ -17,10 +17,10 @@ from tests.support.processes import eventually
 
 _PARENT = """
 import fcntl, resource, subprocess, sys, threading, time
-from envhub_sandbox import parent
+from envhub_sandbox.system import processes
 
 def start():
-    with parent.pidfd() as ourselves:
+    with processes.pidfd() as ourselves:
         number = ourselves
         if sys.argv[1] == "high":  # beyond what select() can wait for
             _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -36,7 +36,7 @@ time.sleep(3600)
 """
 _CHILD = """
 import os, signal, subprocess, sys, time
-from envhub_sandbox import parent
+from envhub_sandbox.system import processes
 
 def end(*_):
     open("ended", "x").close()
@@ -47,7 +47,7 @@ signal.signal(signal.SIGTERM, signal.SIG_IGN if how == "stubborn" else end)
 below = subprocess.Popen([sys.executable, "-I", "-c", "import time; time.sleep(3600)"])
 if how != "nobody":
     patience = {"at once": 0.0, "stubborn": 0.1}.get(how, 600.0)
-    parent.end_with(int(sys.argv[1]), patience)
+    processes.end_with(int(sys.argv[1]), patience)
 print(os.getpid(), below.pid, flush=True)
 time.sleep(3600)
 """
@@ -100,7 +100,7 @@ def test_without_it_it_would_stay(tmp_path: Path) -> None:
 
 def test_who_is_started_by_another_thread_meanwhile_does_not_inherit_it() -> None:
     """It is for one alone."""
-    from envhub_sandbox import parent
+    from envhub_sandbox.system import processes
 
-    with parent.pidfd() as ourselves:
+    with processes.pidfd() as ourselves:
         assert not os.get_inheritable(ourselves)

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox import folders
 from envhub_sandbox.errors import SnapshotError
 from envhub_sandbox.hub import store as store
 from envhub_sandbox.hub.listing import FileRecord
 from envhub_sandbox.session.manifest_cache import ManifestCache
+from envhub_sandbox.system import folders
 from tests.hub.stub_hub import git_blob_id
 from tests.support import inside
 

@@ -1,0 +1,85 @@
+"""Processes of ours: one that ends with its parent, whether a child has ended, standard streams.
+
+A parent hands its child a pidfd of itself, which the child watches. The kernel's own signal at a
+parent's death would come when the thread ends that has started the child, and a change of user
+forgets it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+_STREAMS = 3
+
+
+@contextlib.contextmanager
+def pidfd() -> Iterator[int]:
+    """A pidfd of this process, for one that is started meanwhile with it in ``pass_fds``."""
+    ourselves = os.pidfd_open(os.getpid())
+    try:
+        yield ourselves
+    finally:
+        os.close(ourselves)
+
+
+def end_with(parent: int, patience_s: float) -> None:
+    """End this process as soon as another has ended, and with it the group that it leads.
+
+    Args:
+        parent: A pidfd of the other.
+        patience_s: For what SIGTERM does here, in the main thread, before all are killed; with none
+            they are killed at once.
+    """
+    os.set_inheritable(parent, False)
+    threading.Thread(target=_watch, args=(parent, patience_s), daemon=True).start()
+
+
+def _watch(parent: int, patience_s: float) -> None:
+    poll = select.poll()  # of descriptors beyond 1023, too
+    poll.register(parent, select.POLLIN)
+    while not poll.poll():
+        pass
+    if patience_s > 0:
+        # of all threads the one whose system call it has to interrupt
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
+        time.sleep(patience_s)
+    if os.getpgrp() == os.getpid():
+        os.killpg(0, signal.SIGKILL)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def has_ended(pid: int) -> bool:
+    """Whether a child has ended, reaped or not. It is a zombie before its threads are gone."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace")
+    except OSError:
+        return True
+    # the command may hold anything, parentheses and blanks included
+    return stat.rpartition(")")[2].split()[0] in "ZX"
+
+
+def occupy_streams() -> None:
+    """Take the numbers 0, 1 and 2, where a program was started without them: ``<&- >&- 2>&-``.
+
+    Else our first sockets and pipes would have them: what anybody prints would go to a worker, and
+    what a worker is handed would be closed there in favour of its own standard streams.
+    """
+    while (null := os.open(os.devnull, os.O_RDWR)) < _STREAMS:  # the lowest that is free
+        os.set_inheritable(null, True)
+    os.close(null)
+
+
+def replace_missing_streams() -> None:
+    """Occupy the numbers, and let ``print`` and others find a stream: for a program of ours."""
+    occupy_streams()
+    sys.stdin = sys.stdin or open(os.devnull)  # noqa: SIM115
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
