@@ -1,9 +1,9 @@
 """One task's environment: its life, from the first jail to the last.
 
-It has a ``Lease``, its hold on a jail and the lane there; ``Turns``, since one thread uses it at a
-time; a ``Prewarm``, which starts it; ``Requests``, which ``vector_env`` uses; and, with
+It has a ``Lease``, its hold on a jail and the lane there; a ``UseLock``, since one thread uses it at
+a time; a ``Prewarm``, which starts it; ``Requests``, which ``vector_env`` uses; and, with
 ``restart="transparent"``, a ``Recovery``. None of these knows it. Here it is recovered before a
-reset, closed, and abandoned in a fork.
+reset, closed, and abandoned in a fork. The rules for these are in docs/internals/interruption.md.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from envhub_sandbox.session.requests import Requests
 from envhub_sandbox.session.survival.failures import Failures
 from envhub_sandbox.session.survival.recovery import Recovery
 from envhub_sandbox.session.survival.restart_policy import Restarts
-from envhub_sandbox.session.turns import Turns
+from envhub_sandbox.session.use_lock import UseLock
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.results import Results
@@ -74,13 +74,13 @@ class EnvSession:
         self.lease = lease = Lease(jails, results, self.lifecycle, counters, paces)
         self._restarts = Restarts(policy)
         self._failures = failures = Failures(lease, results, counters, history)
-        self.turns = turns = Turns(lease, failures)
+        self.use = use = UseLock(lease, failures)
         recovery: Recovery | None = None
         if policy.restart == "transparent":
             recovery = Recovery(lease, results, self._restarts, failures, counters, history)
-        self.prewarm = Prewarm(lease, turns, counters, history, recovery)
+        self.prewarm = Prewarm(lease, use, counters, history, recovery)
         self.requests = Requests(
-            lease, turns, self.prewarm, results, counters, history, failures, recovery
+            lease, use, self.prewarm, results, counters, history, failures, recovery
         )
         labels = Labels(self.repository.label, manifest.suite, str(manifest.task))
         LEDGER.add(self, labels, self._restarts)
@@ -123,11 +123,10 @@ class EnvSession:
         if ready and self.repository.timeouts.idle_s is None:
             return
         self.prewarm.note_if_awaited()
-        with self.turns.take("reset"):
-            # The order matters. First what ended unnoticed becomes EXPIRED, then what another
-            # thread waits for is refused, and only then a pending reply counts as late.
+        with self.use.hold("reset"):
+            # The order matters. What ended unnoticed becomes EXPIRED first. A reply that is still
+            # pending here belongs to an interrupted request, since this thread has the lock.
             self.prewarm.look_whether_it_lives()
-            self.requests.refuse_others("reset")
             if self.lifecycle.state is State.PENDING:
                 self._failures.note_interruption()
             if self.lifecycle.state is State.READY and self.repository.timeouts.idle_s is not None:
@@ -187,7 +186,7 @@ class EnvSession:
         if self.lifecycle.state is State.FOREIGN:
             self.lifecycle.on(Event.CLOSE)
             return
-        if not self.turns.lock.acquire(blocking=False):
+        if not self.use.lock.acquire(blocking=False):
             self._interrupt()
             return
         # CLOSED comes first: from then on no other thread starts anything. Then the repository's
@@ -203,14 +202,14 @@ class EnvSession:
             try:
                 self.lease.let_go(wait=False)
             finally:
-                self.turns.lock.release()
+                self.use.lock.release()
 
     def _finish(self) -> None:
-        if self.turns.lock.acquire(blocking=False):  # else another thread is closing it
+        if self.use.lock.acquire(blocking=False):  # else another thread is closing it
             try:
                 self.lease.let_go()
             finally:
-                self.turns.lock.release()
+                self.use.lock.release()
 
     def _end_life(self) -> None:
         self.lifecycle.moved(Event.CLOSE)
@@ -229,16 +228,16 @@ class EnvSession:
             return
         close_s = self.repository.timeouts.close_s
         patience_s = INTERRUPT_S if close_s is None else min(close_s, INTERRUPT_S)
-        if self.turns.lock.acquire(timeout=patience_s):
+        if self.use.lock.acquire(timeout=patience_s):
             try:
                 self.lifecycle.moved(Event.CLOSE)  # the other may have moved at the same moment
                 self.lease.let_go()  # of what is there now: it may have moved elsewhere, too
             finally:
-                self.turns.lock.release()
+                self.use.lock.release()
 
     def abandon(self) -> None:
         """In a fork of the process that made it: touch nothing, and refuse all requests."""
-        self.turns.abandon()
+        self.use.abandon()
         self.lifecycle.moved(Event.FORK)
         self.lifecycle.request = None
         self.lease.abandon()

@@ -23,7 +23,7 @@ from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.refusals import closed_during
 from envhub_sandbox.session.survival.recovery import Recovery
-from envhub_sandbox.session.turns import Turns
+from envhub_sandbox.session.use_lock import UseLock
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_worker.protocol.lifecycle import Event, State
 
@@ -41,7 +41,7 @@ class Prewarm:
 
     Args:
         lease: Its hold on a jail.
-        turns: Whose turn it is.
+        use: Lets one thread use it at a time.
         counters: Say whether anything was asked of it.
         history: Learns that it has started.
         recovery: Learns that it has started, if there is one.
@@ -54,7 +54,7 @@ class Prewarm:
     def __init__(
         self,
         lease: Lease,
-        turns: Turns,
+        use: UseLock,
         counters: Counters,
         history: History,
         recovery: Recovery | None,
@@ -63,7 +63,7 @@ class Prewarm:
         self.unused = False
         self.first_use: Callable[[], None] | None = None
         self._lease = lease
-        self._turns = turns
+        self._use = use
         self._counters = counters
         self._history = history
         self._recovery = recovery
@@ -83,7 +83,7 @@ class Prewarm:
 
     def adopt(self, loaded: LoadedJail) -> None:
         """Use a jail that is already loaded, instead of opening one later."""
-        with self._turns.take("make_env"):
+        with self._use.hold("make_env"):
             self._lease.adopt(loaded, Deadline(self._timeouts.startup_s))
             self._started()
 
@@ -113,7 +113,7 @@ class Prewarm:
         """Start its processes, unless they are there, before any request needs them."""
         deadline = StartupDeadline(self._timeouts.startup_s, unasked=True)
         # whatever fails here fails again in the first request, which raises it
-        with contextlib.suppress(Exception), self._turns.take("make_env"):
+        with contextlib.suppress(Exception), self._use.hold("make_env"):
             if self.lifecycle.state is State.IDLE:
                 self._starting = deadline
                 try:
@@ -127,14 +127,14 @@ class Prewarm:
         starting = self._starting
         if starting is not None:
             starting.give_up()
-        lock = self._turns.lock
+        lock = self._use.lock
         if not lock.acquire(timeout=0 if starting is None else INTERRUPT_S):
             return False  # it is in use
         try:
             unused = self.unused and not self._counters.requests
             if not unused or self.lifecycle.state is not State.READY:
                 return starting is not None
-            with self._turns.take("make_env"):
+            with self._use.hold("make_env"):
                 self.unused = False
                 # The move comes first. An interrupt between here and the end would otherwise leave
                 # an environment that is READY without a jail; this way a reset starts another.

@@ -35,7 +35,7 @@ from envhub_sandbox.session.prewarm import Prewarm
 from envhub_sandbox.session.refusals import refusal
 from envhub_sandbox.session.survival.failures import Failures
 from envhub_sandbox.session.survival.recovery import Recovery
-from envhub_sandbox.session.turns import Turns, collision
+from envhub_sandbox.session.use_lock import UseLock
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Lane, Request
@@ -60,7 +60,7 @@ class Requests:
 
     Args:
         lease: Its jail, and the lane there.
-        turns: Whose turn it is.
+        use: Lets one thread use it at a time.
         prewarm: Starts it.
         results: What it is expected to be, and its slices.
         counters: Of requests, steps and what went wrong.
@@ -71,6 +71,8 @@ class Requests:
     Attributes:
         results: Makes of replies what Gymnasium returns.
         attributes: Those that need no request.
+        use: As given. A thread that asks something holds its lock until it has handled the answer;
+            between an ``*_async`` and its ``*_wait`` no thread does.
         closed: Whether the caller has called ``close``.
         waiting: The request of an ``*_async`` whose ``*_wait`` has not come yet.
         face: What the environment is called in the error after ``close``.
@@ -79,7 +81,7 @@ class Requests:
     def __init__(
         self,
         lease: Lease,
-        turns: Turns,
+        use: UseLock,
         prewarm: Prewarm,
         results: Results,
         counters: Counters,
@@ -94,7 +96,7 @@ class Requests:
         self.waiting: str | None = None
         self.face = "VectorEnv"
         self._lease = lease
-        self._turns = turns
+        self.use = use
         self._prewarm = prewarm
         self._counters = counters
         self._history = history
@@ -151,28 +153,32 @@ class Requests:
 
     def ask(self, operation: str, message_for: MessageFor) -> list[m.Value]:
         """One request, and the values of all shards."""
-        self.refuse_if_busy(operation)
-        self.submit(operation, message_for)
-        return self.collect(self._timeouts.call_s, m.Value)
+        with self.use.lock:
+            self.refuse_if_busy(operation)
+            self.submit(operation, message_for)
+            return self.collect(self._timeouts.call_s, m.Value)
 
     def ask_own(self, operation: str, kind: Callable[..., m.Message], *fields: object) -> m.Message:
         """Ask about what the repository's vector environment has of its own: one shard has it."""
-        self.submit(operation, lambda number, _: kind(number, *fields))
-        [reply] = self.collect(self._timeouts.call_s, (m.Value, m.Method))
+        with self.use.lock:
+            self.refuse_if_busy(operation)
+            self.submit(operation, lambda number, _: kind(number, *fields))
+            [reply] = self.collect(self._timeouts.call_s, (m.Value, m.Method))
         return reply
 
     def ask_one(self, name: str, index: int, message: OneMessageFor) -> m.Message:
         """Ask about one sub-environment; the other shards' replies are empty."""
         operation = f"envs[{index}].{name[:_SHOWN]}"  # which is no reset or step of all
-        self.refuse_if_busy(operation)
+        timeouts = {"reset": self._timeouts.reset_s, "step": self._timeouts.step_s}
 
         def message_for(number: int, bounds: Bounds) -> m.Message:
             start, stop = bounds
             return message(number, index - start if start <= index < stop else None)
 
-        self.submit(operation, message_for)
-        timeouts = {"reset": self._timeouts.reset_s, "step": self._timeouts.step_s}
-        replies = self.collect(timeouts.get(name, self._timeouts.call_s), (m.Value, m.Method))
+        with self.use.lock:
+            self.refuse_if_busy(operation)
+            self.submit(operation, message_for)
+            replies = self.collect(timeouts.get(name, self._timeouts.call_s), (m.Value, m.Method))
         holds = (start <= index < stop for start, stop in self.results.bounds)
         return next(reply for reply, here in zip(replies, holds, strict=True) if here)
 
@@ -191,11 +197,11 @@ class Requests:
             WorkerError: The environment is not in a state to take it.
         """
         try:
-            with self._turns.lock:
+            with self.use.lock:
                 try:
                     self._submit(operation, message_for, instead)
                 except BaseException:
-                    with self._turns.take(operation):  # on failure only: it costs some us
+                    with self.use.hold(operation):  # on failure only: it costs some us
                         raise
                 if self.lifecycle.state is State.CLOSED:
                     self._lease.let_go()
@@ -246,11 +252,11 @@ class Requests:
             ClosedEnvironmentError: A ``close`` in another thread came first.
         """
         try:
-            with self._turns.lock:
+            with self.use.lock:
                 try:
                     replies = self._collect(timeout_s, kind)
                 except BaseException:
-                    with self._turns.judging("a request"):
+                    with self.use.judging("a request"):
                         raise
                 if self.lifecycle.state is State.CLOSED:
                     self._lease.let_go()
@@ -281,7 +287,7 @@ class Requests:
         try:
             return self.results.one_each(what, replies)
         except BaseException:
-            with self._turns.judging("a request"):
+            with self.use.judging("a request"):
                 raise
 
     def finish_reset(
@@ -291,61 +297,58 @@ class Requests:
         try:
             return self.results.reset(replies)
         except batches.Misfit:
-            with self._turns.judging("a request"):
+            with self.use.judging("a request"):
                 infos = self._infos_apart(Deadline(timeout_s))
                 if self._recovery is not None:
                     infos = self._recovery.mark(infos)
                 return self.results.reset(replies, infos)
         except BaseException:
-            with self._turns.judging("a request"):
+            with self.use.judging("a request"):
                 raise
 
     # --- steps ---------------------------------------------------------------------------------
 
     def submit_step(self, actions: Any) -> None:
-        """Send a validated batch of actions; raises as ``submit`` does."""
+        """Send a validated batch of actions, with the lock held; raises as ``submit`` does."""
         try:
-            with self._turns.lock:
-                lifecycle = self.lifecycle
-                if lifecycle.state is not State.READY:
-                    with self._turns.take("step"):
-                        self._make_ready("step")
-                try:
-                    lane = self._lease.lane
-                    assert lane is not None
-                    # The move comes first: an interrupt from here on leaves a reply that may come.
-                    lifecycle.request = "step"
-                    lifecycle.on(Event.SUBMIT)
-                    lane.send_step(actions)
-                except BaseException as error:
-                    with self._turns.take("step"):
-                        self._nothing_was_sent(error)
-                        raise
-                self._counters.requests += 1
-                self._history.step(actions)  # while the jail is at it
+            lifecycle = self.lifecycle
+            if lifecycle.state is not State.READY:
+                with self.use.hold("step"):
+                    self._make_ready("step")
+            try:
+                lane = self._lease.lane
+                assert lane is not None
+                lifecycle.request = "step"
+                lifecycle.on(Event.SUBMIT)  # docs/internals/interruption.md: the move comes first
+                lane.send_step(actions)
+            except BaseException as error:
+                with self.use.hold("step"):
+                    self._nothing_was_sent(error)
+                    raise
+            self._counters.requests += 1
+            self._history.step(actions)  # while the jail is at it
         except WorkerDiedError:
             self.refuse_if_closed()  # a close() in another thread ended it
             raise
 
     def collect_step(self, timeout_s: float | None) -> StepResult:
-        """What ``VectorEnv.step`` returns; raises as ``collect`` does."""
+        """What ``VectorEnv.step`` returns, with the lock held; raises as ``collect`` does."""
         try:
-            with self._turns.lock:
-                deadline: Deadline = self._step_deadline
-                if timeout_s is deadline.timeout_s:
-                    self._step_deadline.running = False
-                else:
-                    deadline = Deadline(timeout_s)
-                try:
-                    lane = self._lease.lane
-                    if lane is None or self.lifecycle.state is not State.PENDING:
-                        raise self._nothing_pending()
-                    self._finish(lane.wait, deadline)
-                    self._counters.stepped(lane.elapsed_ns)
-                    result = lane.result()
-                except BaseException as error:
-                    with self._turns.judging("step"):
-                        result = self._mended(error, deadline)
+            deadline: Deadline = self._step_deadline
+            if timeout_s is deadline.timeout_s:
+                self._step_deadline.running = False
+            else:
+                deadline = Deadline(timeout_s)
+            try:
+                lane = self._lease.lane
+                if lane is None or self.lifecycle.state is not State.PENDING:
+                    raise self._nothing_pending()
+                self._finish(lane.wait, deadline)
+                self._counters.stepped(lane.elapsed_ns)
+                result = lane.result()
+            except BaseException as error:
+                with self.use.judging("step"):
+                    result = self._mended(error, deadline)
         except BaseException as error:
             self.explain(error)
             raise
@@ -388,21 +391,9 @@ class Requests:
         interrupted = self.lifecycle.request if pending else self._failures.interruption
         refused = refusal(state, operation, restart, interrupted)
         if refused is not None:
-            self.refuse_others(operation)
             raise refused
         self._prewarm.note_use()  # already: the next one starts beside this
         self._prewarm.start_on_demand()
-
-    def refuse_others(self, operation: str) -> None:
-        """A request that another thread waits for is not late: it is in use.
-
-        Raises:
-            AlreadyPendingCallError: It is.
-        """
-        if self.lifecycle.state is State.PENDING:
-            found = collision(self, operation)
-            if found is not None:
-                raise found
 
     def _send(self, operation: str, send: Callable[[], None]) -> None:
         self.lifecycle.request = operation

@@ -114,9 +114,10 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         """
         # Not by reset_async and reset_wait: an interrupt between them would leave `waiting` set,
         # and the next request refused, although no reset_wait can follow.
-        self._requests.refuse_if_busy("reset_async")
-        self._send_reset(seed, options)
-        return self._end_reset(self._timeouts.reset_s)
+        with self._requests.use.lock:
+            self._requests.refuse_if_busy("reset_async")
+            self._send_reset(seed, options)
+            return self._end_reset(self._timeouts.reset_s)
 
     @short_traceback
     def reset_async(
@@ -125,9 +126,10 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         options: dict[str, Any] | None = None,
     ) -> None:
         """Send the reset; ``reset_wait`` returns its results."""
-        self._requests.refuse_if_busy("reset_async")
-        self._send_reset(seed, options)
-        self._requests.waiting = "reset"
+        with self._requests.use.lock:
+            self._requests.refuse_if_busy("reset_async")
+            self._send_reset(seed, options)
+            self._requests.waiting = "reset"
 
     def _send_reset(self, seed: Any, options: dict[str, Any] | None) -> None:
         mask = None
@@ -157,8 +159,9 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     @short_traceback
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
         """The results of ``reset_async``; ``timeout`` in seconds, else ``Timeouts.reset_s``."""
-        self._requests.end_wait("reset")
-        return self._end_reset(self._timeouts.reset_s if timeout is None else timeout)
+        with self._requests.use.lock:
+            self._requests.end_wait("reset")
+            return self._end_reset(self._timeouts.reset_s if timeout is None else timeout)
 
     def _end_reset(self, timeout_s: float | None) -> tuple[Any, dict[Any, Any]]:
         replies = self._requests.collect(timeout_s, m.ResetDone)
@@ -181,11 +184,12 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             RemoteEnvError: The environment raised; it is still usable.
         """
         requests = self._requests
-        if requests.closed or requests.waiting is not None:
-            requests.refuse_if_busy("step_async")
         try:  # without the decorator and step_async's calls: this is the method that is called most
-            requests.submit_step(self._read_actions(actions))
-            return requests.collect_step(self._timeouts.step_s)
+            with requests.use.lock:
+                if requests.closed or requests.waiting is not None:
+                    requests.refuse_if_busy("step_async")
+                requests.submit_step(self._read_actions(actions))
+                return requests.collect_step(self._timeouts.step_s)
         except EnvHubError as error:
             if shortened(error):
                 __tracebackhide__ = True  # pytest hides the frame then
@@ -195,27 +199,30 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     @short_traceback
     def step_async(self, actions: Any) -> None:
         """Send the actions; ``step_wait`` returns the results."""
-        self._requests.refuse_if_busy("step_async")
-        self._requests.submit_step(self._read_actions(actions))
-        self._requests.waiting = "step"
+        with self._requests.use.lock:
+            self._requests.refuse_if_busy("step_async")
+            self._requests.submit_step(self._read_actions(actions))
+            self._requests.waiting = "step"
 
     @short_traceback
     def step_wait(self, timeout: float | None = None) -> StepResult:
         """The results of ``step_async``; ``timeout`` in seconds, else ``Timeouts.step_s``."""
-        self._requests.end_wait("step")
-        timeout_s = self._timeouts.step_s if timeout is None else timeout
-        return self._requests.collect_step(timeout_s)
+        with self._requests.use.lock:
+            self._requests.end_wait("step")
+            timeout_s = self._timeouts.step_s if timeout is None else timeout
+            return self._requests.collect_step(timeout_s)
 
     # --- everything else -----------------------------------------------------------------------
 
     @short_traceback
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method, or read an attribute, of every sub-environment: a tuple of results."""
-        self._requests.refuse_if_busy("call_async")
-        if not (args or kwargs) and self._manifest.shardable:
-            return self._read(name)
-        self._send_call(name, args, kwargs)  # as reset
-        return self._end_call(self._timeouts.call_s)
+        with self._requests.use.lock:
+            self._requests.refuse_if_busy("call_async")
+            if not (args or kwargs) and self._manifest.shardable:
+                return self._read(name)
+            self._send_call(name, args, kwargs)  # as reset
+            return self._end_call(self._timeouts.call_s)
 
     def _read(self, name: str) -> tuple[Any, ...]:
         """``call`` without arguments; what is read after each step is watched."""
@@ -235,9 +242,10 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     @short_traceback
     def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
         """Send the call; ``call_wait`` returns its results."""
-        self._requests.refuse_if_busy("call_async")
-        self._send_call(name, args, kwargs)
-        self._requests.waiting = "call"
+        with self._requests.use.lock:
+            self._requests.refuse_if_busy("call_async")
+            self._send_call(name, args, kwargs)
+            self._requests.waiting = "call"
 
     def _send_call(
         self,
@@ -256,8 +264,9 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     @short_traceback
     def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
         """The results of ``call_async``; ``timeout`` in seconds, else ``Timeouts.call_s``."""
-        self._requests.end_wait("call")
-        return self._end_call(self._timeouts.call_s if timeout is None else timeout)
+        with self._requests.use.lock:
+            self._requests.end_wait("call")
+            return self._end_call(self._timeouts.call_s if timeout is None else timeout)
 
     def _end_call(self, timeout_s: float | None) -> tuple[Any, ...]:
         replies = self._requests.collect(timeout_s, m.Value)
@@ -392,14 +401,12 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         ours = not is_servable(name) or hasattr(type(self), name)
         if manifest is None or ours or name not in manifest.attributes:
             raise absent(self, name, "get_attr")
-        self._requests.refuse_if_busy(name)
         reply = self._requests.ask_own("get attribute", m.GetOwn, name)
         if isinstance(reply, m.Value):
             return reply.value
 
         @short_traceback
         def method(*args: Any, **kwargs: Any) -> Any:
-            self._requests.refuse_if_busy(name)
             result = self._requests.ask_own(name, m.CallOwn, name, args, kwargs)
             return typed(result, m.Value).value
 

@@ -257,7 +257,7 @@ def test_close_waits_no_longer_than_it_may(
     with made(timeouts={"close_s": close_s}) as suites:
         held, before = Held(), descendants()
         with monkeypatch.context() as patch:
-            patch.setattr(*inside.turn_lock(suites.env), held)
+            patch.setattr(*inside.use_lock(suites.env), held)
             suites.env.close()
         assert sum(held.waited) == longest
         assert eventually(lambda: descendants() < before)
