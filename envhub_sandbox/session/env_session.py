@@ -1,6 +1,6 @@
 """One task's environment: its life, from the first jail to the last.
 
-It has a ``Lease``, its hold on a jail and the lane there; a ``UseLock``, since one thread uses it at
+It has a ``Lease``, its hold on a jail and the lane there; a ``UseLock``: one thread uses it at
 a time; a ``Prewarm``, which starts it; ``Requests``, which ``vector_env`` uses; and, with
 ``restart="transparent"``, a ``Recovery``. None of these knows it. Here it is recovered before a
 reset, closed, and abandoned in a fork. The rules for these are in docs/internals/interruption.md.
