@@ -30,6 +30,7 @@ from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.provenance import provenance_of
 from envhub_sandbox.session.recipe import Recipe
 from envhub_sandbox.system.locks import SharedLock
+from envhub_sandbox.transport import trace
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import RemoteWarnings
 from envhub_worker.protocol import messages as m
@@ -95,6 +96,7 @@ class Repository:
         installed: dict[str, Any] | None,
         advice: Callable[[str], str],
     ) -> None:
+        trace.start_if_wanted()
         self.snapshot = snapshot
         self.arguments = arguments
         self.policy = policy
