@@ -53,7 +53,7 @@ class Lingering(Generic[S]):
     """
 
     def __init__(self) -> None:
-        # reentrant: the garbage collector or a signal handler may close an environment meanwhile
+        # interruption.md, rule 12
         self._changed = threading.Condition(threading.RLock())
         self._entries: list[_Entry[S]] = []
         self._thread: threading.Thread | None = None

@@ -42,9 +42,8 @@ S = TypeVar("S", bound=Shared)
 class Use(Generic[S]):
     """One use of what is shared, which ends once: given back, or when nobody has it any more.
 
-    A Ctrl-C may come between any two calls, also of those that give something back. So it can be
-    given back again and again, until that was done; and what was taken, and noted by nobody, is
-    given back by its own end.
+    It can be given back again until that is done, and its own end does it too: interruption.md,
+    rules 5 and 7.
 
     Attributes:
         shared: What is used.
@@ -78,7 +77,7 @@ class Use(Generic[S]):
 
 
 class Uses:
-    """Who uses something. The truth is who lives, and no count that an interrupt could falsify."""
+    """Who uses something: those that live, and no count. interruption.md, rule 8."""
 
     def __init__(self) -> None:
         self._refs: list[weakref.ref[Use[Any]]] = []
@@ -105,7 +104,7 @@ class Sharing(Generic[S]):
 
     def __init__(self, lingering: Lingering[S] | None = None) -> None:
         self._lingering = lingering
-        # reentrant: the garbage collector may close an environment in the middle of acquire()
+        # interruption.md, rule 12
         self._lock = threading.RLock()
         self._shared: dict[tuple[int, Hashable], S] = {}
         _all.add(self)

@@ -145,7 +145,7 @@ class Ledger:
 
     def forget(self) -> None:
         """Drop all: in a fork, the environments are those of its parent."""
-        self._lock = threading.RLock()  # the garbage collector may come while it is held
+        self._lock = threading.RLock()  # interruption.md, rule 12
         self._living: dict[
             int, tuple[Labels, weakref.ref[CountedEnv], Counters, RestartCounter]
         ] = {}
@@ -156,7 +156,7 @@ class Ledger:
         key = id(env)
         with self._lock:
             self._living[key] = (labels, weakref.ref(env), env.counters, restarts)
-        weakref.finalize(env, self._went, key).atexit = False
+        weakref.finalize(env, self._went, key).atexit = False  # interruption.md, rule 13
 
     def _went(self, key: int) -> None:
         with self._lock:

@@ -189,9 +189,8 @@ class EnvSession:
         if not self.use.lock.acquire(blocking=False):
             self._interrupt()
             return
-        # CLOSED comes first: from then on no other thread starts anything. Then the repository's
-        # own close may run, and whatever becomes of that, the jail is given back and the lock
-        # released. An interrupt leaves the rest for the next call, which finds it closed.
+        # interruption.md, rules 7, 9 and 11. CLOSED comes first: from then on no other thread
+        # starts anything. Then the repository's own close may run; then the jail is given back.
         try:
             state = self.lifecycle.state
             self._end_life()
@@ -216,14 +215,13 @@ class EnvSession:
         self._restarts.give_up()
 
     def _interrupt(self) -> None:
-        """Another thread waits for a reply: end its jail, then clean up after it.
+        """Another thread waits for a reply: end its jail, then clean up: interruption.md, rule 11.
 
-        If that thread does not release the lock in time, it cleans up itself once it sees that
-        this was closed; the jail's processes have ended by then.
+        If that thread does not release the lock in time, it cleans up itself.
         """
         if not self.lease.interrupt(self._end_life):
-            # No jail to end. The thread that has the turn sees the closed lifecycle where it takes
-            # a jail; it may be past that, so the server is released here.
+            # The other thread sees CLOSED where it takes a jail; it may be past that, so the server
+            # is released here.
             self.lease.depart()
             return
         close_s = self.repository.timeouts.close_s
@@ -236,7 +234,7 @@ class EnvSession:
                 self.use.lock.release()
 
     def abandon(self) -> None:
-        """In a fork of the process that made it: touch nothing, and refuse all requests."""
+        """In a fork: touch nothing, and refuse all requests. interruption.md, rule 14."""
         self.use.abandon()
         self.lifecycle.moved(Event.FORK)
         self.lifecycle.request = None

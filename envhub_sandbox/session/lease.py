@@ -74,13 +74,15 @@ class Lease:
         self._counters = counters
         self._paces = paces
         self._builder = Builder(jails, results)
-        self._ending = threading.RLock()  # nothing is given back that another thread is ending
+        self._ending = (
+            threading.RLock()
+        )  # interruption.md, rule 12: none gives back what another ends
         self._owner = Owner()
         self._was_loaded = False
         self._startup: StartupDeadline | None = None
         self._release_server: Callable[[], None] = _nothing
         self._departs = jails.launcher.stay()
-        weakref.finalize(self, self._departs).atexit = False
+        weakref.finalize(self, self._departs).atexit = False  # interruption.md, rule 13
 
     @property
     def shared(self) -> bool:
@@ -198,12 +200,7 @@ class Lease:
         self._move_in(lambda: self._take(deadline), deadline)
 
     def _move_in(self, take: Callable[[], LoadedJail], deadline: Deadline) -> None:
-        """Build the environment in a jail; a Ctrl-C leaves none behind.
-
-        Python looks for signals where something is called. So nothing is, neither between the
-        taking and the ``try``, nor between the building and the noting. Python 3.10 looks anywhere:
-        there a jail that was not noted is given back by its finalizer.
-        """
+        """Build the environment in a jail; a Ctrl-C leaves none behind: interruption.md, rule 4."""
         loaded = take()
         try:
             lane = self._builder.build(loaded, deadline)
@@ -242,7 +239,7 @@ class Lease:
             try:
                 if loaded is not None:
                     self._jails.give_back(loaded, wait=wait)
-                self.loaded = None  # only now: after an interrupt, the next call does it again
+                self.loaded = None  # interruption.md, rule 7: only now
             except Exception:
                 self.loaded = None
                 raise
@@ -281,6 +278,8 @@ class Lease:
     def interrupt(self, close: Callable[[], None]) -> bool:
         """In another thread: ``close`` the environment, and end the jail that a request waits for.
 
+        See interruption.md, rule 11.
+
         Returns:
             Whether there was one; otherwise a thread that takes one sees that it is closed.
         """
@@ -292,7 +291,7 @@ class Lease:
             return self.loaded is not None
 
     def abandon(self) -> None:
-        """In a fork of its owner: close what is this process's own, and touch nothing else."""
+        """In a fork: close what is this process's own alone. interruption.md, rule 14."""
         self._ending = threading.RLock()
         self._release_server = _nothing
         self._close_lane()
@@ -302,7 +301,7 @@ class Lease:
         if lane is not None:
             self._counters.connected(None)
             lane.close()
-            self.lane = None  # only now, as above
+            self.lane = None  # as above
 
     def _let_server_go(self) -> None:
         self._release_server()

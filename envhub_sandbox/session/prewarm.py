@@ -136,8 +136,7 @@ class Prewarm:
                 return starting is not None
             with self._use.hold("make_env"):
                 self.unused = False
-                # The move comes first. An interrupt between here and the end would otherwise leave
-                # an environment that is READY without a jail; this way a reset starts another.
+                # interruption.md, rule 1: the move comes first, so that a reset starts another
                 self.lifecycle.moved(Event.EXPIRY)
                 self._lease.close_politely()
                 self._lease.give_back()

@@ -4,11 +4,8 @@ The caller's rules and errors are those of ``gymnasium.vector.AsyncVectorEnv``. 
 which requests are legal, the lane takes each to the shards, and a ``Recovery``, if there is one,
 repeats what dead shards did not finish.
 
-A Ctrl-C can come between any two statements, and ``close`` from any thread or signal handler. The
-rule for both: the lifecycle moves *before* a message goes out and *after* its replies are in. So an
-interrupt in between finds a pending request whose reply may come (LATE; ``reset`` waits for it),
-and never READY with a reply still owed, which the next request would take for its own. Only where
-the lane says that nothing was sent, by an error of this project, the move is taken back.
+Where order matters here, docs/internals/interruption.md says why, by the rule's number: the
+lifecycle moves before a message goes out and after its replies are in.
 """
 
 from __future__ import annotations
@@ -319,7 +316,7 @@ class Requests:
                 lane = self._lease.lane
                 assert lane is not None
                 lifecycle.request = "step"
-                lifecycle.on(Event.SUBMIT)  # docs/internals/interruption.md: the move comes first
+                lifecycle.on(Event.SUBMIT)  # interruption.md, rule 1: first
                 lane.send_step(actions)
             except BaseException as error:
                 with self.use.hold("step"):
@@ -397,7 +394,7 @@ class Requests:
 
     def _send(self, operation: str, send: Callable[[], None]) -> None:
         self.lifecycle.request = operation
-        self.lifecycle.on(Event.SUBMIT)  # first, as for a step
+        self.lifecycle.on(Event.SUBMIT)  # interruption.md, rule 1: first
         try:
             send()
         except EnvHubError as error:
@@ -406,7 +403,7 @@ class Requests:
         self._counters.requests += 1
 
     def _nothing_was_sent(self, error: BaseException) -> None:
-        """Go back to where we were, if the lane says so: by an error of this project."""
+        """Go back to where we were, if nothing was sent: interruption.md, rule 2."""
         if isinstance(error, EnvHubError) and self.lifecycle.state is State.PENDING:
             self.lifecycle.answered()
 
@@ -429,7 +426,7 @@ class Requests:
             self._lease.forget_watched()
             self._failed(error, deadline)
         except BaseException as error:  # Ctrl-C, or what another signal handler raises
-            self._lease.forget_watched()
+            self._lease.forget_watched()  # interruption.md, rule 3
             self._failures.interrupted(error)
             raise
         self.lifecycle.answered()

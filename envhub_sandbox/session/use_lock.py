@@ -1,7 +1,7 @@
 """One thread uses an environment at a time; the next one waits. ``close`` never waits for it.
 
-A thread holds the lock from before a request is sent until its replies are handled, so no other
-thread ever finds a request between these. See docs/internals/interruption.md.
+A thread holds the lock from before a request is sent until its replies are handled:
+docs/internals/interruption.md, rules 10 to 12.
 """
 
 from __future__ import annotations
@@ -84,5 +84,5 @@ class UseLock:
             self._failures.dead(error)
 
     def abandon(self) -> None:
-        """In a fork of the process that made it: the thread that held the lock is not here."""
+        """In a fork, which has not the thread that held the lock: interruption.md, rule 14."""
         self.lock = threading.RLock()

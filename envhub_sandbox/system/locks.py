@@ -149,7 +149,7 @@ class SharedLock:
     def __init__(self, path: Path) -> None:
         self._held: list[int] = []
         _shared.add(self)
-        # what a Ctrl-C keeps ``release`` from, this does, which is called whatever became of that
+        # interruption.md, rule 5: also where a Ctrl-C came into ``release``
         weakref.finalize(self, _close, self._held).atexit = False
         with contextlib.suppress(OSError):
             self._held.append(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC))
@@ -189,7 +189,7 @@ def _close(held: list[int]) -> None:
         os.close(held.pop())
 
 
-# --- forks --------------------------------------------------------------------------------------
+# --- forks: interruption.md, rules 14 and 15 ----------------------------------------------------
 
 _held_for_life: set[int] = set()
 _shared: weakref.WeakSet[SharedLock] = weakref.WeakSet()

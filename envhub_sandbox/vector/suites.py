@@ -145,7 +145,7 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
 
     def close(self) -> None:
         """Close every environment and end its processes. Idempotent."""
-        with contextlib.ExitStack() as all_of_them:  # all are closed, also where one raises
+        with contextlib.ExitStack() as all_of_them:  # interruption.md, rule 9
             all_of_them.callback(self._on_close)
             for env in list(self.envs())[::-1]:
                 all_of_them.callback(env.close)

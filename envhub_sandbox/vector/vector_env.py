@@ -69,7 +69,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             self.copy = session.repository.copy
             self.env_fns = from_manifest.env_fns(manifest, session.repository.label)
             self.observation_mode = "same"
-        # processes end with the last reference to the proxy
+        # processes end with the last reference to the proxy; interruption.md, rule 13
         weakref.finalize(self, session.close).atexit = False
 
     @property

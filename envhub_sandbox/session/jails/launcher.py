@@ -123,7 +123,7 @@ class Launcher:
             client.close()
             wanted.close()
             raise
-        try:  # and nothing is called before it, where a Ctrl-C could come
+        try:  # interruption.md, rule 4
             jail.warnings = self.repository.warnings
             WORKER.debug("%s: jail %x opened", self.repository.label, jail.number)
             if wanted.sinks:
@@ -266,7 +266,7 @@ class Launcher:
                 parting(Deadline(_CLOSE_S))
             else:
                 self._hold.partings.add(lambda: parting(Deadline(_CLOSE_S)))
-        else:  # nobody knows what was said before an interrupt: it is said over another connection
+        else:  # interruption.md, rule 7: over another connection, since what was said is not known
             self.interrupt(loaded)
             loaded.jail.drop()
         loaded.ended = True

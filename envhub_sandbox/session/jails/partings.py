@@ -14,8 +14,8 @@ from collections.abc import Callable
 class Partings:
     """What is still to be waited for. Thread-safe without a lock.
 
-    The garbage collector may close an environment in the midst of this, and a list is enough: what
-    one has taken from it, no other waits for.
+    A list is enough: what one thread has taken from it, no other waits for. See interruption.md,
+    rule 12.
     """
 
     def __init__(self) -> None:

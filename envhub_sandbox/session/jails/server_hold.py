@@ -35,7 +35,7 @@ class ServerHold:
         self._on_enter = on_enter
         self._on_empty = on_empty
         self.partings = Partings()
-        # reentrant: the garbage collector may close an environment in the midst of this
+        # interruption.md, rule 12
         self._lock = threading.RLock()
         self._owner = Owner()
         self._open: set[object] = set()

@@ -33,7 +33,7 @@ class Restarts:
 
     def give_up(self) -> None:
         """No more restarts are needed: a wait in another thread ends soon."""
-        # no Event: a signal handler in the midst of its wait could not set it
+        # interruption.md, rule 12: no Event
         self._given_up = True
 
     def spend(self, operation: str) -> None:

@@ -336,3 +336,15 @@ def test_settings_are_written_from_the_docstrings() -> None:
 def test_options_are_written_from_the_commands() -> None:
     """``python -m tests.support.options`` writes them again."""
     assert options.DOCUMENT.read_text() == options.document()
+
+
+def test_the_rules_of_interruption_are_those_that_the_source_names() -> None:
+    """Each rule is named where a line depends on it, and no rule that there is not."""
+    page = (CHECKOUT / "docs" / "internals" / "interruption.md").read_text()
+    rules = {int(found) for found in re.findall(r"^\*\*Rule (\d+):", page, re.MULTILINE)}
+    named: set[int] = set()
+    for path in (CHECKOUT / "envhub_sandbox").rglob("*.py"):
+        for text in re.findall(r"interruption\.md,\s+rules? ([\d, toand]+)", path.read_text()):
+            numbers = [int(number) for number in re.findall(r"\d+", text)]
+            named.update(range(numbers[0], numbers[-1] + 1) if " to " in text else numbers)
+    assert named == rules == set(range(1, len(rules) + 1))
