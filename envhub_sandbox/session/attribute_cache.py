@@ -36,12 +36,7 @@ class _Reads:
 
 
 class AttributeCache:
-    """The attributes of one environment that need no request. Not thread-safe.
-
-    Args:
-        lease: Its jail.
-        counters: Of its steps.
-    """
+    """The attributes of one environment that need no request. Not thread-safe."""
 
     def __init__(self, lease: Lease, counters: Counters) -> None:
         self._lease = lease

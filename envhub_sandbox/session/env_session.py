@@ -72,7 +72,7 @@ class EnvSession:
         self.history = history = History(manifest, policy.crash_history)
         results = Results(manifest, self.bounds)
         self.lease = lease = Lease(jails, results, self.lifecycle, counters, paces)
-        self._restarts = Restarts(policy)
+        self._restarts = Restarts(policy, counters)
         self._failures = failures = Failures(lease, results, counters, history)
         self.use = use = UseLock(lease, failures)
         recovery: Recovery | None = None
@@ -83,7 +83,7 @@ class EnvSession:
             lease, use, self.prewarm, results, counters, history, failures, recovery
         )
         labels = Labels(self.repository.label, manifest.suite, str(manifest.task))
-        LEDGER.add(self, labels, self._restarts)
+        LEDGER.add(self, labels, counters, self.lifecycle)
         _living.add(self)
 
     @property
@@ -108,8 +108,7 @@ class EnvSession:
 
     def stats(self) -> dict[str, Any]:
         """Counters, and where it is in its life."""
-        found = self.counters.snapshot()
-        return {**found, "restarts": self._restarts.count, "state": self.lifecycle.state.name}
+        return {**self.counters.snapshot(), "state": self.lifecycle.state.name}
 
     # --- brought back --------------------------------------------------------------------------
 

@@ -38,15 +38,8 @@ _SUCCESSOR_S = 60.0
 class Lease:
     """The jail of one environment, of which it has one at a time, or none, and the lane there.
 
-    It is used by the thread that has the environment's turn, but for ``interrupt``, which a closing
+    Used by the thread that has the environment's lock, but for ``interrupt``, which a closing
     thread calls, and ``abandon``, which a fork calls.
-
-    Args:
-        jails: Gives and takes back the jail.
-        results: What the environment is expected to be, and its slices.
-        lifecycle: Where the environment is in its life; ``close`` moves it first.
-        counters: Learn which lane serves it.
-        paces: Takes note of what its steps took.
 
     Attributes:
         repository: Whose jails they are.

@@ -39,13 +39,6 @@ _GOING_S = 30.0
 class Prewarm:
     """Starts one environment, and cancels a start ahead that no request has used.
 
-    Args:
-        lease: Its hold on a jail.
-        use: Lets one thread use it at a time.
-        counters: Say whether anything was asked of it.
-        history: Learns that it has started.
-        recovery: Learns that it has started, if there is one.
-
     Attributes:
         unused: Whether it was started ahead, and no reset came yet.
         first_use: Called at the first request; None afterwards.

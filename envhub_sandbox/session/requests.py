@@ -55,20 +55,10 @@ T = TypeVar("T")
 class Requests:
     """The requests of one environment, whose jail is opened by the first of them.
 
-    Args:
-        lease: Its jail, and the lane there.
-        use: Lets one thread use it at a time.
-        prewarm: Starts it.
-        results: What it is expected to be, and its slices.
-        counters: Of requests, steps and what went wrong.
-        history: Of what was asked.
-        failures: Make the errors.
-        recovery: Repeats what the dead did not finish; None where a death is an error.
-
     Attributes:
         results: Makes of replies what Gymnasium returns.
         attributes: Those that need no request.
-        use: As given. A thread that asks something holds its lock until it has handled the answer;
+        use: A thread that asks something holds its lock until it has handled the answer;
             between an ``*_async`` and its ``*_wait`` no thread does.
         closed: Whether the caller has called ``close``.
         waiting: The request of an ``*_async`` whose ``*_wait`` has not come yet.

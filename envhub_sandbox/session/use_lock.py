@@ -21,10 +21,6 @@ from envhub_worker.protocol.untrusted import blamed, is_fault
 class UseLock:
     """The lock of one environment, and what is to be done when it is released.
 
-    Args:
-        lease: Its jail, which is given back after a use that a ``close`` came into.
-        failures: Handle a worker that breaks the rules.
-
     Attributes:
         lock: Held for as long as a use lasts; reentrant, for a signal handler may close what its
             own thread waits for.

@@ -16,12 +16,6 @@ from envhub_worker.protocol.lifecycle import Event
 class Failures:
     """The failures of one environment's requests.
 
-    Args:
-        lease: Its jail.
-        results: Its manifest and slices.
-        counters: Of deaths and late replies.
-        history: What was asked, for a crash bundle.
-
     Attributes:
         interruption: The request whose wait was interrupted, so that its reply is late; None where
             the last late reply has another reason.

@@ -35,16 +35,7 @@ RowsOf = Callable[[m.Message, int], m.Message]
 
 
 class Recovery:
-    """Brings back the dead shards of one environment.
-
-    Args:
-        lease: The environment's jail.
-        results: Its manifest and slices.
-        restarts: How often it may be done, and how soon.
-        failures: Make the errors.
-        counters: Of deaths.
-        history: Learns what came back.
-    """
+    """Brings back the dead shards of one environment."""
 
     def __init__(
         self,
@@ -231,7 +222,7 @@ class Recovery:
         return resets(reset, self._derived(index))
 
     def _derived(self, index: int) -> Any:
-        return self._seeds.derived(self._bounds[index], self._restarts.count)
+        return self._seeds.derived(self._bounds[index], self._counters.restarts)
 
     def _size(self, index: int) -> int:
         start, stop = self._bounds[index]
