@@ -23,7 +23,7 @@ _TRACEBACK_CHARS = 32_768
 _FUNCTION_CHARS, _SOURCE_CHARS = 100, 200
 
 
-def point_out(error: EnvHubError, snapshot: Snapshot) -> None:
+def add_author_line(error: EnvHubError, snapshot: Snapshot) -> None:
     """Add the repository's own line to what it raised, once. Trust: text from the worker.
 
     Args:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import weakref
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
@@ -33,6 +33,7 @@ from envhub_sandbox.transport.shared_memory.sharding import PaceBook
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 
+_USAGE = ("processes", "threads", "files", "memory_bytes")
 _MOST = 1 << 63
 """Of anything that there may be: a server on another host may send larger numbers."""
 _GRACE_S = 2.0
@@ -97,10 +98,10 @@ class EnvSession:
 
     def usage(self) -> dict[str, int]:
         """What its jail holds, as its server counts it; empty if it does not say."""
-        told = self.lease.status()
-        found = {name: told.get(name) for name in ("processes", "threads", "files", "memory_bytes")}
-        counts = {name: one for name, one in found.items() if type(one) is int and 0 <= one < _MOST}
-        return counts if len(counts) == len(found) else {}
+        status = self.lease.status()
+        counts = {name: status.get(name) for name in _USAGE}
+        known = all(type(one) is int and 0 <= one < _MOST for one in counts.values())
+        return cast("dict[str, int]", counts) if known else {}
 
     def denials(self) -> tuple[str, ...] | None:
         """What its jail was denied, as its server says; None where it is not recorded."""

@@ -175,9 +175,9 @@ class Lease:
             room = full and self._launcher.settle() | self.make_room()
             if not room and not retry_s:
                 raise
-            told = error
+            refused = error
         ask = partial(self._jails.take, deadline)
-        return wait_in_line(ask, retry_s, deadline, self.repository.label, told)
+        return wait_in_line(ask, retry_s, deadline, self.repository.label, refused)
 
     def _patience_s(self, error: EnvHubError) -> float:
         """How long to wait: after a server that ended, where restarts are wanted, for another."""

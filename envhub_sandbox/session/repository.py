@@ -1,4 +1,4 @@
-"""One repository under one policy: what is asked of it, and what is told of it when it fails."""
+"""One repository under one policy: what all its environments share, and the errors of its start."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from envhub_sandbox.hub.store import cache_root
 from envhub_sandbox.log import CRASHES
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy, Timeouts
-from envhub_sandbox.session.author_lines import point_out
+from envhub_sandbox.session.author_lines import add_author_line
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.provenance import provenance_of
 from envhub_sandbox.session.recipe import Recipe
@@ -124,7 +124,7 @@ class Repository:
         return _wire_limits(self.policy.limits.message_bytes)
 
     def hold(self) -> None:
-        """Nobody removes its files and packages, until ``let_go``."""
+        """Keep its files and packages from being removed, until ``let_go``."""
         if self._in_use:
             return
         folders = [self.snapshot.root.parent]
@@ -147,7 +147,7 @@ class Repository:
             if isinstance(error, DependencyError) and not str(error).startswith(self.label):
                 error.args = (f"{error}. {self._advice(str(error))}",)
             name_source(error, self.label)
-            point_out(error, self.snapshot)
+            add_author_line(error, self.snapshot)
             raise
 
     def show_warnings(self) -> None:
@@ -192,7 +192,7 @@ class Repository:
         """Write a crash bundle and name it in the error. What hinders that is only logged.
 
         Args:
-            error: What the user is going to be told.
+            error: The error that the user gets.
             recording: What was asked of the environment; None before there is one.
             task: Which environment, as in ``Crash``.
             loaded: Its jail.
@@ -203,11 +203,12 @@ class Repository:
             return
         manifest = None if loaded is None else loaded.manifest
         report = self.latest_report if loaded is None else loaded.jail.report
-        told = manifest, report, self.installed, self.latest_profile
         crash = Crash(
             error=error,
             label=self.label,
-            provenance=provenance_of(self.snapshot, *told),
+            provenance=provenance_of(
+                self.snapshot, manifest, report, self.installed, self.latest_profile
+            ),
             load=self.arguments.message(),
             options=self.recipe.options,
             task=task,

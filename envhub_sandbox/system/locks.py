@@ -88,7 +88,7 @@ def is_held(path: Path) -> bool:
 
     Raises:
         FileNotFoundError: There is no such file.
-        OSError: That cannot be told.
+        OSError: The file cannot be opened, or its file system has no locks.
     """
     with unheld(path) as free:
         return not free
@@ -96,7 +96,7 @@ def is_held(path: Path) -> bool:
 
 @contextlib.contextmanager
 def unheld(path: Path) -> Iterator[bool]:
-    """The opposite of ``is_held``; in this context nobody takes the lock. Raises likewise."""
+    """The opposite of ``is_held``, whose errors it raises; meanwhile no other takes the lock."""
     descriptor = os.open(path, _READ)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -115,8 +115,8 @@ def unheld(path: Path) -> Iterator[bool]:
 class LifeLock:
     """A new file whose lock this process holds for as long as it lives, or until ``release``.
 
-    Under its name nobody sees the file without its lock. Where the file system has no locks,
-    ``is_held`` cannot tell, and says so. A fork does not hold it.
+    The file has its lock before it has its name. Where the file system has no locks, ``is_held``
+    raises. A fork does not hold it.
 
     Args:
         path: The file.
@@ -141,7 +141,7 @@ class LifeLock:
 
 
 class SharedLock:
-    """A file's lock that this process shares until ``release``, or until nobody has this object.
+    """A file's lock that this process shares until ``release``, or until this object has gone.
 
     A fork does not hold it. Nothing is held where there is no such file, or another has it alone.
     """

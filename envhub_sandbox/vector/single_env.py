@@ -16,7 +16,7 @@ from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
-from envhub_sandbox.vector.infos import of_one
+from envhub_sandbox.vector.infos import info_of
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_worker.protocol.manifest.names import absent, is_servable
 from envhub_worker.protocol.untrusted import UNTRUSTED
@@ -87,7 +87,7 @@ class SingleEnv(gym.Env[Any, Any]):
             return begun
         batch, infos = self._vector.reset(seed=seed, options=options)
         with UNTRUSTED:
-            return self._first(batch), of_one(infos, 0, 1)
+            return self._first(batch), info_of(infos, 0, 1)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """One step with ``action``, an element of ``action_space``.
@@ -115,7 +115,7 @@ class SingleEnv(gym.Env[Any, Any]):
         self, batch: Any, rewards: Any, terminations: Any, truncations: Any, infos: Any
     ) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """What a step of the only one returns."""
-        observation, info = self._first(batch), of_one(infos, 0, 1)
+        observation, info = self._first(batch), info_of(infos, 0, 1)
         terminated, truncated = bool(terminations[0]), bool(truncations[0])
         if (terminated or truncated) and self._resets_in_the_same_step:
             last, last_info = info.pop("final_obs"), info.pop("final_info", {})

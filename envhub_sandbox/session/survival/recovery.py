@@ -16,7 +16,7 @@ from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.survival.failures import Failures
 from envhub_sandbox.session.survival.restart_policy import Restarts
-from envhub_sandbox.session.survival.revived_rows import marked, truncated
+from envhub_sandbox.session.survival.revived_rows import mark_revived, revived_step
 from envhub_sandbox.session.survival.seeds import SeedBook, Settings, resets
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.jail import RunnersDiedError
@@ -118,7 +118,7 @@ class Recovery:
         """All infos of the last request, of which those of the fresh shards say that they are."""
         if not self._fresh:
             return infos
-        return marked(infos, self._num_envs, [self._bounds[index] for index in self._fresh])
+        return mark_revived(infos, self._num_envs, [self._bounds[index] for index in self._fresh])
 
     def _of_survivors(self, deaths: RunnersDiedError) -> list[m.Message | None]:
         """What the others answered; None in the place of the dead.
@@ -231,13 +231,13 @@ class Recovery:
 
 def _step_rows(reply: m.Message, size: int) -> m.Message:
     """Trust: input from the worker."""
-    return truncated(typed(reply, m.StepDone), size)
+    return revived_step(typed(reply, m.StepDone), size)
 
 
 def _reset_rows(reply: m.Message, size: int) -> m.Message:
     """Trust: input from the worker."""
     done = typed(reply, m.ResetDone)
-    return m.replace(done, info=marked(done.info, size))
+    return m.replace(done, info=mark_revived(done.info, size))
 
 
 def _ask_anew(

@@ -12,7 +12,7 @@ import pytest
 from envhub_sandbox import errors
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
-from envhub_sandbox.session.author_lines import point_out
+from envhub_sandbox.session.author_lines import add_author_line
 from envhub_sandbox.transport.replies import raised
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.text import MARGIN
@@ -39,7 +39,7 @@ ValueError: no
 def told(traceback: str, snapshot: Snapshot = LOCAL, stage: str = "step") -> EnvHubError:
     """The error that is raised for this traceback."""
     error = raised(m.Raised("ValueError", "ValueError", "no", traceback, stage))
-    point_out(error, snapshot)
+    add_author_line(error, snapshot)
     return error
 
 
@@ -86,7 +86,7 @@ def test_it_is_told_once() -> None:
     """However many layers of ours the error goes through."""
     error = told(TRACE)
     before = str(error), notes(error)
-    point_out(error, LOCAL)
+    add_author_line(error, LOCAL)
     assert (str(error), notes(error)) == before
 
 
