@@ -74,15 +74,13 @@ class EnvSession:
         results = Results(manifest, self.bounds)
         self.lease = lease = Lease(jails, results, self.lifecycle, counters, paces)
         self._restarts = Restarts(policy, counters)
-        self._failures = failures = Failures(lease, results, counters, history)
+        self._failures = failures = Failures(lease, history)
         self.use = use = UseLock(lease, failures)
         recovery: Recovery | None = None
         if policy.restart == "transparent":
-            recovery = Recovery(lease, results, self._restarts, failures, counters, history)
-        self.prewarm = Prewarm(lease, use, counters, history, recovery)
-        self.requests = Requests(
-            lease, use, self.prewarm, results, counters, history, failures, recovery
-        )
+            recovery = Recovery(lease, self._restarts, failures, history)
+        self.prewarm = Prewarm(lease, use, history, recovery)
+        self.requests = Requests(lease, use, self.prewarm, history, failures, recovery)
         labels = Labels(self.repository.label, manifest.suite, str(manifest.task))
         LEDGER.add(self, labels, counters, self.lifecycle)
         _living.add(self)

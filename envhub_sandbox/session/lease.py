@@ -43,6 +43,8 @@ class Lease:
 
     Attributes:
         repository: Whose jails they are.
+        results: What the environment is expected to be, and its slices.
+        counters: Of the environment.
         loaded: The jail; None while there is none.
         lane: The way to its runners there.
         make_room: Asked to end what was started ahead, where a server has no place left.
@@ -63,8 +65,8 @@ class Lease:
         self.make_room: Callable[[], bool] = _no_room
         self._jails = jails
         self._launcher = jails.launcher
-        self._results = results
-        self._counters = counters
+        self.results = results
+        self.counters = counters
         self._paces = paces
         self._builder = Builder(jails, results)
         self._ending = (
@@ -205,7 +207,7 @@ class Lease:
                 self._jails.give_back(loaded)
             raise
         self._was_loaded = True
-        self._counters.connected(lane)
+        self.counters.connected(lane)
         if self.lifecycle.closed:  # only now: a close from here on sees the jail
             raise closed_during("make_env")
 
@@ -252,7 +254,7 @@ class Lease:
         """Remember what steps took, for the next time."""
         pace = None if self.lane is None else self.lane.pace()
         if pace:
-            self._paces.note(self._results.manifest, pace)
+            self._paces.note(self.results.manifest, pace)
 
     def let_go(self, *, wait: bool = True) -> None:
         """Give back whatever is left, for good. A fork of its owner gives back nothing."""
@@ -292,7 +294,7 @@ class Lease:
     def _close_lane(self) -> None:
         lane = self.lane
         if lane is not None:
-            self._counters.connected(None)
+            self.counters.connected(None)
             lane.close()
             self.lane = None  # as above
 

@@ -18,7 +18,6 @@ from itertools import chain
 from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.log import WORKER
-from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.refusals import closed_during
@@ -48,7 +47,6 @@ class Prewarm:
         self,
         lease: Lease,
         use: UseLock,
-        counters: Counters,
         history: History,
         recovery: Recovery | None,
     ) -> None:
@@ -57,7 +55,7 @@ class Prewarm:
         self.first_use: Callable[[], None] | None = None
         self._lease = lease
         self._use = use
-        self._counters = counters
+        self._counters = lease.counters
         self._history = history
         self._recovery = recovery
         self._timeouts = lease.repository.timeouts

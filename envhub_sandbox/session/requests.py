@@ -26,7 +26,6 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_sandbox.session.attribute_cache import AttributeCache
-from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.prewarm import Prewarm
 from envhub_sandbox.session.refusals import refusal
@@ -37,7 +36,7 @@ from envhub_sandbox.transport.deadline import Deadline, StepDeadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Lane, Request
 from envhub_sandbox.transport.replies import all_of
-from envhub_sandbox.transport.results import Results, StepResult
+from envhub_sandbox.transport.results import StepResult
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Event, State
 from envhub_worker.protocol.spaces import batches
@@ -70,14 +69,12 @@ class Requests:
         lease: Lease,
         use: UseLock,
         prewarm: Prewarm,
-        results: Results,
-        counters: Counters,
         history: History,
         failures: Failures,
         recovery: Recovery | None,
     ) -> None:
-        self.results = results
-        self.attributes = AttributeCache(lease, counters)
+        self.results = lease.results
+        self.attributes = AttributeCache(lease)
         self.lifecycle = lease.lifecycle
         self.closed = False
         self.waiting: str | None = None
@@ -85,7 +82,7 @@ class Requests:
         self._lease = lease
         self.use = use
         self._prewarm = prewarm
-        self._counters = counters
+        self._counters = lease.counters
         self._history = history
         self._failures = failures
         self._recovery = recovery

@@ -8,7 +8,7 @@ observation and the end of an episode of its own last step.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
@@ -23,6 +23,9 @@ from envhub_worker.protocol.manifest.names import is_servable
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
+if TYPE_CHECKING:
+    from envhub_sandbox.vector.vector_env import SandboxVectorEnv
+
 _OUTERMOST = 0
 _SEARCHED = -1
 """In place of a depth: whichever wrapper has it."""
@@ -30,24 +33,6 @@ _MOST_WRAPPERS = 1000
 """Around one environment; otherwise a search for the innermost might never end. As many as Python's
 nested calls, which a step through the wrappers makes."""
 _OURS = frozenset({"_vector", "_ask", "_index", "_depth"})
-
-
-class Vector(Protocol):
-    """What a sub-environment asks of its vector environment."""
-
-    num_envs: int
-    metadata: dict[str, Any]
-    render_mode: str | None
-    single_action_space: Any
-    single_observation_space: Any
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether the repository returned Gymnasium's own class, as it is."""
-
-    @property
-    def is_sync(self) -> bool:
-        """Whether the sub-environments are at hand one by one, as in ``SyncVectorEnv``."""
 
 
 class SubEnvironment(gym.Env[Any, Any]):
@@ -65,7 +50,7 @@ class SubEnvironment(gym.Env[Any, Any]):
 
     def __init__(
         self,
-        vector: Vector,
+        vector: SandboxVectorEnv,
         ask: Callable[[str, int, OneMessageFor], m.Message],
         index: int,
         depth: int | None = _OUTERMOST,

@@ -103,7 +103,7 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
             ValueError: There is not exactly one such environment, or it has several
                 sub-environments.
         """
-        return SingleEnv(self.choose(suite, task), self)
+        return SingleEnv(self.choose(suite, task), self.close)
 
     def keep(self, suite: str | None = None, task: int | str | None = None) -> None:
         """Close and drop all but this suite and this task; a task is also found by its text.

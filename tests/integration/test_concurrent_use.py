@@ -52,7 +52,7 @@ def held_between_the_halves(env: Any, monkeypatch: pytest.MonkeyPatch) -> Callab
     return finish
 
 
-@pytest.mark.parametrize("asks", ["step", "reset", "get_attr", "render"])
+@pytest.mark.parametrize("asks", ["step", "reset", "get_attr"])
 def test_the_second_thread_waits(env: Any, monkeypatch: pytest.MonkeyPatch, asks: str) -> None:
     """Nothing of it is sent before the first has its results; then both have theirs."""
     finish = held_between_the_halves(env, monkeypatch)

@@ -12,7 +12,6 @@ from typing import Any
 from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
 from envhub_sandbox.log import WORKER
-from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.survival.failures import Failures
 from envhub_sandbox.session.survival.restart_policy import Restarts
@@ -22,7 +21,6 @@ from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Lane, Request
 from envhub_sandbox.transport.replies import check, typed
-from envhub_sandbox.transport.results import Results
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.lifecycle import Event
@@ -40,20 +38,18 @@ class Recovery:
     def __init__(
         self,
         lease: Lease,
-        results: Results,
         restarts: Restarts,
         failures: Failures,
-        counters: Counters,
         history: History,
     ) -> None:
-        manifest = results.manifest
+        manifest = lease.results.manifest
         self._lease = lease
         self._lifecycle = lease.lifecycle
         self._num_envs = manifest.num_envs
-        self._bounds = results.bounds
+        self._bounds = lease.results.bounds
         self._restarts = restarts
         self._failures = failures
-        self._counters = counters
+        self._counters = lease.counters
         self._history = history
         self._seeds = SeedBook(manifest.num_envs, manifest.shardable)
         self._settings = Settings()

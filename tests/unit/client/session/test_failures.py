@@ -14,7 +14,7 @@ from envhub_sandbox.session.survival.failures import Failures
 def failures_of(lease: Any) -> Failures:
     """Of an environment with this jail."""
     lease.lifecycle.closed, lease.lifecycle.request = False, "step"
-    return Failures(lease, MagicMock(), MagicMock(), MagicMock())
+    return Failures(lease, MagicMock())
 
 
 @pytest.mark.parametrize("kept", [True, False])
