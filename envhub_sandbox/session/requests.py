@@ -137,17 +137,12 @@ class Requests:
 
     def ask(self, operation: str, message_for: MessageFor) -> list[m.Value]:
         """One request, and the values of all shards."""
-        with self.use.lock:
-            self.refuse_if_busy(operation)
-            self.submit(operation, message_for)
-            return self.collect(self._timeouts.call_s, m.Value)
+        return self._ask(operation, message_for, m.Value, self._timeouts.call_s)
 
     def ask_own(self, operation: str, kind: Callable[..., m.Message], *fields: object) -> m.Message:
         """Ask about what the repository's vector environment has of its own: one shard has it."""
-        with self.use.lock:
-            self.refuse_if_busy(operation)
-            self.submit(operation, lambda number, _: kind(number, *fields))
-            [reply] = self.collect(self._timeouts.call_s, (m.Value, m.Method))
+        kinds = (m.Value, m.Method)
+        [reply] = self._ask(operation, lambda n, _: kind(n, *fields), kinds, self._timeouts.call_s)
         return reply
 
     def ask_one(self, name: str, index: int, message: OneMessageFor) -> m.Message:
@@ -159,17 +154,27 @@ class Requests:
             start, stop = bounds
             return message(number, index - start if start <= index < stop else None)
 
+        timeout_s = timeouts.get(name, self._timeouts.call_s)
+        replies = self._ask(operation, message_for, (m.Value, m.Method), timeout_s)
+        holds = (start <= index < stop for start, stop in self.results.bounds)
+        return next(reply for reply, here in zip(replies, holds, strict=True) if here)
+
+    def _ask(
+        self,
+        operation: str,
+        message_for: MessageFor,
+        kind: type[m.M] | tuple[type[m.M], ...],
+        timeout_s: float | None,
+    ) -> list[m.M]:
         with self.use.lock:
             self.refuse_if_busy(operation)
             self.submit(operation, message_for)
-            replies = self.collect(timeouts.get(name, self._timeouts.call_s), (m.Value, m.Method))
-        holds = (start <= index < stop for start, stop in self.results.bounds)
-        return next(reply for reply, here in zip(replies, holds, strict=True) if here)
+            return self.collect(timeout_s, kind)
 
     def submit(
         self, operation: str, message_for: MessageFor, instead: MessageFor | None = None
     ) -> None:
-        """Send a request to every shard, opening the jail if there is none.
+        """With the lock held, send a request to every shard; opens the jail if there is none.
 
         Args:
             operation: What it is called.
@@ -181,14 +186,13 @@ class Requests:
             WorkerError: The environment is not in a state to take it.
         """
         try:
-            with self.use.lock:
-                try:
-                    self._submit(operation, message_for, instead)
-                except BaseException:
-                    with self.use.hold(operation):  # on failure only: it costs some us
-                        raise
-                if self.lifecycle.state is State.CLOSED:
-                    self._lease.let_go()
+            try:
+                self._submit(operation, message_for, instead)
+            except BaseException:
+                with self.use.hold(operation):  # on failure only: it costs some us
+                    raise
+            if self.lifecycle.state is State.CLOSED:
+                self._lease.let_go()
         except WorkerDiedError:
             self.refuse_if_closed()  # a close() in another thread ended it
             raise
@@ -223,7 +227,7 @@ class Requests:
     def collect(
         self, timeout_s: float | None, kind: type[m.M] | tuple[type[m.M], ...]
     ) -> list[m.M]:
-        """The shards' replies to the last ``submit``; the environment is usable afterwards.
+        """With the lock held, the shards' replies to the last ``submit``.
 
         Args:
             timeout_s: How long they may take.
@@ -236,14 +240,13 @@ class Requests:
             ClosedEnvironmentError: A ``close`` in another thread came first.
         """
         try:
-            with self.use.lock:
-                try:
-                    replies = self._collect(timeout_s, kind)
-                except BaseException:
-                    with self.use.judging("a request"):
-                        raise
-                if self.lifecycle.state is State.CLOSED:
-                    self._lease.let_go()
+            try:
+                replies = self._collect(timeout_s, kind)
+            except BaseException:
+                with self.use.judging("a request"):
+                    raise
+            if self.lifecycle.state is State.CLOSED:
+                self._lease.let_go()
         except BaseException as error:
             self.explain(error)
             raise
