@@ -90,10 +90,6 @@ class EnvSession:
         """Whether it is closed for good."""
         return self.lifecycle.closed
 
-    def report(self) -> list[dict[str, Any]]:
-        """The layers of the jail that it lives in; none where it does not live in any."""
-        return self.lease.report()
-
     def usage(self) -> dict[str, int]:
         """What its jail holds, as its server counts it; empty if it does not say."""
         status = self.lease.status()
@@ -101,12 +97,8 @@ class EnvSession:
         known = all(type(one) is int and 0 <= one < _MOST for one in counts.values())
         return cast("dict[str, int]", counts) if known else {}
 
-    def denials(self) -> tuple[str, ...] | None:
-        """What its jail was denied, as its server says; None where it is not recorded."""
-        return self.lease.denials()
-
     def stats(self) -> dict[str, Any]:
-        """Counters, and where it is in its life."""
+        """Counters, and its state."""
         return {**self.counters.snapshot(), "state": self.lifecycle.state.name}
 
     # --- brought back --------------------------------------------------------------------------

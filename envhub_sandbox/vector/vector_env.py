@@ -39,7 +39,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
     Everything that ``VectorEnv`` has, and ``AsyncVectorEnv``'s ``*_async`` and ``*_wait``. Arrays
     that it returns belong to the caller: writable, and never changed by a later step. One thread
-    at a time; ``close`` may come from any.
+    uses it at a time, and a second one waits; ``close`` may come from any.
 
     Attributes:
         num_envs: Number of sub-environments.
@@ -341,7 +341,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     @property
     def sandbox_report(self) -> list[dict[str, Any]]:
         """One mapping per layer: ``layer``, ``enforced``, ``detail``. None unless it runs."""
-        return [dict(layer) for layer in self._session.report()]
+        return [dict(layer) for layer in self._session.lease.report()]
 
     def jail_usage(self) -> dict[str, int]:
         """What its jail holds right now, counted from outside of it by the worker server.
@@ -362,7 +362,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         has used up when the server looks: ``"limit PROCESSES"``, ``OPEN_FILES``, ``DISK_BYTES`` or
         ``DISK_FILES``. None unless it runs under a policy with ``record_denials``.
         """
-        return self._session.denials()
+        return self._session.lease.denials()
 
     def stats(self) -> dict[str, Any]:
         """Counters, at any moment, from any thread; asks nothing of the worker.
