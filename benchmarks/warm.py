@@ -48,7 +48,7 @@ class Warm:
         client = WorkerClient(server.endpoint, server.process_fd, limits)
         client.hello(Deadline(_LONG_S))
         self._patience.wait()
-        order = inside.order(self._launcher, server)
+        order = inside.order(self._launcher)
         start = perf_counter()
         jail = open_jail(client, order, limits, Deadline(_LONG_S))
         taken = (perf_counter() - start) * 1000

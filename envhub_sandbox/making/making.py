@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox.dependencies.choice import Choice, chosen
 from envhub_sandbox.dependencies.missing_module import MissingModule
-from envhub_sandbox.dependencies.pipeline import HERE, PackageSet, packages_for
+from envhub_sandbox.dependencies.pipeline import PackageSet, packages_for
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.hub import store
 from envhub_sandbox.hub.snapshot import Snapshot, named
@@ -21,7 +21,7 @@ from envhub_sandbox.making.proxies import Proxies
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy, Timeouts, policy_from, timeouts_from
 from envhub_sandbox.sandboxes import inprocess
-from envhub_sandbox.sandboxes.base import PackageSource, Sandbox
+from envhub_sandbox.sandboxes.base import Sandbox
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.provenance import provenance_of
 from envhub_sandbox.session.recipe import Recipe, pinned
@@ -50,7 +50,7 @@ def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSui
     processes.occupy_streams()  # before anything of ours is opened
     wanted = _wanted(options.sandbox, options)
     snapshot = _snapshot(reference, options)
-    packages = _packages(snapshot, wanted, options)
+    packages = _packages(snapshot, wanted)
     load = LoadArguments(
         n_envs=options.n_envs,
         use_async_envs=options.use_async_envs,
@@ -100,7 +100,7 @@ def _wanted(sandbox: str | Sandbox, options: Options) -> _Wanted:
     policy = policy_from(options.policy, options.limits)
     timeouts = timeouts_from(options.timeouts)
     place = sandbox_of(sandbox, options.server_key)
-    if choice.where == "own" and sandbox != "process" and not isinstance(place, PackageSource):
+    if choice.where == "own" and place.package_target() is None:
         raise PolicyError(
             f"packages by {option_name('dependencies')} are for this machine, for containers and "
             "for servers on other hosts; this place has packages of its own"
@@ -132,14 +132,13 @@ def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
     return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))
 
 
-def _packages(snapshot: Snapshot, wanted: _Wanted, options: Options) -> PackageSet | None:
+def _packages(snapshot: Snapshot, wanted: _Wanted) -> PackageSet | None:
     """The packages that are made for it; None for those of the place."""
     if wanted.lock is not None:
         return locks.provided(snapshot, wanted.lock)
-    place = wanted.place
-    if options.sandbox != "process" and not isinstance(place, PackageSource):
+    target = wanted.place.package_target()
+    if target is None:
         return None
-    target = place.package_target() if isinstance(place, PackageSource) else HERE
     return packages_for(snapshot, wanted.choice, target, gpu=bool(wanted.policy.gpu))
 
 

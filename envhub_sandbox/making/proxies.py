@@ -9,9 +9,9 @@ from typing import Any
 from envhub_sandbox.hub import store
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.jails.launcher import Launcher
-from envhub_sandbox.session.jails.line import wait_in_line
-from envhub_sandbox.session.jails.loaded import Known, LoadedJail
-from envhub_sandbox.session.jails.sources import JailSource, OwnJails, SharedJail
+from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
+from envhub_sandbox.session.jails.retry_while_busy import retry_while_busy
+from envhub_sandbox.session.jails.sources import JailSource, SharedJail
 from envhub_sandbox.session.manifest_cache import ManifestCache, manifest_key
 from envhub_sandbox.session.prewarm import Prewarm, SuitePrewarm
 from envhub_sandbox.session.provenance import provenance_of
@@ -62,7 +62,7 @@ class Proxies:
             deadline = Deadline(repository.timeouts.startup_s)
             ask = partial(self._launcher.open, deadline)
             try:
-                loaded = wait_in_line(ask, self._launcher.retry_s, deadline, repository.label)
+                loaded = retry_while_busy(ask, self._launcher.retry_s, deadline, repository.label)
             except BaseException:
                 repository.show_warnings()
                 raise
@@ -114,9 +114,8 @@ class Proxies:
     ) -> EnvSession:
         paces = self._cache.paces
         bounds = bounds_for(env, self._num_workers, paces.of(env))
-        known = Known(manifest, env, len(bounds))
-        own = OwnJails(self._launcher, self._cache.forget, known)
-        source: JailSource = own if shared is None else shared
+        expected = ExpectedManifest(manifest, env, len(bounds))
+        source = shared or JailSource(self._launcher, self._cache.forget, expected)
         return EnvSession(source, env, bounds, paces)
 
     def _use(self, loaded: LoadedJail, sessions: list[EnvSession]) -> None:

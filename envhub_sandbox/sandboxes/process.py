@@ -11,21 +11,23 @@ import os
 import select
 import subprocess
 import sys
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import envhub_worker.protocol
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.log import WORKER
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.sandboxes import runtime_folder
-from envhub_sandbox.sandboxes.lingering import Lingering
-from envhub_sandbox.sandboxes.refcount import Sharing, Use, Uses
-from envhub_sandbox.sandboxes.runtime_folder import RuntimeFolder
+from envhub_sandbox.sandboxes.base import Sandbox
+from envhub_sandbox.sandboxes.local_server import LocalServer
+from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse
 from envhub_sandbox.system import processes
-from envhub_sandbox.transport.forks import Owner
 from envhub_worker.protocol.runtime import OWN, Runtime
+
+if TYPE_CHECKING:
+    from envhub_sandbox.dependencies.pipeline import PackageTarget
 
 BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
 _STARTUP_S = 60.0
@@ -33,74 +35,23 @@ _STOP_S = 5.0
 _KEPT_VARIABLES = ("PATH", "LANG", "LC_ALL", "LC_CTYPE", "TZ", "TMPDIR")
 
 
-@dataclass
-class ProcessServer:
-    """A worker server that we started."""
-
-    endpoint: str
-    process_fd: int
-    process: subprocess.Popen[bytes]
-    runtime: RuntimeFolder
-    owner: Owner = field(default_factory=Owner)
-    uses: Uses = field(default_factory=Uses)
-    stopped: bool = False
-
-    @property
-    def folder(self) -> Path:
-        """Where its sockets and its log lie."""
-        return self.runtime.path
-
-    @property
-    def fd_path(self) -> str:
-        """The socket that takes descriptors."""
-        return str(self.folder / "fds")
-
-    @property
-    def runs(self) -> bool:
-        """Whether it has not ended, and can be reached.
-
-        One that was killed is a zombie before its threads are gone, and only then can it be waited
-        for: it takes no requests any more. Nor can anyone connect to one whose sockets a cleaner
-        of temporary files has removed; who is connected already goes on.
-        """
-        alive = self.process.poll() is None and not processes.has_ended(self.process.pid)
-        return alive and self.runtime.has_sockets("server", "fds")
-
-    def stop(self) -> None:
-        """End it and everything below it, in bounded time. A fork of its owner does nothing.
-
-        Idempotent; what interrupts it, it goes on after.
-        """
-        if self.stopped or not self.owner.is_here:
-            return
-        self.process.terminate()
-        try:
-            self.process.wait(_STOP_S)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-        self.runtime.remove()
-        try:
-            self.stopped = True  # once: the number may be somebody else's a moment later
-            os.close(self.process_fd)
-        except OSError:
-            return
-
-    def __del__(self) -> None:
-        self.stop()  # a start that was interrupted before anybody noted it
-
-
-class ProcessSandbox:
+class ProcessSandbox(Sandbox):
     """Workers on this machine, confined by the kernel."""
 
     name = "process"
 
     def __init__(self) -> None:
-        self._servers: Sharing[ProcessServer] = Sharing(Lingering())
+        self._pool: ServerPool[LocalServer] = ServerPool()
+
+    def package_target(self) -> PackageTarget:
+        """Packages are made for the interpreters of this machine."""
+        from envhub_sandbox.dependencies.pipeline import HERE
+
+        return HERE
 
     def acquire(
         self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
-    ) -> Use[ProcessServer]:
+    ) -> ServerUse[LocalServer]:
         """The server for this process, started if there is none."""
         if not sys.platform.startswith("linux"):
             raise SandboxUnavailableError(
@@ -108,48 +59,28 @@ class ProcessSandbox:
                 "nothing here can confine a process. Run the worker in a container or on a Linux "
                 "host."
             )
-        return self._servers.acquire(store, partial(_start, store, runtime), idle_s)
+        return self._pool.acquire(store, partial(_start, store, runtime), idle_s)
 
 
-def _start(store: Path, runtime: Runtime) -> ProcessServer:
-    folder = RuntimeFolder(runtime_folder.SERVER)  # of mode 0700: the endpoint is ours alone
-    endpoint = f"ipc://{folder.path}/server"
-    ready, ready_end = os.pipe()
-    process = None
-    try:
-        process = _execute(folder.path, store, runtime, endpoint, ready_end)
-        server = ProcessServer(endpoint, os.pidfd_open(process.pid), process, folder)
-    except BaseException:
-        if process is not None:
-            process.kill()
-            process.wait()
-        os.close(ready)
-        folder.remove()
-        raise
-    finally:
-        os.close(ready_end)
-    try:
+def _start(store: Path, runtime: Runtime) -> LocalServer:
+    server = LocalServer(runtime_folder.SERVER, "", _STOP_S)
+    with server.starting(partial(_execute, server, store, runtime)) as ready:
         for path in runtime_folder.remove_stale():  # while it starts, this costs nothing
             WORKER.info("removed %s, which a client that was killed had left", path)
         _wait_until_ready(ready, server)
-    except BaseException:
-        server.stop()
-        raise
-    finally:
-        os.close(ready)
     return server
 
 
 def _execute(
-    folder: Path, store: Path, runtime: Runtime, endpoint: str, ready: int
+    server: LocalServer, store: Path, runtime: Runtime, ready: int
 ) -> subprocess.Popen[bytes]:
     arguments = [
         *(sys.executable, "-I", str(BOOTSTRAP), "worker", "serve"),
-        *("--endpoint", endpoint, "--runtime-dir", str(folder)),
+        *("--endpoint", server.endpoint, "--runtime-dir", str(server.folder)),
         *("--readable-root", str(store)),
         *("--ahead", "--python", runtime.python, "--packages", runtime.packages),
     ]
-    with (folder / "server.log").open("wb") as log, processes.pidfd() as ourselves:
+    with (server.folder / "server.log").open("wb") as log, processes.pidfd() as ourselves:
         return subprocess.Popen(
             [*arguments, "--ready-fd", str(ready), "--client-pidfd", str(ourselves)],
             stdin=subprocess.DEVNULL,
@@ -168,7 +99,7 @@ def _environment() -> dict[str, str]:
     return {**kept, "OPENBLAS_NUM_THREADS": "1"}
 
 
-def _wait_until_ready(ready: int, server: ProcessServer) -> None:
+def _wait_until_ready(ready: int, server: LocalServer) -> None:
     readable, _, _ = select.select([ready], [], [], _STARTUP_S)
     if readable and os.read(ready, 16):
         return

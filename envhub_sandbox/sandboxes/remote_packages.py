@@ -67,7 +67,7 @@ def _rows(wanted: Sequence[Wanted]) -> tuple[tuple[str, str], ...]:
     return tuple((str(one), one.where) for one in wanted)
 
 
-def bring(
+def request_packages(
     order: m.NeedPackages,
     client: WorkerClient,
     deadline: Deadline,
@@ -81,7 +81,7 @@ def bring(
         ServerBusyError: Others of the same key are at it.
         WorkerTimeoutError: It took too long.
     """
-    told = ""
+    shown = ""
     while True:
         reply, _ = client.request(order, deadline=deadline)
         found = expect(reply, m.Packages)
@@ -92,9 +92,9 @@ def bring(
         if found.state != "making":
             raise RemoteProtocolError("the server has packages in a state that there is not")
         line = printable(found.told[:_MAX_CHARS], _MAX_CHARS)
-        if line != told:
+        if line != shown:
             tell(line)
-            told = line
+            shown = line
         left = deadline.left_s()
         time.sleep(_POLL_S if left is None else min(_POLL_S, left))
 

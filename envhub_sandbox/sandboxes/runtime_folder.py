@@ -1,7 +1,7 @@
 """Private folders of servers: where they lie, and which of them no process uses any more.
 
 Each has sockets, and a socket's path has 107 bytes at most. Its client holds the lock of a file in
-it for as long as it lives, so that whoever comes later can tell that it has gone: it may be killed
+it for as long as it lives, so that others can tell later that it has gone: it may be killed
 at any moment, also before there is a server that would clean up. Containers name such a folder.
 """
 
@@ -30,7 +30,7 @@ _BEGUN = {f".{_CLIENT_FILE}", f".{_LOCK_FILE}"}
 _SOCKET_BYTES = 107
 _LONGEST = f"/{CONTAINER}12345678/sockets/server"
 _EMPTY_S = 60.0
-"""Nobody needs so long from a folder to the first file in it."""
+"""No client needs so long from a folder to the first file in it."""
 
 
 class RuntimeFolder:
@@ -123,7 +123,7 @@ def is_in_use(path: Path) -> bool:
 
     Raises:
         FileNotFoundError: It is no folder of a client, or not one of this machine.
-        OSError: That cannot be told.
+        OSError: That cannot be known.
     """
     if not (path.is_absolute() and _NAME.fullmatch(path.name)):
         raise FileNotFoundError(errno.ENOENT, "it is no runtime folder", str(path))

@@ -19,7 +19,7 @@ from envhub_worker.protocol.text import printable
 
 _WAIT_S = 15.0
 _LOOKER = b"status"
-"""The session of whoever only looks; it is not counted."""
+"""The session of a client that only looks; it is not counted."""
 _WORDS = ("python", "profile", "weakest_profile")
 _MOST = 1 << 63
 _MOST_NAMES = 32

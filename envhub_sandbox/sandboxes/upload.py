@@ -55,7 +55,7 @@ def _sent(root: Path, path: Path) -> Sent:
     return Sent(path.relative_to(root).as_posix(), size, running.digest())
 
 
-def bring(
+def upload(
     client: WorkerClient, root: Path, files: tuple[Sent, ...], deadline: Deadline
 ) -> tuple[str, int]:
     """Bring files to a server.

@@ -14,10 +14,14 @@ from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerError
 from envhub_sandbox.session.counters import Counters
-from envhub_sandbox.session.jails.line import of_a_lost_server, of_a_server_that_ends, wait_in_line
+from envhub_sandbox.session.jails.builder import Builder
 from envhub_sandbox.session.jails.loaded import LoadedJail
-from envhub_sandbox.session.jails.placement import Builder
-from envhub_sandbox.session.jails.sources import JailSource, SharedJail
+from envhub_sandbox.session.jails.retry_while_busy import (
+    is_draining,
+    is_unanswered,
+    retry_while_busy,
+)
+from envhub_sandbox.session.jails.sources import JailSource
 from envhub_sandbox.session.refusals import closed_during
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
@@ -82,7 +86,7 @@ class Lease:
     @property
     def shared(self) -> bool:
         """Whether other environments live in the same jail."""
-        return isinstance(self._jails, SharedJail)
+        return self._jails.shared
 
     def report(self) -> list[dict[str, Any]]:
         """The layers of the jail; none where there is none."""
@@ -179,7 +183,7 @@ class Lease:
                 raise
             refused = error
         ask = partial(self._jails.take, deadline)
-        return wait_in_line(ask, retry_s, deadline, self.repository.label, refused)
+        return retry_while_busy(ask, retry_s, deadline, self.repository.label, refused)
 
     def _patience_s(self, error: EnvHubError) -> float:
         """How long to wait: after a server that ended, where restarts are wanted, for another."""
@@ -187,8 +191,8 @@ class Lease:
         retry_s = self._launcher.retry_s if full else 0.0
         if self.repository.policy.restart == "never":
             return retry_s
-        lost = self._was_loaded and of_a_lost_server(error)
-        return max(retry_s, _SUCCESSOR_S) if lost or of_a_server_that_ends(error) else retry_s
+        lost = self._was_loaded and is_unanswered(error)
+        return max(retry_s, _SUCCESSOR_S) if lost or is_draining(error) else retry_s
 
     def _move(self, deadline: Deadline) -> None:
         self.leave()

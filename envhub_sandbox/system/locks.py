@@ -96,7 +96,7 @@ def is_held(path: Path) -> bool:
 
 @contextlib.contextmanager
 def unheld(path: Path) -> Iterator[bool]:
-    """The opposite of ``is_held``, whose errors it raises; meanwhile no other takes the lock."""
+    """The opposite of ``is_held``; in this context the lock is not taken. Raises likewise."""
     descriptor = os.open(path, _READ)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -112,11 +112,27 @@ def unheld(path: Path) -> Iterator[bool]:
         os.close(descriptor)
 
 
-class LifeLock:
-    """A new file whose lock this process holds for as long as it lives, or until ``release``.
+class _HeldLock:
+    """A lock that this process holds until ``release``, or until nothing refers to this object.
 
-    The file has its lock before it has its name. Where the file system has no locks, ``is_held``
-    raises. A fork does not hold it.
+    A fork does not hold it.
+    """
+
+    def __init__(self) -> None:
+        self._held: list[int] = []
+        _locks.add(self)
+        # interruption.md, rule 5: also where a Ctrl-C came into ``release``
+        weakref.finalize(self, _close, self._held).atexit = False
+
+    def release(self) -> None:
+        """Give it back. Idempotent, and nothing in a fork."""
+        _close(self._held)
+
+
+class LifeLock(_HeldLock):
+    """A new file whose lock this process holds: under its name it is never seen without.
+
+    Where the file system has no locks, ``is_held`` cannot tell, and says so.
 
     Args:
         path: The file.
@@ -124,40 +140,26 @@ class LifeLock:
     """
 
     def __init__(self, path: Path, content: str = "") -> None:
+        super().__init__()
         new = path.with_name(f".{path.name}")
-        self._descriptor = os.open(new, _WRITE | os.O_EXCL, 0o600)
-        _held_for_life.add(self._descriptor)
+        self._held.append(os.open(new, _WRITE | os.O_EXCL, 0o600))
         with contextlib.suppress(OSError):
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX)
-        os.write(self._descriptor, content.encode())
+            fcntl.flock(self._held[0], fcntl.LOCK_EX)
+        os.write(self._held[0], content.encode())
         os.rename(new, path)
 
-    def release(self) -> None:
-        """Give it back. Idempotent, and nothing in a fork."""
-        if self._descriptor in _held_for_life:
-            _held_for_life.discard(self._descriptor)
-            os.close(self._descriptor)
-        self._descriptor = -1
 
+class SharedLock(_HeldLock):
+    """A file's lock that this process shares with others who use the file; see ``sharers``.
 
-class SharedLock:
-    """A file's lock that this process shares until ``release``, or until this object has gone.
-
-    A fork does not hold it. Nothing is held where there is no such file, or another has it alone.
+    Nothing is held where there is no such file, or another has it alone.
     """
 
     def __init__(self, path: Path) -> None:
-        self._held: list[int] = []
-        _shared.add(self)
-        # interruption.md, rule 5: also where a Ctrl-C came into ``release``
-        weakref.finalize(self, _close, self._held).atexit = False
+        super().__init__()
         with contextlib.suppress(OSError):
-            self._held.append(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC))
+            self._held.append(os.open(path, _READ))
             fcntl.flock(self._held[0], fcntl.LOCK_SH | fcntl.LOCK_NB)
-
-    def release(self) -> None:
-        """Give it back. Idempotent, and nothing in a fork."""
-        _close(self._held)
 
 
 def sharers(path: Path) -> dict[int, str]:
@@ -189,18 +191,12 @@ def _close(held: list[int]) -> None:
         os.close(held.pop())
 
 
-# --- forks: interruption.md, rules 14 and 15 ----------------------------------------------------
-
-_held_for_life: set[int] = set()
-_shared: weakref.WeakSet[SharedLock] = weakref.WeakSet()
+# interruption.md, rules 14 and 15
+_locks: weakref.WeakSet[_HeldLock] = weakref.WeakSet()
 
 
 def _forked() -> None:
-    for descriptor in _held_for_life:
-        with contextlib.suppress(OSError):
-            os.close(descriptor)
-    _held_for_life.clear()
-    for lock in _shared:
+    for lock in _locks:
         lock.release()
 
 

@@ -8,7 +8,7 @@ observation and the end of an episode of its own last step.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 
@@ -22,9 +22,6 @@ from envhub_worker.protocol.codec.inert import RemoteObject
 from envhub_worker.protocol.manifest.names import is_servable
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.untrusted import UNTRUSTED
-
-if TYPE_CHECKING:
-    from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 
 _OUTERMOST = 0
 _SEARCHED = -1
@@ -42,7 +39,7 @@ class SubEnvironment(gym.Env[Any, Any]):
     names that libraries look for in any object are not asked for: ``get_wrapper_attr`` names them.
 
     Args:
-        vector: Its vector environment.
+        vector: Its ``SandboxVectorEnv``.
         ask: Asks the worker about it.
         index: Which of the sub-environments it is.
         depth: How many wrappers are looked through; None for all.
@@ -50,7 +47,7 @@ class SubEnvironment(gym.Env[Any, Any]):
 
     def __init__(
         self,
-        vector: SandboxVectorEnv,
+        vector: Any,
         ask: Callable[[str, int, OneMessageFor], m.Message],
         index: int,
         depth: int | None = _OUTERMOST,

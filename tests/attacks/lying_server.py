@@ -23,6 +23,8 @@ import zmq
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
+from envhub_sandbox.sandboxes.base import Sandbox
+from envhub_sandbox.sandboxes.pool import WorkerServer
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.manifest.manifest import (
@@ -69,12 +71,12 @@ class Asked:
         return [*m.pack_header(relayed, number), *frames]
 
 
-@dataclass
-class LyingServer:
+@dataclass(eq=False)
+class LyingServer(WorkerServer):
     """What ``Sandbox.acquire`` gives; lies are looked up by the type of the request."""
 
     lies: dict[type[m.Message], Lie] = field(default_factory=dict)
-    fd_path: None = None
+    runs: bool = True
     asked: list[m.Message] = field(default_factory=list)
     heard: bytearray = field(default_factory=bytearray)
     """Every byte that a client sent: what a hostile worker knows by then."""
@@ -121,7 +123,7 @@ class LyingServer:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-class LyingSandbox:
+class LyingSandbox(Sandbox):
     """A place for workers that has only the liar."""
 
     name = "liar"
@@ -129,7 +131,7 @@ class LyingSandbox:
     def __init__(self, server: LyingServer) -> None:
         self._server = server
 
-    def acquire(self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0) -> LyingUse:
+    def acquire(self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0) -> Any:
         """The liar."""
         return LyingUse(self._server)
 
@@ -138,7 +140,7 @@ class LyingSandbox:
 class LyingUse:
     """One use of the liar, which the test ends."""
 
-    shared: LyingServer
+    server: LyingServer
     live: bool = True
 
     def release(self) -> None:

@@ -28,7 +28,7 @@ def main(profile: str, secret: str) -> int:
     """Hold a jail open until there is nothing more to read."""
     cache = store.cache_root()
     use = PROCESS.acquire(cache / "snapshots")
-    server = use.shared
+    server = use.server
     with Arena(profile, "").environment() as env:
         run = Run(new_alias(), True)
         call(env, run, "create_file", {"path": f"/dev/shm/envhub-{os.getpid()}", "text": secret})

@@ -171,7 +171,7 @@ def granted(env: Any, payload: str, options: dict[str, Any]) -> None:
 def test_servers_sockets_are_not_part_of_the_hosts_network(arena: Arena) -> None:
     """The folder with a server's socket and the one that takes descriptors is out of reach."""
     use = PROCESS.acquire(store.cache_root() / "snapshots")
-    server = use.shared
+    server = use.server
     place = server.folder / f"{token()[:8]}.sock"
     server.folder.chmod(0o711)  # file modes shall not be what stops it
     try:

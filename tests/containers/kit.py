@@ -15,7 +15,7 @@ from typing import Any
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.run_arguments import CLIENT_LABEL, SNAPSHOT
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
-from envhub_sandbox.sandboxes.lingering import stop_idle
+from envhub_sandbox.sandboxes.pool import stop_idle
 from tests.attacks.harness import Arena, Run, answered, new_alias
 from tests.support.processes import eventually
 

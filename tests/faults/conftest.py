@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.sandboxes.lingering import stop_idle
+from envhub_sandbox.sandboxes.pool import stop_idle
 from tests.faults.traces import Traces, temporary_root
 from tests.support.processes import eventually
 from tests.support.samples import sample

@@ -28,7 +28,7 @@ lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
 def _held(neighbour: Any) -> tuple[int, int, int]:
     """Uses of a server and jails in it, and descriptors of ours."""
     gc.collect()
-    uses, jails = len(inside.server(neighbour).uses), inside.jails(neighbour)
+    uses, jails = inside.users(neighbour), inside.jails(neighbour)
     return uses, jails, len(os.listdir("/proc/self/fd"))
 
 

@@ -11,7 +11,7 @@ import psutil
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.sandboxes.lingering import stop_idle
+from envhub_sandbox.sandboxes.pool import stop_idle
 from tests.faults.clients import finish, is_clean, left, line, start
 from tests.faults.traces import temporary_root
 from tests.support.processes import descendants, eventually

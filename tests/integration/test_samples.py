@@ -11,7 +11,7 @@ from gymnasium.error import ClosedEnvironmentError
 from gymnasium.vector import AutoresetMode
 
 from envhub_sandbox import EnvSuites, make_env
-from envhub_sandbox.sandboxes.lingering import stop_idle
+from envhub_sandbox.sandboxes.pool import stop_idle
 from tests.support.compare import assert_same
 from tests.support.processes import descendants, eventually
 from tests.support.samples import make_env_of, reference, sample

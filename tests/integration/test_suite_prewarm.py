@@ -19,7 +19,7 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvError
 from envhub_sandbox.hub import store
-from envhub_sandbox.sandboxes.lingering import stop_idle
+from envhub_sandbox.sandboxes.pool import stop_idle
 from tests.support import inside
 from tests.support.processes import descendants, eventually
 from tests.support.repositories import write_repository

@@ -300,6 +300,6 @@ def test_only_the_edited_file_travels_to_a_real_server(server: Listening, tmp_pa
         client.hello(Deadline(30))
         (repository / "empty").write_bytes(b"no more")
         files = upload.listing(repository)
-        assert upload.bring(client, repository, files, Deadline(30))[1] == len(b"no more")
-        assert upload.bring(client, repository, files, Deadline(30))[1] == 0
+        assert upload.upload(client, repository, files, Deadline(30))[1] == len(b"no more")
+        assert upload.upload(client, repository, files, Deadline(30))[1] == 0
         client.close()

@@ -24,7 +24,7 @@ ANOTHER = m.VERSION + 1
 def test_a_server_refuses_a_client_of_another_version(tmp_path: Path, version: int) -> None:
     """The refusal names both versions."""
     use = PROCESS.acquire(tmp_path)
-    server = use.shared
+    server = use.server
     client = WorkerClient(server.endpoint, server.process_fd)
     try:
         reply, _ = client.request(m.Hello(version, b"x"), deadline=Deadline(30))

@@ -14,7 +14,7 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, ServerBusyError, WorkerError
 from envhub_sandbox.sandboxes.remote import RemoteSandbox
-from envhub_sandbox.session.jails.line import wait_in_line
+from envhub_sandbox.session.jails.retry_while_busy import retry_while_busy
 from envhub_sandbox.transport.deadline import StartupDeadline
 from envhub_worker.access import keys
 from envhub_worker.access.line import Line
@@ -122,7 +122,7 @@ def test_a_wait_counts_neither_against_the_start_nor_after_a_close() -> None:
             raise ServerBusyError("full", retry_s=0.2)
         return "in"
 
-    assert wait_in_line(ask, 600.0, deadline, "it") == "in"
+    assert retry_while_busy(ask, 600.0, deadline, "it") == "in"
     assert len(asked) == 3
     deadline.postpone(5000.0)
     assert (deadline.left_s() or 0.0) > 5000.0
@@ -131,7 +131,7 @@ def test_a_wait_counts_neither_against_the_start_nor_after_a_close() -> None:
     deadline.postpone(5000.0)
     assert deadline.passed
     with pytest.raises(ServerBusyError):
-        wait_in_line(ask, 600.0, deadline, "it")
+        retry_while_busy(ask, 600.0, deadline, "it")
     assert len(asked) == 1
 
 

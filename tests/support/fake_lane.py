@@ -104,7 +104,7 @@ class FakeRepository(Repository):
     """A repository without files, of which no crash is kept."""
 
     def __init__(self) -> None:
-        self.snapshot = cast("Any", SimpleNamespace(label="a/b", path=None))
+        self.snapshot = cast("Any", SimpleNamespace(label="a/b", path=None, root=None))
         self.policy, self.timeouts = Policy(crash_history=8), Timeouts()
         self.warnings, self.recipe, self.copy = RemoteWarnings(), None, True
 
@@ -120,7 +120,7 @@ def session_over(lane: FakeLane) -> EnvSession:
     """A session that is READY, with its environment behind this lane."""
     repository = FakeRepository()
     launcher = SimpleNamespace(repository=repository, stay=lambda: lambda: None)
-    jails = SimpleNamespace(launcher=launcher)
+    jails = SimpleNamespace(launcher=launcher, shared=False)
     paces = SimpleNamespace(note=lambda *_: None)
     session = EnvSession(cast("Any", jails), env_manifest(), [(0, NUM_ENVS)], cast("Any", paces))
     session.lease.lane = cast("Any", lane)

@@ -154,6 +154,11 @@ def server(env: Any) -> Any:
     return _running(env).server
 
 
+def users(env: Any) -> int:
+    """How many uses of its worker server there are."""
+    return _running(env).use.users()
+
+
 def pids(env: Any) -> list[int]:
     """The processes of its jail, as its server knows them."""
     status, _ = client(env).request(m.GetStatus(), deadline=Deadline(60))
@@ -195,9 +200,9 @@ def hold_server(env: Any, release: Callable[[], None]) -> None:
     session(env).lease._release_server = release
 
 
-def order(known: Launcher, of: Any) -> Any:
-    """What is asked of a server for a jail of this repository."""
-    return known._order(of, 1)
+def order(known: Launcher) -> Any:
+    """What is asked of a server of this machine for a jail of this repository."""
+    return known._order(1)
 
 
 def _running(env: Any) -> LoadedJail:
@@ -234,7 +239,7 @@ def link_losses(found: Any) -> int:
 
 def fall_silent(env: Any) -> None:
     """End the thread that tells the server that this client lives."""
-    server(env).host._stop.set()
+    server(env)._stop.set()
 
 
 def send_half(connection: WorkerClient, frames: Sequence[Buffer]) -> None:
@@ -262,8 +267,8 @@ FORMS: tuple[Spot, Spot] = ((packing, "_OUTGOING"), (packing, "_INCOMING"))
 """What is remembered of the shape of messages, each way."""
 CHECK_OF_WARNINGS: Spot = (warned, "_checked")
 """What looks at each warning of a worker's."""
-IDLE_CONTAINERS: Spot = (sandbox, "_IDLE")
-"""Where a container is that nobody uses."""
+CONTAINERS: Spot = (sandbox, "_POOL")
+"""The containers of this process."""
 CONTAINER_STARTS: Spot = (sandbox.RepositoryContainer, "_start")
 """What starts one."""
 

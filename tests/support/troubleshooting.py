@@ -48,6 +48,7 @@ _PARTS = (
         "Servers on other hosts",
         (
             "envhub_sandbox/sandboxes/remote.py",
+            "envhub_sandbox/sandboxes/remote_keys.py",
             "envhub_sandbox/sandboxes/remote_packages.py",
             "envhub_sandbox/transport/tcp.py",
             "envhub_sandbox/transport/connection.py",

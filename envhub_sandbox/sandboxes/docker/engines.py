@@ -106,7 +106,7 @@ def find_engine(name: str | None) -> Engine:
 
 
 def is_elsewhere(name: str) -> bool:
-    """Whether an engine was told to work on another machine: nothing of ours can be there."""
+    """Whether an engine is set to work on another machine: nothing of ours can be there."""
     host = os.environ.get("DOCKER_HOST")
     return name == "docker" and bool(host) and not str(host).startswith("unix:")
 

@@ -7,8 +7,8 @@ every interpreter is left out of it.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-import json
 import re
 import subprocess
 import tempfile
@@ -16,15 +16,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from envhub_sandbox.dependencies.resolve import Lock, Target
-from envhub_sandbox.errors import DependencyError, SandboxUnavailableError
-from envhub_sandbox.sandboxes.docker.engines import Engine, EngineError, environment, own_limits
+from envhub_sandbox.errors import DependencyError
+from envhub_sandbox.sandboxes.docker.engines import Engine, EngineError, environment
+from envhub_sandbox.sandboxes.docker.packages import inside
 
 LOCK_LABEL = "dev.envhub.lock"
-INTERPRETER = "/opt/envhub-worker/bin/python"
-"""The server's, in every image."""
-_ASK = (
-    "import json, os, sys; print(json.dumps(['%d.%d' % sys.version_info[:2], os.uname().machine]))"
-)
 _PACKAGE = re.compile(r"[a-z0-9][a-z0-9.+-]+")
 
 # An interpreter runs these at its start, before anything could confine it.
@@ -44,23 +40,9 @@ USER 65532:65532
 
 
 def target_of(engine: Engine, image: str) -> Target:
-    """What runs in a worker's image; it is asked.
-
-    Raises:
-        SandboxUnavailableError: It is none.
-    """
-    try:
-        said = engine.run(
-            *("run", "--rm", "--no-healthcheck", "--network", "none", "--read-only"),
-            *("--cap-drop", "ALL"),
-            *("--security-opt", "no-new-privileges", "--pull", "never"),
-            *(word for limit in own_limits(engine) for word in ("--ulimit", limit)),
-            *("--entrypoint", INTERPRETER, image, "-I", "-c", _ASK),
-        )
-        python, machine = json.loads(said)
-    except (EngineError, ValueError) as error:
-        raise SandboxUnavailableError(f"{image!r} is no image of envhub-worker: {error}") from error
-    return Target(version=str(python), machine=str(machine))
+    """What runs in a worker's image; raises as ``inside``."""
+    found, _ = inside(engine, image)
+    return Target(version=".".join(found.version.split(".")[:2]), machine=found.machine)
 
 
 def tag_for(repository: str, base: str, lock: Lock, system: Sequence[str]) -> str:
@@ -116,8 +98,6 @@ def build(engine: Engine, recipe: str, lock: Lock, tag: str, network: str | None
 
 def exists(engine: Engine, tag: str) -> bool:
     """Whether the engine has an image."""
-    try:
-        engine.run("image", "inspect", "--format", "{{.Id}}", tag)
-    except EngineError:
-        return False
-    return True
+    with contextlib.suppress(EngineError):
+        return bool(engine.run("image", "inspect", "--format", "{{.Id}}", tag))
+    return False

@@ -4,8 +4,8 @@ Run as a script of its own, with ``-I -S`` and the standard library only::
 
     monitor.py CLIENT_PIDFD READY_FD FOLDER NAME -- ENGINE run ...
 
-It starts the engine's attached ``run`` with a pipe as stdin that nobody else holds (a fork of the
-client would keep it open), and ends it by closing that pipe: when the client ends, by whatever
+It starts the engine's attached ``run`` with a pipe as stdin that no other process holds (a fork of
+the client would keep it open), and ends it by closing that pipe: when the client ends, by whatever
 signal, or at SIGTERM. Killed itself, its pipe closes all the same. On ``READY_FD`` it writes one
 JSON document, what the container announced or how the engine's command ended. At the end it
 removes the container, if it is still there, and ``FOLDER``.
@@ -37,7 +37,7 @@ def main(argv: Sequence[str]) -> int:
     signal.set_wakeup_fd(wakes)
     signal.signal(signal.SIGTERM, lambda *_: None)
     try:
-        return Keeper(client, ready, woken, command).run()
+        return ContainerMonitor(client, ready, woken, command).run()
     finally:
         with contextlib.suppress(OSError, subprocess.TimeoutExpired):
             # usually gone by now; an engine that was restarted meanwhile may have kept it
@@ -50,7 +50,7 @@ def _quietly(command: list[str], timeout_s: float) -> None:
     subprocess.run(command, stdin=nothing, stdout=nothing, stderr=nothing, timeout=timeout_s)
 
 
-class Keeper:
+class ContainerMonitor:
     """The loop: the client's life, the container's output, and its end."""
 
     def __init__(self, client: int, ready: int, woken: int, command: list[str]) -> None:
@@ -94,7 +94,7 @@ class Keeper:
 
     def _tell(self, document: bytes) -> None:
         if self._ready >= 0:
-            with contextlib.suppress(OSError):  # nobody waits any more
+            with contextlib.suppress(OSError):  # the client waits no more
                 os.write(self._ready, document[:_LINE_BYTES] + b"\n")
             os.close(self._ready)
             self._ready = -1

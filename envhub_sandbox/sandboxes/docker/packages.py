@@ -22,12 +22,13 @@ from envhub_sandbox.sandboxes.docker.engines import (
     find_image,
     own_limits,
 )
-from envhub_sandbox.sandboxes.docker.image import INTERPRETER
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.host import Described
     from envhub_sandbox.dependencies.interpreters import Interpreter
 
+_INTERPRETER = "/opt/envhub-worker/bin/python"
+"""The server's, in every image."""
 # without site, so that nothing of what is installed there runs: its metadata is read
 _ASK = """
 import glob, json, os, platform, sys
@@ -94,7 +95,7 @@ def inside(engine: Engine, image: str) -> tuple[Interpreter, dict[str, Described
             *("run", "--rm", "--no-healthcheck", "--network", "none", "--read-only"),
             *("--cap-drop", "ALL", "--security-opt", "no-new-privileges", "--pull", "never"),
             *(word for limit in own_limits(engine) for word in ("--ulimit", limit)),
-            *("--entrypoint", INTERPRETER, image, "-I", "-S", "-c", _ASK),
+            *("--entrypoint", _INTERPRETER, image, "-I", "-S", "-c", _ASK),
         )
         implementation, version, machine, libc, there = json.loads(said)
         installed = {
@@ -104,7 +105,7 @@ def inside(engine: Engine, image: str) -> tuple[Interpreter, dict[str, Described
     except (EngineError, ValueError, TypeError, AttributeError) as error:
         raise SandboxUnavailableError(f"{image!r} is no image of envhub-worker: {error}") from error
     facts = (str(implementation), release(str(version)), str(machine), str(libc))
-    return Interpreter(INTERPRETER, *facts), installed
+    return Interpreter(_INTERPRETER, *facts), installed
 
 
 def fitting(theirs: Interpreter, request: PackageRequest) -> Interpreter:

@@ -1,6 +1,6 @@
 """What clients that were killed left behind: containers, folders, control groups.
 
-Only what can be told to be ours, and to be nobody's any more. Whoever lives holds a lock: a client
+Only what is certainly ours and not in use any more. A process that lives holds a lock: a client
 that of its folder, which its container names in a label, and a server those of its folders and
 control groups. What has no such lock is left alone. So is what belongs to another user, whose files
 we may not even see; root sees all, and removes every user's containers and control groups.
@@ -37,7 +37,7 @@ _GROUP = re.compile(r"envhub_\d+_\w[\w-]*")
 
 @dataclass(frozen=True)
 class Leftover:
-    """One thing that nobody uses any more.
+    """One thing that is not in use any more.
 
     Attributes:
         kind: ``"container"``, ``"folder"`` or ``"control group"``.

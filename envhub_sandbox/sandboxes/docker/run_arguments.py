@@ -20,7 +20,7 @@ SOCKETS = "/run/envhub"
 """The only channel: a folder of mode 0700 that client and server share."""
 SNAPSHOTS = "/snapshots"
 SNAPSHOT = f"{SNAPSHOTS}/this"
-"""Where the repository's files lie inside: their path outside is nobody's business."""
+"""Where the repository's files lie inside: their path outside stays unknown there."""
 PACKAGES = "/packages"
 """Where packages lie inside that were made for the repository."""
 
@@ -58,7 +58,7 @@ class Container:
         scratch: Bytes of /tmp.
         runtime: The engine's runtime, or None for its default.
         gpus: What ``--gpus`` takes, or None.
-        ulimits: What ``--ulimit`` takes, besides that nobody dumps core.
+        ulimits: What ``--ulimit`` takes, besides that no core is dumped.
     """
 
     name: str
@@ -102,7 +102,7 @@ def _confinement(engine: Engine, wanted: Container) -> list[str]:
     user, group = wanted.user
     podman = engine.kind == "podman"
     # /proc as it is: a jail can mount one of its own only where an unmasked one is in sight. What
-    # the masks would hide is root's, whom nobody in there can become, and jails see none of it.
+    # the masks would hide is root's, whom no process in there can become, and jails see none of it.
     unmasked = "unmask=ALL" if podman else "systempaths=unconfined"
     words = ["--network", wanted.network, "--read-only", "--cap-drop", "ALL"]
     words += ["--security-opt", "no-new-privileges", "--security-opt", f"seccomp={wanted.seccomp}"]

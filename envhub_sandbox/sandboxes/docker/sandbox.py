@@ -15,16 +15,16 @@ import secrets
 import select
 import subprocess
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes import runtime_folder
-from envhub_sandbox.sandboxes.base import ServerUse
+from envhub_sandbox.sandboxes.base import Sandbox
 from envhub_sandbox.sandboxes.docker import attestation, packages, run_arguments, seccomp_profile
 from envhub_sandbox.sandboxes.docker.engines import (
     Engine,
@@ -35,11 +35,12 @@ from envhub_sandbox.sandboxes.docker.engines import (
     own_limits,
 )
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
-from envhub_sandbox.sandboxes.lingering import Lingering
-from envhub_sandbox.sandboxes.refcount import Sharing, Use, Uses
-from envhub_sandbox.sandboxes.runtime_folder import RuntimeFolder
+from envhub_sandbox.sandboxes.local_server import LocalServer
+from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
 from envhub_sandbox.system import processes
-from envhub_sandbox.transport.forks import Owner
+from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 _MONITOR = Path(__file__).with_name("monitor.py")
@@ -54,7 +55,7 @@ _UNUSED_USERS = range(0x6E000000, 0x6EFFFFFF)
 
 
 @dataclass(kw_only=True)
-class DockerSandbox:
+class DockerSandbox(Sandbox):
     """Workers in containers. What ``sandbox="docker"`` means is this with its defaults.
 
     Attributes:
@@ -77,7 +78,7 @@ class DockerSandbox:
     pids: int | None = None
     cpus: float | None = None
     cgroups: bool = True
-    name: str = field(default="docker", init=False)
+    name = "docker"
 
     def __post_init__(self) -> None:
         for option in ("memory", "pids", "cpus"):
@@ -123,10 +124,6 @@ class DockerSandbox:
         """Packages are made on this machine, for the image's Python."""
         return packages.ImageTarget(lambda: find_engine(self.engine), self.image)
 
-    def acquire(self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0) -> ServerUse:
-        """Not without a repository: a container sees the files of one only."""
-        raise SandboxUnavailableError("a container is started for a repository, not for a store")
-
 
 def _check_users(engine: Engine) -> None:
     if engine.kind == "docker" and engine.rootless:
@@ -137,145 +134,110 @@ def _check_users(engine: Engine) -> None:
         )
 
 
-@dataclass
-class ContainerServer:
+class ContainerServer(LocalServer):
     """A worker server in a container that we started.
 
     Attributes:
-        layers: What holds around it.
-        profile: That of its jails.
-        packages: Where those lie in there that were made for the repository.
+        wanted: What the engine was asked for.
+        profile: The profile of its jails, chosen among what can be had in there.
         python: Their interpreter; empty for the server's own.
     """
 
-    runtime: RuntimeFolder
-    process: subprocess.Popen[bytes]
-    process_fd: int
-    layers: list[Mapping[str, Any]]
-    profile: str
-    python: str
-    owner: Owner = field(default_factory=Owner)
-    uses: Uses = field(default_factory=Uses)
-    stopped: bool = False
-    snapshot: str = run_arguments.SNAPSHOT
-    packages: str = ""
+    wanted: Container
 
-    @property
-    def endpoint(self) -> str:
-        """Its ZeroMQ endpoint, in the folder that we share."""
-        return f"ipc://{self.runtime.path}/sockets/server"
-
-    @property
-    def fd_path(self) -> str:
-        """The socket that takes descriptors."""
-        return f"{self.runtime.path}/sockets/fds"
-
-    @property
-    def runs(self) -> bool:
-        """Whether it has not ended, and can be reached."""
-        alive = self.process.poll() is None
-        return alive and self.runtime.has_sockets("sockets/server", "sockets/fds")
-
-    def stop(self) -> None:
-        """End the container, in bounded time. A fork of its owner does nothing.
-
-        Idempotent; what interrupts it, it goes on after.
-        """
-        if self.stopped or not self.owner.is_here:
-            return
-        _end(self.process)
-        self.runtime.remove()  # also where the monitor was killed itself
-        try:
-            self.stopped = True  # once: the number may be somebody else's a moment later
-            os.close(self.process_fd)
-        except OSError:
-            return
-
-    def __del__(self) -> None:
-        self.stop()  # a start that was interrupted before anybody noted it
+    def __init__(self) -> None:
+        super().__init__(runtime_folder.CONTAINER, "sockets", _STOP_S)
+        self.profile = self.python = ""
 
 
-_IDLE: Lingering[ContainerServer] = Lingering()
+_POOL: ServerPool[ContainerServer] = ServerPool()
 
 
-class RepositoryContainer:
+@dataclass(eq=False)
+class RepositoryContainer(Sandbox):
     """The sandbox of one repository: one container, which its environments share."""
 
     name = "docker"
+    options: DockerSandbox
+    engine: Engine
+    image: str
+    snapshot: Path
+    policy: Policy
+    packages: str = ""
 
-    def __init__(
-        self,
-        options: DockerSandbox,
-        engine: Engine,
-        image: str,
-        snapshot: Path,
-        policy: Policy,
-        packages: str = "",
-    ) -> None:
-        self.interpreter = f"{image} in {engine.kind}{f' with {packages}' if packages else ''}"
-        self._packages = packages
-        self._options, self._engine, self._image = options, engine, image
-        self._snapshot, self._policy = snapshot, policy
-        # of one make_env, whose limits are for it alone; only one that nobody uses changes hands
-        self._servers: Sharing[ContainerServer] = Sharing(_IDLE)
-        self._key = repr((options, engine, image, str(snapshot), policy, packages))
+    def runs_on(self, runtime: Runtime) -> Runtime:
+        """The image, by its id."""
+        packages = f" with {self.packages}" if self.packages else ""
+        return Runtime(f"{self.image} in {self.engine.kind}{packages}")
 
     def acquire(
         self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
-    ) -> Use[ContainerServer]:
-        """The repository's container, started if there is none."""
-        return self._servers.acquire(self._key, self._start, idle_s)
+    ) -> ServerUse[ContainerServer]:
+        """The repository's container, started if there is none.
+
+        Its limits are for one ``make_env`` alone, so only an unused one changes hands.
+        """
+        return _POOL.acquire(repr(self), self._start, idle_s, group=self)
+
+    def prepare(
+        self, order: m.OpenJail, server: WorkerServer, client: WorkerClient, deadline: Deadline
+    ) -> m.OpenJail:
+        """Files and packages lie elsewhere in there, and not every profile can be had."""
+        container = cast("ContainerServer", server)
+        return m.replace(
+            order,
+            snapshot=run_arguments.SNAPSHOT,
+            # with packages of its own it has no use for those of another environment in the image
+            python="" if self.packages else container.python,
+            packages=run_arguments.PACKAGES if self.packages else "",
+            confinement={**order.confinement, "profile": container.profile},
+        )
 
     def _start(self) -> ContainerServer:
-        folder = RuntimeFolder(runtime_folder.CONTAINER)
-        ready, ready_end = os.pipe()
-        try:
-            wanted = self._wanted(folder.path)
-            process = _execute(self._engine, wanted, folder.path, ready_end)
-        except BaseException:
-            os.close(ready)
-            folder.remove()
-            raise
-        finally:
-            os.close(ready_end)
-        try:
-            return self._enclosed(wanted, folder, process, _answer(ready, process))
-        except BaseException:
-            _end(process)
-            folder.remove()
-            raise
-        finally:
-            os.close(ready)
-
-    def _enclosed(
-        self,
-        wanted: Container,
-        folder: RuntimeFolder,
-        process: subprocess.Popen[bytes],
-        answer: bytes,
-    ) -> ContainerServer:
-        _check_started(self._engine, wanted, answer)
-        found = attestation.parse(answer)
-        if not (folder.path / "sockets" / "fds").is_socket():
-            raise SandboxUnavailableError(
-                f"{self._engine.kind} started a container that shares no socket with this process: "
-                "an engine in a virtual machine, or a runtime with a kernel of its own. Run the "
-                f"worker there, and connect to it with {option_name('sandbox', 'tcp://HOST:PORT')}"
-            )
-        title = f"{self._engine.kind} {self._engine.version}, image {self._options.image}"
-        runtime = self._options.runtime or "default"
-        title += f" ({self._image[:19]}), runtime {runtime}, {wanted.name}"
-        layers = attestation.layers(wanted, found, title)
-        profile = attestation.profile_for(self._policy.profile, found)
-        fd = os.pidfd_open(process.pid)
-        # with packages of its own it has no use for those of another environment in the image
-        python = "" if self._packages else found.python
-        server = ContainerServer(folder, process, fd, [*layers], profile, python)
-        server.packages = run_arguments.PACKAGES if self._packages else ""
+        server = ContainerServer()
+        with server.starting(partial(self._execute, server)) as ready:
+            answer, wanted = _answer(ready), server.wanted
+            _check_started(self.engine, wanted, answer)
+            found = attestation.parse(answer)
+            if not Path(server.fd_path).is_socket():
+                raise SandboxUnavailableError(
+                    f"{self.engine.kind} started a container that shares no socket with this "
+                    "process: an engine in a virtual machine, or a runtime with a kernel of its "
+                    "own. Run the worker there, and connect to it with "
+                    f"{option_name('sandbox', 'tcp://HOST:PORT')}"
+                )
+            server.layers = attestation.layers(wanted, found, self._title(wanted))
+            server.profile = attestation.profile_for(self.policy.profile, found)
+            server.python = found.python
         return server
 
+    def _title(self, wanted: Container) -> str:
+        engine, options = self.engine, self.options
+        return (
+            f"{engine.kind} {engine.version}, image {options.image} ({self.image[:19]}), "
+            f"runtime {options.runtime or 'default'}, {wanted.name}"
+        )
+
+    def _execute(self, server: ContainerServer, ready: int) -> subprocess.Popen[bytes]:
+        server.wanted = wanted = self._wanted(server.folder)
+        with processes.pidfd() as ourselves:
+            return subprocess.Popen(
+                [
+                    *(sys.executable, "-I", "-S", str(_MONITOR), str(ourselves), str(ready)),
+                    *(str(server.folder), wanted.name, "--", self.engine.command),
+                    *run_arguments.run_arguments(self.engine, wanted),
+                ],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                cwd="/",
+                env=environment(),
+                pass_fds=(ready, ourselves),
+                start_new_session=True,  # Ctrl-C is for the client, which then ends the container
+            )
+
     def _wanted(self, folder: Path) -> Container:
-        options, policy = self._options, self._policy
+        options, policy = self.options, self.policy
         user, group = _user()
         sockets = folder / "sockets"
         sockets.mkdir(mode=0o700)
@@ -291,15 +253,15 @@ class RepositoryContainer:
         memory, pids, cpus = limits if options.cgroups else (None, None, None)
         return Container(
             name=f"envhub-{secrets.token_hex(6)}",
-            image=self._image,
+            image=self.image,
             labels={
                 run_arguments.CLIENT_LABEL: str(os.getpid()),
                 run_arguments.FOLDER_LABEL: str(folder),
                 run_arguments.USER_LABEL: str(os.geteuid()),
             },
             sockets=str(sockets),
-            snapshot=str(self._snapshot),
-            packages=self._packages,
+            snapshot=str(self.snapshot),
+            packages=self.packages,
             readable=policy.readable,
             seccomp=str(folder / "seccomp.json"),
             user=(user, group),
@@ -310,7 +272,7 @@ class RepositoryContainer:
             scratch=run_arguments.scratch_for(policy),
             runtime=options.runtime,
             gpus=(options.gpus or "all") if policy.gpu else None,
-            ulimits=own_limits(self._engine),
+            ulimits=own_limits(self.engine),
         )
 
 
@@ -322,27 +284,7 @@ def _user() -> tuple[int, int]:
     return user, user
 
 
-def _execute(
-    engine: Engine, wanted: Container, folder: Path, ready: int
-) -> subprocess.Popen[bytes]:
-    with processes.pidfd() as ourselves:
-        return subprocess.Popen(
-            [
-                *(sys.executable, "-I", "-S", str(_MONITOR), str(ourselves), str(ready)),
-                *(str(folder), wanted.name, "--", engine.command),
-                *run_arguments.run_arguments(engine, wanted),
-            ],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            cwd="/",
-            env=environment(),
-            pass_fds=(ready, ourselves),
-            start_new_session=True,  # Ctrl-C is for the client, which then ends the container
-        )
-
-
-def _answer(ready: int, process: subprocess.Popen[bytes]) -> bytes:
+def _answer(ready: int) -> bytes:
     """The monitor's one line."""
     readable, _, _ = select.select([ready], [], [], _STARTUP_S)
     answer = os.read(ready, _ANNOUNCEMENT_BYTES + 1) if readable else b""
@@ -376,12 +318,3 @@ def _check_started(engine: Engine, wanted: Container, answer: bytes) -> None:
         f"the container's program ended at once (exit code {said['ended']}); an image that was "
         f"built from another version must be built again:\n{tail[-4000:]}"
     )
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    process.terminate()
-    try:
-        process.wait(_STOP_S)
-    except subprocess.TimeoutExpired:
-        process.kill()  # its pipe closes, and the container ends
-        process.wait()

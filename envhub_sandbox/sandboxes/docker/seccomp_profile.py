@@ -64,7 +64,7 @@ _SYSTEM_V = """
     mq_getsetattr mq_notify mq_open mq_timedreceive mq_timedsend mq_unlink msgctl msgget msgrcv
     msgsnd semctl semget semop semtimedop shmat shmctl shmdt shmget
 """
-# What locks a jail down. Outside of a user namespace these need capabilities that nobody here has.
+# What locks a jail down. Outside of a user namespace these need capabilities, which none here has.
 _LOCKDOWN = """
     landlock_add_rule landlock_create_ruleset landlock_restrict_self mount mount_setattr move_mount
     open_tree pivot_root seccomp sethostname setns umount2 unshare

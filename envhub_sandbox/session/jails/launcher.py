@@ -3,29 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.errors import (
-    EnvHubError,
-    LoadError,
-    WorkerTimeoutError,
-)
+from envhub_sandbox.errors import EnvHubError, LoadError, WorkerTimeoutError
 from envhub_sandbox.log import WORKER
-from envhub_sandbox.sandboxes.base import (
-    Crowded,
-    EnclosedServer,
-    FarServer,
-    PerRepository,
-    Sandbox,
-    ServerUse,
-    WorkerServer,
-)
-from envhub_sandbox.session.jails import denied
-from envhub_sandbox.session.jails.loaded import Known, LoadedJail
+from envhub_sandbox.sandboxes.base import Sandbox
+from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
+from envhub_sandbox.session.jails import denials
+from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
 from envhub_sandbox.session.jails.server_hold import ServerHold
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.transport.connection import WorkerClient
@@ -36,13 +25,12 @@ from envhub_sandbox.transport.replies import expect, typed
 from envhub_sandbox.transport.values.generators import generator
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import EnvManifest, decode_manifest
-from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _CLOSE_S = 5.0
 _STATUS_S = 1.0
 _DENIED_S = 10.0
-"""Who records wants to know it, also of a host that is busy."""
+"""A caller who has denials recorded wants to know them, also of a host that is busy."""
 _UNKNOWN = ("server", "connection", "gone")
 """How a jail died of which its server can say nothing."""
 
@@ -62,13 +50,11 @@ class Launcher:
 
     def __init__(self, repository: Repository, sandbox: Sandbox, store: Path) -> None:
         self.repository = repository
-        self._sandbox = sandbox
-        self.runs_on = runtime = repository.runtime
-        if isinstance(sandbox, PerRepository):
-            root, policy = repository.snapshot.root, repository.policy
-            own = sandbox.for_repository(root, policy, runtime)
-            self._sandbox, self.runs_on = own, Runtime(own.interpreter)
-        self.retry_s = self._sandbox.retry_s if isinstance(self._sandbox, Crowded) else 0.0
+        runtime = repository.runtime
+        place = sandbox.for_repository(repository.snapshot.root, repository.policy, runtime)
+        self._sandbox = place
+        self.runs_on = place.runs_on(runtime)
+        self.retry_s = place.retry_s
         self._store = store
         self._hold = ServerHold(self._acquire, repository.hold, repository.let_go)
         self._jail_numbers = count(1)
@@ -81,11 +67,11 @@ class Launcher:
         """An environment may need the server again; returns what says that it is closed."""
         return self._hold.enter()
 
-    def _acquire(self) -> ServerUse:
+    def _acquire(self) -> ServerUse[WorkerServer]:
         idle_s = self.repository.timeouts.server_idle_s
         return self._sandbox.acquire(self._store, self.repository.runtime, idle_s)
 
-    def open(self, deadline: Deadline, known: Known | None = None) -> LoadedJail:
+    def open(self, deadline: Deadline, known: ExpectedManifest | None = None) -> LoadedJail:
         """Fork a jail and have its first runner call ``make_env``.
 
         Args:
@@ -99,25 +85,26 @@ class Launcher:
         """
         use = self._acquire()
         try:
-            server = use.shared
-            if self.repository.timeouts.server_idle_s != 0 and not isinstance(server, FarServer):
-                self._hold.keep(server)
+            # one on another host runs anyway
+            if self.repository.timeouts.server_idle_s != 0 and use.server.far is None:
+                self._hold.keep(use.server)
             with self.repository.starting(deadline):
                 return self._open(use, deadline, known)
         except BaseException:
             use.release()
             raise
 
-    def _open(self, use: ServerUse, deadline: Deadline, known: Known | None) -> LoadedJail:
-        server = use.shared
+    def _open(
+        self, use: ServerUse[WorkerServer], deadline: Deadline, known: ExpectedManifest | None
+    ) -> LoadedJail:
+        server = use.server
         wanted = self._wanted_output()
         client = self._client(server)
         try:
             client.hello(deadline)
-            if isinstance(server, FarServer):
-                server.bring(client, deadline)
             # all at once, where they will load what is known: else it is asked for, and then again
-            order = self._order(server, known.shards if known else 1)
+            order = self._order(known.shards if known else 1)
+            order = self._sandbox.prepare(order, server, client, deadline)
             jail = open_jail(client, order, self.repository.wire_limits, deadline)
         except BaseException:
             client.close()
@@ -127,10 +114,11 @@ class Launcher:
             jail.warnings = self.repository.warnings
             WORKER.debug("%s: jail %x opened", self.repository.label, jail.number)
             if wanted.sinks:
-                follower = OutputFollower(lambda: self._connected(server), jail.number, wanted)
+                connect = partial(self._connected, server)
+                follower = OutputFollower(connect, jail.number, wanted)
                 jail.before_end = follower.stop
-            around = server.layers if isinstance(server, EnclosedServer) else ()
-            jail.report = self.repository.latest_report = [*map(dict, around), *jail.report]
+            layers = [*map(dict, server.layers), *jail.report]
+            jail.report = self.repository.latest_report = layers
             self.repository.latest_profile = str(order.confinement["profile"])
             if known is None:
                 return self._load(jail, use, deadline)
@@ -145,19 +133,27 @@ class Launcher:
             raise
 
     def _client(self, server: WorkerServer) -> WorkerClient:
-        far = server.far if isinstance(server, FarServer) else None
-        return WorkerClient(server.endpoint, server.process_fd, self.repository.wire_limits, far)
+        limits = self.repository.wire_limits
+        return WorkerClient(server.endpoint, server.process_fd, limits, server.far)
 
-    def _order(self, server: WorkerServer, runners: int) -> m.OpenJail:
-        confinement = self.repository.policy.confinement()
-        snapshot, runtime = str(self.repository.snapshot.root), self.repository.runtime
-        if isinstance(server, EnclosedServer):
-            snapshot, runtime = server.snapshot, Runtime(server.python, server.packages)
-            confinement = replace(confinement, profile=server.profile)
-        label, entry = self.repository.label, self.repository.snapshot.path
-        return m.OpenJail(label, *runtime, snapshot, entry, asdict(confinement), runners)
+    def _connected(self, server: WorkerServer, deadline: Deadline | None = None) -> WorkerClient:
+        client = self._client(server)
+        try:
+            client.hello(deadline or Deadline(_CLOSE_S))
+        except BaseException:
+            client.close()
+            raise
+        return client
 
-    def _load(self, jail: JailHandle, use: ServerUse, deadline: Deadline) -> LoadedJail:
+    def _order(self, runners: int) -> m.OpenJail:
+        repository, snapshot = self.repository, self.repository.snapshot
+        confinement = asdict(repository.policy.confinement())
+        files = str(snapshot.root), snapshot.path
+        return m.OpenJail(repository.label, *repository.runtime, *files, confinement, runners)
+
+    def _load(
+        self, jail: JailHandle, use: ServerUse[WorkerServer], deadline: Deadline
+    ) -> LoadedJail:
         runner = jail.runners[0]
         [reply] = jail.exchange(
             "make_env", [(runner, self.repository.arguments.message())], deadline
@@ -181,15 +177,6 @@ class Launcher:
         if path is not None and number > 1:
             path = path.with_name(f"{path.stem}-{number}{path.suffix}")
         return Wanted(self.repository.label, path)
-
-    def _connected(self, server: WorkerServer) -> WorkerClient:
-        client = self._client(server)
-        try:
-            client.hello(Deadline(_CLOSE_S))
-        except BaseException:
-            client.close()
-            raise
-        return client
 
     def spread(
         self, loaded: LoadedJail, shards: int, deadline: Deadline, task: EnvManifest
@@ -218,11 +205,9 @@ class Launcher:
     def connect(self, loaded: LoadedJail, deadline: Deadline) -> LoadedJail:
         """A further connection to an open jail; environments that share one wait apart."""
         use = self._acquire()
-        client = self._client(use.shared)
         try:
-            client.hello(deadline)
+            client = self._connected(use.server, deadline)
         except BaseException:
-            client.close()
             use.release()
             raise
         jail = loaded.jail.through(client)
@@ -236,17 +221,19 @@ class Launcher:
         loaded.closed = True
 
     def close(self, loaded: LoadedJail, *, wait: bool = True) -> None:
-        """End a jail and give its server back. Idempotent; what interrupts it, it goes on after.
+        """End a jail and give its server back.
+
+        Idempotent. If interrupted, the next call finishes the work.
 
         Args:
             loaded: The jail.
-            wait: Until nothing of it is left; else whoever closes another environment of the
-                repository does, if there is one: no later than the last.
+            wait: Until nothing of it is left; else the close of another environment of the
+                repository waits, if there is one: no later than the last.
         """
-        if loaded.closed or loaded.parting:  # a signal handler may come into it, or a thread
+        if loaded.closed or loaded.closing:  # a signal handler may come into it, or a thread
             return
         try:
-            loaded.parting = True
+            loaded.closing = True
             if not loaded.ended:
                 self._end(loaded, wait=wait)
             loaded.use.release()
@@ -255,25 +242,23 @@ class Launcher:
             loaded.use.release()
             raise
         finally:
-            loaded.parting = False
+            loaded.closing = False
 
     def _end(self, loaded: LoadedJail, *, wait: bool) -> None:
         if not loaded.ending and not loaded.jail.client.torn:
             loaded.ending = True
             WORKER.debug("%s: jail %x closes", self.repository.label, loaded.jail.number)
-            parting = loaded.jail.ask_to_close()
-            if wait or not self._hold.goes_on(loaded.server):
-                parting(Deadline(_CLOSE_S))
-            else:
-                self._hold.partings.add(lambda: parting(Deadline(_CLOSE_S)))
-        else:  # interruption.md, rule 7: over another connection, since what was said is not known
+            wait_for_end = partial(loaded.jail.ask_to_close(), Deadline(_CLOSE_S))
+            if wait or not self._hold.close_later(loaded.server, wait_for_end):
+                wait_for_end()
+        else:  # interruption.md, rule 7: what was sent is not known: over another connection
             self.interrupt(loaded)
             loaded.jail.drop()
         loaded.ended = True
 
     def settle(self) -> bool:
         """Wait for the jails that are on their way out; whether there was one."""
-        return self._hold.partings.settle()
+        return self._hold.settle()
 
     def states(self, loaded: LoadedJail) -> tuple[str, ...]:
         """What a jail's runners are doing, one word each."""
@@ -290,10 +275,10 @@ class Launcher:
         return self._status(loaded.server, loaded.jail.number, Deadline(_STATUS_S))
 
     def denials(self, server: WorkerServer, jail: int) -> tuple[str, ...] | None:
-        """What a jail was denied; None where nobody records it, or nobody knows it any more."""
+        """What a jail was denied; None where it is not recorded, or not known any more."""
         if not self.repository.policy.record_denials:
             return None
-        return denied.read(self._status(server, jail, Deadline(_DENIED_S)).get("denied"))
+        return denials.read_denials(self._status(server, jail, Deadline(_DENIED_S)).get("denied"))
 
     def note_denied(self, error: BaseException, server: WorkerServer, jail: int) -> None:
         """Put what a jail was denied into the error that it ends with, before it is closed."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from envhub_sandbox.sandboxes.base import ServerUse, WorkerServer
+from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
 from envhub_sandbox.transport.forks import Owner
 from envhub_sandbox.transport.jail import JailHandle
 from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest
 
 
 @dataclass(frozen=True)
-class Known:
+class ExpectedManifest:
     """What a repository's ``make_env`` has returned before.
 
     Attributes:
@@ -30,8 +30,8 @@ class Known:
 class LoadedJail:
     """An open jail whose first runner has called ``make_env``.
 
-    It has to be given back. Where a Ctrl-C comes between its taking and its noting, so that nobody
-    has it who could, its own end does.
+    It has to be given back. Where a Ctrl-C comes between its taking and its noting, its
+    finalizer does.
 
     Attributes:
         jail: The jail.
@@ -40,7 +40,7 @@ class LoadedJail:
         use: That of the server that it is in.
         give_back: Gives it back: see ``Launcher.close`` and ``disconnect``.
         ending: Whether its end was begun.
-        parting: Whether somebody is at it.
+        closing: Whether a call of ``Launcher.close`` is at it.
         ended: Whether it was asked for, so that only the server's use is left.
         closed: Whether all was given back.
         changed: Whether it returned something else in one of them than the manifest says.
@@ -50,10 +50,10 @@ class LoadedJail:
     manifest: Manifest
     value: dict[str, object]
     loaded: set[int]
-    use: ServerUse
+    use: ServerUse[WorkerServer]
     give_back: Callable[[LoadedJail], None]
     ending: bool = False
-    parting: bool = False
+    closing: bool = False
     ended: bool = False
     closed: bool = False
     changed: bool = False
@@ -62,7 +62,7 @@ class LoadedJail:
     @property
     def server(self) -> WorkerServer:
         """Where it is."""
-        return self.use.shared
+        return self.use.server
 
     def __del__(self) -> None:
         # at the end of the process, which closes nothing one by one, no server is in use any more

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from typing import Any
 
-from envhub_sandbox.sandboxes.base import ServerUse, WorkerServer
-from envhub_sandbox.session.jails.partings import Partings
+from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
 from envhub_sandbox.transport.forks import Owner
 
 
@@ -14,33 +14,34 @@ class ServerHold:
     """Keeps a server from the first jail on until the last environment is closed. Thread-safe.
 
     An evaluation closes each task before it opens the next, and may think in between for longer
-    than a server lingers.
+    than an idle server is kept. Nor does it wait for each jail's end: that takes some 20 ms, for
+    the kernel has to take memory and mounts away. So closing one environment of several only asks
+    for the end, and who closes the next one waits for it, or who closes the last.
 
     Args:
         acquire: Asks for a use of the server.
         on_enter: Called when there is one environment more.
         on_empty: Called when the last one is closed; where that is interrupted, again.
-
-    Attributes:
-        partings: The ends of jails in it that have not been waited for.
     """
 
     def __init__(
         self,
-        acquire: Callable[[], ServerUse],
+        acquire: Callable[[], ServerUse[Any]],
         on_enter: Callable[[], None],
         on_empty: Callable[[], None],
     ) -> None:
         self._acquire = acquire
         self._on_enter = on_enter
         self._on_empty = on_empty
-        self.partings = Partings()
         # interruption.md, rule 12
         self._lock = threading.RLock()
         self._owner = Owner()
         self._open: set[object] = set()
-        self._use: ServerUse | None = None
-        self._left: list[ServerUse] = []
+        self._use: ServerUse[Any] | None = None
+        self._left: list[ServerUse[Any]] = []
+        # without the lock, since waits may be added while one is waited for: a list is enough, as
+        # what one caller has taken from it no other waits for
+        self._pending_closes: list[Callable[[], None]] = []
 
     def enter(self) -> Callable[[], None]:
         """There is one environment more; returns what says that it is closed. Idempotent."""
@@ -56,24 +57,43 @@ class ServerHold:
             if not self._open or self._is_kept(used):
                 return
             use = self._acquire()
-            if self._use is not None:  # it has died
+            if self._use is not None:  # its server has died
                 self._left.append(self._use)
             self._use = use
         self._let_go()
 
-    def goes_on(self, server: WorkerServer) -> bool:
-        """Whether this one is kept for more than the one who asks."""
+    def close_later(self, server: WorkerServer, wait: Callable[[], None]) -> bool:
+        """Have the next close wait for the end of a jail; False if no other is to come.
+
+        Waits for the ends before this one, most of which have come.
+        """
         with self._lock:
-            return self._is_kept(server) and len(self._open) > 1
+            if not self._is_kept(server) or len(self._open) <= 1:
+                return False
+        self.settle()
+        self._pending_closes.append(wait)
+        return True
+
+    def settle(self) -> bool:
+        """Wait for the jails that are on their way out; whether there was one."""
+        found = False
+        while self._pending_closes:
+            try:
+                wait = self._pending_closes.pop()
+            except IndexError:  # another thread was faster
+                break
+            found = True
+            wait()
+        return found
 
     def _is_kept(self, server: WorkerServer) -> bool:
         use = self._use
-        return use is not None and use.live and use.shared is server
+        return use is not None and use.live and use.server is server
 
     def _leave(self, ticket: object) -> None:
-        """What interrupts it, whoever leaves next goes on after, and may be the same."""
+        """If interrupted, the next one who leaves finishes the work; it may be the same."""
         if not self._owner.is_here:
-            return  # a fork: the server is the parent's, and somebody may have held the lock
+            return  # a fork: the server is the parent's, and another thread may have held the lock
         with self._lock:
             self._open.discard(ticket)
             if not self._open and self._use is not None:
@@ -81,7 +101,7 @@ class ServerHold:
                 self._use = None
         try:
             if self._left:
-                self.partings.settle()
+                self.settle()
         finally:
             self._let_go()
         with self._lock:

@@ -9,67 +9,60 @@ from __future__ import annotations
 import threading
 import weakref
 from collections.abc import Callable
-from typing import Protocol
 
 from envhub_sandbox.session.jails.launcher import Launcher
-from envhub_sandbox.session.jails.loaded import Known, LoadedJail
+from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.forks import Owner
 
 
-class JailSource(Protocol):
-    """Gives jails and takes them back.
+class JailSource:
+    """Gives each environment a jail of its own, and takes it back.
 
-    Attributes:
+    Args:
         launcher: Opens them.
         forget_manifest: Drops the remembered manifest, when a jail contradicts it.
+        expected: What such a jail is going to be.
+
+    Attributes:
+        shared: Whether several environments live in one jail.
     """
 
-    launcher: Launcher
-    forget_manifest: Callable[[], None]
-
-    def take(self, deadline: Deadline) -> LoadedJail:
-        """A jail for one environment."""
-
-    def end(self, loaded: LoadedJail) -> None:
-        """End the jail now, over another connection: somebody may be waiting on its own."""
-
-    def give_back(self, loaded: LoadedJail, *, wait: bool = True) -> None:
-        """Drop the connection; the last user's jail ends, which one need not wait for."""
-
-
-class OwnJails:
-    """A jail for each environment, of which ``known`` says what it is going to be."""
+    shared = False
 
     def __init__(
-        self, launcher: Launcher, forget_manifest: Callable[[], None], known: Known
+        self,
+        launcher: Launcher,
+        forget_manifest: Callable[[], None],
+        expected: ExpectedManifest | None = None,
     ) -> None:
         self.launcher = launcher
         self.forget_manifest = forget_manifest
-        self._known = known
+        self._expected = expected
 
     def take(self, deadline: Deadline) -> LoadedJail:
-        """A fresh jail."""
-        return self.launcher.open(deadline, self._known)
+        """A jail for one environment."""
+        return self.launcher.open(deadline, self._expected)
 
     def end(self, loaded: LoadedJail) -> None:
-        """End it."""
+        """End the jail now, over another connection: a thread may wait on its own."""
         self.launcher.interrupt(loaded)
 
     def give_back(self, loaded: LoadedJail, *, wait: bool = True) -> None:
-        """End it and drop the connection."""
+        """Drop the connection; the last user's jail ends, which one need not wait for."""
         self.launcher.close(loaded, wait=wait)
 
 
-class SharedJail:
+class SharedJail(JailSource):
     """One jail for all environments of a repository, each with a connection of its own.
 
     A death or a time-out of one environment takes the others' process along: they share it.
     """
 
+    shared = True
+
     def __init__(self, launcher: Launcher, forget_manifest: Callable[[], None]) -> None:
-        self.launcher = launcher
-        self.forget_manifest = forget_manifest
+        super().__init__(launcher, forget_manifest)
         self._lock = threading.RLock()  # interruption.md, rule 12
         self._owner = Owner()
         self._first: LoadedJail | None = None
@@ -78,7 +71,7 @@ class SharedJail:
     def provide(self, loaded: LoadedJail) -> None:
         """Start with a jail that is loaded already."""
         self._first = loaded
-        # nobody may ever take it, nor close
+        # it may never be taken, nor closed
         weakref.finalize(self, self.launcher.close, loaded).atexit = False
 
     def take(self, deadline: Deadline) -> LoadedJail:
@@ -91,7 +84,7 @@ class SharedJail:
             return connected
 
     def end(self, loaded: LoadedJail) -> None:
-        """End the jail, for everybody."""
+        """End the jail, for all environments."""
         self.launcher.interrupt(loaded)
         with self._lock:
             if self._first is not None and self._first.jail.number == loaded.jail.number:
@@ -100,7 +93,7 @@ class SharedJail:
     def give_back(self, loaded: LoadedJail, *, wait: bool = True) -> None:
         """Drop a connection; with the last one the jail ends."""
         self.launcher.disconnect(loaded)
-        loaded.jail.watched.forget()  # a reply may be lost that says what the others would be told
+        loaded.jail.watched.forget()  # a lost reply may have named changed attributes
         with self._lock:
             self._users.discard(loaded)
             if not self._users:

@@ -49,7 +49,7 @@ def test_the_thread_outlives_every_fault(moment: str, monkeypatch: pytest.Monkey
                 raise zmq.ZMQError(errno.ENOTSOCK)
 
     monkeypatch.setattr(remote, "WorkerClient", Connection)
-    host = remote.Host("tcp://host:1", Far(None, None))
+    server = remote.RemoteServer("tcp://host:1", Far(None, None))
     assert heard.wait(60)
     assert left == []
-    host.stop()
+    server.stop()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -15,12 +14,10 @@ import pytest
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.policy import Limits, Policy
-from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.docker import attestation, engines, run_arguments, seccomp_profile
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.docker.sandbox import ContainerServer, DockerSandbox
-from envhub_sandbox.sandboxes.runtime_folder import RuntimeFolder
 from envhub_worker.lockdown.seccomp import policy as seccomp_policy
 from envhub_worker.protocol.messages.surroundings import Surroundings
 from envhub_worker.protocol.runtime import Runtime
@@ -426,12 +423,11 @@ def test_impossible_limits_are_refused(options: dict[str, Any]) -> None:
 
 def test_a_container_whose_monitor_was_killed_leaves_no_folder() -> None:
     """The monitor cannot remove it then; whoever gives the container up does."""
-    folder = RuntimeFolder(runtime_folder.CONTAINER)
-    (folder.path / "sockets").mkdir()
-    monitor = subprocess.Popen([sys.executable, "-S", "-c", "input()"], stdin=subprocess.PIPE)
-    server = ContainerServer(folder, monitor, os.pidfd_open(monitor.pid), [], "strict", "")
-    monitor.kill()
-    monitor.communicate()
+    server = ContainerServer()
+    words = [sys.executable, "-S", "-c", "input()"]
+    with server.starting(lambda ready: subprocess.Popen(words, stdin=subprocess.PIPE)):
+        server.process.kill()
+        server.process.communicate()
     assert not server.runs
     server.stop()
-    assert not folder.path.exists()
+    assert not server.folder.exists()

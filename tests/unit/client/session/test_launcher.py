@@ -16,6 +16,8 @@ from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_worker.protocol import messages as m
 from tests.support.fake_lane import FakeLane, session_over
 
+_SERVER: Any = SimpleNamespace(endpoint="", process_fd=0, far=None)
+
 
 class _Client:
     """Every connection to the server, as one."""
@@ -53,8 +55,7 @@ class _Place(Sandbox):
         """A use of it."""
         if self.fails:
             raise WorkerStartupError("it did not come up")
-        server = SimpleNamespace(endpoint="", process_fd=0)
-        return SimpleNamespace(shared=server, live=False, release=self.release)
+        return SimpleNamespace(server=_SERVER, live=False, release=self.release)
 
     def release(self) -> None:
         """One use less."""
@@ -157,7 +158,7 @@ def test_denials_are_asked_for_where_the_server_can_know(
     client.status = ({"jail": 7, "denied": ("ptrace",)},)
     error = WorkerDiedError("it died", reason=reason)
     for _ in range(2):
-        launcher.note_denied(error, cast("Any", SimpleNamespace(endpoint="", process_fd=0)), 7)
+        launcher.note_denied(error, _SERVER, 7)
     launcher.note_denied(KeyboardInterrupt(), cast("Any", None), 7)
     assert len(client.asked) == asked
     assert error.denied == (("ptrace",) if asked else None)

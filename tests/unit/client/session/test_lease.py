@@ -18,6 +18,8 @@ from tests.support.fake_lane import FakeLane, session_over
 class _Jails:
     """Where jails come from, and what was done with them, in order."""
 
+    shared = False
+
     def __init__(self, launcher: Any) -> None:
         self.done: list[str] = []
         self.fails: dict[str, list[BaseException]] = {}

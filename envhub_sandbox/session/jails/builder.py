@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 from envhub_sandbox.errors import LoadError
 from envhub_sandbox.session.jails.loaded import LoadedJail
-from envhub_sandbox.session.jails.sources import JailSource, SharedJail
+from envhub_sandbox.session.jails.sources import JailSource
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.lane import Lane, RelayLane
 from envhub_sandbox.transport.replies import typed
@@ -37,9 +37,8 @@ class Builder:
         self._manifest = results.manifest
         self._bounds = results.bounds
         # runners of a jail that several environments share die with it, for all of them
-        own = not isinstance(jails, SharedJail)
-        self._own = own
-        self._keeps = own and jails.launcher.repository.policy.restart == "transparent"
+        self._own = not jails.shared
+        self._keeps = self._own and jails.launcher.repository.policy.restart == "transparent"
         self._number = next(_numbers)  # in every jail: what was packed for one, another understands
 
     def build(self, loaded: LoadedJail, deadline: Deadline) -> Lane:

@@ -18,12 +18,12 @@ _AGAIN_S = 1.0
 T = TypeVar("T")
 
 
-def wait_in_line(
+def retry_while_busy(
     ask: Callable[[], T],
     retry_s: float,
     deadline: Deadline,
     label: str,
-    told: EnvHubError | None = None,
+    refusal: EnvHubError | None = None,
 ) -> T:
     """Ask, and ask again while the answer is that there is no room.
 
@@ -33,22 +33,22 @@ def wait_in_line(
     Args:
         ask: Asks once.
         retry_s: For how long.
-        deadline: For all else; whoever gives it up is waited for no more.
+        deadline: For all else; once it is given up, the waiting ends.
         label: For whom, in the log.
-        told: What the answer was before.
+        refusal: The answer to an earlier try.
 
     Raises:
         ServerBusyError: There was no room in all that time.
     """
     until, pause_s = monotonic() + retry_s, _SOON_S
-    ends = told is not None and (of_a_server_that_ends(told) or of_a_lost_server(told))
+    ends = refusal is not None and (is_draining(refusal) or is_unanswered(refusal))
     while True:
         try:
             return ask()
         except (ServerBusyError, WorkerDiedError, UnreachableError) as error:
             left_s = until - monotonic()
-            ends = ends or of_a_server_that_ends(error)
-            worth_it = isinstance(error, ServerBusyError) or (ends and of_a_lost_server(error))
+            ends = ends or is_draining(error)
+            worth_it = isinstance(error, ServerBusyError) or (ends and is_unanswered(error))
             if left_s <= 0 or deadline.unasked or not worth_it:
                 raise
             if pause_s == _SOON_S:
@@ -57,12 +57,12 @@ def wait_in_line(
             pause_s = max(getattr(error, "retry_s", _AGAIN_S), _SLICE_S * 2)
 
 
-def of_a_server_that_ends(error: EnvHubError) -> bool:
+def is_draining(error: EnvHubError) -> bool:
     """Whether another in its place is worth waiting for."""
     return isinstance(error, ServerBusyError) and error.quota == DRAINING
 
 
-def of_a_lost_server(error: EnvHubError) -> bool:
+def is_unanswered(error: EnvHubError) -> bool:
     """Whether there was no answer, so that it may have been between two servers."""
     if isinstance(error, WorkerDiedError):
         return error.reason == "connection"

@@ -1,0 +1,303 @@
+"""The worker servers of this process: started for the first user, given up by the last.
+
+An unused server is ended, or kept for a while if its last user asked for that: a caller
+who closes one environment often opens another.
+
+Interrupts, finalizers, threads and forks come between any two statements (interruption.md):
+
+- Who uses a server is read off the uses that live. There is no count that a Ctrl-C could falsify
+  (rule 8). A use that was taken and noted nowhere is given back by its own finalizer (rule 5).
+- A use that is given back is not ``live`` first, and ``done`` last. Each step between the two may
+  be repeated without harm, so ``release`` can be called until it comes through (rule 7).
+- The lock is reentrant: the garbage collector may close an environment in the middle of
+  ``acquire``, and a signal handler in the middle of anything (rule 12).
+- A server is ended outside of the lock, so that a caller who wants a fresh one does not wait.
+- A fork sees its parent's servers under another pid, and leaves them alone.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import os
+import threading
+import weakref
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from time import monotonic
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+if TYPE_CHECKING:
+    from envhub_sandbox.transport.tcp import Far
+
+_LONGEST_WAIT_S = 3600.0
+
+
+class WorkerServer(ABC):
+    """A running worker server.
+
+    Attributes:
+        endpoint: Its ZeroMQ endpoint.
+        process_fd: A descriptor that becomes readable when it ends.
+        fd_path: The socket that takes descriptors, or None where memory cannot be shared.
+        layers: What confines the server itself, with all of its jails, one mapping a layer:
+            ``layer``, ``enforced``, ``detail``.
+        far: Its key and ours, where it is on another host and sees no file of this one.
+    """
+
+    endpoint: str
+    process_fd: int
+    fd_path: str | None = None
+    layers: Sequence[Mapping[str, Any]] = ()
+    far: Far | None = None
+
+    @property
+    @abstractmethod
+    def runs(self) -> bool:
+        """Whether it has not ended, and can be reached."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """End it and everything below it, in bounded time. A fork of its owner does nothing.
+
+        Idempotent. If interrupted, the next call finishes the work.
+        """
+
+
+S = TypeVar("S", bound=WorkerServer)
+S_co = TypeVar("S_co", bound=WorkerServer, covariant=True)
+
+
+class _Entry(Generic[S_co]):
+    """A server, who uses it, and until when it is kept after them; None for as long as we live."""
+
+    def __init__(self, key: Hashable, server: S_co) -> None:
+        self.pid = os.getpid()
+        self.key = key
+        self.group: Hashable = None
+        self.server = server
+        self.until: float | None = None
+        self._uses: list[weakref.ref[ServerUse[Any]]] = []
+
+    def uses(self) -> list[ServerUse[Any]]:
+        """Those that have not been given back."""
+        found = (ref() for ref in self._uses)
+        return [use for use in found if use is not None and use.live]
+
+    def add(self, use: ServerUse[Any]) -> None:
+        """There is one more; those that have ended are forgotten."""
+        self._uses = [*map(weakref.ref, self.uses()), weakref.ref(use)]
+
+
+class ServerUse(Generic[S_co]):
+    """One use of a server, which ends once: given back, or when nothing refers to it any more.
+
+    Attributes:
+        server: The server.
+        live: Whether it has not been given back.
+    """
+
+    _done = True  # until there is something to give back
+
+    def __init__(self, pool: ServerPool[Any], entry: _Entry[S_co], idle_s: float | None) -> None:
+        self._pool, self._entry, self._idle_s = pool, entry, idle_s
+        self.server = entry.server
+        self.live = True
+        self._done = False
+        entry.add(self)  # from here on the server may not be ended
+
+    def users(self) -> int:
+        """How many uses of the server there are."""
+        return len(self._entry.uses())
+
+    def release(self) -> None:
+        """Give it back; the last one who does gives the server up. Idempotent.
+
+        If interrupted, the next call finishes the work. A fork does nothing: a thread that does
+        not exist there may have held the lock.
+        """
+        if not self._done and self._entry.pid == os.getpid():
+            self._done = self._pool.give_back(self, self._entry, self._idle_s)
+
+    def __del__(self) -> None:
+        self.release()
+
+
+class ServerPool(Generic[S]):
+    """The servers of one kind. Thread-safe; a fork starts its own.
+
+    One unused server is kept at most: with a further one, the time of the one before has come. A
+    daemon thread ends them, and exists only while there is something to wait for; at the end of
+    the process all are ended at once.
+    """
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition(threading.RLock())
+        self._used: dict[tuple[int, Hashable, Hashable], _Entry[S]] = {}
+        self._idle: list[_Entry[S]] = []
+        self._thread: threading.Thread | None = None
+        self._ends = False
+        _pools.add(self)
+
+    def acquire(
+        self,
+        key: Hashable,
+        start: Callable[[], S],
+        idle_s: float | None = 0.0,
+        group: Hashable = None,
+    ) -> ServerUse[S]:
+        """A use of the server with this key, in use or idle; started if none runs.
+
+        Args:
+            key: Which.
+            start: Starts it.
+            idle_s: For how long it is kept if this use is the last; 0 ends it, None keeps it until
+                the end of this process.
+            group: Who shares it. One of another group gets it only while it is unused.
+        """
+        place = os.getpid(), key, group
+        with self._changed:
+            entry = self._used.get(place)
+            if entry is not None:
+                use = ServerUse(self, entry, idle_s)
+                # the garbage collector may just have closed the one environment that used it
+                if self._used.get(place) is entry and entry.server.runs:
+                    return use
+                use.release()
+            entry = self._take(key) or _Entry(key, start())
+            entry.group = group
+            use = ServerUse(self, entry, idle_s)
+            self._used[place] = entry
+            return use
+
+    def give_back(self, use: ServerUse[S], entry: _Entry[S], idle_s: float | None) -> bool:
+        """For ``ServerUse`` alone: end it, or go on where that was interrupted; True at the end."""
+        with self._changed:
+            use.live = False
+            if entry.uses():
+                return True  # the last of them gives the server up
+            place = entry.pid, entry.key, entry.group
+            if self._used.get(place) is entry:
+                del self._used[place]
+            if idle_s != 0 and not self._ends and entry.server.runs:
+                self._keep(entry, None if idle_s is None else monotonic() + idle_s)
+                return True
+        entry.server.stop()
+        return True
+
+    # --- the idle ones; the lock is held -------------------------------------------------------
+
+    def _keep(self, entry: _Entry[S], until: float | None) -> None:
+        for other in self._mine():
+            other.until = 0.0
+        entry.until = until
+        if entry not in self._idle:  # else an interrupted release has put it there
+            self._idle.append(entry)
+        self._watch()
+
+    def _take(self, key: Hashable) -> _Entry[S] | None:
+        """The idle one with this key, for the caller; one that has died is ended soon."""
+        for entry in self._mine():
+            if entry.key == key:
+                if entry.server.runs:
+                    self._idle.remove(entry)
+                    self._changed.notify_all()
+                    return entry
+                entry.until = 0.0
+                self._watch()
+        return None
+
+    def _mine(self) -> list[_Entry[S]]:
+        return [entry for entry in self._idle if entry.pid == os.getpid()]
+
+    def _earliest(self) -> tuple[float, _Entry[S]] | None:
+        timed = [(entry.until, entry) for entry in self._mine() if entry.until is not None]
+        return min(timed, key=lambda one: one[0], default=None)
+
+    def _watch(self) -> None:
+        self._changed.notify_all()
+        if self._thread is None and self._earliest() is not None:
+            thread = threading.Thread(target=self._run, name="envhub-idle", daemon=True)
+            thread.start()
+            self._thread = thread  # only now: one that never started can be neither had nor joined
+
+    # --- their ends ----------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while (server := self._due()) is not None:
+            try:
+                server.stop()
+            except BaseException:
+                with self._changed:
+                    self._thread = None  # the next one gets a thread of its own
+                raise
+
+    def _due(self) -> S | None:
+        """The next whose time has come; None, and the end of the thread, once there is none."""
+        with self._changed:
+            while (earliest := self._earliest()) is not None:
+                until, entry = earliest
+                left = until - monotonic()
+                if left <= 0:
+                    self._idle.remove(entry)
+                    return entry.server
+                self._changed.wait(min(left, _LONGEST_WAIT_S))
+            self._thread = None
+            return None
+
+    def stop_idle(self) -> None:
+        """End the idle ones now, and wait for those that are ending."""
+        self._stop(self._mine)
+
+    def stop_all(self) -> None:
+        """End all that this process has started, and keep none from now on: at its exit."""
+        self._ends = True
+        self._stop(lambda: [*self._mine(), *self._used_here()])
+
+    def _used_here(self) -> list[_Entry[S]]:
+        return [entry for entry in self._used.values() if entry.pid == os.getpid()]
+
+    def _stop(self, which: Callable[[], list[_Entry[S]]]) -> None:
+        with self._changed:
+            entries, thread = which(), self._thread
+            for entry in entries:
+                for use in entry.uses():
+                    use.live, use._done = False, True
+            self._idle = [entry for entry in self._idle if entry not in entries]
+            self._used = {p: entry for p, entry in self._used.items() if entry not in entries}
+            self._changed.notify_all()
+        with contextlib.ExitStack() as stack:  # whatever interrupts one end, the others follow
+            if thread is not None and thread is not threading.current_thread():
+                stack.callback(thread.join)
+            for entry in entries:
+                stack.callback(entry.server.stop)
+
+    def forked(self) -> None:
+        """In a fork: the thread that held the lock does not exist, nor does the one that waits."""
+        self._changed = threading.Condition(threading.RLock())
+        self._thread = None
+
+
+_pools: weakref.WeakSet[ServerPool[Any]] = weakref.WeakSet()
+
+
+def stop_idle() -> None:
+    """End the unused servers of this process, of every kind."""
+    with contextlib.ExitStack() as stack:
+        for pool in list(_pools):
+            stack.callback(pool.stop_idle)
+
+
+def _stop_all() -> None:
+    with contextlib.ExitStack() as stack:
+        for pool in list(_pools):
+            stack.callback(pool.stop_all)
+
+
+def _forked() -> None:
+    for pool in list(_pools):
+        pool.forked()
+
+
+atexit.register(_stop_all)
+os.register_at_fork(after_in_child=_forked)

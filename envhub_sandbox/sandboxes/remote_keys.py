@@ -1,0 +1,120 @@
+"""Addresses of servers on other hosts, and the keys by which each side knows the other."""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import os
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
+from envhub_sandbox.hub.logins import without_login
+from envhub_sandbox.option_names import option_name
+from envhub_worker.protocol.keys import parse_key
+
+SERVER_KEY_VARIABLE = "ENVHUB_SERVER_KEY"
+CLIENT_KEY_VARIABLE = "ENVHUB_CLIENT_KEY"
+CONFIG_VARIABLE = "ENVHUB_CONFIG"
+
+
+def address_of(endpoint: str) -> str:
+    """``host:port`` of an endpoint.
+
+    Raises:
+        PolicyError: It is none.
+    """
+    parts = urlsplit(endpoint)
+    if "@" in parts.netloc:
+        raise PolicyError(
+            "sandbox: a remote server knows its clients by their keys; leave the login before the "
+            f"@ out: {without_login(endpoint)!r}"
+        )
+    try:
+        port = parts.port
+    except ValueError:
+        port = None
+    if parts.scheme != "tcp" or not parts.hostname or port is None or parts.path:
+        raise PolicyError(f"sandbox is {endpoint!r}; a remote server is tcp://HOST:PORT")
+    return f"{parts.hostname}:{port}"
+
+
+def is_loopback(endpoint: str) -> bool:
+    """Whether an endpoint names a loopback address."""
+    host = urlsplit(endpoint).hostname or ""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def config_folder() -> Path:
+    """``$ENVHUB_CONFIG``, or the user's configuration folder for ``envhub-sandbox``."""
+    chosen = os.environ.get(CONFIG_VARIABLE)
+    if chosen:
+        return Path(chosen).expanduser().absolute()
+    import platformdirs
+
+    return Path(platformdirs.user_config_dir("envhub-sandbox", appauthor=False))
+
+
+def server_key(endpoint: str, given: str | None) -> bytes:
+    """A server's public key: given, in the environment, or in ``known_hosts``.
+
+    Raises:
+        SandboxUnavailableError: There is none.
+        PolicyError: It is no key.
+    """
+    text = given or os.environ.get(SERVER_KEY_VARIABLE) or _known(address_of(endpoint))
+    if not text:
+        raise SandboxUnavailableError(
+            f"the public key of {endpoint} is not known, and without it anybody could pretend to "
+            "be that server. It prints its key when it starts; pass it with "
+            f"{option_name('server_key')}, set {SERVER_KEY_VARIABLE}, or write "
+            f"'{address_of(endpoint)} KEY' into {config_folder() / 'known_hosts'}"
+        )
+    return _parsed(text, "server_key")
+
+
+def _known(address: str) -> str | None:
+    with contextlib.suppress(OSError):
+        for line in (config_folder() / "known_hosts").read_text().splitlines():
+            words = line.split()
+            if len(words) == 2 and words[0] == address:
+                return words[1]
+    return None
+
+
+def is_key_file(key: str | os.PathLike[str] | None) -> bool:
+    """Whether it names a key's file, and is not the key."""
+    if not isinstance(key, str):
+        return key is not None
+    try:
+        parse_key(key)
+    except ValueError:
+        return os.sep in key  # anything else may be a key that was mistyped
+    return False
+
+
+def client_key(given: str | os.PathLike[str] | None) -> bytes:
+    """Our secret key: given, in the environment, or in its file; raises as ``server_key``."""
+    default = config_folder() / "client.key"
+    text = given or os.environ.get(CLIENT_KEY_VARIABLE) or (default if default.exists() else None)
+    if text is None:
+        raise SandboxUnavailableError(
+            f"a remote server lets only known clients in, and we have no key: run 'envhub-worker "
+            f"keygen --out {default.parent}' and give the public key to the server's "
+            f"--authorized-clients, or set {CLIENT_KEY_VARIABLE} to the key that the server printed"
+        )
+    path = Path(text)
+    with contextlib.suppress(OSError):
+        if isinstance(text, os.PathLike) or os.sep in text or path.is_file():
+            return _parsed(path.expanduser().read_text(), "client_key")
+    return _parsed(os.fspath(text), "client_key")
+
+
+def _parsed(text: str, what: str) -> bytes:
+    try:
+        return parse_key(text)
+    except ValueError as error:
+        raise PolicyError(f"{what}: {error}") from None

@@ -1,0 +1,359 @@
+"""Servers that environments share: started once, kept for their time, and ended once."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox.policy import Policy, timeouts_from
+from envhub_sandbox.sandboxes import pool as pool_module
+from envhub_sandbox.sandboxes.docker import sandbox as docker
+from envhub_sandbox.sandboxes.docker.engines import Engine
+from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
+from tests.support import inside
+from tests.support.interrupts import before_line
+from tests.support.processes import eventually
+
+Pool = ServerPool["Server"]
+
+
+class Server(WorkerServer):
+    """Remembers who ended it, once; its end can be made to last."""
+
+    runs = True
+
+    def __init__(self) -> None:
+        self.ends: list[str] = []
+        self.ending, self.may_end = threading.Event(), threading.Event()
+        self.may_end.set()
+
+    def stop(self) -> None:
+        """An interrupted end is asked for again."""
+        self.ending.set()
+        assert self.may_end.wait(60)
+        self.runs = False
+        if not self.ends:
+            self.ends.append(threading.current_thread().name)
+
+
+def given_up(pool: Pool, key: str, idle_s: float | None) -> Server:
+    """One that was used once."""
+    use = pool.acquire(key, Server, idle_s)
+    use.release()
+    return use.server
+
+
+def here() -> list[str]:
+    """What a server says that was ended once, by this thread."""
+    return [threading.current_thread().name]
+
+
+def waiting() -> list[threading.Thread]:
+    """The threads that end servers when their time has come."""
+    return [thread for thread in threading.enumerate() if thread.name == "envhub-idle"]
+
+
+@pytest.fixture
+def pool() -> Iterator[Pool]:
+    """At the end of a test nothing is kept, and no thread waits."""
+    made: Pool = ServerPool()
+    yield made
+    made.stop_idle()
+    assert eventually(lambda: not waiting())
+
+
+# --- in use --------------------------------------------------------------------------------------
+
+
+def test_started_for_the_first_and_ended_by_the_last(pool: Pool) -> None:
+    """However many use it in between; the next one gets a fresh one."""
+    one, two = pool.acquire("key", Server), pool.acquire("key", Server)
+    first = one.server
+    assert two.server is first
+    assert two.users() == 2
+    for _ in range(2):
+        one.release()
+    assert not first.ends
+    two.release()
+    assert first.ends == here()
+    assert pool.acquire("key", Server).server is not first
+
+
+def test_each_key_has_its_own(pool: Pool) -> None:
+    """Two keys, two servers."""
+    one, two = pool.acquire(1, Server), pool.acquire(2, Server)
+    assert one.server is not two.server
+
+
+def test_a_dead_one_stays_with_its_users_and_others_get_a_fresh_one(pool: Pool) -> None:
+    """The dead one is ended when its last user gives it back, and the fresh one is not."""
+    dead = pool.acquire("key", Server)
+    dead.server.runs = False
+    fresh = pool.acquire("key", Server)
+    assert fresh.server is not dead.server
+    assert (dead.users(), fresh.users()) == (1, 1)
+    dead.release()
+    assert (dead.server.ends, fresh.server.ends) == (here(), [])
+    assert pool.acquire("key", Server).server is fresh.server
+
+
+def test_what_does_not_start_is_not_remembered(pool: Pool) -> None:
+    """The next one tries again."""
+
+    def fails() -> Server:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        pool.acquire("key", fails)
+    assert pool.acquire("key", Server).users() == 1
+
+
+def test_all_are_ended_at_exit_and_none_is_kept(pool: Pool) -> None:
+    """Those in use and the idle one; and what is started afterwards is a fresh one."""
+    idle = given_up(pool, "idle", 600)
+    uses = [pool.acquire(key, Server, 600) for key in (1, 2)]
+    pool.stop_all()
+    assert [idle.ends, *(use.server.ends for use in uses)] == [here()] * 3
+    uses[0].release()  # its descriptors may be another's by now
+    assert uses[0].server.ends == here()
+    late = pool.acquire(1, Server, 600)
+    assert late.server is not uses[0].server
+    late.release()
+    assert late.server.ends == here()
+
+
+def test_a_fork_starts_its_own(pool: Pool) -> None:
+    """Also if another thread held the lock at that moment."""
+    ours = pool.acquire("key", Server)
+    held, done = threading.Event(), threading.Event()
+
+    def start() -> Server:
+        held.set()
+        done.wait(60)
+        return Server()
+
+    thread = threading.Thread(target=pool.acquire, args=("other", start))
+    thread.start()
+    assert held.wait(60)
+    child = os.fork()
+    if child == 0:  # pragma: no cover
+        os._exit(0 if pool.acquire("key", Server).server is not ours.server else 1)
+    done.set()
+    thread.join()
+    assert os.waitpid(child, 0)[1] == 0
+
+
+def test_a_fork_gives_nothing_back(pool: Pool) -> None:
+    """It waits for no lock, not even for one of its own: as it forgets what its parent used."""
+    ours = [pool.acquire("key", Server)]
+    server = ours[0].server
+    child = os.fork()
+    if child == 0:  # pragma: no cover
+        held = threading.Event()
+
+        def start() -> Server:
+            held.set()
+            threading.Event().wait()
+            raise AssertionError
+
+        threading.Timer(60, os._exit, [1]).start()  # which ends what hangs
+        threading.Thread(target=pool.acquire, args=("other", start)).start()
+        code = 0 if held.wait(50) else 1
+        ours[0].release()
+        ours.clear()
+        os._exit(1 if server.ends else code)
+    assert os.waitpid(child, 0)[1] == 0
+    assert (ours[0].users(), server.ends) == (1, [])
+
+
+def test_a_use_that_is_lost_is_given_back(pool: Pool) -> None:
+    """A Ctrl-C came between the taking and the noting: its own end gives it back, once."""
+    kept, lost = pool.acquire("key", Server), pool.acquire("key", Server)
+    server = kept.server
+    assert kept.users() == 2
+    del lost
+    assert (kept.users(), server.ends) == (1, [])
+    del kept
+    assert server.ends == here()
+
+
+@pytest.mark.parametrize("then", ["given back again", "forgotten", "another opens"])
+def test_an_interrupted_release_is_finished_by_the_next(then: str) -> None:
+    """Wherever it was interrupted; it is ended once, and never under one who uses it."""
+    line, came = 0, True
+    while came:
+        pool: Pool = ServerPool()
+        use: ServerUse[Server] = pool.acquire("key", Server)
+        server = use.server
+        came = before_line(pool_module.__file__, line, use.release)
+        if then == "another opens":
+            again = pool.acquire("key", Server)
+            del use
+            assert not again.server.ends
+            again.release()
+            assert again.server.ends == here()
+        elif then == "forgotten":
+            del use
+        else:
+            use.release()
+        assert server.ends == here()
+        line += 1
+    assert line > 5
+
+
+# --- kept for the next ---------------------------------------------------------------------------
+
+
+def test_the_next_gets_the_idle_one(pool: Pool) -> None:
+    """However often it changes hands, it is not ended."""
+    first = given_up(pool, "key", 600)
+    for _ in range(100):
+        assert given_up(pool, "key", 600) is first
+    assert not first.ends
+
+
+def test_its_time_comes(pool: Pool) -> None:
+    """It is ended once, in the background, and the thread that did it ends, too."""
+    server = given_up(pool, "key", 0.01)
+    assert eventually(lambda: server.ends == ["envhub-idle"])
+    assert eventually(lambda: not waiting())
+    assert given_up(pool, "key", 0) is not server
+
+
+def test_one_is_kept_at_most(pool: Pool) -> None:
+    """With the next its time has come, however long it was."""
+    first, second = given_up(pool, "one", None), given_up(pool, "two", None)
+    assert eventually(lambda: bool(first.ends))
+    assert not second.ends
+
+
+def test_one_that_has_died_in_use_is_not_kept(pool: Pool) -> None:
+    """It is ended by the one who gives it back."""
+    use = pool.acquire("key", Server, None)
+    use.server.runs = False
+    use.release()
+    assert use.server.ends == here()
+
+
+@pytest.mark.parametrize("idle_s", [600, None])
+def test_an_idle_one_that_has_died_is_ended_by_the_next(pool: Pool, idle_s: float | None) -> None:
+    """And not when its time has come: until it is waited for, it is a zombie."""
+    dead = given_up(pool, "key", idle_s)
+    dead.runs = False
+    fresh = pool.acquire("key", Server)
+    assert fresh.server is not dead
+    assert eventually(lambda: len(dead.ends) == 1)
+    assert not fresh.server.ends
+    fresh.release()
+
+
+def test_one_that_ends_delays_no_fresh_one(pool: Pool) -> None:
+    """From the moment on that its time has come it is not handed on, and its end not waited for."""
+    use = pool.acquire("key", Server, 0.01)
+    old = use.server
+    old.may_end.clear()
+    use.release()
+    assert old.ending.wait(60)
+    fresh = pool.acquire("key", Server)
+    assert fresh.server is not old
+    old.may_end.set()
+    assert eventually(lambda: bool(old.ends))
+    assert not fresh.server.ends
+
+
+def test_taken_or_ended_but_never_both(pool: Pool) -> None:
+    """Whoever comes in the moment in which the time comes gets none that was ended."""
+    for attempt in range(300):
+        given_up(pool, "key", (attempt % 10) * 1e-4)
+        taken = pool.acquire("key", Server, 1e-4)
+        assert taken.server.runs
+        assert not taken.server.ends
+        taken.release()
+
+
+def test_many_at_once_share_the_idle_one(pool: Pool) -> None:
+    """Threads that open and close with times around nothing never meet an ended one."""
+    wrong: list[Server] = []
+
+    def use() -> None:
+        for attempt in range(100):
+            taken = pool.acquire("key", Server, (attempt % 3) * 1e-4)
+            if taken.server.ends:
+                wrong.append(taken.server)
+            taken.release()
+
+    threads = [threading.Thread(target=use) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+
+
+def test_the_end_waits_for_what_is_ending(pool: Pool) -> None:
+    """So that nothing is left half ended."""
+    use = pool.acquire("key", Server, 0.01)
+    server = use.server
+    server.may_end.clear()
+    use.release()
+    assert server.ending.wait(60)
+    threading.Timer(0.1, server.may_end.set).start()
+    pool.stop_idle()
+    assert server.ends == ["envhub-idle"]
+
+
+def test_a_fork_has_no_idle_one_and_ends_none(pool: Pool) -> None:
+    """Also if another thread was about to end it at that moment."""
+    ours = given_up(pool, "key", 600)
+    child = os.fork()
+    if child == 0:  # pragma: no cover
+        code = 1
+        try:
+            own = given_up(pool, "key", 0.01)
+            assert own is not ours
+            assert eventually(lambda: bool(own.ends))
+            assert not ours.ends
+            code = 0
+        finally:
+            os._exit(code)
+    assert os.waitpid(child, 0)[1] == 0
+    assert pool.acquire("key", Server).server is ours
+
+
+def test_a_container_changes_hands_only_when_it_is_idle(
+    monkeypatch: pytest.MonkeyPatch, pool: Pool
+) -> None:
+    """Its memory is one ``make_env``'s; another policy, or another repository, has its own."""
+    monkeypatch.setattr(*inside.CONTAINERS, pool)
+    monkeypatch.setattr(*inside.CONTAINER_STARTS, lambda self: Server())
+    engine = Engine("docker", "/usr/bin/docker", "1", rootless=False)
+
+    def sandbox(snapshot: str = "/one", **policy: Any) -> docker.RepositoryContainer:
+        options, made = docker.DockerSandbox(), Policy(**policy)
+        return docker.RepositoryContainer(options, engine, "sha256:0", Path(snapshot), made)
+
+    first, second = sandbox(), sandbox()
+    one, two = first.acquire(Path("/"), idle_s=600), second.acquire(Path("/"))
+    assert one.server is not two.server
+    two.release()
+    one.release()
+    again = sandbox().acquire(Path("/"))
+    assert again.server is one.server
+    other = sandbox().acquire(Path("/"), idle_s=600)
+    other.release()
+    further = sandbox("/two").acquire(Path("/")), sandbox(network="loopback").acquire(Path("/"))
+    assert other.server not in [use.server for use in further]
+    assert sandbox().acquire(Path("/")).server is other.server
+
+
+def test_the_setting_takes_nothing_and_for_ever() -> None:
+    """The only time that may be 0."""
+    assert timeouts_from({"server_idle_s": 0}).server_idle_s == 0
+    assert timeouts_from({"server_idle_s": None}).server_idle_s is None
+    with pytest.raises(ValueError, match="server_idle_s is -1"):
+        timeouts_from({"server_idle_s": -1})
