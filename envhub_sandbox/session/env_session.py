@@ -112,7 +112,6 @@ class EnvSession:
         ready = self.lifecycle.state is State.READY and not self.prewarm.unused
         if ready and self.repository.timeouts.idle_s is None:
             return
-        self.prewarm.note_if_awaited()
         with self.use.hold("reset"):
             # The order matters. What ended unnoticed becomes EXPIRED first. A reply that is still
             # pending here belongs to an interrupted request, since this thread has the lock.

@@ -41,6 +41,7 @@ class Prewarm:
     Attributes:
         unused: Whether it was started ahead, and no reset came yet.
         first_use: Called at the first request; None afterwards.
+        starting: The deadline of a start ahead that is under way, which has the use lock.
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class Prewarm:
         self._history = history
         self._recovery = recovery
         self._timeouts = lease.repository.timeouts
-        self._starting: StartupDeadline | None = None  # of a start ahead that is under way
+        self.starting: StartupDeadline | None = None
 
     @property
     def closed(self) -> bool:
@@ -106,16 +107,16 @@ class Prewarm:
         # whatever fails here fails again in the first request, which raises it
         with contextlib.suppress(Exception), self._use.hold("make_env"):
             if self.lifecycle.state is State.IDLE:
-                self._starting = deadline
+                self.starting = deadline
                 try:
                     self._start(deadline)
                     self.unused = True
                 finally:
-                    self._starting = None
+                    self.starting = None
 
     def cancel(self) -> bool:
         """Give up what was started ahead, unless it was used since; whether there was any."""
-        starting = self._starting
+        starting = self.starting
         if starting is not None:
             starting.give_up()
         lock = self._use.lock
@@ -159,11 +160,6 @@ class Prewarm:
         if self.first_use is not None:
             first_use, self.first_use = self.first_use, None
             first_use()
-
-    def note_if_awaited(self) -> None:
-        """A reset waits for a start ahead: that is its first use, so the next one may start."""
-        if self._starting is not None:
-            self.note_use()
 
 
 class SuitePrewarm:

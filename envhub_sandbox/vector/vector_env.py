@@ -114,6 +114,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         """
         # Not by reset_async and reset_wait: an interrupt between them would leave `waiting` set,
         # and the next request refused, although no reset_wait can follow.
+        self._note_first_use()
         with self._requests.use.lock:
             self._requests.refuse_if_busy("reset_async")
             self._send_reset(seed, options)
@@ -126,10 +127,17 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         options: dict[str, Any] | None = None,
     ) -> None:
         """Send the reset; ``reset_wait`` returns its results."""
+        self._note_first_use()
         with self._requests.use.lock:
             self._requests.refuse_if_busy("reset_async")
             self._send_reset(seed, options)
             self._requests.waiting = "reset"
+
+    def _note_first_use(self) -> None:
+        """Before the lock, which a start ahead has: meanwhile the next one may start."""
+        prewarm = self._session.prewarm
+        if prewarm.starting is not None and not self.closed:
+            prewarm.note_use()
 
     def _send_reset(self, seed: Any, options: dict[str, Any] | None) -> None:
         mask = None
