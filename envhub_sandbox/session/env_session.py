@@ -47,14 +47,8 @@ class EnvSession:
     a signal handler.
 
     Args:
-        jails: Gives and takes back the jail.
-        manifest: What the environment is expected to be.
         bounds: The slices of its sub-environments, one for each shard.
         paces: Takes note of what its steps took.
-
-    Attributes:
-        requests: What it is asked.
-        prewarm: Starts it, also ahead of the first request.
     """
 
     def __init__(

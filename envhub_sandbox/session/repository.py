@@ -64,14 +64,9 @@ class Repository:
     """What the environments of one ``make_env`` have in common. Opens nothing: see ``Launcher``.
 
     Args:
-        snapshot: The verified files.
-        arguments: For the repository's ``make_env``.
-        policy: What a jail may do.
-        timeouts: How long operations may take.
         runtime: The interpreter of the jails, and their packages.
         lane: ``"auto"`` or ``"frames"``.
         copy: Whether observations are copied for the caller, or lent.
-        recipe: How to make it again.
         installed: What was installed for it, for the provenance.
         advice: Says what to do where a module is missing, for the error's text.
 
@@ -191,12 +186,8 @@ class Repository:
     ) -> None:
         """Write a crash bundle and name it in the error. What hinders that is only logged.
 
-        Args:
-            error: The error that the user gets.
-            recording: What was asked of the environment; None before there is one.
-            task: Which environment, as in ``Crash``.
-            loaded: Its jail.
-            shared: Whether other environments lived in it.
+        ``recording``, ``task`` and ``loaded`` are None before there is an environment; ``shared``
+        says whether others lived in its jail.
         """
         ours = self.policy.crash_history and error.bundle is None
         if not ours or getattr(error, "reason", "") in ("killed", "idle", "gone", "connection"):

@@ -176,10 +176,8 @@ class Requests:
     ) -> None:
         """With the lock held, send a request to every shard; opens the jail if there is none.
 
-        Args:
-            operation: What it is called.
-            message_for: Makes what is asked, as the history keeps it.
-            instead: Makes what is sent in its place, if the answer is to say more.
+        ``instead`` makes what is sent in the place of what the history keeps, if the answer is to
+        say more.
 
         Raises:
             LocalProtocolError: It cannot be sent; nothing was.
@@ -228,10 +226,6 @@ class Requests:
         self, timeout_s: float | None, kind: type[m.M] | tuple[type[m.M], ...]
     ) -> list[m.M]:
         """With the lock held, the shards' replies to the last ``submit``.
-
-        Args:
-            timeout_s: How long they may take.
-            kind: The message that a reply must be, or several.
 
         Raises:
             WorkerTimeoutError: The environment is then LATE: ``reset`` brings it back.

@@ -34,13 +34,10 @@ class Restarts:
         self._given_up = True
 
     def spend(self, operation: str) -> None:
-        """Count one more, and wait if the last one was a moment ago.
-
-        Args:
-            operation: What needs it.
+        """Count one more for an operation, and wait if the last one was a moment ago.
 
         Raises:
-            WorkerDiedError: There are none left, or somebody has given up.
+            WorkerDiedError: There are none left, or the environment was closed.
         """
         budget = self._policy.restart_budget
         if self._counters.restarts >= budget:
