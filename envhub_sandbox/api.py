@@ -10,7 +10,7 @@ from typing import Any
 from envhub_sandbox.making.making import make
 from envhub_sandbox.making.options import Options
 from envhub_sandbox.policy import Limits, Policy, Timeouts
-from envhub_sandbox.sandboxes.base import Sandbox
+from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.tracebacks import short_traceback
 

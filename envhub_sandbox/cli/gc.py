@@ -27,9 +27,9 @@ def gc(
     that an engine is installed and could not be asked.
     """
     with reported(debug=debug):
-        from envhub_sandbox.sandboxes.docker import prune
+        from envhub_sandbox.sandboxes.docker import leftovers
 
-        found, unasked = prune.find()
+        found, unasked = leftovers.find()
         removed = [] if dry_run else [one for one in found if one.remove()]
         if json:
             items = [

@@ -21,7 +21,7 @@ from envhub_sandbox.making.proxies import Proxies
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy, Timeouts, policy_from, timeouts_from
 from envhub_sandbox.sandboxes import inprocess
-from envhub_sandbox.sandboxes.base import Sandbox
+from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.provenance import provenance_of
 from envhub_sandbox.session.recipe import Recipe, pinned

@@ -11,7 +11,7 @@ from typing import Any
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.making import arguments
 from envhub_sandbox.policy import Limits, Policy, Timeouts
-from envhub_sandbox.sandboxes.base import Sandbox
+from envhub_sandbox.sandboxes.sandbox import Sandbox
 
 _LANES = ("auto", "frames")
 _ONLY_HERE = ("trust_remote_code", "token", "limits")

@@ -7,7 +7,7 @@ from typing import Any
 
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.option_names import option_name
-from envhub_sandbox.sandboxes.base import Sandbox
+from envhub_sandbox.sandboxes.sandbox import Sandbox
 
 
 def reference_of(cfg: Any) -> tuple[str, Any]:
@@ -43,7 +43,7 @@ def sandbox_of(sandbox: str | Sandbox, server_key: str | None) -> Sandbox:
             "RemoteSandbox has its own"
         )
     if not isinstance(sandbox, str):
-        if not callable(getattr(sandbox, "acquire", None)):
+        if not callable(getattr(sandbox, "for_repository", None)):
             raise _unknown(sandbox)
         return sandbox
     if sandbox == "process":

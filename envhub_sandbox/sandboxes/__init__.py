@@ -1,1 +1,1 @@
-"""The places that a worker can run in: one file each, one protocol in ``base``."""
+"""The places that a worker can run in: one file each, and what each answers in ``sandbox``."""

@@ -23,8 +23,8 @@ import zmq
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
-from envhub_sandbox.sandboxes.base import Sandbox
 from envhub_sandbox.sandboxes.pool import WorkerServer
+from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.manifest.manifest import (

@@ -20,7 +20,7 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import WorkerDiedError, WorkerStartupError
 from envhub_sandbox.sandboxes import runtime_folder
-from envhub_sandbox.sandboxes.docker import prune
+from envhub_sandbox.sandboxes.docker import leftovers
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.run_arguments import FOLDER_LABEL, USER_LABEL
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
@@ -160,7 +160,7 @@ def test_client_and_monitor_killed_together_leave_no_container(engine: Engine) -
         monitor.kill()
         assert nothing_left(engine, made.process.pid)
         [folder] = folders(made.process.pid)
-        found = [one for one in prune.find().leftovers if one.name == str(folder)]
+        found = [one for one in leftovers.find().leftovers if one.name == str(folder)]
         assert [one.remove() for one in found] == [True]
         assert not folder.exists()
 
@@ -240,7 +240,7 @@ def test_gc_removes_what_is_ours_and_dead_and_nothing_else(engine: Engine) -> No
                 "stranger": {"org.example": dead},
             }.items()
         }
-        for found in prune.stale_containers(engine):
+        for found in leftovers.stale_containers(engine):
             assert found.remove()
         listed = engine.run("ps", "--all", "--no-trunc", "--format", "{{.ID}}").split()
         assert {who for who, name in made.items() if name in listed} == set(made) - {"dead"}

@@ -50,9 +50,9 @@ class Engine:
         """What a command prints.
 
         Raises:
-            EngineError: It failed.
+            EngineError: It failed, or did not answer.
         """
-        return run(self.command, *arguments)
+        return _run(self.command, *arguments)
 
 
 def environment() -> dict[str, str]:
@@ -64,16 +64,11 @@ def environment() -> dict[str, str]:
     }
 
 
-def run(command: str, *arguments: str, stdin: str = "") -> str:
-    """What an engine's program prints.
-
-    Raises:
-        EngineError: It failed, or did not answer.
-    """
+def _run(command: str, *arguments: str) -> str:
     try:
         done = subprocess.run(
             [command, *arguments],
-            input=stdin.encode(),
+            stdin=subprocess.DEVNULL,
             capture_output=True,
             env=environment(),
             timeout=_ANSWER_S,
@@ -123,7 +118,7 @@ def _engine(name: str, path: str | None, host: str | None) -> Engine:
             f"{option_name('sandbox', 'tcp://HOST:PORT')}."
         )
     try:
-        kind = "podman" if "podman" in run(command, "--version") else name
+        kind = "podman" if "podman" in _run(command, "--version") else name
         return _described(kind, command)
     except EngineError as error:
         raise SandboxUnavailableError(explained(name, str(error))) from error
@@ -131,7 +126,7 @@ def _engine(name: str, path: str | None, host: str | None) -> Engine:
 
 def _described(kind: str, command: str) -> Engine:
     try:
-        facts = json.loads(run(command, "info", "--format", "{{json .}}"))
+        facts = json.loads(_run(command, "info", "--format", "{{json .}}"))
     except ValueError as error:
         raise EngineError(f"its answer is no JSON: {error}") from error
     if kind == "podman":

@@ -24,7 +24,6 @@ from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerSt
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes import runtime_folder
-from envhub_sandbox.sandboxes.base import Sandbox
 from envhub_sandbox.sandboxes.docker import attestation, packages, run_arguments, seccomp_profile
 from envhub_sandbox.sandboxes.docker.engines import (
     Engine,
@@ -37,6 +36,7 @@ from envhub_sandbox.sandboxes.docker.engines import (
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.local_server import LocalServer
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
+from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.system import processes
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline

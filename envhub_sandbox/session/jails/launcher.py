@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import re
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
@@ -11,9 +13,8 @@ from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, LoadError, WorkerTimeoutError
 from envhub_sandbox.log import WORKER
-from envhub_sandbox.sandboxes.base import Sandbox
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
-from envhub_sandbox.session.jails import denials
+from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
 from envhub_sandbox.session.jails.server_hold import ServerHold
 from envhub_sandbox.session.repository import Repository
@@ -31,6 +32,8 @@ _CLOSE_S = 5.0
 _STATUS_S = 1.0
 _DENIED_S = 10.0
 """A caller who has denials recorded wants to know them, also of a host that is busy."""
+_DENIAL = re.compile(r"[a-z0-9_]{1,40}( [A-Z0-9_]{1,40}| /.{0,400})?")
+_MOST_DENIALS = 64
 _UNKNOWN = ("server", "connection", "gone")
 """How a jail died of which its server can say nothing."""
 
@@ -278,7 +281,7 @@ class Launcher:
         """What a jail was denied; None where it is not recorded, or not known any more."""
         if not self.repository.policy.record_denials:
             return None
-        return denials.read_denials(self._status(server, jail, Deadline(_DENIED_S)).get("denied"))
+        return read_denials(self._status(server, jail, Deadline(_DENIED_S)).get("denied"))
 
     def note_denied(self, error: BaseException, server: WorkerServer, jail: int) -> None:
         """Put what a jail was denied into the error that it ends with, before it is closed."""
@@ -288,15 +291,8 @@ class Launcher:
             error.denied = self.denials(server, jail)
 
     def _status(self, server: WorkerServer, jail: int, deadline: Deadline) -> dict[str, Any]:
-        client = self._client(server)
         try:
-            client.hello(deadline)
-            status, _ = client.request(m.GetStatus(), deadline=deadline)
-        except EnvHubError:
-            return {}
-        finally:
-            client.close()
-        try:
+            status = self._ask(server, m.GetStatus(), deadline)
             with UNTRUSTED:
                 jails = [one for one in expect(status, m.Status).jails if isinstance(one, dict)]
                 return next((one for one in jails if one.get("jail") == jail), {})
@@ -306,13 +302,14 @@ class Launcher:
     def interrupt(self, loaded: LoadedJail) -> None:
         """End a jail over a connection of its own, while another thread waits on the first."""
         loaded.jail.before_end()
-        client = self._client(loaded.server)
-        deadline = Deadline(_CLOSE_S)
+        with contextlib.suppress(EnvHubError):  # the server has gone, and the jail with it
+            self._ask(loaded.server, m.CloseJail(loaded.jail.number), Deadline(_CLOSE_S))
+
+    def _ask(self, server: WorkerServer, message: m.Message, deadline: Deadline) -> m.Message:
+        client = self._client(server)
         try:
             client.hello(deadline)
-            client.request(m.CloseJail(loaded.jail.number), deadline=deadline)
-        except EnvHubError:
-            pass  # the server has gone, and the jail with it
+            return client.request(message, deadline=deadline)[0]
         finally:
             client.close()
 
@@ -327,3 +324,14 @@ def _is_what(value: object, task: EnvManifest) -> bool:
 def _refuse_late(deadline: Deadline) -> None:
     if deadline.passed:
         raise WorkerTimeoutError("the worker's manifest could not be read in time")
+
+
+def read_denials(said: object) -> tuple[str, ...] | None:
+    """What a jail was denied, as its server remembers it; None where it is not recorded.
+
+    Trust: a server on another host may say anything, and paths are a stranger's words.
+    """
+    if not isinstance(said, tuple):
+        return None
+    texts = (one for one in said[:_MOST_DENIALS] if isinstance(one, str) and one.isprintable())
+    return tuple(one for one in texts if _DENIAL.fullmatch(one))

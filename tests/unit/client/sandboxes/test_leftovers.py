@@ -11,7 +11,7 @@ import pytest
 
 from envhub_sandbox.errors import SandboxUnavailableError
 from envhub_sandbox.sandboxes import runtime_folder
-from envhub_sandbox.sandboxes.docker import prune
+from envhub_sandbox.sandboxes.docker import leftovers
 from envhub_sandbox.sandboxes.docker.run_arguments import FOLDER_LABEL, USER_LABEL
 from envhub_sandbox.system.locks import LifeLock
 from envhub_worker.lockdown.limits.cgroups import Hierarchy, Tree
@@ -130,7 +130,7 @@ def test_removing_removes_the_folder_and_nothing_beside(tmp_path: Path) -> None:
     folder(tmp_path, "envhub-docker-dead0000", {"alive": "", "seccomp.json": "{}"})
     beside = alive(tmp_path, "envhub-docker-alive000")
     [path] = runtime_folder.stale_folders(tmp_path)
-    assert prune.Leftover("folder", str(path)).remove()
+    assert leftovers.Leftover("folder", str(path)).remove()
     assert list(tmp_path.iterdir()) == [beside]
 
 
@@ -140,12 +140,12 @@ def test_control_groups_of_ended_servers_are_left_behind(tmp_path: Path) -> None
     for name in ("memory/envhub_1_zygote-1", "envhub_1_leaf", "envhub_x_y", "user_1_zygote-1"):
         (tmp_path / name / "jail-1").mkdir(parents=True)
     (tmp_path / "envhub_1_leaf" / "cgroup.procs").write_text("7\n")
-    groups = list(prune.stale_groups(tmp_path))
+    groups = list(leftovers.stale_groups(tmp_path))
     assert [Path(one.name).name for one in groups] == ["envhub_1_zygote-1"]
     assert groups[0].remove()
     assert not Path(groups[0].name).exists()
     [mine] = tmp_path.glob(f"envhub_{os.getpid()}_zygote-1")
-    assert not prune.Leftover("control group", str(mine)).remove()
+    assert not leftovers.Leftover("control group", str(mine)).remove()
     living.remove()
     assert not mine.exists()
 
@@ -184,4 +184,4 @@ def test_what_runs_for_a_client_of_another_machine_is_left_alone(
     elif client == "alive":
         alive(tmp_path, "envhub-docker-client00")
     engine: Any = OneContainer(tmp_path / "envhub-docker-client00", status)
-    assert [one.name for one in prune.stale_containers(engine)] == ["it"] * stale
+    assert [one.name for one in leftovers.stale_containers(engine)] == ["it"] * stale

@@ -64,11 +64,6 @@ def found(**changes: Any) -> Surroundings:
     return attestation.parse(json.dumps({**SAID, **changes}).encode())
 
 
-def pairs(words: list[str]) -> set[tuple[str, str]]:
-    """Every option with the word that follows it."""
-    return set(itertools.pairwise(words))
-
-
 def test_the_command_line_is_this_one() -> None:
     """Word for word: what stands here is what confines."""
     assert run_arguments.run_arguments(DOCKER, WANTED) == [
@@ -91,33 +86,34 @@ def test_the_command_line_is_this_one() -> None:
     ]
 
 
-def test_podman_gets_its_own_words() -> None:
-    """The same walls; a plain user keeps the id, and no writable folder is added."""
-    words = run_arguments.run_arguments(PODMAN, WANTED)
-    assert ("--userns", "keep-id") in pairs(words)
-    assert ("--security-opt", "unmask=ALL") in pairs(words)
-    assert "--read-only-tmpfs=false" in words
+WITH_GPUS = {"runtime": "runsc", "gpus": "all"}
 
 
-def test_an_engine_that_maps_users_does_not_map_ours() -> None:
-    """The socket folder is the caller's, and nobody else's."""
-    words = run_arguments.run_arguments(replace(DOCKER, remapped=True), WANTED)
-    assert ("--userns", "host") in pairs(words)
-
-
-def test_a_comma_in_a_path_is_no_separator() -> None:
-    """A folder's name cannot add an option to a mount."""
-    wanted = replace(WANTED, snapshot='/store/a,dst=/etc,"b"')
-    words = run_arguments.run_arguments(DOCKER, wanted)
-    assert '"type=bind","src=/store/a,dst=/etc,""b""","dst=/snapshots/this","readonly"' in words
-
-
-def test_runtime_and_gpus_are_handed_on() -> None:
-    """In each engine's own words."""
-    wanted = replace(WANTED, runtime="runsc", gpus="all")
-    docker, podman = (run_arguments.run_arguments(one, wanted) for one in (DOCKER, PODMAN))
-    assert {("--runtime", "runsc"), ("--gpus", "all")} <= pairs(docker)
-    assert {("--runtime", "runsc"), ("--device", "nvidia.com/gpu=all")} <= pairs(podman)
+@pytest.mark.parametrize(
+    ("engine", "changes", "expected"),
+    [
+        (
+            PODMAN,  # the same walls; a plain user keeps the id, and no writable folder is added
+            {},
+            {("--userns", "keep-id"), ("--security-opt", "unmask=ALL"), "--read-only-tmpfs=false"},
+        ),
+        (replace(DOCKER, remapped=True), {}, {("--userns", "host")}),  # the sockets are ours
+        (DOCKER, WITH_GPUS, {("--runtime", "runsc"), ("--gpus", "all")}),
+        (PODMAN, WITH_GPUS, {("--runtime", "runsc"), ("--device", "nvidia.com/gpu=all")}),
+        (
+            DOCKER,  # a comma in a path adds no option to a mount
+            {"snapshot": '/store/a,dst=/etc,"b"'},
+            {'"type=bind","src=/store/a,dst=/etc,""b""","dst=/snapshots/this","readonly"'},
+        ),
+    ],
+    ids=["podman", "users mapped", "docker's GPUs", "podman's GPUs", "a comma"],
+)
+def test_each_engine_gets_its_own_words(
+    engine: Engine, changes: dict[str, Any], expected: set[Any]
+) -> None:
+    """What is wanted is the same."""
+    words = run_arguments.run_arguments(engine, replace(WANTED, **changes))
+    assert expected <= {*words, *itertools.pairwise(words)}
 
 
 def test_without_control_groups_there_are_no_limits() -> None:
@@ -364,37 +360,34 @@ def engine_that_says(
 
 
 @pytest.mark.parametrize(
-    ("options", "rootless", "remapped"),
+    ("program", "facts", "expected"),
     [
-        (["name=seccomp,profile=default"], False, False),
-        (["name=seccomp,profile=default", "name=rootless"], True, False),
-        (["name=userns"], False, True),
+        ("Docker version 28", ["name=seccomp"], ("docker", "28.0", False, False)),
+        ("Docker version 28", ["name=seccomp", "name=rootless"], ("docker", "28.0", True, False)),
+        ("Docker version 28", ["name=userns"], ("docker", "28.0", False, True)),
+        # some systems have podman under docker's name; it takes podman's options
+        ("podman version 5.1", [], ("podman", "5.1", True, False)),
     ],
 )
-def test_an_engine_says_whose_users_it_has(
+def test_an_engine_says_what_it_is(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    options: list[str],
-    rootless: bool,
-    remapped: bool,
+    program: str,
+    facts: list[str],
+    expected: tuple[str, str, bool, bool],
 ) -> None:
-    """Rootless docker is refused; one that maps users is told not to."""
-    facts = {"ServerVersion": "28.0", "SecurityOptions": options}
-    engine = engine_that_says(tmp_path, monkeypatch, "Docker version 28", facts)
-    assert (engine.kind, engine.version) == ("docker", "28.0")
-    assert (engine.rootless, engine.remapped) == (rootless, remapped)
-    if rootless:
+    """Rootless docker is refused; one that maps users gets an option against that."""
+    said = {
+        "ServerVersion": "28.0",
+        "SecurityOptions": facts,
+        "host": {"security": {"rootless": True}},
+        "version": {"Version": "5.1"},
+    }
+    engine = engine_that_says(tmp_path, monkeypatch, program, said)
+    assert (engine.kind, engine.version, engine.rootless, engine.remapped) == expected
+    if expected[0] == "docker" and expected[2]:
         with pytest.raises(SandboxUnavailableError, match="podman"):
             DockerSandbox(engine="docker").for_repository(tmp_path, Policy(), Runtime(""))
-
-
-def test_podman_under_dockers_name_is_podman(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Some systems have a program of that name; it takes podman's options."""
-    facts = {"host": {"security": {"rootless": True}}, "version": {"Version": "5.1"}}
-    engine = engine_that_says(tmp_path, monkeypatch, "podman version 5.1", facts)
-    assert (engine.kind, engine.version, engine.rootless) == ("podman", "5.1", True)
 
 
 def test_an_engine_without_a_server_is_not_one(
