@@ -15,7 +15,6 @@ from typing import Any, cast
 
 from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
-from envhub_sandbox.log import WORKER
 from envhub_sandbox.session.counters import LEDGER, Counters, Labels
 from envhub_sandbox.session.jails.sources import JailSource
 from envhub_sandbox.session.lease import Lease
@@ -26,6 +25,7 @@ from envhub_sandbox.session.survival.failures import Failures
 from envhub_sandbox.session.survival.recovery import Recovery
 from envhub_sandbox.session.survival.restart_policy import Restarts
 from envhub_sandbox.session.use_lock import UseLock
+from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.results import Results

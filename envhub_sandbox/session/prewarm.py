@@ -17,12 +17,12 @@ from itertools import chain
 
 from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.log import WORKER
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.refusals import closed_during
 from envhub_sandbox.session.survival.recovery import Recovery
 from envhub_sandbox.session.use_lock import UseLock
+from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_worker.protocol.lifecycle import Event, State
 

@@ -22,7 +22,6 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.hub.store import cache_root
-from envhub_sandbox.log import CRASHES
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy, Timeouts
 from envhub_sandbox.session.author_lines import add_author_line
@@ -30,6 +29,7 @@ from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.provenance import provenance_of
 from envhub_sandbox.session.recipe import Recipe
 from envhub_sandbox.system.locks import SharedLock
+from envhub_sandbox.system.log import CRASHES
 from envhub_sandbox.transport import trace
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import RemoteWarnings

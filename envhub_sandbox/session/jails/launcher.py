@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, LoadError, WorkerTimeoutError
-from envhub_sandbox.log import WORKER
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
 from envhub_sandbox.session.jails.server_hold import ServerHold
 from envhub_sandbox.session.repository import Repository
+from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, open_jail
