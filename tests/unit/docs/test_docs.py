@@ -351,3 +351,14 @@ def test_the_rules_of_interruption_are_those_that_the_source_names() -> None:
             numbers = [int(number) for number in re.findall(r"\d+", found)]
             named.update(range(numbers[0], numbers[-1] + 1) if " to " in found else numbers)
     assert named == rules == set(range(1, len(rules) + 1))
+
+
+@pytest.mark.parametrize("page", ["a-step", "interruption"])
+def test_the_files_that_a_page_on_the_inside_names_are_there(page: str) -> None:
+    """By their path, or by its end."""
+    text = (CHECKOUT / "docs" / "internals" / f"{page}.md").read_text()
+    roots = [CHECKOUT / name for name in ("envhub_sandbox", "worker", "tests")]
+    files = [f"/{one.relative_to(CHECKOUT)}" for root in roots for one in root.rglob("*.py")]
+    named = re.findall(r"`([a-z_/-]+\.py)`", text)
+    assert named
+    assert [one for one in named if not any(file.endswith(f"/{one}") for file in files)] == []
