@@ -49,7 +49,7 @@ class SandboxEnv(SingleEnv):
     ) -> None:
         suites = make_env(ref, n_envs=1, **_with_render_mode(options, render_mode))
         try:
-            super().__init__(suites.choose(suite, task), suites)
+            super().__init__(suites.choose(suite, task), suites.close)
         except BaseException:
             suites.close()
             raise

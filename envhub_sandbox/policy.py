@@ -161,8 +161,8 @@ def policy_from(
 ) -> Policy:
     """A policy from what ``make_env`` was given.
 
-    A mapping of ``limits`` changes those that it names. An object says all of them, so that beside
-    limits of the policy's own nobody could tell which are meant.
+    A mapping of ``limits`` changes those that it names. An object has all of them, which is
+    ambiguous beside limits of the policy's own.
 
     Raises:
         PolicyError: It is no policy, or the limits are said twice.

@@ -23,8 +23,8 @@ from envhub_sandbox.errors import (
     name_source,
 )
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.log import DEPENDENCIES
 from envhub_sandbox.option_names import option_name
+from envhub_sandbox.system.log import DEPENDENCIES
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.environments import Environment

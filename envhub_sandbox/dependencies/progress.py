@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
-from envhub_sandbox.log import DEPENDENCIES
+from envhub_sandbox.system.log import DEPENDENCIES
 
 if TYPE_CHECKING:
     from rich.console import Console

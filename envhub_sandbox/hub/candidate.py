@@ -20,7 +20,7 @@ from envhub_sandbox.hub.listing import (
     within_limits,
 )
 from envhub_sandbox.hub.reference import HubRef
-from envhub_sandbox.log import SNAPSHOT
+from envhub_sandbox.system.log import SNAPSHOT
 
 _SHOWN_FILES = 20
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from envhub_sandbox.errors import SnapshotError
-from envhub_sandbox.log import SNAPSHOT
+from envhub_sandbox.system.log import SNAPSHOT
 
 TIMEOUT_S = 20.0
 """For git: a hostile pattern in ``.gitignore`` can take for ever."""

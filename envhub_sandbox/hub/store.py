@@ -31,10 +31,10 @@ from urllib.parse import urlsplit
 from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
 from envhub_sandbox.hub.hashing import Mismatch, digest_of
 from envhub_sandbox.hub.listing import FileRecord
-from envhub_sandbox.log import SNAPSHOT
 from envhub_sandbox.system import folders
 from envhub_sandbox.system.files import write_whole
 from envhub_sandbox.system.locks import sharers
+from envhub_sandbox.system.log import SNAPSHOT
 
 CACHE_VARIABLE = "ENVHUB_CACHE"
 _FORMAT = 1

@@ -18,7 +18,7 @@ from gymnasium.vector.utils import iterate
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from envhub_sandbox.api import make_env
-from envhub_sandbox.vector.infos import of_one
+from envhub_sandbox.vector.infos import info_of
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _Indices = int | Iterable[int] | None
@@ -92,7 +92,7 @@ class SandboxVecEnv(VecEnv):
             mask = np.arange(self.num_envs) == index
             batch, infos = self.vector.reset(seed=seeds, options={**own, "reset_mask": mask})
             with UNTRUSTED:
-                self.reset_infos[index] = of_one(infos, index, self.num_envs)
+                self.reset_infos[index] = info_of(infos, index, self.num_envs)
         return batch
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -125,7 +125,7 @@ class SandboxVecEnv(VecEnv):
         with UNTRUSTED:
             for index in ended:
                 infos[index]["terminal_observation"] = lasts[index]
-                self.reset_infos[index] = of_one(told, index, self.num_envs)
+                self.reset_infos[index] = info_of(told, index, self.num_envs)
         return batch
 
     def _begun(self, ended: list[int], infos: list[dict[str, Any]]) -> None:
@@ -180,4 +180,4 @@ class SandboxVecEnv(VecEnv):
         return self.vector.render() or [None] * self.num_envs
 
     def _infos(self, told: dict[str, Any]) -> list[dict[str, Any]]:
-        return [of_one(told, index, self.num_envs) for index in range(self.num_envs)]
+        return [info_of(told, index, self.num_envs) for index in range(self.num_envs)]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.lease import Lease
 from envhub_worker.protocol.lifecycle import State
 
@@ -36,16 +35,11 @@ class _Reads:
 
 
 class AttributeCache:
-    """The attributes of one environment that need no request. Not thread-safe.
+    """The attributes of one environment that need no request. Not thread-safe."""
 
-    Args:
-        lease: Its jail.
-        counters: Of its steps.
-    """
-
-    def __init__(self, lease: Lease, counters: Counters) -> None:
+    def __init__(self, lease: Lease) -> None:
         self._lease = lease
-        self._counters = counters
+        self._counters = lease.counters
         self._reads: dict[str, _Reads] = {}
 
     def get(self, name: str) -> tuple[Any, ...] | None:

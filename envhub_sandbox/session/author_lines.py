@@ -23,13 +23,8 @@ _TRACEBACK_CHARS = 32_768
 _FUNCTION_CHARS, _SOURCE_CHARS = 100, 200
 
 
-def point_out(error: EnvHubError, snapshot: Snapshot) -> None:
-    """Add the repository's own line to what it raised, once. Trust: text from the worker.
-
-    Args:
-        error: What failed; one that no code of the repository raised stays as it is.
-        snapshot: Its files.
-    """
+def add_author_line(error: EnvHubError, snapshot: Snapshot) -> None:
+    """Add the repository's own line to what it raised, once. Trust: text from the worker."""
     remote = error if isinstance(error, RemoteEnvError) else error.__cause__
     if not isinstance(remote, RemoteEnvError) or "__notes__" in vars(error):
         return

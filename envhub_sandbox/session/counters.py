@@ -11,19 +11,15 @@ import threading
 import weakref
 from array import array
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from envhub_sandbox.transport.lane import Lane
+from envhub_worker.protocol.lifecycle import Lifecycle
+
 KEPT = 1024
 """Step latencies that are kept: the last ones. A power of two."""
-
-
-class Connection(Protocol):
-    """The way to an environment's processes, which counts by itself."""
-
-    def traffic(self) -> tuple[int, int, int]:
-        """Stale replies, and bytes sent and received."""
 
 
 class Counters:
@@ -34,6 +30,7 @@ class Counters:
         timeouts: Replies that were late.
         deaths: Processes that ended under a request.
         steps: Steps that were answered.
+        restarts: Fresh processes after deaths.
     """
 
     def __init__(self) -> None:
@@ -41,9 +38,10 @@ class Counters:
         self.timeouts = 0
         self.deaths = 0
         self.steps = 0
+        self.restarts = 0
         self._total_ns = 0
         self._latencies = array("q", bytes(8 * KEPT))
-        self._connection: Connection | None = None
+        self._connection: Lane | None = None
         self._before = (0, 0, 0)
 
     def stepped(self, elapsed_ns: int) -> None:
@@ -52,7 +50,7 @@ class Counters:
         self.steps += 1
         self._total_ns += elapsed_ns
 
-    def connected(self, connection: Connection | None) -> None:
+    def connected(self, connection: Lane | None) -> None:
         """From now on this connection serves the environment; None: no connection does."""
         if connection is not self._connection:
             self._before, self._connection = self._traffic(), connection
@@ -77,6 +75,7 @@ class Counters:
             "steps": self.steps,
             "timeouts": self.timeouts,
             "deaths": self.deaths,
+            "restarts": self.restarts,
             "stale_replies": stale,
             "sent_bytes": sent,
             "received_bytes": received,
@@ -106,27 +105,12 @@ class Labels(NamedTuple):
     task: str
 
 
-class CountedEnv(Protocol):
-    """An environment."""
-
-    counters: Counters
-
-    def stats(self) -> Mapping[str, Any]:
-        """Its numbers."""
-
-
-class RestartCounter(Protocol):
-    """Counts the restarts of an environment."""
-
-    count: int
-
-
 class Row(NamedTuple):
     """The numbers of all environments with the same labels.
 
     Attributes:
         labels: Of these environments.
-        numbers: ``Counters.numbers`` and ``restarts``, of the living and of those that are gone.
+        numbers: ``Counters.numbers``, of the living and of those that are gone.
         states: How many of the living are in each state.
         latencies_s: The last step latencies of the living.
     """
@@ -145,46 +129,38 @@ class Ledger:
 
     def forget(self) -> None:
         """Drop all: in a fork, the environments are those of its parent."""
-        self._lock = threading.RLock()  # the garbage collector may come while it is held
-        self._living: dict[
-            int, tuple[Labels, weakref.ref[CountedEnv], Counters, RestartCounter]
-        ] = {}
+        self._lock = threading.RLock()  # interruption.md, rule 12
+        self._living: dict[int, tuple[Labels, Counters, Lifecycle]] = {}
         self._gone: dict[Labels, dict[str, float]] = {}
 
-    def add(self, env: CountedEnv, labels: Labels, restarts: RestartCounter) -> None:
+    def add(self, env: object, labels: Labels, counters: Counters, lifecycle: Lifecycle) -> None:
         """Add an environment. Its counts stay when it goes."""
         key = id(env)
         with self._lock:
-            self._living[key] = (labels, weakref.ref(env), env.counters, restarts)
-        weakref.finalize(env, self._went, key).atexit = False
+            self._living[key] = labels, counters, lifecycle
+        weakref.finalize(env, self._went, key).atexit = False  # interruption.md, rule 13
 
     def _went(self, key: int) -> None:
         with self._lock:
             entry = self._living.pop(key, None)
             if entry is not None:
-                labels, _, counters, restarts = entry
-                _add(self._gone.setdefault(labels, {}), _numbers(counters, restarts))
+                labels, counters, _ = entry
+                _add(self._gone.setdefault(labels, {}), counters.numbers())
 
     def rows(self) -> list[Row]:
         """A row for each set of labels."""
         with self._lock:
             living = list(self._living.values())
             rows = {labels: Row(labels, dict(n), {}, []) for labels, n in self._gone.items()}
-        for labels, env, counters, restarts in living:
+        for labels, counters, lifecycle in living:
             row = rows.setdefault(labels, Row(labels, {}, {}, []))
-            _add(row.numbers, _numbers(counters, restarts))
-            found = env()
-            if found is not None:
-                _add(row.states, {found.stats()["state"]: 1})
+            _add(row.numbers, counters.numbers())
+            _add(row.states, {lifecycle.state.name: 1})
             row.latencies_s.append(counters.latencies_s())
         return [
             row._replace(latencies_s=np.concatenate([[], *row.latencies_s]))
             for row in rows.values()
         ]
-
-
-def _numbers(counters: Counters, restarts: RestartCounter) -> dict[str, float]:
-    return {**counters.numbers(), "restarts": restarts.count}
 
 
 def _add(total: dict[str, Any], more: Mapping[str, float]) -> None:

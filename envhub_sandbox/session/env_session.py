@@ -1,9 +1,9 @@
 """One task's environment: its life, from the first jail to the last.
 
-It has a ``Lease``, its hold on a jail and the lane there; ``Turns``, since one thread uses it at a
-time; a ``Prewarm``, which starts it; ``Requests``, which ``vector_env`` uses; and, with
+It has a ``Lease``, its hold on a jail and the lane there; a ``UseLock``: one thread uses it at
+a time; a ``Prewarm``, which starts it; ``Requests``, which ``vector_env`` uses; and, with
 ``restart="transparent"``, a ``Recovery``. None of these knows it. Here it is recovered before a
-reset, closed, and abandoned in a fork.
+reset, closed, and abandoned in a fork. The rules for these are in docs/internals/interruption.md.
 """
 
 from __future__ import annotations
@@ -11,11 +11,10 @@ from __future__ import annotations
 import os
 import weakref
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
-from envhub_sandbox.log import WORKER
 from envhub_sandbox.session.counters import LEDGER, Counters, Labels
 from envhub_sandbox.session.jails.sources import JailSource
 from envhub_sandbox.session.lease import Lease
@@ -25,7 +24,8 @@ from envhub_sandbox.session.requests import Requests
 from envhub_sandbox.session.survival.failures import Failures
 from envhub_sandbox.session.survival.recovery import Recovery
 from envhub_sandbox.session.survival.restart_policy import Restarts
-from envhub_sandbox.session.turns import Turns
+from envhub_sandbox.session.use_lock import UseLock
+from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.pace import PaceBook
@@ -33,6 +33,7 @@ from envhub_sandbox.transport.results import Results
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 
+_USAGE = ("processes", "threads", "files", "memory_bytes")
 _MOST = 1 << 63
 """Of anything that there may be: a server on another host may send larger numbers."""
 _GRACE_S = 2.0
@@ -46,14 +47,8 @@ class EnvSession:
     a signal handler.
 
     Args:
-        jails: Gives and takes back the jail.
-        manifest: What the environment is expected to be.
         bounds: The slices of its sub-environments, one for each shard.
         paces: Takes note of what its steps took.
-
-    Attributes:
-        requests: What it is asked.
-        prewarm: Starts it, also ahead of the first request.
     """
 
     def __init__(
@@ -72,18 +67,16 @@ class EnvSession:
         self.history = history = History(manifest, policy.crash_history)
         results = Results(manifest, self.bounds)
         self.lease = lease = Lease(jails, results, self.lifecycle, counters, paces)
-        self._restarts = Restarts(policy)
-        self._failures = failures = Failures(lease, results, counters, history)
-        self.turns = turns = Turns(lease, failures)
+        self._restarts = Restarts(policy, counters)
+        self._failures = failures = Failures(lease, history)
+        self.use = use = UseLock(lease, failures)
         recovery: Recovery | None = None
         if policy.restart == "transparent":
-            recovery = Recovery(lease, results, self._restarts, failures, counters, history)
-        self.prewarm = Prewarm(lease, turns, counters, history, recovery)
-        self.requests = Requests(
-            lease, turns, self.prewarm, results, counters, history, failures, recovery
-        )
+            recovery = Recovery(lease, self._restarts, failures, history)
+        self.prewarm = Prewarm(lease, use, history, recovery)
+        self.requests = Requests(lease, use, self.prewarm, history, failures, recovery)
         labels = Labels(self.repository.label, manifest.suite, str(manifest.task))
-        LEDGER.add(self, labels, self._restarts)
+        LEDGER.add(self, labels, counters, self.lifecycle)
         _living.add(self)
 
     @property
@@ -91,25 +84,16 @@ class EnvSession:
         """Whether it is closed for good."""
         return self.lifecycle.closed
 
-    def report(self) -> list[dict[str, Any]]:
-        """The layers of the jail that it lives in; none where it does not live in any."""
-        return self.lease.report()
-
     def usage(self) -> dict[str, int]:
         """What its jail holds, as its server counts it; empty if it does not say."""
-        told = self.lease.status()
-        found = {name: told.get(name) for name in ("processes", "threads", "files", "memory_bytes")}
-        counts = {name: one for name, one in found.items() if type(one) is int and 0 <= one < _MOST}
-        return counts if len(counts) == len(found) else {}
-
-    def denials(self) -> tuple[str, ...] | None:
-        """What its jail was denied, as its server says; None where it is not recorded."""
-        return self.lease.denials()
+        status = self.lease.status()
+        counts = {name: status.get(name) for name in _USAGE}
+        known = all(type(one) is int and 0 <= one < _MOST for one in counts.values())
+        return cast("dict[str, int]", counts) if known else {}
 
     def stats(self) -> dict[str, Any]:
-        """Counters, and where it is in its life."""
-        found = self.counters.snapshot()
-        return {**found, "restarts": self._restarts.count, "state": self.lifecycle.state.name}
+        """Counters, and its state."""
+        return {**self.counters.snapshot(), "state": self.lifecycle.state.name}
 
     # --- brought back --------------------------------------------------------------------------
 
@@ -122,12 +106,10 @@ class EnvSession:
         ready = self.lifecycle.state is State.READY and not self.prewarm.unused
         if ready and self.repository.timeouts.idle_s is None:
             return
-        self.prewarm.note_if_awaited()
-        with self.turns.take("reset"):
-            # The order matters. First what ended unnoticed becomes EXPIRED, then what another
-            # thread waits for is refused, and only then a pending reply counts as late.
+        with self.use.hold("reset"):
+            # The order matters. What ended unnoticed becomes EXPIRED first. A reply that is still
+            # pending here belongs to an interrupted request, since this thread has the lock.
             self.prewarm.look_whether_it_lives()
-            self.requests.refuse_others("reset")
             if self.lifecycle.state is State.PENDING:
                 self._failures.note_interruption()
             if self.lifecycle.state is State.READY and self.repository.timeouts.idle_s is not None:
@@ -187,12 +169,11 @@ class EnvSession:
         if self.lifecycle.state is State.FOREIGN:
             self.lifecycle.on(Event.CLOSE)
             return
-        if not self.turns.lock.acquire(blocking=False):
+        if not self.use.lock.acquire(blocking=False):
             self._interrupt()
             return
-        # CLOSED comes first: from then on no other thread starts anything. Then the repository's
-        # own close may run, and whatever becomes of that, the jail is given back and the lock
-        # released. An interrupt leaves the rest for the next call, which finds it closed.
+        # interruption.md, rules 7, 9 and 11. CLOSED comes first: from then on no other thread
+        # starts anything. Then the repository's own close may run; then the jail is given back.
         try:
             state = self.lifecycle.state
             self._end_life()
@@ -203,42 +184,41 @@ class EnvSession:
             try:
                 self.lease.let_go(wait=False)
             finally:
-                self.turns.lock.release()
+                self.use.lock.release()
 
     def _finish(self) -> None:
-        if self.turns.lock.acquire(blocking=False):  # else another thread is closing it
+        if self.use.lock.acquire(blocking=False):  # else another thread is closing it
             try:
                 self.lease.let_go()
             finally:
-                self.turns.lock.release()
+                self.use.lock.release()
 
     def _end_life(self) -> None:
         self.lifecycle.moved(Event.CLOSE)
         self._restarts.give_up()
 
     def _interrupt(self) -> None:
-        """Another thread waits for a reply: end its jail, then clean up after it.
+        """Another thread waits for a reply: end its jail, then clean up: interruption.md, rule 11.
 
-        If that thread does not release the lock in time, it cleans up itself once it sees that
-        this was closed; the jail's processes have ended by then.
+        If that thread does not release the lock in time, it cleans up itself.
         """
         if not self.lease.interrupt(self._end_life):
-            # No jail to end. The thread that has the turn sees the closed lifecycle where it takes
-            # a jail; it may be past that, so the server is released here.
+            # The other thread sees CLOSED where it takes a jail; it may be past that, so the server
+            # is released here.
             self.lease.depart()
             return
         close_s = self.repository.timeouts.close_s
         patience_s = INTERRUPT_S if close_s is None else min(close_s, INTERRUPT_S)
-        if self.turns.lock.acquire(timeout=patience_s):
+        if self.use.lock.acquire(timeout=patience_s):
             try:
                 self.lifecycle.moved(Event.CLOSE)  # the other may have moved at the same moment
                 self.lease.let_go()  # of what is there now: it may have moved elsewhere, too
             finally:
-                self.turns.lock.release()
+                self.use.lock.release()
 
     def abandon(self) -> None:
-        """In a fork of the process that made it: touch nothing, and refuse all requests."""
-        self.turns.abandon()
+        """In a fork: touch nothing, and refuse all requests. interruption.md, rule 14."""
+        self.use.abandon()
         self.lifecycle.moved(Event.FORK)
         self.lifecycle.request = None
         self.lease.abandon()

@@ -42,18 +42,13 @@ _SUCCESSOR_S = 60.0
 class Lease:
     """The jail of one environment, of which it has one at a time, or none, and the lane there.
 
-    It is used by the thread that has the environment's turn, but for ``interrupt``, which a closing
+    Used by the thread that has the environment's lock, but for ``interrupt``, which a closing
     thread calls, and ``abandon``, which a fork calls.
-
-    Args:
-        jails: Gives and takes back the jail.
-        results: What the environment is expected to be, and its slices.
-        lifecycle: Where the environment is in its life; ``close`` moves it first.
-        counters: Learn which lane serves it.
-        paces: Takes note of what its steps took.
 
     Attributes:
         repository: Whose jails they are.
+        results: What the environment is expected to be, and its slices.
+        counters: Of the environment.
         loaded: The jail; None while there is none.
         lane: The way to its runners there.
         make_room: Asked to end what was started ahead, where a server has no place left.
@@ -74,17 +69,19 @@ class Lease:
         self.make_room: Callable[[], bool] = _no_room
         self._jails = jails
         self._launcher = jails.launcher
-        self._results = results
-        self._counters = counters
+        self.results = results
+        self.counters = counters
         self._paces = paces
         self._builder = Builder(jails, results)
-        self._ending = threading.RLock()  # nothing is given back that another thread is ending
+        self._ending = (
+            threading.RLock()
+        )  # interruption.md, rule 12: none gives back what another ends
         self._owner = Owner()
         self._was_loaded = False
         self._startup: StartupDeadline | None = None
         self._release_server: Callable[[], None] = _nothing
         self._departs = jails.launcher.stay()
-        weakref.finalize(self, self._departs).atexit = False
+        weakref.finalize(self, self._departs).atexit = False  # interruption.md, rule 13
 
     @property
     def shared(self) -> bool:
@@ -184,9 +181,9 @@ class Lease:
             room = full and self._launcher.settle() | self.make_room()
             if not room and not retry_s:
                 raise
-            told = error
+            refused = error
         ask = partial(self._jails.take, deadline)
-        return retry_while_busy(ask, retry_s, deadline, self.repository.label, told)
+        return retry_while_busy(ask, retry_s, deadline, self.repository.label, refused)
 
     def _patience_s(self, error: EnvHubError) -> float:
         """How long to wait: after a server that ended, where restarts are wanted, for another."""
@@ -202,12 +199,7 @@ class Lease:
         self._move_in(lambda: self._take(deadline), deadline)
 
     def _move_in(self, take: Callable[[], LoadedJail], deadline: Deadline) -> None:
-        """Build the environment in a jail; a Ctrl-C leaves none behind.
-
-        Python looks for signals where something is called. So nothing is, neither between the
-        taking and the ``try``, nor between the building and the noting. Python 3.10 looks anywhere:
-        there a jail that was not noted is given back by its finalizer.
-        """
+        """Build the environment in a jail; a Ctrl-C leaves none behind: interruption.md, rule 4."""
         loaded = take()
         try:
             lane = self._builder.build(loaded, deadline)
@@ -219,7 +211,7 @@ class Lease:
                 self._jails.give_back(loaded)
             raise
         self._was_loaded = True
-        self._counters.connected(lane)
+        self.counters.connected(lane)
         if self.lifecycle.closed:  # only now: a close from here on sees the jail
             raise closed_during("make_env")
 
@@ -246,7 +238,7 @@ class Lease:
             try:
                 if loaded is not None:
                     self._jails.give_back(loaded, wait=wait)
-                self.loaded = None  # only now: after an interrupt, the next call does it again
+                self.loaded = None  # interruption.md, rule 7: only now
             except Exception:
                 self.loaded = None
                 raise
@@ -266,7 +258,7 @@ class Lease:
         """Remember what steps took, for the next time."""
         pace = None if self.lane is None else self.lane.pace()
         if pace:
-            self._paces.note(self._results.manifest, pace)
+            self._paces.note(self.results.manifest, pace)
 
     def let_go(self, *, wait: bool = True) -> None:
         """Give back whatever is left, for good. A fork of its owner gives back nothing."""
@@ -285,6 +277,8 @@ class Lease:
     def interrupt(self, close: Callable[[], None]) -> bool:
         """In another thread: ``close`` the environment, and end the jail that a request waits for.
 
+        See interruption.md, rule 11.
+
         Returns:
             Whether there was one; otherwise a thread that takes one sees that it is closed.
         """
@@ -296,7 +290,7 @@ class Lease:
             return self.loaded is not None
 
     def abandon(self) -> None:
-        """In a fork of its owner: close what is this process's own, and touch nothing else."""
+        """In a fork: close what is this process's own alone. interruption.md, rule 14."""
         self._ending = threading.RLock()
         self._release_server = _nothing
         self._close_lane()
@@ -304,9 +298,9 @@ class Lease:
     def _close_lane(self) -> None:
         lane = self.lane
         if lane is not None:
-            self._counters.connected(None)
+            self.counters.connected(None)
             lane.close()
-            self.lane = None  # only now, as above
+            self.lane = None  # as above
 
     def _let_server_go(self) -> None:
         self._release_server()

@@ -31,12 +31,7 @@ _FORMAT = 1
 
 
 class ManifestCache:
-    """One entry of the cache.
-
-    Args:
-        folder: Where entries lie.
-        key: The entry's name, or None for what must not be remembered.
-    """
+    """One entry of the cache; its ``key`` is None for what must not be remembered."""
 
     def __init__(self, folder: Path, key: str | None) -> None:
         self._path = None if key is None else folder / key

@@ -17,13 +17,12 @@ from itertools import chain
 
 from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.log import WORKER
-from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.refusals import closed_during
 from envhub_sandbox.session.survival.recovery import Recovery
-from envhub_sandbox.session.turns import Turns
+from envhub_sandbox.session.use_lock import UseLock
+from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_worker.protocol.lifecycle import Event, State
 
@@ -39,23 +38,16 @@ _GOING_S = 30.0
 class Prewarm:
     """Starts one environment, and cancels a start ahead that no request has used.
 
-    Args:
-        lease: Its hold on a jail.
-        turns: Whose turn it is.
-        counters: Say whether anything was asked of it.
-        history: Learns that it has started.
-        recovery: Learns that it has started, if there is one.
-
     Attributes:
         unused: Whether it was started ahead, and no reset came yet.
         first_use: Called at the first request; None afterwards.
+        starting: The deadline of a start ahead that is under way, which has the use lock.
     """
 
     def __init__(
         self,
         lease: Lease,
-        turns: Turns,
-        counters: Counters,
+        use: UseLock,
         history: History,
         recovery: Recovery | None,
     ) -> None:
@@ -63,12 +55,12 @@ class Prewarm:
         self.unused = False
         self.first_use: Callable[[], None] | None = None
         self._lease = lease
-        self._turns = turns
-        self._counters = counters
+        self._use = use
+        self._counters = lease.counters
         self._history = history
         self._recovery = recovery
         self._timeouts = lease.repository.timeouts
-        self._starting: StartupDeadline | None = None  # of a start ahead that is under way
+        self.starting: StartupDeadline | None = None
 
     @property
     def closed(self) -> bool:
@@ -83,7 +75,7 @@ class Prewarm:
 
     def adopt(self, loaded: LoadedJail) -> None:
         """Use a jail that is already loaded, instead of opening one later."""
-        with self._turns.take("make_env"):
+        with self._use.hold("make_env"):
             self._lease.adopt(loaded, Deadline(self._timeouts.startup_s))
             self._started()
 
@@ -113,31 +105,30 @@ class Prewarm:
         """Start its processes, unless they are there, before any request needs them."""
         deadline = StartupDeadline(self._timeouts.startup_s, unasked=True)
         # whatever fails here fails again in the first request, which raises it
-        with contextlib.suppress(Exception), self._turns.take("make_env"):
+        with contextlib.suppress(Exception), self._use.hold("make_env"):
             if self.lifecycle.state is State.IDLE:
-                self._starting = deadline
+                self.starting = deadline
                 try:
                     self._start(deadline)
                     self.unused = True
                 finally:
-                    self._starting = None
+                    self.starting = None
 
     def cancel(self) -> bool:
         """Give up what was started ahead, unless it was used since; whether there was any."""
-        starting = self._starting
+        starting = self.starting
         if starting is not None:
             starting.give_up()
-        lock = self._turns.lock
+        lock = self._use.lock
         if not lock.acquire(timeout=0 if starting is None else INTERRUPT_S):
             return False  # it is in use
         try:
             unused = self.unused and not self._counters.requests
             if not unused or self.lifecycle.state is not State.READY:
                 return starting is not None
-            with self._turns.take("make_env"):
+            with self._use.hold("make_env"):
                 self.unused = False
-                # The move comes first. An interrupt between here and the end would otherwise leave
-                # an environment that is READY without a jail; this way a reset starts another.
+                # interruption.md, rule 1: the move comes first, so that a reset starts another
                 self.lifecycle.moved(Event.EXPIRY)
                 self._lease.close_politely()
                 self._lease.give_back()
@@ -169,11 +160,6 @@ class Prewarm:
         if self.first_use is not None:
             first_use, self.first_use = self.first_use, None
             first_use()
-
-    def note_if_awaited(self) -> None:
-        """A reset waits for a start ahead: that is its first use, so the next one may start."""
-        if self._starting is not None:
-            self.note_use()
 
 
 class SuitePrewarm:

@@ -25,11 +25,7 @@ def refusal(
 ) -> EnvHubError | None:
     """Why an environment takes no request now; None if it takes one.
 
-    Args:
-        state: Where it is in its life.
-        operation: What is asked.
-        restart: The policy's ``restart``.
-        interrupted: The request whose wait was interrupted.
+    ``restart`` is the policy's; ``interrupted`` the request whose wait was interrupted.
     """
     if state in (State.IDLE, State.READY):
         return None

@@ -1,4 +1,4 @@
-"""One repository under one policy: what is asked of it, and what is told of it when it fails."""
+"""One repository under one policy: what all its environments share, and the errors of its start."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.hub.store import cache_root
-from envhub_sandbox.log import CRASHES
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy, Timeouts
-from envhub_sandbox.session.author_lines import point_out
+from envhub_sandbox.session.author_lines import add_author_line
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.provenance import provenance_of
 from envhub_sandbox.session.recipe import Recipe
 from envhub_sandbox.system.locks import SharedLock
+from envhub_sandbox.system.log import CRASHES
+from envhub_sandbox.transport import trace
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import RemoteWarnings
 from envhub_worker.protocol import messages as m
@@ -63,14 +64,9 @@ class Repository:
     """What the environments of one ``make_env`` have in common. Opens nothing: see ``Launcher``.
 
     Args:
-        snapshot: The verified files.
-        arguments: For the repository's ``make_env``.
-        policy: What a jail may do.
-        timeouts: How long operations may take.
         runtime: The interpreter of the jails, and their packages.
         lane: ``"auto"`` or ``"frames"``.
         copy: Whether observations are copied for the caller, or lent.
-        recipe: How to make it again.
         installed: What was installed for it, for the provenance.
         advice: Says what to do where a module is missing, for the error's text.
 
@@ -95,6 +91,7 @@ class Repository:
         installed: dict[str, Any] | None,
         advice: Callable[[str], str],
     ) -> None:
+        trace.start_if_wanted()
         self.snapshot = snapshot
         self.arguments = arguments
         self.policy = policy
@@ -122,7 +119,7 @@ class Repository:
         return _wire_limits(self.policy.limits.message_bytes)
 
     def hold(self) -> None:
-        """Nobody removes its files and packages, until ``let_go``."""
+        """Keep its files and packages from being removed, until ``let_go``."""
         if self._in_use:
             return
         folders = [self.snapshot.root.parent]
@@ -145,7 +142,7 @@ class Repository:
             if isinstance(error, DependencyError) and not str(error).startswith(self.label):
                 error.args = (f"{error}. {self._advice(str(error))}",)
             name_source(error, self.label)
-            point_out(error, self.snapshot)
+            add_author_line(error, self.snapshot)
             raise
 
     def show_warnings(self) -> None:
@@ -189,23 +186,20 @@ class Repository:
     ) -> None:
         """Write a crash bundle and name it in the error. What hinders that is only logged.
 
-        Args:
-            error: What the user is going to be told.
-            recording: What was asked of the environment; None before there is one.
-            task: Which environment, as in ``Crash``.
-            loaded: Its jail.
-            shared: Whether other environments lived in it.
+        ``recording``, ``task`` and ``loaded`` are None before there is an environment; ``shared``
+        says whether others lived in its jail.
         """
         ours = self.policy.crash_history and error.bundle is None
         if not ours or getattr(error, "reason", "") in ("killed", "idle", "gone", "connection"):
             return
         manifest = None if loaded is None else loaded.manifest
         report = self.latest_report if loaded is None else loaded.jail.report
-        told = manifest, report, self.installed, self.latest_profile
         crash = Crash(
             error=error,
             label=self.label,
-            provenance=provenance_of(self.snapshot, *told),
+            provenance=provenance_of(
+                self.snapshot, manifest, report, self.installed, self.latest_profile
+            ),
             load=self.arguments.message(),
             options=self.recipe.options,
             task=task,

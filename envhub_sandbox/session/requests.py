@@ -4,11 +4,8 @@ The caller's rules and errors are those of ``gymnasium.vector.AsyncVectorEnv``. 
 which requests are legal, the lane takes each to the shards, and a ``Recovery``, if there is one,
 repeats what dead shards did not finish.
 
-A Ctrl-C can come between any two statements, and ``close`` from any thread or signal handler. The
-rule for both: the lifecycle moves *before* a message goes out and *after* its replies are in. So an
-interrupt in between finds a pending request whose reply may come (LATE; ``reset`` waits for it),
-and never READY with a reply still owed, which the next request would take for its own. Only where
-the lane says that nothing was sent, by an error of this project, the move is taken back.
+Where order matters here, docs/internals/interruption.md says why, by the rule's number: the
+lifecycle moves before a message goes out and after its replies are in.
 """
 
 from __future__ import annotations
@@ -29,18 +26,17 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_sandbox.session.attribute_cache import AttributeCache
-from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.prewarm import Prewarm
 from envhub_sandbox.session.refusals import refusal
 from envhub_sandbox.session.survival.failures import Failures
 from envhub_sandbox.session.survival.recovery import Recovery
-from envhub_sandbox.session.turns import Turns, collision
+from envhub_sandbox.session.use_lock import UseLock
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Lane, Request
 from envhub_sandbox.transport.replies import all_of
-from envhub_sandbox.transport.results import Results, StepResult
+from envhub_sandbox.transport.results import StepResult
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Event, State
 from envhub_worker.protocol.spaces import batches
@@ -58,19 +54,11 @@ T = TypeVar("T")
 class Requests:
     """The requests of one environment, whose jail is opened by the first of them.
 
-    Args:
-        lease: Its jail, and the lane there.
-        turns: Whose turn it is.
-        prewarm: Starts it.
-        results: What it is expected to be, and its slices.
-        counters: Of requests, steps and what went wrong.
-        history: Of what was asked.
-        failures: Make the errors.
-        recovery: Repeats what the dead did not finish; None where a death is an error.
-
     Attributes:
         results: Makes of replies what Gymnasium returns.
         attributes: Those that need no request.
+        use: A thread that asks something holds its lock until it has handled the answer;
+            between an ``*_async`` and its ``*_wait`` no thread does.
         closed: Whether the caller has called ``close``.
         waiting: The request of an ``*_async`` whose ``*_wait`` has not come yet.
         face: What the environment is called in the error after ``close``.
@@ -79,24 +67,22 @@ class Requests:
     def __init__(
         self,
         lease: Lease,
-        turns: Turns,
+        use: UseLock,
         prewarm: Prewarm,
-        results: Results,
-        counters: Counters,
         history: History,
         failures: Failures,
         recovery: Recovery | None,
     ) -> None:
-        self.results = results
-        self.attributes = AttributeCache(lease, counters)
+        self.results = lease.results
+        self.attributes = AttributeCache(lease)
         self.lifecycle = lease.lifecycle
         self.closed = False
         self.waiting: str | None = None
         self.face = "VectorEnv"
         self._lease = lease
-        self._turns = turns
+        self.use = use
         self._prewarm = prewarm
-        self._counters = counters
+        self._counters = lease.counters
         self._history = history
         self._failures = failures
         self._recovery = recovery
@@ -151,54 +137,60 @@ class Requests:
 
     def ask(self, operation: str, message_for: MessageFor) -> list[m.Value]:
         """One request, and the values of all shards."""
-        self.refuse_if_busy(operation)
-        self.submit(operation, message_for)
-        return self.collect(self._timeouts.call_s, m.Value)
+        return self._ask(operation, message_for, m.Value, self._timeouts.call_s)
 
     def ask_own(self, operation: str, kind: Callable[..., m.Message], *fields: object) -> m.Message:
         """Ask about what the repository's vector environment has of its own: one shard has it."""
-        self.submit(operation, lambda number, _: kind(number, *fields))
-        [reply] = self.collect(self._timeouts.call_s, (m.Value, m.Method))
+        kinds = (m.Value, m.Method)
+        [reply] = self._ask(operation, lambda n, _: kind(n, *fields), kinds, self._timeouts.call_s)
         return reply
 
     def ask_one(self, name: str, index: int, message: OneMessageFor) -> m.Message:
         """Ask about one sub-environment; the other shards' replies are empty."""
         operation = f"envs[{index}].{name[:_SHOWN]}"  # which is no reset or step of all
-        self.refuse_if_busy(operation)
+        timeouts = {"reset": self._timeouts.reset_s, "step": self._timeouts.step_s}
 
         def message_for(number: int, bounds: Bounds) -> m.Message:
             start, stop = bounds
             return message(number, index - start if start <= index < stop else None)
 
-        self.submit(operation, message_for)
-        timeouts = {"reset": self._timeouts.reset_s, "step": self._timeouts.step_s}
-        replies = self.collect(timeouts.get(name, self._timeouts.call_s), (m.Value, m.Method))
+        timeout_s = timeouts.get(name, self._timeouts.call_s)
+        replies = self._ask(operation, message_for, (m.Value, m.Method), timeout_s)
         holds = (start <= index < stop for start, stop in self.results.bounds)
         return next(reply for reply, here in zip(replies, holds, strict=True) if here)
+
+    def _ask(
+        self,
+        operation: str,
+        message_for: MessageFor,
+        kind: type[m.M] | tuple[type[m.M], ...],
+        timeout_s: float | None,
+    ) -> list[m.M]:
+        with self.use.lock:
+            self.refuse_if_busy(operation)
+            self.submit(operation, message_for)
+            return self.collect(timeout_s, kind)
 
     def submit(
         self, operation: str, message_for: MessageFor, instead: MessageFor | None = None
     ) -> None:
-        """Send a request to every shard, opening the jail if there is none.
+        """With the lock held, send a request to every shard; opens the jail if there is none.
 
-        Args:
-            operation: What it is called.
-            message_for: Makes what is asked, as the history keeps it.
-            instead: Makes what is sent in its place, if the answer is to say more.
+        ``instead`` makes what is sent in the place of what the history keeps, if the answer is to
+        say more.
 
         Raises:
             LocalProtocolError: It cannot be sent; nothing was.
             WorkerError: The environment is not in a state to take it.
         """
         try:
-            with self._turns.lock:
-                try:
-                    self._submit(operation, message_for, instead)
-                except BaseException:
-                    with self._turns.take(operation):  # on failure only: it costs some us
-                        raise
-                if self.lifecycle.state is State.CLOSED:
-                    self._lease.let_go()
+            try:
+                self._submit(operation, message_for, instead)
+            except BaseException:
+                with self.use.hold(operation):  # on failure only: it costs some us
+                    raise
+            if self.lifecycle.state is State.CLOSED:
+                self._lease.let_go()
         except WorkerDiedError:
             self.refuse_if_closed()  # a close() in another thread ended it
             raise
@@ -233,11 +225,7 @@ class Requests:
     def collect(
         self, timeout_s: float | None, kind: type[m.M] | tuple[type[m.M], ...]
     ) -> list[m.M]:
-        """The shards' replies to the last ``submit``; the environment is usable afterwards.
-
-        Args:
-            timeout_s: How long they may take.
-            kind: The message that a reply must be, or several.
+        """With the lock held, the shards' replies to the last ``submit``.
 
         Raises:
             WorkerTimeoutError: The environment is then LATE: ``reset`` brings it back.
@@ -246,14 +234,13 @@ class Requests:
             ClosedEnvironmentError: A ``close`` in another thread came first.
         """
         try:
-            with self._turns.lock:
-                try:
-                    replies = self._collect(timeout_s, kind)
-                except BaseException:
-                    with self._turns.judging("a request"):
-                        raise
-                if self.lifecycle.state is State.CLOSED:
-                    self._lease.let_go()
+            try:
+                replies = self._collect(timeout_s, kind)
+            except BaseException:
+                with self.use.judging("a request"):
+                    raise
+            if self.lifecycle.state is State.CLOSED:
+                self._lease.let_go()
         except BaseException as error:
             self.explain(error)
             raise
@@ -281,7 +268,7 @@ class Requests:
         try:
             return self.results.one_each(what, replies)
         except BaseException:
-            with self._turns.judging("a request"):
+            with self.use.judging("a request"):
                 raise
 
     def finish_reset(
@@ -291,61 +278,58 @@ class Requests:
         try:
             return self.results.reset(replies)
         except batches.Misfit:
-            with self._turns.judging("a request"):
+            with self.use.judging("a request"):
                 infos = self._infos_apart(Deadline(timeout_s))
                 if self._recovery is not None:
                     infos = self._recovery.mark(infos)
                 return self.results.reset(replies, infos)
         except BaseException:
-            with self._turns.judging("a request"):
+            with self.use.judging("a request"):
                 raise
 
     # --- steps ---------------------------------------------------------------------------------
 
     def submit_step(self, actions: Any) -> None:
-        """Send a validated batch of actions; raises as ``submit`` does."""
+        """Send a validated batch of actions, with the lock held; raises as ``submit`` does."""
         try:
-            with self._turns.lock:
-                lifecycle = self.lifecycle
-                if lifecycle.state is not State.READY:
-                    with self._turns.take("step"):
-                        self._make_ready("step")
-                try:
-                    lane = self._lease.lane
-                    assert lane is not None
-                    # The move comes first: an interrupt from here on leaves a reply that may come.
-                    lifecycle.request = "step"
-                    lifecycle.on(Event.SUBMIT)
-                    lane.send_step(actions)
-                except BaseException as error:
-                    with self._turns.take("step"):
-                        self._nothing_was_sent(error)
-                        raise
-                self._counters.requests += 1
-                self._history.step(actions)  # while the jail is at it
+            lifecycle = self.lifecycle
+            if lifecycle.state is not State.READY:
+                with self.use.hold("step"):
+                    self._make_ready("step")
+            try:
+                lane = self._lease.lane
+                assert lane is not None
+                lifecycle.request = "step"
+                lifecycle.on(Event.SUBMIT)  # interruption.md, rule 1: first
+                lane.send_step(actions)
+            except BaseException as error:
+                with self.use.hold("step"):
+                    self._nothing_was_sent(error)
+                    raise
+            self._counters.requests += 1
+            self._history.step(actions)  # while the jail is at it
         except WorkerDiedError:
             self.refuse_if_closed()  # a close() in another thread ended it
             raise
 
     def collect_step(self, timeout_s: float | None) -> StepResult:
-        """What ``VectorEnv.step`` returns; raises as ``collect`` does."""
+        """What ``VectorEnv.step`` returns, with the lock held; raises as ``collect`` does."""
         try:
-            with self._turns.lock:
-                deadline: Deadline = self._step_deadline
-                if timeout_s is deadline.timeout_s:
-                    self._step_deadline.running = False
-                else:
-                    deadline = Deadline(timeout_s)
-                try:
-                    lane = self._lease.lane
-                    if lane is None or self.lifecycle.state is not State.PENDING:
-                        raise self._nothing_pending()
-                    self._finish(lane.wait, deadline)
-                    self._counters.stepped(lane.elapsed_ns)
-                    result = lane.result()
-                except BaseException as error:
-                    with self._turns.judging("step"):
-                        result = self._mended(error, deadline)
+            deadline: Deadline = self._step_deadline
+            if timeout_s is deadline.timeout_s:
+                self._step_deadline.running = False
+            else:
+                deadline = Deadline(timeout_s)
+            try:
+                lane = self._lease.lane
+                if lane is None or self.lifecycle.state is not State.PENDING:
+                    raise self._nothing_pending()
+                self._finish(lane.wait, deadline)
+                self._counters.stepped(lane.elapsed_ns)
+                result = lane.result()
+            except BaseException as error:
+                with self.use.judging("step"):
+                    result = self._mended(error, deadline)
         except BaseException as error:
             self.explain(error)
             raise
@@ -388,25 +372,13 @@ class Requests:
         interrupted = self.lifecycle.request if pending else self._failures.interruption
         refused = refusal(state, operation, restart, interrupted)
         if refused is not None:
-            self.refuse_others(operation)
             raise refused
         self._prewarm.note_use()  # already: the next one starts beside this
         self._prewarm.start_on_demand()
 
-    def refuse_others(self, operation: str) -> None:
-        """A request that another thread waits for is not late: it is in use.
-
-        Raises:
-            AlreadyPendingCallError: It is.
-        """
-        if self.lifecycle.state is State.PENDING:
-            found = collision(self, operation)
-            if found is not None:
-                raise found
-
     def _send(self, operation: str, send: Callable[[], None]) -> None:
         self.lifecycle.request = operation
-        self.lifecycle.on(Event.SUBMIT)  # first, as for a step
+        self.lifecycle.on(Event.SUBMIT)  # interruption.md, rule 1: first
         try:
             send()
         except EnvHubError as error:
@@ -415,7 +387,7 @@ class Requests:
         self._counters.requests += 1
 
     def _nothing_was_sent(self, error: BaseException) -> None:
-        """Go back to where we were, if the lane says so: by an error of this project."""
+        """Go back to where we were, if nothing was sent: interruption.md, rule 2."""
         if isinstance(error, EnvHubError) and self.lifecycle.state is State.PENDING:
             self.lifecycle.answered()
 
@@ -438,7 +410,7 @@ class Requests:
             self._lease.forget_watched()
             self._failed(error, deadline)
         except BaseException as error:  # Ctrl-C, or what another signal handler raises
-            self._lease.forget_watched()
+            self._lease.forget_watched()  # interruption.md, rule 3
             self._failures.interrupted(error)
             raise
         self.lifecycle.answered()

@@ -75,16 +75,16 @@ def write_private(path: Path, content: bytes) -> None:
 
 
 def why_distrusted(place: Path, ours: Path) -> str:
-    """Who besides us and root can change what lies at a place, and what to do; empty for nobody.
+    """Who besides us and root can change what lies at a place, and what to do; empty if none can.
 
-    Every step of the path counts, links and what they lead to included: whoever can write in a
-    folder can put another one in the place of what is in it. In a sticky folder, such as /tmp,
+    Every step of the path counts, links and what they lead to included: a user who can write in
+    a folder can put another one in the place of what is in it. In a sticky folder, such as /tmp,
     only its owner can, so there it counts whose the next step is. A POSIX access list shows in
     the group's bits, which are its mask.
 
     Args:
         place: An existing absolute path.
-        ours: Where the folders begin that we made: these must be writable for nobody else. Above,
+        ours: Where the folders begin that we made: no other user may write there. Above,
             the group may write if it is its user's own, as many systems set homes up.
 
     Raises:
@@ -137,12 +137,12 @@ def _fault(path: str, status: os.stat_result, strict: bool) -> str:
     who = "everybody" if mode & stat.S_IWOTH else f"the group {_group(status.st_gid)}"
     return (
         f"the {kind} {path} can be written by {who} (mode {mode:04o}). "
-        f"If nobody has done so: chmod go-w {quoted}"
+        f"If none has done so: chmod go-w {quoted}"
     )
 
 
 def is_ours_alone(folder: Path) -> bool:
-    """Whether nobody but its owner, who is us or root, writes in a folder.
+    """Whether only its owner, who is us or root, can write in a folder.
 
     Raises:
         OSError: It cannot be looked at.
@@ -152,7 +152,7 @@ def is_ours_alone(folder: Path) -> bool:
 
 
 def is_trusted(user: int) -> bool:
-    """Whether a user could change our files anyway: ourselves, root, and whoever owns ``/``.
+    """Whether a user could change our files anyway: ourselves, root, and the owner of ``/``.
 
     The last is root, as it looks from inside a user namespace.
     """

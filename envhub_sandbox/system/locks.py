@@ -88,7 +88,7 @@ def is_held(path: Path) -> bool:
 
     Raises:
         FileNotFoundError: There is no such file.
-        OSError: That cannot be known.
+        OSError: The file cannot be opened, or its file system has no locks.
     """
     with unheld(path) as free:
         return not free
@@ -121,7 +121,7 @@ class _HeldLock:
     def __init__(self) -> None:
         self._held: list[int] = []
         _locks.add(self)
-        # what a Ctrl-C keeps ``release`` from, this does, which is called whatever became of that
+        # interruption.md, rule 5: also where a Ctrl-C came into ``release``
         weakref.finalize(self, _close, self._held).atexit = False
 
     def release(self) -> None:
@@ -191,6 +191,7 @@ def _close(held: list[int]) -> None:
         os.close(held.pop())
 
 
+# interruption.md, rules 14 and 15
 _locks: weakref.WeakSet[_HeldLock] = weakref.WeakSet()
 
 

@@ -193,7 +193,7 @@ class WorkerClient:
         while True:
             try:
                 # one by one: pyzmq's own loop costs more than the calls in it
-                self.torn = True
+                self.torn = True  # interruption.md, rule 1
                 for frame in frames[:-1]:
                     self._socket.send(frame, _MORE_NOW, copy)
                 self._socket.send(frames[-1], _NOW, copy)

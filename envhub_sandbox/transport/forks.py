@@ -1,4 +1,4 @@
-"""Which process something belongs to: a fork of it inherits that, and must leave it alone."""
+"""Which process something belongs to: docs/internals/interruption.md, rule 14."""
 
 from __future__ import annotations
 

@@ -291,7 +291,7 @@ def open_jail(
         return JailHandle(client, opened.jail, runners, report, limits)
     except EnvHubError:
         raise
-    except BaseException:  # Ctrl-C: it is open, or will be, and its number is known here only
+    except BaseException:  # interruption.md, rule 6
         _end_unseen(client, sent)
         raise
 

@@ -223,7 +223,7 @@ class RelayLane:
     def send_some(self, operation: str, runners: Sequence[int], packed: Sequence[Frames]) -> None:
         """Send some runners a message each; ``replies`` has what they answer."""
         self._owed = None
-        self._sending = True  # an interrupt from here on leaves half a message, or a whole one
+        self._sending = True  # interruption.md, rule 1: half a message, or a whole one
         try:
             self._owed = self.jail.relay(operation, list(zip(runners, packed, strict=True)))
         except EnvHubError:  # nothing was sent

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TextIO
 
 from envhub_sandbox.errors import EnvHubError, PolicyError
-from envhub_sandbox.log import OUTPUT
+from envhub_sandbox.system.log import OUTPUT
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.replies import expect

@@ -35,9 +35,6 @@ def batch_of(space: gym.Space[Any], value: Any, count: int, where: str = "action
     """A batch of ``count`` members of a *single* action space.
 
     Args:
-        space: The single action space.
-        value: What the caller passed to ``step``.
-        count: Number of sub-environments.
         where: What to call it in an error.
 
     Returns:
@@ -108,12 +105,7 @@ def _batch_of_tuples(
 
 
 class ActionReader:
-    """``batch_of`` for one environment, with what does not change worked out once.
-
-    Args:
-        space: The single action space.
-        count: Number of sub-environments.
-    """
+    """``batch_of`` for one environment, with what does not change worked out once."""
 
     def __init__(self, space: gym.Space[Any], count: int) -> None:
         self._space = space

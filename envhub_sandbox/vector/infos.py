@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 
-def of_one(infos: dict[Any, Any], index: int, num_envs: int) -> dict[Any, Any]:
+def info_of(infos: dict[Any, Any], index: int, num_envs: int) -> dict[Any, Any]:
     """The info of sub-environment ``index``.
 
     The other way round from ``VectorEnv._add_info``: a key counts where its mask, ``"_" + key``,
@@ -26,7 +26,7 @@ def of_one(infos: dict[Any, Any], index: int, num_envs: int) -> dict[Any, Any]:
 
 def _of_one(value: Any, index: int, num_envs: int) -> Any:
     if isinstance(value, dict):
-        return of_one(value, index, num_envs)
+        return info_of(value, index, num_envs)
     if isinstance(value, (np.ndarray, list, tuple)) and len(value) == num_envs:
         return value[index]
     return value  # not of the sub-environments, but of the vector environment

@@ -8,7 +8,8 @@ step takes the same way, the fast one, as every other.
 from __future__ import annotations
 
 import html
-from typing import Any, Protocol, SupportsFloat, cast
+from collections.abc import Callable
+from typing import Any, SupportsFloat, cast
 
 import gymnasium as gym
 import numpy as np
@@ -16,19 +17,12 @@ from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
-from envhub_sandbox.vector.infos import of_one
+from envhub_sandbox.vector.infos import info_of
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_worker.protocol.manifest.names import absent, is_servable
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _PLAIN = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
-
-
-class Closable(Protocol):
-    """What ends with the environment."""
-
-    def close(self) -> None:
-        """End it; more than once does nothing."""
 
 
 class SingleEnv(gym.Env[Any, Any]):
@@ -42,20 +36,22 @@ class SingleEnv(gym.Env[Any, Any]):
 
     Args:
         vector: With ``num_envs`` 1.
-        owner: Closed with it, the vector environment included; else only that is closed.
+        close: Closes it and all that was made with it; None closes the vector environment alone.
 
     Raises:
         ValueError: ``vector`` has another number of sub-environments.
     """
 
-    def __init__(self, vector: VectorEnv[Any, Any, Any], owner: Closable | None = None) -> None:
+    def __init__(
+        self, vector: VectorEnv[Any, Any, Any], close: Callable[[], None] | None = None
+    ) -> None:
         if vector.num_envs != 1:
             raise ValueError(
                 f"a gymnasium.Env is one environment, and {vector!r} has {vector.num_envs}: make "
                 "it with n_envs=1"
             )
         self._vector = vector
-        self._owner = owner
+        self._close = close or vector.close
         self._begun: tuple[Any, dict[str, Any]] | None = None
         self.observation_space = vector.single_observation_space
         self.action_space = vector.single_action_space
@@ -87,7 +83,7 @@ class SingleEnv(gym.Env[Any, Any]):
             return begun
         batch, infos = self._vector.reset(seed=seed, options=options)
         with UNTRUSTED:
-            return self._first(batch), of_one(infos, 0, 1)
+            return self._first(batch), info_of(infos, 0, 1)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """One step with ``action``, an element of ``action_space``.
@@ -115,7 +111,7 @@ class SingleEnv(gym.Env[Any, Any]):
         self, batch: Any, rewards: Any, terminations: Any, truncations: Any, infos: Any
     ) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """What a step of the only one returns."""
-        observation, info = self._first(batch), of_one(infos, 0, 1)
+        observation, info = self._first(batch), info_of(infos, 0, 1)
         terminated, truncated = bool(terminations[0]), bool(truncations[0])
         if (terminated or truncated) and self._resets_in_the_same_step:
             last, last_info = info.pop("final_obs"), info.pop("final_info", {})
@@ -131,7 +127,7 @@ class SingleEnv(gym.Env[Any, Any]):
 
     def close(self) -> None:
         """End its processes. Idempotent."""
-        (self._owner or self._vector).close()
+        self._close()
 
     @property
     def np_random(self) -> np.random.Generator:

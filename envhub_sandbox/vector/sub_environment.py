@@ -8,7 +8,7 @@ observation and the end of an episode of its own last step.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 
@@ -32,24 +32,6 @@ nested calls, which a step through the wrappers makes."""
 _OURS = frozenset({"_vector", "_ask", "_index", "_depth"})
 
 
-class Vector(Protocol):
-    """What a sub-environment asks of its vector environment."""
-
-    num_envs: int
-    metadata: dict[str, Any]
-    render_mode: str | None
-    single_action_space: Any
-    single_observation_space: Any
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether the repository returned Gymnasium's own class, as it is."""
-
-    @property
-    def is_sync(self) -> bool:
-        """Whether the sub-environments are at hand one by one, as in ``SyncVectorEnv``."""
-
-
 class SubEnvironment(gym.Env[Any, Any]):
     """One sub-environment of a vector environment, and what its wrappers wrap.
 
@@ -57,7 +39,7 @@ class SubEnvironment(gym.Env[Any, Any]):
     names that libraries look for in any object are not asked for: ``get_wrapper_attr`` names them.
 
     Args:
-        vector: Its vector environment.
+        vector: Its ``SandboxVectorEnv``.
         ask: Asks the worker about it.
         index: Which of the sub-environments it is.
         depth: How many wrappers are looked through; None for all.
@@ -65,7 +47,7 @@ class SubEnvironment(gym.Env[Any, Any]):
 
     def __init__(
         self,
-        vector: Vector,
+        vector: Any,
         ask: Callable[[str, int, OneMessageFor], m.Message],
         index: int,
         depth: int | None = _OUTERMOST,

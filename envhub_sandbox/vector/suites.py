@@ -76,21 +76,19 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
         Raises:
             ValueError: There is not exactly one; the text names what there is.
         """
-        found = [
-            (a_suite, a_task)
-            for a_suite, tasks in self.items()
-            for a_task in tasks
-            if suite in (None, a_suite) and task in (None, a_task)
-        ]
+        found = self._named(suite, lambda one: task in (None, one))
         if len(found) == 1:
             return self[found[0][0]][found[0][1]]
         if found:
-            names = ", ".join(f"[{a_suite!r}][{a_task!r}]" for a_suite, a_task in found)
-            raise ValueError(f"there are {len(found)} environments; choose one: {names}")
-        names = ", ".join(
-            f"[{a_suite!r}][{a_task!r}]" for a_suite in self for a_task in self[a_suite]
-        )
-        raise ValueError(f"there is no suite {suite!r} with a task {task!r}; there are: {names}")
+            raise ValueError(f"there are {len(found)} environments; choose one: {_names(found)}")
+        there = _names(self._named(None, lambda _: True))
+        raise ValueError(f"there is no suite {suite!r} with a task {task!r}; there are: {there}")
+
+    def _named(
+        self, suite: str | None, is_meant: Callable[[int | str], bool]
+    ) -> list[tuple[str, int | str]]:
+        suites = [(name, tasks) for name, tasks in self.items() if suite in (None, name)]
+        return [(name, task) for name, tasks in suites for task in tasks if is_meant(task)]
 
     def single(self, suite: str | None = None, task: int | str | None = None) -> SingleEnv:
         """One environment as an ordinary ``gymnasium.Env``; its ``close`` closes all of these.
@@ -103,7 +101,7 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
             ValueError: There is not exactly one such environment, or it has several
                 sub-environments.
         """
-        return SingleEnv(self.choose(suite, task), self)
+        return SingleEnv(self.choose(suite, task), self.close)
 
     def keep(self, suite: str | None = None, task: int | str | None = None) -> None:
         """Close and drop all but this suite and this task; a task is also found by its text.
@@ -111,12 +109,7 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
         Raises:
             ValueError: Nothing would be left; the text names what there is.
         """
-        chosen = {
-            (a_suite, a_task)
-            for a_suite, tasks in self.items()
-            for a_task in tasks
-            if suite in (None, a_suite) and task in (None, a_task, str(a_task))
-        }
+        chosen = self._named(suite, lambda one: task in (None, one, str(one)))
         if not chosen:
             self.choose(suite, task)
         for a_suite, tasks in list(self.items()):
@@ -145,7 +138,7 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
 
     def close(self) -> None:
         """Close every environment and end its processes. Idempotent."""
-        with contextlib.ExitStack() as all_of_them:  # all are closed, also where one raises
+        with contextlib.ExitStack() as all_of_them:  # interruption.md, rule 9
             all_of_them.callback(self._on_close)
             for env in list(self.envs())[::-1]:
                 all_of_them.callback(env.close)
@@ -160,3 +153,7 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
         traceback: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def _names(found: list[tuple[str, int | str]]) -> str:
+    return ", ".join(f"[{suite!r}][{task!r}]" for suite, task in found)

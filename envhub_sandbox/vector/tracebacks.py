@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import ParamSpec, TypeVar
 
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerError
-from envhub_sandbox.log import ERRORS
+from envhub_sandbox.system.log import ERRORS
 from envhub_worker.protocol.text import shortage
 
 _VARIABLE, _FULL = "ENVHUB_TRACEBACK", "full"

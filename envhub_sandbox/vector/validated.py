@@ -37,7 +37,7 @@ class ValidatedVectorEnv(SandboxVectorEnv):
     def __init__(self, session: EnvSession) -> None:
         super().__init__(session)
         spaces_of_actions = self.single_action_space, self.action_space
-        # not a bound method: an environment that refers to itself is not closed with its last owner
+        # not a bound method: it would refer to this environment (interruption.md, rule 13)
         self._read_actions = partial(_read_and_check, self._read_actions, *spaces_of_actions)
 
     def _end_reset(self, timeout_s: float | None) -> tuple[Any, dict[Any, Any]]:

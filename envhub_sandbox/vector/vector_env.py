@@ -39,7 +39,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
     Everything that ``VectorEnv`` has, and ``AsyncVectorEnv``'s ``*_async`` and ``*_wait``. Arrays
     that it returns belong to the caller: writable, and never changed by a later step. One thread
-    at a time; ``close`` may come from any.
+    uses it at a time, and a second one waits; ``close`` may come from any.
 
     Attributes:
         num_envs: Number of sub-environments.
@@ -69,7 +69,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             self.copy = session.repository.copy
             self.env_fns = from_manifest.env_fns(manifest, session.repository.label)
             self.observation_mode = "same"
-        # processes end with the last reference to the proxy
+        # processes end with the last reference to the proxy; interruption.md, rule 13
         weakref.finalize(self, session.close).atexit = False
 
     @property
@@ -114,9 +114,11 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         """
         # Not by reset_async and reset_wait: an interrupt between them would leave `waiting` set,
         # and the next request refused, although no reset_wait can follow.
-        self._requests.refuse_if_busy("reset_async")
-        self._send_reset(seed, options)
-        return self._end_reset(self._timeouts.reset_s)
+        self._note_first_use()
+        with self._requests.use.lock:
+            self._requests.refuse_if_busy("reset_async")
+            self._send_reset(seed, options)
+            return self._end_reset(self._timeouts.reset_s)
 
     @short_traceback
     def reset_async(
@@ -125,9 +127,17 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         options: dict[str, Any] | None = None,
     ) -> None:
         """Send the reset; ``reset_wait`` returns its results."""
-        self._requests.refuse_if_busy("reset_async")
-        self._send_reset(seed, options)
-        self._requests.waiting = "reset"
+        self._note_first_use()
+        with self._requests.use.lock:
+            self._requests.refuse_if_busy("reset_async")
+            self._send_reset(seed, options)
+            self._requests.waiting = "reset"
+
+    def _note_first_use(self) -> None:
+        """Before the lock, which a start ahead has: meanwhile the next one may start."""
+        prewarm = self._session.prewarm
+        if prewarm.starting is not None and not self.closed:
+            prewarm.note_use()
 
     def _send_reset(self, seed: Any, options: dict[str, Any] | None) -> None:
         mask = None
@@ -157,8 +167,9 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     @short_traceback
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
         """The results of ``reset_async``; ``timeout`` in seconds, else ``Timeouts.reset_s``."""
-        self._requests.end_wait("reset")
-        return self._end_reset(self._timeouts.reset_s if timeout is None else timeout)
+        with self._requests.use.lock:
+            self._requests.end_wait("reset")
+            return self._end_reset(self._timeouts.reset_s if timeout is None else timeout)
 
     def _end_reset(self, timeout_s: float | None) -> tuple[Any, dict[Any, Any]]:
         replies = self._requests.collect(timeout_s, m.ResetDone)
@@ -181,11 +192,12 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             RemoteEnvError: The environment raised; it is still usable.
         """
         requests = self._requests
-        if requests.closed or requests.waiting is not None:
-            requests.refuse_if_busy("step_async")
         try:  # without the decorator and step_async's calls: this is the method that is called most
-            requests.submit_step(self._read_actions(actions))
-            return requests.collect_step(self._timeouts.step_s)
+            with requests.use.lock:
+                if requests.closed or requests.waiting is not None:
+                    requests.refuse_if_busy("step_async")
+                requests.submit_step(self._read_actions(actions))
+                return requests.collect_step(self._timeouts.step_s)
         except EnvHubError as error:
             if shortened(error):
                 __tracebackhide__ = True  # pytest hides the frame then
@@ -195,27 +207,30 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     @short_traceback
     def step_async(self, actions: Any) -> None:
         """Send the actions; ``step_wait`` returns the results."""
-        self._requests.refuse_if_busy("step_async")
-        self._requests.submit_step(self._read_actions(actions))
-        self._requests.waiting = "step"
+        with self._requests.use.lock:
+            self._requests.refuse_if_busy("step_async")
+            self._requests.submit_step(self._read_actions(actions))
+            self._requests.waiting = "step"
 
     @short_traceback
     def step_wait(self, timeout: float | None = None) -> StepResult:
         """The results of ``step_async``; ``timeout`` in seconds, else ``Timeouts.step_s``."""
-        self._requests.end_wait("step")
-        timeout_s = self._timeouts.step_s if timeout is None else timeout
-        return self._requests.collect_step(timeout_s)
+        with self._requests.use.lock:
+            self._requests.end_wait("step")
+            timeout_s = self._timeouts.step_s if timeout is None else timeout
+            return self._requests.collect_step(timeout_s)
 
     # --- everything else -----------------------------------------------------------------------
 
     @short_traceback
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method, or read an attribute, of every sub-environment: a tuple of results."""
-        self._requests.refuse_if_busy("call_async")
-        if not (args or kwargs) and self._manifest.shardable:
-            return self._read(name)
-        self._send_call(name, args, kwargs)  # as reset
-        return self._end_call(self._timeouts.call_s)
+        with self._requests.use.lock:
+            self._requests.refuse_if_busy("call_async")
+            if not (args or kwargs) and self._manifest.shardable:
+                return self._read(name)
+            self._send_call(name, args, kwargs)  # as reset
+            return self._end_call(self._timeouts.call_s)
 
     def _read(self, name: str) -> tuple[Any, ...]:
         """``call`` without arguments; what is read after each step is watched."""
@@ -235,9 +250,10 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     @short_traceback
     def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
         """Send the call; ``call_wait`` returns its results."""
-        self._requests.refuse_if_busy("call_async")
-        self._send_call(name, args, kwargs)
-        self._requests.waiting = "call"
+        with self._requests.use.lock:
+            self._requests.refuse_if_busy("call_async")
+            self._send_call(name, args, kwargs)
+            self._requests.waiting = "call"
 
     def _send_call(
         self,
@@ -256,8 +272,9 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     @short_traceback
     def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
         """The results of ``call_async``; ``timeout`` in seconds, else ``Timeouts.call_s``."""
-        self._requests.end_wait("call")
-        return self._end_call(self._timeouts.call_s if timeout is None else timeout)
+        with self._requests.use.lock:
+            self._requests.end_wait("call")
+            return self._end_call(self._timeouts.call_s if timeout is None else timeout)
 
     def _end_call(self, timeout_s: float | None) -> tuple[Any, ...]:
         replies = self._requests.collect(timeout_s, m.Value)
@@ -332,7 +349,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     @property
     def sandbox_report(self) -> list[dict[str, Any]]:
         """One mapping per layer: ``layer``, ``enforced``, ``detail``. None unless it runs."""
-        return [dict(layer) for layer in self._session.report()]
+        return [dict(layer) for layer in self._session.lease.report()]
 
     def jail_usage(self) -> dict[str, int]:
         """What its jail holds right now, counted from outside of it by the worker server.
@@ -353,7 +370,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         has used up when the server looks: ``"limit PROCESSES"``, ``OPEN_FILES``, ``DISK_BYTES`` or
         ``DISK_FILES``. None unless it runs under a policy with ``record_denials``.
         """
-        return self._session.denials()
+        return self._session.lease.denials()
 
     def stats(self) -> dict[str, Any]:
         """Counters, at any moment, from any thread; asks nothing of the worker.
@@ -392,14 +409,12 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         ours = not is_servable(name) or hasattr(type(self), name)
         if manifest is None or ours or name not in manifest.attributes:
             raise absent(self, name, "get_attr")
-        self._requests.refuse_if_busy(name)
         reply = self._requests.ask_own("get attribute", m.GetOwn, name)
         if isinstance(reply, m.Value):
             return reply.value
 
         @short_traceback
         def method(*args: Any, **kwargs: Any) -> Any:
-            self._requests.refuse_if_busy(name)
             result = self._requests.ask_own(name, m.CallOwn, name, args, kwargs)
             return typed(result, m.Value).value
 

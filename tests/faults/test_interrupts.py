@@ -1,4 +1,4 @@
-"""Ctrl-C or ``close`` at the worst moment: everything is given back, and what is told is true."""
+"""Ctrl-C or ``close`` at the worst moment: all is given back, and the error says what happened."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
 
 
 def made(lane: str = "auto", **options: Any) -> Any:
-    """Two sub-environments, of which the last hangs when it is told to; reset."""
+    """Two sub-environments, of which the last hangs at a certain action; reset."""
     fails = options.pop("fails", {"moment": "step", "fault": "hang"})
     suites = make_env(sample("faulty"), n_envs=2, lane=lane, env_kwargs=fails, **options)
     suites.env.reset()
@@ -76,7 +76,7 @@ def test_a_second_ctrl_c_in_recovery_leaves_a_usable_environment(
 def test_ctrl_c_while_what_was_started_ahead_is_given_up(
     why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its jail has gone already: nobody takes it for ready."""
+    """Its jail has gone already, and it is not taken for ready."""
     make_env(sample("counter"), n_envs=2).close()  # known from here on: it starts later
     with make_env(sample("counter"), n_envs=2) as suites:
         env = suites.env
@@ -99,7 +99,7 @@ def test_ctrl_c_while_what_was_started_ahead_is_given_up(
 def test_ctrl_c_in_sending_a_step_leaves_a_late_reply(
     moment: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nobody knows whether it was done, so nobody goes on as if it was not."""
+    """It is not known whether it was done, so the next request is refused."""
     with made("frames") as suites:
         env = suites.env
         jail = inside.jail(env)
@@ -165,7 +165,7 @@ class Inside:
         self._go_on.set()
 
 
-def told(operation: Callable[[], object]) -> tuple[threading.Thread, list[BaseException]]:
+def threaded(operation: Callable[[], object]) -> tuple[threading.Thread, list[BaseException]]:
     """Run an operation in another thread; what it raises."""
     raised: list[BaseException] = []
 
@@ -181,8 +181,8 @@ def told(operation: Callable[[], object]) -> tuple[threading.Thread, list[BaseEx
 
 
 def close_during_reset(env: Any, inside: Inside) -> None:
-    """Close while another thread resets and has come to a place; it is told so."""
-    thread, raised = told(env.reset)
+    """Close while another thread resets and has come to a place; that raises so."""
+    thread, raised = threaded(env.reset)
     inside.wait()
     env.close()
     inside.leave()
@@ -206,7 +206,7 @@ def test_close_ends_the_wait_before_a_restart(
         monkeypatch.setattr(restart_policy, "backoff_s", waiting)
         loaded = inside.loaded(env)
         assert loaded is not None
-        thread, raised = told(env.reset if restart == "on_reset" else lambda: env.step([0, 1]))
+        thread, raised = threaded(env.reset if restart == "on_reset" else lambda: env.step([0, 1]))
         waiting.wait()
         env.close()
         thread.join(60)
@@ -257,7 +257,7 @@ def test_close_waits_no_longer_than_it_may(
     with made(timeouts={"close_s": close_s}) as suites:
         held, before = Held(), descendants()
         with monkeypatch.context() as patch:
-            patch.setattr(*inside.turn_lock(suites.env), held)
+            patch.setattr(*inside.use_lock(suites.env), held)
             suites.env.close()
         assert sum(held.waited) == longest
         assert eventually(lambda: descendants() < before)
@@ -268,7 +268,7 @@ def test_close_waits_no_longer_than_it_may(
 def test_a_jail_that_comes_up_after_close_is_given_back(
     moment: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever closes does not wait for it: whoever opened it gives it back."""
+    """The thread that closes does not wait for it: the one that opened it gives it back."""
     monkeypatch.setattr(*inside.CLOSE_PATIENCE, 0.0)
     with make_env(sample("faulty"), env_kwargs={"tasks": 2}) as suites:
         suites["suite"][0].reset()
@@ -305,7 +305,7 @@ class Closing(Lifecycle):
 
 
 def recover(env: Any) -> None:
-    """Reset after a step that nobody waits for any more."""
+    """Reset after a step whose wait was interrupted."""
     inside.session(env).requests.submit_step(np.zeros(2, np.int64))
     env.reset()
 
@@ -338,7 +338,7 @@ def test_closed_in_the_midst_says_closed(lane: str, before: bool, operation: str
 
 @lanes
 def test_what_was_interrupted_is_said(lane: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a notebook the next cell tells what the stopped one did; a late reply is told as such."""
+    """In a notebook the next cell names what the stopped one did; a late reply is named as late."""
     with made(lane) as suites:
         env = suites.env
         lane_in_use = inside.session(env).lease.lane

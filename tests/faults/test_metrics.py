@@ -17,6 +17,7 @@ from envhub_sandbox import errors, make_env  # noqa: E402
 from envhub_sandbox.metrics import EnvHubCollector  # noqa: E402
 from envhub_sandbox.session import counters  # noqa: E402
 from envhub_sandbox.session.counters import Counters, Labels, Ledger  # noqa: E402
+from envhub_worker.protocol.lifecycle import Lifecycle  # noqa: E402
 from tests.support import inside  # noqa: E402
 from tests.support.samples import sample  # noqa: E402
 
@@ -128,29 +129,17 @@ def test_bytes_are_counted_over_both_lanes(lane: str) -> None:
 
 
 class Env:
-    """What the ledger asks of an environment."""
-
-    def __init__(self) -> None:
-        self.counters = Counters()
-
-    def stats(self) -> dict[str, Any]:
-        """Its state."""
-        return {"state": "READY"}
-
-
-class Restarts:
-    """What it asks of whoever counts them."""
-
-    count = 2
+    """What the ledger counts."""
 
 
 def test_what_is_gone_takes_no_room() -> None:
     """A thousand environments leave one line of numbers."""
     ledger, labels = Ledger(), Labels("r", "s", "t")
     for _ in range(1000):
-        env = Env()
-        ledger.add(env, labels, Restarts())
-        env.counters.stepped(10**9)
+        env, counted = Env(), Counters()
+        ledger.add(env, labels, counted, Lifecycle())
+        counted.stepped(10**9)
+        counted.restarts = 2
         del env
     [row] = ledger.rows()
     assert (row.numbers["steps"], row.numbers["step_seconds"]) == (1000, 1000.0)
@@ -166,7 +155,7 @@ def test_names_of_the_worker_cannot_break_the_exposition(
     """A task's name is a stranger's text."""
     ledger, env = Ledger(), Env()
     nasty = 'a"b\\c\nd} 5\x1b[31m'
-    ledger.add(env, Labels("r", nasty, nasty * 1000), Restarts())
+    ledger.add(env, Labels("r", nasty, nasty * 1000), Counters(), Lifecycle())
     monkeypatch.setattr("envhub_sandbox.metrics.LEDGER", ledger)
     found = scraped(registry, "r")
     assert all("\x1b" not in value for _, labels in found for _, value in labels)

@@ -19,7 +19,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
-from envhub_sandbox.session.author_lines import point_out
+from envhub_sandbox.session.author_lines import add_author_line
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError, open_jail
 from envhub_sandbox.transport.remote_warnings import MOST, RemoteWarnings
@@ -447,7 +447,7 @@ def tracebacks(dice: Dice) -> None:
     text = "".join(rng.choices(_PIECES, k=rng.choice((3, 10, 40, 4000))))
     stage = rng.choice(("step", "import", "make_env"))
     error: Any = raised(m.Raised("ValueError", text[:600], text[:9000], text, stage))
-    point_out(error, _SNAPSHOT)
+    add_author_line(error, _SNAPSHOT)
     for told in (str(error), *vars(error).get("__notes__", ())):
         demand(all(one in "\n\t" or one.isprintable() for one in told), "a control character")
         demand(len(told) < 200_000, "a text without end")  # each line has a margin

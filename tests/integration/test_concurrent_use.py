@@ -1,4 +1,4 @@
-"""Two threads that use one environment at once: the second is told so, the first goes on."""
+"""Two threads that use one environment at once: the second waits, and close does not."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gymnasium.error import AlreadyPendingCallError
+from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import WorkerTimeoutError
+from envhub_worker.protocol.lifecycle import State
 from tests.support import inside
 from tests.support.samples import SAMPLES
 
@@ -52,17 +53,63 @@ def held_between_the_halves(env: Any, monkeypatch: pytest.MonkeyPatch) -> Callab
 
 
 @pytest.mark.parametrize("asks", ["step", "reset", "get_attr"])
-def test_the_second_thread_is_told(env: Any, monkeypatch: pytest.MonkeyPatch, asks: str) -> None:
-    """It names the first, whose results come, and nothing is late."""
+def test_the_second_thread_waits(env: Any, monkeypatch: pytest.MonkeyPatch, asks: str) -> None:
+    """Nothing of it is sent before the first has its results; then both have theirs."""
     finish = held_between_the_halves(env, monkeypatch)
-    arguments = {"step": (ACTIONS,), "reset": (), "get_attr": ("gravity",)}[asks]
-    with pytest.raises(AlreadyPendingCallError, match="'rollout' is using this environment"):
-        getattr(env, asks)(*arguments)
+    arguments = {"step": (ACTIONS,), "get_attr": ("gravity",)}.get(asks, ())
+    sent, results = env.stats()["requests"], []
+    second = threading.Thread(target=lambda: results.append(getattr(env, asks)(*arguments)))
+    second.start()
+    assert not getattr(*inside.use_lock(env)).acquire(blocking=False)
+    assert (env.stats()["requests"], results) == (sent, [])
     assert finish()[0].shape == (2, 4)
+    second.join(DEADLINE_S)
+    assert len(results) == 1
     assert env.step(ACTIONS)[0].shape == (2, 4)
 
 
-def test_what_nobody_waits_for_is_late(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_second_thread_is_refused_after_an_async_call(env: Any) -> None:
+    """No thread has the lock between the two calls."""
+    env.step_async(ACTIONS)
+    refused: list[type] = []
+
+    def step() -> None:
+        try:
+            env.step(ACTIONS)
+        except AlreadyPendingCallError as error:
+            refused.append(type(error))
+
+    second = threading.Thread(target=step)
+    second.start()
+    second.join(DEADLINE_S)
+    assert refused == [AlreadyPendingCallError]
+    assert env.step_wait()[0].shape == (2, 4)
+
+
+def test_a_close_in_another_thread_does_not_wait(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also between the halves of a step, which ends with an error then."""
+    errors: list[Exception] = []
+    step = env.step
+
+    def stepped(actions: Any) -> Any:
+        try:
+            return step(actions)
+        except ClosedEnvironmentError as error:
+            errors.append(error)
+            return [np.zeros((2, 4))]
+
+    monkeypatch.setattr(env, "step", stepped)
+    finish = held_between_the_halves(env, monkeypatch)
+    closing = threading.Thread(target=env.close)
+    closing.start()
+    while inside.session(env).lifecycle.state is not State.CLOSED:
+        pass
+    finish()
+    closing.join(DEADLINE_S)
+    assert len(errors) == 1
+
+
+def test_a_step_without_its_second_half_is_late(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """The control: an interrupt between the halves, and no other thread."""
 
     def interrupted(timeout_s: float | None = None) -> Any:

@@ -12,7 +12,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import DependencyError, RequirementError, ResolutionError
-from envhub_sandbox.log import DEPENDENCIES
+from envhub_sandbox.system.log import DEPENDENCIES
 from tests.support.compare import assert_same
 from tests.support.repositories import CARTPOLES, write_repository
 from tests.support.wheels import Index, make_wheel

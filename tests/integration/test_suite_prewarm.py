@@ -193,7 +193,7 @@ def test_closing_what_is_being_given_up_leaves_no_server(tasks: Callable[..., Ta
     """Whoever gives it up has its turn still, and nothing of it any more: neither waits."""
     envs = tasks(2)
     envs[0].reset()
-    owner, name = inside.turn_lock(envs[1])
+    owner, name = inside.use_lock(envs[1])
     held, closed = threading.Event(), threading.Event()
 
     def give_up() -> None:

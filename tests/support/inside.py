@@ -77,14 +77,14 @@ def choice_of_packages() -> Spot:
     return making, "packages_for"
 
 
-def turn_lock(env: Any) -> Spot:
+def use_lock(env: Any) -> Spot:
     """What a thread holds while it asks the environment something."""
-    return session(env).turns, "lock"
+    return session(env).use, "lock"
 
 
 def clean_up(env: Any) -> None:
     """What a thread does that has outlasted a ``close``."""
-    with session(env).turns.take("a test"):
+    with session(env).use.hold("a test"):
         return
 
 

@@ -44,7 +44,7 @@ def output_policy(worker_output: str | None) -> str | None:
 @contextlib.contextmanager
 def logged(*, verbose: bool, worker_output: str | None) -> Iterator[None]:
     """Show logs on stderr while it lasts."""
-    from envhub_sandbox.log import OUTPUT, ROOT
+    from envhub_sandbox.system.log import OUTPUT, ROOT
 
     shown = []
     if verbose:

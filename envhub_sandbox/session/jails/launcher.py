@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, LoadError, WorkerTimeoutError
-from envhub_sandbox.log import WORKER
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
 from envhub_sandbox.session.jails.server_hold import ServerHold
 from envhub_sandbox.session.repository import Repository
+from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, open_jail
@@ -113,7 +113,7 @@ class Launcher:
             client.close()
             wanted.close()
             raise
-        try:  # and nothing is called before it, where a Ctrl-C could come
+        try:  # interruption.md, rule 4
             jail.warnings = self.repository.warnings
             WORKER.debug("%s: jail %x opened", self.repository.label, jail.number)
             if wanted.sinks:
@@ -254,7 +254,7 @@ class Launcher:
             wait_for_end = partial(loaded.jail.ask_to_close(), Deadline(_CLOSE_S))
             if wait or not self._hold.close_later(loaded.server, wait_for_end):
                 wait_for_end()
-        else:  # what was sent before an interrupt is not known: it is sent over another connection
+        else:  # interruption.md, rule 7: what was sent is not known: over another connection
             self.interrupt(loaded)
             loaded.jail.drop()
         loaded.ended = True

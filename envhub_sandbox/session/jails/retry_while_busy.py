@@ -7,7 +7,7 @@ from time import monotonic, sleep
 from typing import TypeVar
 
 from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerDiedError
-from envhub_sandbox.log import WORKER
+from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.tcp import UnreachableError
 from envhub_worker.protocol.messages.busy import DRAINING

@@ -33,7 +33,7 @@ class ServerHold:
         self._acquire = acquire
         self._on_enter = on_enter
         self._on_empty = on_empty
-        # reentrant: the garbage collector may close an environment in the middle of this
+        # interruption.md, rule 12
         self._lock = threading.RLock()
         self._owner = Owner()
         self._open: set[object] = set()

@@ -63,7 +63,7 @@ class SharedJail(JailSource):
 
     def __init__(self, launcher: Launcher, forget_manifest: Callable[[], None]) -> None:
         super().__init__(launcher, forget_manifest)
-        self._lock = threading.RLock()  # the garbage collector may close one of them meanwhile
+        self._lock = threading.RLock()  # interruption.md, rule 12
         self._owner = Owner()
         self._first: LoadedJail | None = None
         self._users: weakref.WeakSet[LoadedJail] = weakref.WeakSet()

@@ -4,36 +4,24 @@ from __future__ import annotations
 
 from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerTimeoutError
-from envhub_sandbox.log import WORKER
-from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.refusals import closed_during, expiry
+from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.results import Results
 from envhub_worker.protocol.lifecycle import Event
 
 
 class Failures:
     """The failures of one environment's requests.
 
-    Args:
-        lease: Its jail.
-        results: Its manifest and slices.
-        counters: Of deaths and late replies.
-        history: What was asked, for a crash bundle.
-
     Attributes:
         interruption: The request whose wait was interrupted, so that its reply is late; None where
             the last late reply has another reason.
     """
 
-    def __init__(
-        self, lease: Lease, results: Results, counters: Counters, history: History
-    ) -> None:
+    def __init__(self, lease: Lease, history: History) -> None:
         self._lease = lease
-        self._manifest = results.manifest
-        self._shards = len(results.bounds)
-        self._counters = counters
+        self._counters = lease.counters
         self._history = history
         self.interruption: str | None = None
 
@@ -114,12 +102,13 @@ class Failures:
         self._write_crash(error)
 
     def _write_crash(self, error: WorkerDiedError | WorkerTimeoutError) -> None:
-        lease, manifest = self._lease, self._manifest
+        lease, results = self._lease, self._lease.results
+        manifest = results.manifest
         task = {
             "suite": manifest.suite,
             "task": manifest.task,
             "num_envs": manifest.num_envs,
-            "shards": self._shards,
+            "shards": len(results.bounds),
             "lane": None if lease.lane is None else lease.lane.name,
         }
         recording, loaded = self._history.recording(), lease.loaded

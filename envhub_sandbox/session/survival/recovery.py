@@ -11,18 +11,16 @@ from typing import Any
 
 from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
-from envhub_sandbox.log import WORKER
-from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.survival.failures import Failures
 from envhub_sandbox.session.survival.restart_policy import Restarts
-from envhub_sandbox.session.survival.revived_rows import marked, truncated
+from envhub_sandbox.session.survival.revived_rows import mark_revived, revived_step
 from envhub_sandbox.session.survival.seeds import SeedBook, Settings, resets
+from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Lane, Request
 from envhub_sandbox.transport.replies import check, typed
-from envhub_sandbox.transport.results import Results
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.lifecycle import Event
@@ -35,34 +33,23 @@ RowsOf = Callable[[m.Message, int], m.Message]
 
 
 class Recovery:
-    """Brings back the dead shards of one environment.
-
-    Args:
-        lease: The environment's jail.
-        results: Its manifest and slices.
-        restarts: How often it may be done, and how soon.
-        failures: Make the errors.
-        counters: Of deaths.
-        history: Learns what came back.
-    """
+    """Brings back the dead shards of one environment."""
 
     def __init__(
         self,
         lease: Lease,
-        results: Results,
         restarts: Restarts,
         failures: Failures,
-        counters: Counters,
         history: History,
     ) -> None:
-        manifest = results.manifest
+        manifest = lease.results.manifest
         self._lease = lease
         self._lifecycle = lease.lifecycle
         self._num_envs = manifest.num_envs
-        self._bounds = results.bounds
+        self._bounds = lease.results.bounds
         self._restarts = restarts
         self._failures = failures
-        self._counters = counters
+        self._counters = lease.counters
         self._history = history
         self._seeds = SeedBook(manifest.num_envs, manifest.shardable)
         self._settings = Settings()
@@ -127,7 +114,7 @@ class Recovery:
         """All infos of the last request, of which those of the fresh shards say that they are."""
         if not self._fresh:
             return infos
-        return marked(infos, self._num_envs, [self._bounds[index] for index in self._fresh])
+        return mark_revived(infos, self._num_envs, [self._bounds[index] for index in self._fresh])
 
     def _of_survivors(self, deaths: RunnersDiedError) -> list[m.Message | None]:
         """What the others answered; None in the place of the dead.
@@ -231,7 +218,7 @@ class Recovery:
         return resets(reset, self._derived(index))
 
     def _derived(self, index: int) -> Any:
-        return self._seeds.derived(self._bounds[index], self._restarts.count)
+        return self._seeds.derived(self._bounds[index], self._counters.restarts)
 
     def _size(self, index: int) -> int:
         start, stop = self._bounds[index]
@@ -240,13 +227,13 @@ class Recovery:
 
 def _step_rows(reply: m.Message, size: int) -> m.Message:
     """Trust: input from the worker."""
-    return truncated(typed(reply, m.StepDone), size)
+    return revived_step(typed(reply, m.StepDone), size)
 
 
 def _reset_rows(reply: m.Message, size: int) -> m.Message:
     """Trust: input from the worker."""
     done = typed(reply, m.ResetDone)
-    return m.replace(done, info=marked(done.info, size))
+    return m.replace(done, info=mark_revived(done.info, size))
 
 
 def _ask_anew(

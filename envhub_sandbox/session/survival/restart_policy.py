@@ -6,6 +6,7 @@ import time
 
 from envhub_sandbox.errors import WorkerDiedError
 from envhub_sandbox.policy import Policy
+from envhub_sandbox.session.counters import Counters
 
 _CALM_S = 60.0
 _LONGEST_S = 30.0
@@ -13,18 +14,14 @@ _LOOK_AGAIN_S = 0.1
 
 
 class Restarts:
-    """The restarts of one environment.
+    """The restarts of one environment, which its counters count."""
 
-    Attributes:
-        count: How many there were.
-    """
-
-    def __init__(self, policy: Policy) -> None:
+    def __init__(self, policy: Policy, counters: Counters) -> None:
         self._policy = policy
+        self._counters = counters
         self._last = -_CALM_S
         self._in_a_row = 0
         self._given_up = False
-        self.count = 0
 
     @property
     def permitted(self) -> bool:
@@ -33,20 +30,17 @@ class Restarts:
 
     def give_up(self) -> None:
         """No more restarts are needed: a wait in another thread ends soon."""
-        # no Event: a signal handler in the midst of its wait could not set it
+        # interruption.md, rule 12: no Event
         self._given_up = True
 
     def spend(self, operation: str) -> None:
-        """Count one more, and wait if the last one was a moment ago.
-
-        Args:
-            operation: What needs it.
+        """Count one more for an operation, and wait if the last one was a moment ago.
 
         Raises:
-            WorkerDiedError: There are none left, or somebody has given up.
+            WorkerDiedError: There are none left, or the environment was closed.
         """
         budget = self._policy.restart_budget
-        if self.count >= budget:
+        if self._counters.restarts >= budget:
             raise WorkerDiedError(
                 f"the worker process has died again, and all {budget} restarts are used up "
                 "(restart_budget of the policy); make the environment again",
@@ -56,7 +50,7 @@ class Restarts:
         self._in_a_row = 0 if calm else self._in_a_row + 1
         self._wait(backoff_s(self._policy.restart_backoff_s, self._in_a_row), operation)
         self._last = time.monotonic()
-        self.count += 1
+        self._counters.restarts += 1
 
     def _wait(self, wait_s: float, operation: str) -> None:
         until = time.monotonic() + wait_s

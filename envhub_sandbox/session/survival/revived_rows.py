@@ -14,7 +14,7 @@ RESTARTED = "worker_restarted"
 """The key in the infos: whether a sub-environment was lost and came back reset."""
 
 
-def truncated(reply: m.StepDone, count: int) -> m.StepDone:
+def revived_step(reply: m.StepDone, count: int) -> m.StepDone:
     """A fresh runner's rows of the step in which another died. Trust: its flags are not used.
 
     Of the rewards the shape is used where they are an array: then it was paid for in bytes. A
@@ -26,11 +26,11 @@ def truncated(reply: m.StepDone, count: int) -> m.StepDone:
         np.zeros(rewards.shape if is_batch(rewards) else (count,)),
         np.zeros(count, np.bool_),
         np.ones(count, np.bool_),
-        marked(reply.info, count),
+        mark_revived(reply.info, count),
     )
 
 
-def marked(
+def mark_revived(
     info: dict[Any, Any], count: int, bounds: Iterable[tuple[int, int]] | None = None
 ) -> dict[Any, Any]:
     """Infos that say of each sub-environment, or of those within, that it came back."""

@@ -77,12 +77,7 @@ class Settings:
 
 
 def derived_seed(seed: int | None, restart: int) -> int | None:
-    """The seed of a sub-environment that comes back with an environment's ``restart``-th restart.
-
-    Args:
-        seed: The last that it was given, or None.
-        restart: Counts from 1.
-    """
+    """The seed after the ``restart``-th restart of what was last seeded with ``seed``."""
     if seed is None:
         return None
     return int(np.random.SeedSequence((abs(seed), restart)).generate_state(1)[0])
@@ -91,11 +86,8 @@ def derived_seed(seed: int | None, restart: int) -> int | None:
 def resets(message: m.Reset, derived: Any) -> list[m.Message]:
     """What a fresh runner is asked in the place of one that died in a reset.
 
-    The reset itself; where it is one of some sub-environments only, all are reset before.
-
-    Args:
-        message: What the dead one was asked.
-        derived: Seeds for what the caller gave none for.
+    The reset itself, with derived seeds where the caller gave none; where it is one of some
+    sub-environments only, all are reset before.
     """
     if message.mask is not None:
         return [m.Reset(message.env, derived, None, None), message]

@@ -78,7 +78,7 @@ class Attachment:
         """Let go of them."""
         self.watch.close()
         for index, pidfd in list(self._pidfds.items()):
-            del self._pidfds[index]  # and nothing is called in between, where a Ctrl-C could come
+            del self._pidfds[index]  # interruption.md, rule 4
             os.close(pidfd)
 
 

@@ -170,7 +170,7 @@ class SharedMemoryLane:
 
     def send_step(self, actions: Any) -> None:
         """See ``Lane``."""
-        self._owed = _STEP  # first: an interrupt from here on leaves a reply that may come
+        self._owed = _STEP  # interruption.md, rule 1: first
         self._steps += 1
         leaves = [actions] if self._flat_actions else slabs.flatten(self._action_space, actions)
         self._asked_ns = perf_counter_ns()
@@ -249,7 +249,7 @@ class SharedMemoryLane:
                 self.observations.leave()
             self._relay.send(request)
             return
-        self._owed = operation  # first, as for a step
+        self._owed = operation  # interruption.md, rule 1: first
         self._asked_ns = perf_counter_ns()
         self._spin = self._talk_spin
         # a reset writes a batch, and what is written must not be held by anyone

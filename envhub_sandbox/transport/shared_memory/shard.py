@@ -35,9 +35,8 @@ _RECHECK_MS = 2
 class LaneShard:
     """The slabs and doorbells of one shard.
 
-    An interrupt may fall between any two statements of a request. So what is remembered of the
-    slab is forgotten before it is written, and noted again afterwards: otherwise the next request
-    would leave out what the runner has never seen.
+    What is remembered of a slab is forgotten before it is written, and noted again afterwards:
+    docs/internals/interruption.md, rule 3.
 
     Args:
         layout: Where everything lies.

@@ -336,3 +336,29 @@ def test_settings_are_written_from_the_docstrings() -> None:
 def test_options_are_written_from_the_commands() -> None:
     """``python -m tests.support.options`` writes them again."""
     assert options.DOCUMENT.read_text() == options.document()
+
+
+def test_the_rules_of_interruption_are_those_that_the_source_names() -> None:
+    """Each rule is named where a line depends on it, and no rule that there is not."""
+    page = (CHECKOUT / "docs" / "internals" / "interruption.md").read_text()
+    rules = {int(found) for found in re.findall(r"^\*\*Rule (\d+):", page, re.MULTILINE)}
+    named: set[int] = set()
+    for path in (CHECKOUT / "envhub_sandbox").rglob("*.py"):
+        text = path.read_text()
+        for found in (
+            re.findall(r"\brules? (\d[\d, toand]*)", text) if "interruption.md" in text else ()
+        ):
+            numbers = [int(number) for number in re.findall(r"\d+", found)]
+            named.update(range(numbers[0], numbers[-1] + 1) if " to " in found else numbers)
+    assert named == rules == set(range(1, len(rules) + 1))
+
+
+@pytest.mark.parametrize("page", ["a-step", "interruption"])
+def test_the_files_that_a_page_on_the_inside_names_are_there(page: str) -> None:
+    """By their path, or by its end."""
+    text = (CHECKOUT / "docs" / "internals" / f"{page}.md").read_text()
+    roots = [CHECKOUT / name for name in ("envhub_sandbox", "worker", "tests")]
+    files = [f"/{one.relative_to(CHECKOUT)}" for root in roots for one in root.rglob("*.py")]
+    named = re.findall(r"`([a-z_/-]+\.py)`", text)
+    assert named
+    assert [one for one in named if not any(file.endswith(f"/{one}") for file in files)] == []

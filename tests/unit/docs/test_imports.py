@@ -53,7 +53,7 @@ DESERIALISERS = {"_pickle", "copyreg", "dill", "joblib", "marshal", "pickle", "s
 # Which package may import which; a package is a folder or a module right below one of the two.
 # Every package may import the lowest ones, LOWEST, as far as these stand below it.
 LOWEST = {
-    *("envhub_sandbox.errors", "envhub_sandbox.log", "envhub_sandbox.option_names"),
+    *("envhub_sandbox.errors", "envhub_sandbox.option_names"),
     *("envhub_sandbox.system", "envhub_worker.protocol"),
 }
 MAY_IMPORT = {
@@ -87,7 +87,6 @@ MAY_IMPORT = {
     "envhub_sandbox.sources": {"hub"},
     "envhub_sandbox.hub": set(),
     "envhub_sandbox.policy": set(),
-    "envhub_sandbox.log": set(),
     "envhub_sandbox.errors": set(),
     "envhub_sandbox.option_names": set(),
     "envhub_sandbox.system": set(),

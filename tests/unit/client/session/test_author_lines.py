@@ -1,4 +1,4 @@
-"""Errors lead whoever wrote an environment to his line, whatever text a worker sends."""
+"""Errors name the author's own line, whatever text a worker sends."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from envhub_sandbox import errors
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
-from envhub_sandbox.session.author_lines import point_out
+from envhub_sandbox.session.author_lines import add_author_line
 from envhub_sandbox.transport.replies import raised
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.text import MARGIN
@@ -36,10 +36,10 @@ ValueError: no
 """
 
 
-def told(traceback: str, snapshot: Snapshot = LOCAL, stage: str = "step") -> EnvHubError:
+def failed(traceback: str, snapshot: Snapshot = LOCAL, stage: str = "step") -> EnvHubError:
     """The error that is raised for this traceback."""
     error = raised(m.Raised("ValueError", "ValueError", "no", traceback, stage))
-    point_out(error, snapshot)
+    add_author_line(error, snapshot)
     return error
 
 
@@ -55,7 +55,7 @@ def notes(error: EnvHubError) -> str:
 @pytest.mark.parametrize("stage", ["step", "make_env"])
 def test_the_authors_last_line_is_in_the_text(snapshot: Snapshot, place: str, stage: str) -> None:
     """By the name that he knows, and the whole traceback is in the notes, by these names too."""
-    error = told(TRACE, snapshot, stage)
+    error = failed(TRACE, snapshot, stage)
     last = f"  File {place.format('lib/a.py')}, line 2, in helper\n    return np.linalg.inv(x)"
     assert str(error).endswith(f"ValueError: no\n{last}")
     assert f"File {place.format('env.py')}, line 12, in step\n    helper(0)\n" in notes(error)
@@ -67,8 +67,8 @@ def test_the_authors_last_line_is_in_the_text(snapshot: Snapshot, place: str, st
 
 
 def test_a_path_in_the_store_is_taken_for_the_authors_too() -> None:
-    """As workers of before tell it."""
-    error = told(TRACE.replace('"env.py"', f'"{ROOT}/env.py"').replace('"lib/a.py"', '"x.py"'))
+    """As older workers name files."""
+    error = failed(TRACE.replace('"env.py"', f'"{ROOT}/env.py"').replace('"lib/a.py"', '"x.py"'))
     assert str(error).endswith('  File "/home/me/my-env/env.py", line 12, in step\n    helper(0)')
     assert ROOT not in notes(error)
 
@@ -78,15 +78,15 @@ def test_a_path_in_the_store_is_taken_for_the_authors_too() -> None:
 )
 def test_only_files_of_the_snapshot_are_pointed_at(name: str) -> None:
     """A worker fills in which of them; it cannot send the reader anywhere else."""
-    error = told(f'Traceback:\n  File "{name}", line 3, in x\n    y\nValueError: no\n')
+    error = failed(f'Traceback:\n  File "{name}", line 3, in x\n    y\nValueError: no\n')
     assert str(error) == "ValueError: no"
 
 
 def test_it_is_told_once() -> None:
     """However many layers of ours the error goes through."""
-    error = told(TRACE)
+    error = failed(TRACE)
     before = str(error), notes(error)
-    point_out(error, LOCAL)
+    add_author_line(error, LOCAL)
     assert (str(error), notes(error)) == before
 
 
@@ -104,14 +104,14 @@ def test_it_is_told_once() -> None:
 def test_a_syntax_error_has_its_caret(margin: str, source: str, caret: str, shown: str) -> None:
     """Below the very character, or not at all."""
     lines = ("Traceback:", '  File "env.py", line 1', margin + source, margin + caret, "no")
-    error = told("\n".join(lines), stage="import")
+    error = failed("\n".join(lines), stage="import")
     assert str(error).endswith(f'  File "/home/me/my-env/env.py", line 1\n{shown}')
 
 
 def test_copies_and_pickles_keep_the_line() -> None:
     """As those of a pool's worker do."""
     for stage in ("step", "make_env"):
-        error = told(TRACE, stage=stage)
+        error = failed(TRACE, stage=stage)
         for made in (copy.copy(error), pickle.loads(pickle.dumps(error))):
             assert (str(made), notes(made)) == (str(error), notes(error))
 
@@ -137,7 +137,7 @@ HOSTILE = "\x1b]0;owned\x07\x1b[2J\r\u202e"
 @pytest.mark.parametrize("stage", ["step", "import"])
 def test_hostile_tracebacks_stay_bounded_and_printable(trace: str, stage: str) -> None:
     """Nothing that a terminal obeys, and no more than a screen in the text itself."""
-    error = told(trace, stage=stage)
+    error = failed(trace, stage=stage)
     for text in (str(error), notes(error)):
         assert all(char in "\n\t" or char.isprintable() for char in text)
         assert len(text) < 40_000
@@ -147,7 +147,7 @@ def test_hostile_tracebacks_stay_bounded_and_printable(trace: str, stage: str) -
 def test_names_of_the_machine_that_a_terminal_would_obey_are_escaped() -> None:
     """A folder may have any name."""
     folder = Snapshot(f"/home/{HOSTILE}", "local", "local-1", "env.py", Path(ROOT), FILES)
-    error = told(TRACE, folder)
+    error = failed(TRACE, folder)
     assert "\\x1b" in str(error)
     for text in (str(error), notes(error)):
         assert all(char in "\n\t" or char.isprintable() for char in text)
@@ -157,7 +157,7 @@ def test_names_of_the_machine_that_a_terminal_would_obey_are_escaped() -> None:
 
 
 def a_failure(folder: Path, source: str) -> m.Raised:
-    """What a runner tells of a file that raises when it is run."""
+    """What a runner says of a file that raises when it is run."""
     path = folder / "env.py"
     path.write_text(source)
     try:
@@ -170,16 +170,16 @@ def a_failure(folder: Path, source: str) -> m.Raised:
 def test_files_of_the_repository_have_their_names_in_it(tmp_path: Path) -> None:
     """Causes included; the line of the source is found all the same."""
     source = "try:\n    1 / 0\nexcept ArithmeticError as error:\n    raise KeyError from error\n"
-    told = a_failure(tmp_path, source)
-    assert told.traceback.count('File "env.py", line') == 2
-    assert "    1 / 0\n" in told.traceback
-    assert str(tmp_path) not in told.traceback
+    failure = a_failure(tmp_path, source)
+    assert failure.traceback.count('File "env.py", line') == 2
+    assert "    1 / 0\n" in failure.traceback
+    assert str(tmp_path) not in failure.traceback
 
 
 def test_a_syntax_error_has_its_line(tmp_path: Path) -> None:
     """It has no frame in the repository."""
-    told = a_failure(tmp_path, "def make_env(:\n")
-    assert '  File "env.py", line 1\n    def make_env(:\n                 ^\n' in told.traceback
+    failure = a_failure(tmp_path, "def make_env(:\n")
+    assert '  File "env.py", line 1\n    def make_env(:\n                 ^\n' in failure.traceback
 
 
 def test_our_own_frames_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -193,11 +193,11 @@ def test_our_own_frames_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     try:
-        told = a_failure(tmp_path, source).traceback
+        failure = a_failure(tmp_path, source).traceback
     finally:
         for name in [name for name in sys.modules if name.split(".")[0] == "hub_env"]:
             del sys.modules[name]
-    _, *lines = [line.strip() for line in told.splitlines() if "File" in line]  # the first is here
+    _, *lines = [line.strip() for line in failure.splitlines() if "File" in line]
     assert lines == [
         'File "env.py", line 3, in <module>',
         'File "other.py", line 1, in <module>',

@@ -9,7 +9,7 @@ import pytest
 from gymnasium import spaces
 
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
-from envhub_sandbox.session.survival.revived_rows import truncated
+from envhub_sandbox.session.survival.revived_rows import revived_step
 from envhub_sandbox.session.survival.seeds import SeedBook, derived_seed, resets
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
@@ -148,7 +148,7 @@ def test_rows_of_the_dead_are_truncated_whatever_the_fresh_say() -> None:
     """Its flags and rewards are not its own to choose."""
     yes = np.ones(2, np.bool_)
     said = m.StepDone(np.zeros((2, 1)), np.full((2, 3), 9.0), yes, ~yes, {"worker_restarted": ~yes})
-    row = truncated(said, 2)
+    row = revived_step(said, 2)
     assert row.rewards.tolist() == [[0.0] * 3] * 2  # type: ignore[attr-defined]
     assert (row.terminations.tolist(), row.truncations.tolist()) == ([False] * 2, [True] * 2)  # type: ignore[attr-defined]
     assert row.info["worker_restarted"].tolist() == [True, True]  # type: ignore[attr-defined]
@@ -163,7 +163,7 @@ def test_a_shape_that_is_only_told_is_not_taken_for_rewards(shape: tuple[int, ..
     said = m.unpack(frames, things=DescriptionReader)
     assert isinstance(said, m.StepDone)
     assert getattr(said.rewards, "shape", None) == shape
-    assert truncated(said, 2).rewards.shape == (2,)  # type: ignore[attr-defined]
+    assert revived_step(said, 2).rewards.shape == (2,)  # type: ignore[attr-defined]
     for shardable in (True, False):
         space = spaces.Box(-1, 1, (1,), np.float64)
         found = Results(env_manifest(single_observation_space=space, shardable=shardable), [(0, 2)])

@@ -110,7 +110,7 @@ def test_a_late_reply_is_refused_until_a_reset(session: EnvSession, lane: FakeLa
 
 
 def test_ctrl_c_in_a_wait_says_so_next_time(session: EnvSession, lane: FakeLane) -> None:
-    """Whoever is asked next does not answer for the interrupted one."""
+    """The next request does not take the answer to the interrupted one."""
     lane.fails = KeyboardInterrupt()
     session.requests.submit_step(ACTIONS)
     with pytest.raises(KeyboardInterrupt):

@@ -147,7 +147,7 @@ def test_action_errors_are_value_errors() -> None:
 @pytest.mark.parametrize("value", [5, 1.5, None])
 @pytest.mark.parametrize("space", [spaces.Text(3), spaces.Graph(spaces.Discrete(2), None)])
 def test_a_scalar_for_members_is_gymnasiums_error_too(space: Any, value: Any) -> None:
-    """Whoever catches what ``SyncVectorEnv`` raises catches ours."""
+    """Code that catches what ``SyncVectorEnv`` raises catches ours."""
     with pytest.raises(CustomSpaceError):
         list(iterate(batch_space(space, 2), value))
     with pytest.raises(CustomSpaceError) as caught:

@@ -28,7 +28,7 @@ _SPACES = (
 
 
 class _Story(gym.Env[Any, Any]):
-    """Counts its steps and its resets, ends every third step, and tells it in its infos."""
+    """Counts its steps and its resets, ends every third step, and says so in its infos."""
 
     observation_space = spaces.Box(0, 1e6, (2,), np.float32)
     action_space = spaces.Discrete(4)
@@ -68,7 +68,7 @@ class _Echo(gym.Env[Any, Any]):
 
 
 def play(env: gym.Env[Any, Any]) -> list[Any]:
-    """Four episodes, each begun by whoever plays."""
+    """Four episodes, each begun by the caller."""
     seen: list[Any] = []
     for episode in range(4):
         observation, info = env.reset(seed=5 if episode == 0 else None)
@@ -84,7 +84,7 @@ def play(env: gym.Env[Any, Any]) -> list[Any]:
 
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_episodes_are_those_of_the_environment_itself(mode: AutoresetMode) -> None:
-    """Observations, rewards, ends, infos, draws, and no reset that nobody asked for."""
+    """Observations, rewards, ends, infos, draws, and no reset that was not asked for."""
     vector = SyncVectorEnv([_Story], autoreset_mode=mode)
     assert play(SingleEnv(vector)) == play(_Story())
 
@@ -118,7 +118,7 @@ def test_actions_and_observations_are_of_the_single_spaces(space: spaces.Space[A
 
 
 def test_infos_lose_their_masks() -> None:
-    """Only what this step told, mappings within mappings included."""
+    """Only the infos of this step, mappings within mappings included."""
     env = SingleEnv(SyncVectorEnv([_Story]))
     env.reset()
     assert set(env.step(0)[4]) == {"step", "deep"}
@@ -152,7 +152,7 @@ def test_infos_may_have_numbers_for_keys() -> None:
 
 
 class _Liar(VectorEnv[Any, Any, Any]):
-    """A repository's own class, which returns whatever it is told to."""
+    """A repository's own class, which returns what the test wants."""
 
     num_envs = 1
     observation_space = single_observation_space = spaces.Discrete(2)

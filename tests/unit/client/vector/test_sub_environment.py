@@ -15,7 +15,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject
 
 
-def told(value: object) -> SubEnvironment:
+def one_of_two(value: object) -> SubEnvironment:
     """The first of two, of which everything is the same."""
     space = spaces.Discrete(2)
     vector: Any = SimpleNamespace(num_envs=2, is_sync=True, single_observation_space=space)
@@ -23,8 +23,8 @@ def told(value: object) -> SubEnvironment:
 
 
 def test_wrappers_without_end_are_refused() -> None:
-    """Whoever looks for the innermost one comes to an end."""
-    env: Any = told(RemoteObject("gymnasium.Wrapper", "<Wrapper>"))
+    """A search for the innermost one comes to an end."""
+    env: Any = one_of_two(RemoteObject("gymnasium.Wrapper", "<Wrapper>"))
     wrappers = 0
     with pytest.raises(RemoteProtocolError, match="wrap one"):  # noqa: PT012
         while hasattr(env, "env"):
@@ -35,6 +35,6 @@ def test_wrappers_without_end_are_refused() -> None:
 
 def test_what_is_neither_true_nor_false_breaks_the_rules() -> None:
     """Whether an attribute is there is a question of yes or no."""
-    assert told(1).has_wrapper_attr("a") is True
+    assert one_of_two(1).has_wrapper_attr("a") is True
     with pytest.raises(RemoteProtocolError):
-        told(np.zeros(2)).has_wrapper_attr("a")
+        one_of_two(np.zeros(2)).has_wrapper_attr("a")

@@ -92,7 +92,7 @@ def test_what_may_be_our_fault_keeps_its_frames(error: BaseException) -> None:
 
 
 def test_a_variable_shows_them_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For whoever reports a bug."""
+    """For a bug report."""
     monkeypatch.setenv("ENVHUB_TRACEBACK", "full")
     assert frames(LoadError("no")) == WHOLE
 
@@ -106,7 +106,7 @@ def test_the_log_has_them_once(caplog: pytest.LogCaptureFixture) -> None:
     assert [frame.name for frame in traceback.extract_tb(record.exc_info[2])] == WHOLE
 
 
-def test_what_the_caller_was_handling_is_still_told() -> None:
+def test_what_the_caller_was_handling_is_kept() -> None:
     """With the frames that are his."""
     error, mine = LoadError("no"), KeyError("mine")
     try:

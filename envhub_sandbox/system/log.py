@@ -1,8 +1,8 @@
 """Our part of the ``logging`` tree. Silent until the application that uses us sets it up.
 
-``envhub_sandbox.worker`` tells of jails: opened, closed (DEBUG), died, timed out, restarted (INFO).
+``envhub_sandbox.worker`` logs jails: opened, closed (DEBUG), died, timed out, restarted (INFO).
 ``envhub_sandbox.worker.output`` has every line that they print (DEBUG). ``envhub_sandbox.snapshot``
-tells of downloads, ``envhub_sandbox.dependencies`` of packages, ``envhub_sandbox.crashes`` of
+logs downloads, ``envhub_sandbox.dependencies`` packages, ``envhub_sandbox.crashes``
 crash bundles. ``envhub_sandbox.errors`` has our own frames of what is raised (DEBUG).
 """
 

@@ -1,0 +1,84 @@
+"""One thread uses an environment at a time; the next one waits. ``close`` never waits for it.
+
+A thread holds the lock from before a request is sent until its replies are handled:
+docs/internals/interruption.md, rules 10 to 12.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
+from envhub_sandbox.session.lease import Lease
+from envhub_sandbox.session.refusals import closed_during
+from envhub_sandbox.session.survival.failures import Failures
+from envhub_worker.protocol.lifecycle import State
+from envhub_worker.protocol.untrusted import blamed, is_fault
+
+
+class UseLock:
+    """The lock of one environment, and what is to be done when it is released.
+
+    Attributes:
+        lock: Held for as long as a use lasts; reentrant, for a signal handler may close what its
+            own thread waits for.
+    """
+
+    def __init__(self, lease: Lease, failures: Failures) -> None:
+        self.lock = threading.RLock()
+        self._lease = lease
+        self._failures = failures
+
+    @contextmanager
+    def hold(self, operation: str) -> Iterator[None]:
+        """Hold the lock. A ``close`` that came meanwhile did not wait: finish it here."""
+        with self.lock, self._lease.repository.named():
+            try:
+                yield
+            except BaseException as error:
+                self._after_close(operation, error)
+                raise
+            if self._lease.lifecycle.state is State.CLOSED:
+                self._lease.let_go()
+
+    def _after_close(self, operation: str, error: BaseException) -> None:
+        """What failed because of a ``close`` in its midst says so, and gives back what is left.
+
+        Raises:
+            WorkerDiedError: It was closed, and the error does not say so.
+        """
+        if not self._lease.lifecycle.closed:
+            return
+        self._lease.let_go()
+        if isinstance(error, Exception) and not isinstance(error, WorkerDiedError):
+            raise closed_during(operation) from error
+
+    @contextmanager
+    def judging(self, operation: str) -> Iterator[None]:
+        """Hold the lock to handle replies: a worker that breaks a rule in them is given up.
+
+        Raises:
+            RemoteProtocolError: It did, whatever the handling raised; the environment is then DEAD.
+        """
+        with self.hold(operation):
+            try:
+                yield
+            except Exception as error:
+                # in any other state the error has been dealt with already, or ended a wait
+                if self._lease.lifecycle.state is State.READY:
+                    self._judge(error)
+                raise
+
+    def _judge(self, error: Exception) -> None:
+        if is_fault(error):
+            broken = blamed(error)
+            self._failures.dead(broken)
+            raise broken from error
+        if isinstance(error, RemoteProtocolError):
+            self._failures.dead(error)
+
+    def abandon(self) -> None:
+        """In a fork, which has not the thread that held the lock: interruption.md, rule 14."""
+        self.lock = threading.RLock()

@@ -1,0 +1,96 @@
+"""``ENVHUB_TRACE=1``: print each message to and from a worker to stderr, with its time.
+
+    +0.004210 MainThread > WorkerClient.send OpenJail
+    +0.052377 MainThread < WorkerClient.receive JailOpened (48.1 ms)
+
+A line names classes of messages and operations, and never a value. Without the variable no class is
+changed, so a step costs the same.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+import threading
+from collections.abc import Callable
+from time import perf_counter
+from typing import Any
+
+from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.lane import RelayLane, Request
+from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
+from envhub_worker.protocol import messages as m
+
+_VARIABLE = "ENVHUB_TRACE"
+_SENDING: dict[type, tuple[str, ...]] = {
+    WorkerClient: ("send",),
+    RelayLane: ("send_step", "send", "send_for_infos"),
+    SharedMemoryLane: ("send_step", "send", "send_for_infos"),
+}
+_WAITING: dict[type, tuple[str, ...]] = {
+    WorkerClient: ("receive",),
+    RelayLane: ("wait", "replies"),
+    SharedMemoryLane: ("wait", "replies"),
+}
+
+
+@functools.cache
+def _start() -> None:
+    began = perf_counter()
+
+    def say(text: str) -> None:
+        passed_s = perf_counter() - began
+        sys.stderr.write(f"+{passed_s:.6f} {threading.current_thread().name} {text}\n")
+
+    for cls, names in _SENDING.items():
+        for name in names:
+            setattr(cls, name, _sending(getattr(cls, name), say))
+    for cls, names in _WAITING.items():
+        for name in names:
+            setattr(cls, name, _waiting(getattr(cls, name), say))
+
+
+def start_if_wanted() -> None:
+    """Print from now on, where the variable says so."""
+    if os.environ.get(_VARIABLE) == "1":
+        _start()
+
+
+def _sending(method: Callable[..., Any], say: Callable[[str], None]) -> Callable[..., Any]:
+    @functools.wraps(method)
+    def sending(self: Any, *args: Any, **kwargs: Any) -> Any:
+        say(f"> {method.__qualname__} {' '.join(filter(None, map(_named, args)))}".rstrip())
+        return method(self, *args, **kwargs)
+
+    return sending
+
+
+def _waiting(method: Callable[..., Any], say: Callable[[str], None]) -> Callable[..., Any]:
+    @functools.wraps(method)
+    def waiting(self: Any, *args: Any, **kwargs: Any) -> Any:
+        began, what = perf_counter(), ""
+        try:
+            result = method(self, *args, **kwargs)
+            what = _named(result)
+        except BaseException as error:
+            what = type(error).__name__
+            raise
+        finally:
+            passed_ms = (perf_counter() - began) * 1e3
+            say(f"< {method.__qualname__} {what} ({passed_ms:.3f} ms)".replace("  ", " "))
+        return result
+
+    return waiting
+
+
+def _named(value: object) -> str:
+    """The classes of messages in it, and what a request is called."""
+    if isinstance(value, Request):
+        return f"{value.operation} {_named(value.messages)}"
+    if isinstance(value, m.Message):
+        operation = getattr(value, "operation", None)
+        return f"{type(value).__name__} {operation}" if operation else type(value).__name__
+    if isinstance(value, (list, tuple)):
+        return " ".join(filter(None, map(_named, value)))
+    return ""
