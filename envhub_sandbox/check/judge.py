@@ -19,11 +19,12 @@ from envhub_sandbox import __version__
 from envhub_sandbox.api import make_env
 from envhub_sandbox.check.checks import CHECKS
 from envhub_sandbox.check.findings import Report
-from envhub_sandbox.check.play import denials
-from envhub_sandbox.check.play.confinement import walls
-from envhub_sandbox.check.play.task import Asked, TaskJudge
+from envhub_sandbox.check.play.confinement import Confinement
+from envhub_sandbox.check.play.denials import denial_findings
+from envhub_sandbox.check.play.task import TaskJudge
+from envhub_sandbox.check.settings import JudgeOptions
+from envhub_sandbox.check.static.static import undeclared
 from envhub_sandbox.check.static.survey import survey
-from envhub_sandbox.check.static.undeclared import undeclared
 from envhub_sandbox.dependencies.choice import chosen
 from envhub_sandbox.dependencies.declared import declared
 from envhub_sandbox.dependencies.pipeline import packages_for
@@ -56,14 +57,11 @@ _ITS_FAULT = (
 """Where it does not load: what the repository is to blame for."""
 
 
-__all__ = ["Asked", "judge"]
-
-
 class _StoppedError(Exception):
     """Nothing more can be asked of this task, or of the repository."""
 
 
-def judge(asked: Asked, report: Report | None = None) -> Report:
+def judge(asked: JudgeOptions, report: Report | None = None) -> Report:
     """Judge a repository.
 
     Args:
@@ -79,14 +77,14 @@ def judge(asked: Asked, report: Report | None = None) -> Report:
     snapshot = named(asked.reference, **where)
     report = Report(asked.reference) if report is None else report
     report.reference, report.commit = pinned(snapshot), snapshot.commit
-    report.asked = _told(asked)
+    report.asked = _how(asked)
     _Judge(asked, snapshot, report).ask()
     report.judged("deadline", [])
     return report
 
 
-def _told(asked: Asked) -> dict[str, str]:
-    """How it is judged, for who reads of it later: in the caller's words and ours."""
+def _how(asked: JudgeOptions) -> dict[str, str]:
+    """How it is judged, in the caller's words and ours."""
     policy = policy_from(asked.arguments.get("policy"), asked.arguments.get("limits"))
     limits = (_limit(name, value) for name, value in vars(policy.limits).items() if value)
     return {
@@ -118,7 +116,7 @@ def _cause(error: EnvHubError) -> str:
 
 
 class _Judge:
-    def __init__(self, asked: Asked, snapshot: Snapshot, report: Report) -> None:
+    def __init__(self, asked: JudgeOptions, snapshot: Snapshot, report: Report) -> None:
         self._asked, self._snapshot, self._report = asked, snapshot, report
         self._files = parsing.read(snapshot)
         self._unrecorded = ""
@@ -150,11 +148,8 @@ class _Judge:
         try:
             choice, _ = chosen(self._asked.arguments.get("dependencies", "auto"), None)
             says = declared(self._snapshot.root, self._snapshot.path)
-            wanted = (
-                {}
-                if says is None
-                else {one.requirement.name: one.requirement for one in says.wanted}
-            )
+            stated = () if says is None else says.wanted
+            wanted = {one.requirement.name: one.requirement for one in stated}
             if self._asked.arguments.get("python") is None and self._is_here:
                 made = packages_for(self._snapshot, choice)
                 if made is not None:
@@ -186,7 +181,7 @@ class _Judge:
         """Its environments; of the very files that were read, or it cannot be judged."""
         given = {**self._asked.arguments, "cfg": self._report.reference, **changes}
         policy = policy_from(given.get("policy"), given.get("limits"))
-        # no death is to be survived that nobody is told of
+        # a death that a restart hides would be no finding
         given |= {"policy": replace(policy, restart="never"), "limits": None}
         suites = make_env(**given)
         if suites.provenance["commit"] != self._snapshot.commit:  # a folder of this machine
@@ -200,8 +195,8 @@ class _Judge:
             suites = self._made_to_record()
         except _ITS_FAULT as error:
             self._unloaded(error)
-            self.denied(error.denied)
-            self._note_walls(None)
+            self._denied(error.denied)
+            self._note_confinement(None)
             raise _StoppedError from error
         with suites:
             self._report.judged("loads", [])
@@ -209,29 +204,31 @@ class _Judge:
                 self._ask_tasks(suites)
             finally:  # also where an interrupt ends it
                 self._report.provenance = suites.provenance
-                self._note_walls(suites.provenance)
+                self._note_confinement(suites.provenance)
 
     def _ask_tasks(self, suites: EnvSuites) -> None:
         tasks = self._asked.tasks(suites)
         self._report.waiting = [f"{suite} / {task}" for suite, task in tasks]
         for suite, task in tasks:
             self._asked.tell(f"{suite} / {task}")
-            asking = self._task(suites, suite, task)
-            with self._stopping(f"{suite} / {task}", asking):
+            asking = TaskJudge(
+                self._asked,
+                self._report,
+                self.make,
+                suites[suite][task],
+                (suite, task),
+                takes_render_mode=self._takes_render_mode,
+            )
+            with self._stopping(f"{suite} / {task}"):
                 asking.ask()
-            self.denied(asking.denied(), f"{suite} / {task}")
+            self._denied(asking.denied(), f"{suite} / {task}")
             asking.film()
             suites[suite][task].close()
             self._report.waiting.pop(0)
 
-    def _task(self, suites: EnvSuites, suite: str, task: Any) -> TaskJudge:
-        env, takes = suites[suite][task], self._takes_render_mode
-        asked, report = self._asked, self._report
-        return TaskJudge(asked, report, self.make, env, (suite, task), takes_render_mode=takes)
-
-    def _note_walls(self, provenance: Mapping[str, Any] | None) -> None:
+    def _note_confinement(self, provenance: Mapping[str, Any] | None) -> None:
         policy = policy_from(self._asked.arguments.get("policy"), None)
-        self._report.walls = walls(policy.profile, provenance, self._unrecorded)
+        self._report.confinement = Confinement.of(policy.profile, provenance, self._unrecorded)
 
     def _unloaded(self, error: EnvHubError) -> None:
         if isinstance(error, (WorkerDiedError, WorkerTimeoutError)):
@@ -241,16 +238,16 @@ class _Judge:
         elif not self._found("imports"):  # where it stands has been said already
             self._report.judged("imports", [str(error)])
 
-    def denied(self, denied: Iterable[str] | None, task: str = "") -> None:
+    def _denied(self, denied: Iterable[str] | None, task: str = "") -> None:
         """What a jail was refused, where that was recorded."""
         if denied is not None:
-            for check, found in denials.sorted_out(denied).items():
+            for check, found in denial_findings(denied).items():
                 self._report.judged(check, found, task)
 
     def _made_to_record(self) -> EnvSuites:
         """Of which what they are denied is recorded, where a kernel and its containers let it be.
 
-        With the longer steps that this costs nobody measures a time.
+        That makes steps longer, so no time is measured in this play.
         """
         given = self._asked.arguments
         if not self._is_here:
@@ -265,14 +262,12 @@ class _Judge:
         return self.make(num_workers=1, validate=True)
 
     @contextmanager
-    def _stopping(self, task: str, asking: TaskJudge) -> Iterator[None]:
+    def _stopping(self, task: str) -> Iterator[None]:
         try:
-            with asking.ending():
-                yield
-        except ObservationError as error:
-            self._report.judged("observation-space", [str(error)], task)
-        except CustomSpaceError as error:  # of actions
-            self._report.judged("runs", [str(error)], task)
+            yield
+        except (ObservationError, CustomSpaceError) as error:  # the latter's is of actions
+            check = "observation-space" if isinstance(error, ObservationError) else "runs"
+            self._report.judged(check, [str(error)], task)
         except RemoteEnvError as error:
             line = error.where.strip().partition("\n")[0]
             found = [f"{error.type_name}: {error.message}" + (f" ({line})" if line else "")]

@@ -29,6 +29,12 @@ def shrunk(frame: Frame, side: int) -> Frame:
     return small
 
 
+def even(frame: Frame) -> Frame:
+    """A frame with even sides, as encoders need them: an odd one repeats its last row or column."""
+    height, width, _ = frame.shape
+    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+
+
 def png(frame: Frame) -> bytes:
     """A frame as PNG, uint8 ``(height, width, 3)``: eight bits, RGB, filter "Up"."""
     height, width, _ = frame.shape

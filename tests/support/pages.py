@@ -7,9 +7,9 @@ from html.parser import HTMLParser
 import numpy as np
 
 from envhub_sandbox.check.findings import Finding, Report
-from envhub_sandbox.check.many.lines import Listed
+from envhub_sandbox.check.many.entries import ListEntry
 from envhub_sandbox.check.many.results import Result, Verdict
-from envhub_sandbox.check.play.confinement import walls
+from envhub_sandbox.check.play.confinement import Confinement
 from envhub_sandbox.check.play.plays import Film, Play
 from envhub_sandbox.rollouts.episodes import Episode
 from envhub_sandbox.rollouts.pictures import png
@@ -68,7 +68,7 @@ def report_of(text: str) -> Report:
     }
     made.asked = {"sandbox": text}
     missing = {"layer": text, "enforced": False, "detail": text}
-    made.walls = walls("strict", {"profile": "no-userns", "layers": [missing]}, text)
+    made.confinement = Confinement.of("strict", {"profile": "no-userns", "layers": [missing]}, text)
     film = Film((png(FRAME), png(FRAME)), b"a video", frames=2, fps=25.0, lacks=text)
     made.plays[text] = Play({"observations": text}, memory=[1 << 20, 2 << 20], film=film)
     made.plays[text].step_s = [0.001, 0.002]
@@ -81,7 +81,7 @@ def report_of(text: str) -> Report:
 
 def results_of(text: str) -> list[Result]:
     """Results in which every word is somebody's."""
-    one = Listed(text, f"{text}@main", 1)
+    one = ListEntry(text, f"{text}@main", 1)
     return [
         Result(
             listed=one,

@@ -34,7 +34,7 @@ Command = Callable[[T, Path, int], list[str]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ended(Generic[T]):
+class Outcome(Generic[T]):
     """What has become of a process.
 
     Attributes:
@@ -107,7 +107,7 @@ class _Running(Generic[T]):
             self._process.wait(_KILLED_S)
         return self._process.returncode
 
-    def ended(self, most_s: float, patience_s: float) -> Ended[T] | None:
+    def ended(self, most_s: float, patience_s: float) -> Outcome[T] | None:
         """What has become of it, if it has ended; one that takes or says too much is ended."""
         why = ""
         if not self.has_ended:
@@ -117,7 +117,7 @@ class _Running(Generic[T]):
             end([self], patience_s)
         self.kill()
         code = self.reap()
-        return Ended(
+        return Outcome(
             order=self.order,
             folder=self._folder,
             code=None if why else code,
@@ -166,7 +166,7 @@ def judgements(
     most_s: float,
     variables: Mapping[str, str],
     patience_s: float = PATIENCE_S,
-) -> Generator[Ended[T], None, None]:
+) -> Generator[Outcome[T], None, None]:
     """Run a command for each order, and tell in the order in which they end.
 
     Whoever stops asking, or is interrupted, must close the iterator: then all are ended.

@@ -182,7 +182,7 @@ def _held(report: Report) -> Iterator[str]:
 
 def _judged(report: Report) -> Iterator[str]:
     if report.asked:
-        told = () if report.walls is None else report.walls.lines()
+        told = () if report.confinement is None else report.confinement.lines()
         yield "<h2>How it was judged</h2>"
         yield from facts([*report.asked.items(), *(("confined by", line) for line in told)])
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import islice
 from typing import Any
 
 from envhub_worker.protocol.text import printable
@@ -14,7 +13,7 @@ _WHOLE = "strict"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Walls:
+class Confinement:
     """The confinement of one judgement.
 
     Attributes:
@@ -25,12 +24,25 @@ class Walls:
     """
 
     asked: str
-    profile: str = ""
-    missing: tuple[tuple[str, str], ...] = ()
-    unrecorded: str = ""
+    profile: str
+    missing: tuple[tuple[str, str], ...]
+    unrecorded: str
+
+    @classmethod
+    def of(cls, asked: str, provenance: Mapping[str, Any] | None, unrecorded: str) -> Confinement:
+        """Of what ran. Trust: a server on another host may have said which layers hold."""
+        ran = provenance or {}
+        layers = ran.get("layers") or ()
+        missing = [one for one in layers if one.get("enforced") is not True][:_MOST]
+        return cls(
+            asked=asked,
+            profile=ran.get("profile") or "",
+            missing=tuple((_line(one.get("layer")), _line(one.get("detail"))) for one in missing),
+            unrecorded=_line(unrecorded),
+        )
 
     @property
-    def are_fewer(self) -> bool:
+    def is_partial(self) -> bool:
         """Whether a person should know that there was less than there can be."""
         return (self.profile or self.asked) != _WHOLE or bool(self.unrecorded)
 
@@ -56,22 +68,6 @@ class Walls:
             "recorded": not self.unrecorded,
             "why_not_recorded": self.unrecorded or None,
         }
-
-
-def walls(asked: str, provenance: Mapping[str, Any] | None, unrecorded: str) -> Walls:
-    """Of what ran. Trust: a server on another host may have said which layers hold."""
-    told = provenance or {}
-    missing = (one for one in told.get("layers") or () if one.get("enforced") is not True)
-    return Walls(
-        asked=asked,
-        profile=told.get("profile") or "",
-        missing=tuple(_named(one) for one in islice(missing, _MOST)),
-        unrecorded=_line(unrecorded),
-    )
-
-
-def _named(layer: Mapping[str, Any]) -> tuple[str, str]:
-    return _line(layer.get("layer")), _line(layer.get("detail"))
 
 
 def _line(text: object) -> str:

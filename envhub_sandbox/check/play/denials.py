@@ -1,7 +1,7 @@
 """What a jail was denied, by the word of its first process: attempts that say something.
 
 The system call filter asks that process, so that nothing is the repository's word; but a path is
-read out of the memory of whoever asks for it, who may change it meanwhile.
+read out of the memory of the process that asks, which may change it meanwhile.
 """
 
 from __future__ import annotations
@@ -21,14 +21,10 @@ _HARMLESS = frozenset(
 """What allocators, pools of threads and the C library try on their way, and do without."""
 
 
-def sorted_out(denied: Iterable[str]) -> dict[str, list[str]]:
+def denial_findings(denied: Iterable[str]) -> dict[str, list[str]]:
     """The findings of each check, of what was denied. Trust: paths are a stranger's words."""
-    found: dict[str, list[str]] = {
-        "denied-network": [],
-        "denied-files": [],
-        "denied-kernel": [],
-        "limits-reached": [],
-    }
+    checks = ("denied-network", "denied-files", "denied-kernel", "limits-reached")
+    found: dict[str, list[str]] = {check: [] for check in checks}
     for one in sorted(set(denied) - _HARMLESS):
         check, text = _finding(one)
         found[check].append(text)

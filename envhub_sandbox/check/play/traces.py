@@ -32,7 +32,7 @@ class Trace:
         episodes: How many ended.
         times: Seconds: of the reset and of steps, for who reads it; no check asks for them.
         counted: The episodes that ended, to be looked at; fewer, where its rewards are such that
-            nobody can count.
+            they cannot be counted.
         spent: Seconds of each step.
     """
 

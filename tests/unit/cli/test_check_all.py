@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 import typer
 from typer.testing import CliRunner, Result
 
-from envhub_sandbox.check.many.lines import Listed
+from envhub_sandbox.check.many.entries import ListEntry
 from envhub_sandbox.check.many.results import Result as Judgement
-from envhub_sandbox.check.many.results import Results, Verdict
-from envhub_sandbox.check.many.running import Ended
+from envhub_sandbox.check.many.results import Verdict
+from envhub_sandbox.check.many.running import Outcome
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.check import many
 from envhub_sandbox.cli.check.check import check
@@ -29,7 +30,7 @@ def started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, 
     def judgements(orders, command, *, folder, jobs, **_):  # type: ignore[no-untyped-def]
         for number, order in enumerate(orders):
             found.append((jobs, command(order, folder / str(number), 7)))
-            yield Ended(
+            yield Outcome(
                 order=order, folder=folder, code=3, seconds=1.0, out=b"", said="Error: not there"
             )
 
@@ -179,11 +180,13 @@ def test_limits_stay_within_the_budget(
         ([Verdict.UNJUDGED, Verdict.FAILED], Exit.ENVIRONMENT),
     ],
 )
-def test_what_fails_counts_most(verdicts: list[Verdict], code: Exit, tmp_path: Path) -> None:
+def test_what_fails_counts_most(verdicts: list[Verdict], code: Exit) -> None:
     """As docs/ci.md says."""
-    listed = [Listed(f"a/{number}", f"a/{number}", number) for number in range(2)]
-    of = {
-        one: Judgement(listed=one, verdict=verdict)
+    listed = [ListEntry(f"a/{number}", f"a/{number}", number) for number in range(2)]
+    results = [
+        Judgement(listed=one, verdict=verdict)
         for one, verdict in zip(listed, verdicts, strict=True)
-    }
-    assert many.Judged(Results(tmp_path, ""), of).exit is code
+    ]
+    given = dict.fromkeys(one.name for one in fields(many.ListRun) if one.init)
+    given |= {"of": dict(zip(listed, results, strict=True))}
+    assert many.ListRun(**given).exit is code

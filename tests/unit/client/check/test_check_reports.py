@@ -12,7 +12,7 @@ from envhub_sandbox.check import reports
 from envhub_sandbox.check.checks import CHECKS, Severity
 from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.check.page.page import page
-from envhub_sandbox.check.play.confinement import walls
+from envhub_sandbox.check.play.confinement import Confinement
 from envhub_worker.protocol.text import printable
 
 _HOSTILE = (
@@ -61,8 +61,8 @@ def test_what_confined_it_is_text(text: str) -> None:
     layers = [{"layer": text, "enforced": False, "detail": text}] * 1_000
     held = {"layer": "seccomp", "enforced": True, "detail": ""}
     provenance = {"profile": "container", "layers": [held, *layers]}
-    made.walls = walls("strict", provenance, text * 1_000)
-    lines = list(made.walls.lines())
+    made.confinement = Confinement.of("strict", provenance, text * 1_000)
+    lines = list(made.confinement.lines())
     assert lines[0] == "profile container, within a container; strict was asked for"
     assert (len(lines), max(map(len, lines)) < 1_000) == (42, True)
     assert all(len(line.splitlines()) == 1 and printable(line) == line for line in lines)
@@ -80,11 +80,11 @@ def test_all_that_there_can_be_is_a_line_and_no_notice() -> None:
     """As where it did not load, so that nobody knows which layers held."""
     made = Report("./walk:env.py")
     for profile in ("strict", ""):
-        made.walls = walls("strict", {"profile": profile, "layers": []}, "")
-        [line] = made.walls.lines()
+        made.confinement = Confinement.of("strict", {"profile": profile, "layers": []}, "")
+        [line] = made.confinement.lines()
         assert line.startswith("profile strict, as asked for")
         assert list(reports.workflow_commands(made)) == []
-        assert made.walls.document()["recorded"] is True
+        assert made.confinement.document()["recorded"] is True
 
 
 @pytest.mark.parametrize("text", _HOSTILE)
@@ -170,7 +170,7 @@ def test_the_most_severe_stands_first_in_every_form() -> None:
     order = ["runs", "seeding", "slow-steps", "denied-files", "card", "licence"]
     told = reports.document(made, failures)
     assert [one["check"] for one in told["findings"]] == order
-    assert [one.id for one in reports.read(told)[0].findings] == order
+    assert [one.id for one in reports.read_report(told)[0].findings] == order
     cases = [one.attrib["name"] for one in ElementTree.fromstring(reports.junit(made, failures))]
     assert cases == [*order, "loads"]
     [run] = json.loads(reports.sarif(made, failures))["runs"]
@@ -248,7 +248,7 @@ def test_what_was_not_judged_is_told_in_every_form() -> None:
     told = reports.document(made, [])
     assert told["unjudged"]["tasks"] == ["a / 0", "b / 1"]
     assert not set(told["unjudged"]["checks"]) & {"runs", "card", "loads", "deadline"}
-    again, _ = reports.read({**told, "passed": True})
+    again, _ = reports.read_report({**told, "passed": True})
     assert (again.unmade, again.waiting) == (made.unmade, made.waiting)
     root = ElementTree.fromstring(reports.junit(made, []))
     skipped = [one.attrib for one in root if one.find("skipped") is not None]

@@ -15,7 +15,7 @@ import pytest
 from envhub_sandbox.check import reports
 from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.check.many import index, results
-from envhub_sandbox.check.many.lines import Listed
+from envhub_sandbox.check.many.entries import ListEntry
 from envhub_sandbox.check.many.results import (
     FolderError,
     ForeignResultError,
@@ -27,7 +27,7 @@ from envhub_sandbox.check.many.results import (
 from envhub_worker.protocol.text import printable
 from tests.support.pages import Page, results_of
 
-_ONE = Listed("org/repo", "org/repo@main", 1)
+_ONE = ListEntry("org/repo", "org/repo@main", 1)
 _HOSTILE = (
     "<script>alert(1)</script>",
     "</title></style></td></a><img src=x onerror=alert(1)>",
@@ -67,7 +67,7 @@ def test_a_report_is_read_as_it_was_written() -> None:
     """From its document, whatever a repository wrote into it."""
     for text in (*_HOSTILE, ""):
         document = told(text)
-        report, failures = reports.read(document)
+        report, failures = reports.read_report(document)
         again = json.loads(json.dumps(reports.document(report, failures)))
         assert [one["check"] for one in again["findings"]] == ["runs", "card"]
         assert [one["fails"] for one in again["findings"]] == [True, False]
@@ -86,7 +86,7 @@ def test_what_was_judged_is_known_again(folder: Path) -> None:
     )
     assert Results(folder, "as ever").kept(_ONE) == made
     assert Results(folder, "otherwise").kept(_ONE) is None
-    assert Results(folder, "as ever").kept(Listed("org/x", "org/x@main", 1)) is None
+    assert Results(folder, "as ever").kept(ListEntry("org/x", "org/x@main", 1)) is None
     Results(folder, "as ever").forget(_ONE)
     assert Results(folder, "as ever").kept(_ONE) is None
 
@@ -239,7 +239,7 @@ def test_an_index_shows_first_what_fails() -> None:
 def test_other_forms_are_well_formed_too(text: str) -> None:
     """JUnit's file, annotations and the summary of a workflow."""
     made = results_of(text)
-    report, failures = reports.read(told(text))
+    report, failures = reports.read_report(told(text))
     root = ElementTree.fromstring(index.junit(made, lambda _: (report, failures)))
     assert [one.attrib["errors"] for one in root] == ["0", "1", "1", "0"]
     assert root.attrib["errors"] == "2"
@@ -256,6 +256,9 @@ def test_other_forms_are_well_formed_too(text: str) -> None:
 def test_an_index_is_bounded() -> None:
     """However much is said of however many."""
     one = Result(
-        listed=Listed("x" * 4_096, "y", 1), verdict=Verdict.UNJUDGED, said="<" * 100_000, ended="z"
+        listed=ListEntry("x" * 4_096, "y", 1),
+        verdict=Verdict.UNJUDGED,
+        said="<" * 100_000,
+        ended="z",
     )
     assert len(index.page([one] * 2_000)) < 20_000_000

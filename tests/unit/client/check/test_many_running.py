@@ -10,7 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from envhub_sandbox.check.many.running import Ended, judgements
+from envhub_sandbox.check.many.running import Outcome, judgements
 from envhub_sandbox.errors import WorkerStartupError
 from tests.support.processes import eventually
 
@@ -45,7 +45,9 @@ def command(order: str, place: Path, _: int = -1) -> list[str]:
     ]
 
 
-def run(folder: Path, *orders: str, jobs: int = 2, most_s: float = 300.0) -> dict[str, Ended[str]]:
+def run(
+    folder: Path, *orders: str, jobs: int = 2, most_s: float = 300.0
+) -> dict[str, Outcome[str]]:
     """What becomes of orders."""
     found = judgements(
         orders, command, folder=folder, jobs=jobs, most_s=most_s, variables={"ENVHUB_X": "1"}
