@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,7 +31,7 @@ class Trace:
         autoreset: What the autoreset mode would not permit, the first few.
         infos: Infos that do not say which sub-environments they are of, the first few.
         episodes: How many ended.
-        times: Seconds: of the reset and of steps, for who reads it; no check asks for them.
+        times: Seconds of the reset and of steps, for the report.
         counted: The episodes that ended, to be looked at; fewer, where its rewards are such that
             they cannot be counted.
         spent: Seconds of each step.
@@ -73,7 +74,7 @@ def play(
         steps: Vector steps.
         actions_seed: Of the actions alone.
         like: Stop at the first step that differs from this one.
-        observe: Is called with the number of each step that was made; 0 is the reset.
+        observe: Called with the number of each step that was made; 0 is the reset.
     """
     trace, ended = Trace(), np.zeros(env.num_envs, np.bool_)
     counter: EpisodeCounter | None = EpisodeCounter(env.num_envs, env.num_envs * steps, mode)
@@ -153,41 +154,50 @@ def _judge(trace: Trace, result: tuple[Any, ...], ended: Any, mode: str | None, 
 
 
 def _look_at(trace: Trace, observations: Any, where: str) -> None:
-    found = next(_unbounded(observations), None)
-    if found is not None:
+    for found in itertools.islice(_unbounded(observations), 1):
         _note(trace.unbounded, f"{where}: an observation has {found}")
 
 
-def _unbounded(value: Any) -> Iterator[str]:
-    """What is not finite in observations. Trust: input from the worker, already decoded."""
+def _leaves(value: Any, without: Collection[str] = ()) -> Iterator[Any]:
+    """What stands in mappings, sequences and arrays of objects. Trust: input from the worker,
+    already decoded, and so bounded in depth and size."""
     if isinstance(value, Mapping):
-        for one in value.values():
-            yield from _unbounded(one)
-    elif isinstance(value, (list, tuple)):
-        for one in value:
-            yield from _unbounded(one)
-    elif hasattr(value, "tolist") and hasattr(value, "cpu"):  # a tensor
-        yield from _unbounded(value.cpu().numpy())
+        value = [value[name] for name in value if name not in without]
     elif isinstance(value, np.ndarray) and value.dtype == object:
-        yield from _unbounded(list(value.flat))
-    elif isinstance(value, (float, np.ndarray, np.generic)):
-        array = np.asarray(value)
-        if array.dtype.kind in "fc" and not np.isfinite(array).all():
-            yield "NaN" if np.isnan(array).any() else "infinity"
+        value = list(value.flat)
+    if isinstance(value, (list, tuple)):
+        for one in value:
+            yield from _leaves(one, without)
+    else:
+        yield value
 
 
-def _bytes_of(value: Any) -> int:
-    """What an info weighs, roughly; without the last observation of an episode.
+def _unbounded(observations: Any) -> Iterator[str]:
+    """What is not finite in observations."""
+    for leaf in _leaves(observations):
+        value = _on_cpu(leaf)
+        if isinstance(value, (float, np.ndarray, np.generic)):
+            array = np.asarray(value)
+            if array.dtype.kind in "fc" and not np.isfinite(array).all():
+                yield "NaN" if np.isnan(array).any() else "infinity"
 
-    Trust: input from the worker, already decoded, and so bounded in depth and size.
-    """
-    if isinstance(value, Mapping):
-        return sum(_bytes_of(value[name]) for name in value if name not in _LAST)
-    if isinstance(value, np.ndarray) and value.dtype != object:
-        return value.nbytes
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return sum(map(_bytes_of, value))
-    return len(value) if isinstance(value, (str, bytes)) else 8
+
+def _bytes_of(infos: Any) -> int:
+    """What infos weigh, roughly; without the last observation of an episode."""
+    return sum(
+        leaf.nbytes
+        if isinstance(leaf, np.ndarray)
+        else len(leaf)
+        if isinstance(leaf, (str, bytes))
+        else 8
+        for leaf in _leaves(infos, _LAST)
+    )
+
+
+def _on_cpu(value: Any) -> Any:
+    """A tensor as an array; everything else as it is."""
+    is_tensor = hasattr(value, "tolist") and hasattr(value, "cpu")
+    return value.cpu().numpy() if is_tensor else value
 
 
 def _masks(infos: Mapping[Any, Any], count: int) -> Iterator[str]:
@@ -217,6 +227,7 @@ def digest(value: Any) -> str:
 
 
 def _feed(hashed: Any, value: Any) -> None:
+    value = _on_cpu(value)
     if isinstance(value, np.ndarray) and value.dtype != object:
         hashed.update(f"array {value.dtype.str} {value.shape}".encode())
         hashed.update(np.ascontiguousarray(value).tobytes())
@@ -229,7 +240,5 @@ def _feed(hashed: Any, value: Any) -> None:
         hashed.update(f"items {len(value)}".encode())
         for one in value:
             _feed(hashed, one)
-    elif hasattr(value, "tolist") and hasattr(value, "cpu"):  # a tensor
-        _feed(hashed, value.cpu().numpy())
     else:
         hashed.update(f"{type(value).__name__} {value!r}".encode("utf-8", "replace"))

@@ -15,12 +15,12 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli.doctor import places
+from envhub_sandbox.cli.doctor import folders
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, show
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, describe, reported
 from envhub_sandbox.cli.shared.memory import free_bytes
@@ -55,8 +55,8 @@ def make_env(n_envs=1, use_async_envs=False):
 _PROBE_S = 60.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class Finding:
+@dataclass(frozen=True)
+class Trial:
     """What came of one profile.
 
     Attributes:
@@ -69,11 +69,11 @@ class Finding:
     """
 
     profile: str
-    available: bool
-    layers: list[dict[str, Any]]
-    first_step_s: float | None
-    problem: str | None
-    code: Exit
+    available: bool = False
+    layers: list[dict[str, Any]] = field(default_factory=list)
+    first_step_s: float | None = None
+    problem: str | None = None
+    code: Exit = Exit.OK
 
 
 def doctor(
@@ -135,27 +135,26 @@ def doctor(
                 "--server-key and --insecure-loopback are of a server: envhub doctor "
                 "tcp://HOST:PORT"
             )
-        with Bar(quiet=json) as bar, places.of_its_own() as folder:
+        with Bar(quiet=json) as bar, folders.scratch_folder() as folder:
             (folder / "idle").mkdir()
             (folder / "idle" / "env.py").write_text(_ENV_PY)
-            findings = []
+            trials = []
             for name in PROFILES:
                 bar.begin(f"trying {name}")
-                findings.append(examine(str(folder / "idle"), name))
+                trials.append(examine(str(folder / "idle"), name))
             bar.begin("trying each layer")
             probed = probe()
-        cache = places.cache_problem(by_others=profile != "strict" or not findings[0].available)
+        cache = folders.cache_problem(by_others=profile != "strict" or not trials[0].available)
         if json:
-            profiles = [asdict(finding) for finding in findings]
-            told = {"versions": versions(), "engine": engine(), **resources(cache)}
-            print_json({"host": host(), **told, "profiles": profiles, **probed})
+            here = {"host": host(), "versions": versions(), "engine": engine(), **resources(cache)}
+            print_json({**here, "profiles": list(map(asdict, trials)), **probed})
         else:
-            _print(findings)
+            _print(trials)
             _print_missing(probed)
             if cache is not None:
                 out()
                 out(f"The cache: {safe_line(cache, 1000)}")
-        decisive = next(finding for finding in findings if finding.profile == profile)
+        decisive = next(trial for trial in trials if trial.profile == profile)
         raise typer.Exit(decisive.code or (Exit.SNAPSHOT if cache else Exit.OK))
 
 
@@ -182,7 +181,7 @@ def engine() -> dict[str, Any]:
 
 
 def resources(problem: str | None) -> dict[str, Any]:
-    """Bytes that are free: of memory, None where the kernel does not tell, and for the cache."""
+    """Bytes that are free: of memory, None where the kernel does not say, and for the cache."""
     from envhub_sandbox.hub.store import cache_root
 
     disk: dict[str, Any] = {"folder": None, "free_bytes": None, "problem": problem}
@@ -195,7 +194,7 @@ def resources(problem: str | None) -> dict[str, Any]:
 def probe() -> dict[str, Any]:
     """What came of each layer by itself: ``layers``, an ``apparmor_profile`` or None, and ``gpu``.
 
-    ``gpu`` are the device nodes that ``gpu=True`` grants, or None where nobody could look.
+    ``gpu`` are the device nodes that ``gpu=True`` grants, or None where that cannot be seen.
     """
     from envhub_sandbox.sandboxes.process import BOOTSTRAP
 
@@ -206,11 +205,11 @@ def probe() -> dict[str, Any]:
     except (OSError, subprocess.SubprocessError, ValueError):
         # what the profiles say still stands
         return {"layers": [], "apparmor_profile": None, "gpu": None}
-    told = {name: found[name] for name in ("layers", "apparmor_profile")}
-    return {**told, "gpu": found["host"]["gpu"]}
+    kept = {name: found[name] for name in ("layers", "apparmor_profile")}
+    return {**kept, "gpu": found["host"]["gpu"]}
 
 
-def examine(folder: str, profile: str) -> Finding:
+def examine(folder: str, profile: str) -> Trial:
     """Run the idle environment under a profile."""
     from envhub_sandbox.api import make_env
 
@@ -225,46 +224,30 @@ def examine(folder: str, profile: str) -> Finding:
     except EnvHubError as error:
         missing = isinstance(error, SandboxUnavailableError)
         problem = describe(error).replace(f"{folder}:env.py: ", "")
-        return _finding(profile, problem=problem, code=Exit.SANDBOX if missing else Exit.WORKER)
-    return _finding(profile, layers=layers, first_step_s=taken)
+        return Trial(profile, problem=problem, code=Exit.SANDBOX if missing else Exit.WORKER)
+    return Trial(profile, available=True, layers=layers, first_step_s=taken)
 
 
-def _finding(
-    profile: str,
-    *,
-    layers: list[dict[str, Any]] | None = None,
-    first_step_s: float | None = None,
-    problem: str | None = None,
-    code: Exit = Exit.OK,
-) -> Finding:
-    return Finding(
-        profile=profile,
-        available=problem is None,
-        layers=layers or [],
-        first_step_s=first_step_s,
-        problem=problem,
-        code=code,
-    )
-
-
-def _print(findings: list[Finding]) -> None:
+def _print(trials: list[Trial]) -> None:
     facts = host()
     user = "root" if facts["root"] else "a plain user"
     out(f"{facts['system']} on {facts['machine']}, as {user}, {facts['python']}")
-    for finding in findings:
+    for trial in trials:
         out()
-        if finding.problem is not None:
-            out(f"{finding.profile}: not available here", "bold red")
-            for line in safe_text(finding.problem).splitlines():
-                out(f"  {line}")
+        if trial.problem is not None:
+            out(f"{trial.profile}: not available here", "bold red")
+            _indented(trial.problem, "  ")
             continue
-        out(
-            f"{finding.profile}: available (first step after {finding.first_step_s:.2f} s)",
-            "bold green",
-        )
-        for layer in finding.layers:
+        took = f"first step after {trial.first_step_s:.2f} s"
+        out(f"{trial.profile}: available ({took})", "bold green")
+        for layer in trial.layers:
             mark = "holds" if layer.get("enforced") else "none"
             show(f"  {mark:6} {safe_line(layer.get('layer'))}", layer.get("detail"), width=26)
+
+
+def _indented(text: str, margin: str) -> None:
+    for line in safe_text(text).splitlines():
+        out(f"{margin}{line}")
 
 
 def _print_missing(probed: dict[str, Any]) -> None:
@@ -278,8 +261,7 @@ def _print_missing(probed: dict[str, Any]) -> None:
         out("Layers that are missing here, each tried by itself:", "bold")
     for layer in missing:
         out(f"  {safe_line(layer['layer'])}: {safe_line(layer['detail'])}")
-        for line in safe_text(layer["fix"]).splitlines():
-            out(f"    {line}")
+        _indented(layer["fix"], "    ")
     if probed["apparmor_profile"]:
         out()
         out("An AppArmor profile that permits user namespaces to this interpreter:")

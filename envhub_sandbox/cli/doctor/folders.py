@@ -12,7 +12,7 @@ from envhub_sandbox.errors import SandboxUnavailableError, SnapshotError
 
 
 @contextlib.contextmanager
-def of_its_own() -> Iterator[Path]:
+def scratch_folder() -> Iterator[Path]:
     """A folder for a repository and a cache: what is wrong with the caller's hides no layer.
 
     Raises:
