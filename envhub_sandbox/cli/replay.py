@@ -14,7 +14,7 @@ from envhub_sandbox.cli.shared.progress import Bar
 
 if TYPE_CHECKING:
     from envhub_sandbox.crash.reader import Bundle
-    from envhub_sandbox.crash.replay import Replayed
+    from envhub_sandbox.crash.replay import ReplayResult
 
 BundleFolder = Annotated[
     Path,
@@ -106,7 +106,7 @@ class _Replay:
                 "yours, or you trust whoever gave you the bundle, add --grant"
             )
 
-    def _run(self, bundle: Bundle, bar: Bar) -> Replayed:
+    def _run(self, bundle: Bundle, bar: Bar) -> ReplayResult:
         from envhub_sandbox.crash.replay import replay
 
         bar.begin(f"loading {safe_line(bundle.label)}")
@@ -160,7 +160,7 @@ class _Replay:
 
     # --- what is printed -----------------------------------------------------------------------
 
-    def _print(self, bundle: Bundle, replayed: Replayed) -> None:
+    def _print(self, bundle: Bundle, replayed: ReplayResult) -> None:
         if self._as_json:
             print_json(self._document(bundle, replayed))
             return
@@ -172,7 +172,7 @@ class _Replay:
             out(safe_text(replayed.note))
         out(_SAID[replayed.verdict.value])
 
-    def _document(self, bundle: Bundle, replayed: Replayed) -> dict[str, Any]:
+    def _document(self, bundle: Bundle, replayed: ReplayResult) -> dict[str, Any]:
         return {
             "bundle": str(self._folder),
             "label": bundle.label,

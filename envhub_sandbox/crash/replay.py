@@ -8,6 +8,7 @@ from enum import Enum
 from typing import Any
 
 from envhub_sandbox.crash.reader import Bundle
+from envhub_sandbox.crash.writer import death_of
 from envhub_sandbox.errors import ActionError, RemoteEnvError, WorkerDiedError, WorkerTimeoutError
 from envhub_worker.protocol import messages as m
 
@@ -24,7 +25,7 @@ class Verdict(str, Enum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Replayed:
+class ReplayResult:
     """What a replay did.
 
     Attributes:
@@ -42,34 +43,19 @@ class Replayed:
     note: str = ""
 
 
-def replay(
-    make: Callable[[], Any], bundle: Bundle, tick: Callable[[int], None] = lambda done: None
-) -> Replayed:
+def replay(make: Callable[[], Any], bundle: Bundle) -> ReplayResult:
     """Make the environment and repeat a bundle's requests.
 
     Args:
         make: Makes the environment: what ``make_env`` raises, it may raise.
         bundle: What was asked.
-        tick: Told how many requests have been repeated.
     """
     try:
         env = make()
     except (WorkerDiedError, WorkerTimeoutError) as error:
         return _ended(error, bundle, 0, 0)
     if env is None:
-        return Replayed(verdict=Verdict.SURVIVED, requests=0, steps=0)
-    for message in bundle.before:
-        try:
-            ended = _ask(env, message)
-        except _UNFIT as error:
-            note = f"what had been set before does not fit this environment: {error}"
-            return Replayed(verdict=Verdict.DIFFERENT, requests=0, steps=0, note=note)
-        if ended is not None:
-            return _ended(ended, bundle, 0, 0)
-    return _repeat(env, bundle, tick)
-
-
-def _repeat(env: Any, bundle: Bundle, tick: Callable[[int], None]) -> Replayed:
+        return ReplayResult(verdict=Verdict.SURVIVED, requests=0, steps=0)
     steps = 0
     for done, message in enumerate(bundle.requests, start=1):
         steps += isinstance(message, m.Step)
@@ -77,11 +63,10 @@ def _repeat(env: Any, bundle: Bundle, tick: Callable[[int], None]) -> Replayed:
             ended = _ask(env, message)
         except _UNFIT as error:
             note = f"request {done} does not fit this environment: {error}"
-            return Replayed(verdict=Verdict.DIFFERENT, requests=done, steps=steps, note=note)
+            return ReplayResult(verdict=Verdict.DIFFERENT, requests=done, steps=steps, note=note)
         if ended is not None:
             return _ended(ended, bundle, done, steps)
-        tick(done)
-    return Replayed(verdict=Verdict.SURVIVED, requests=len(bundle.requests), steps=steps)
+    return ReplayResult(verdict=Verdict.SURVIVED, requests=len(bundle.requests), steps=steps)
 
 
 def _ask(env: Any, message: m.Message) -> WorkerDiedError | WorkerTimeoutError | None:
@@ -97,20 +82,16 @@ def _ask(env: Any, message: m.Message) -> WorkerDiedError | WorkerTimeoutError |
 
 def _ended(
     error: WorkerDiedError | WorkerTimeoutError, bundle: Bundle, requests: int, steps: int
-) -> Replayed:
-    died = isinstance(error, WorkerDiedError)
-    how = {
-        "reason": error.reason if isinstance(error, WorkerDiedError) else "timeout",
-        "exit_code": getattr(error, "exit_code", None) if died else None,
-        "signal": getattr(error, "signal", None) if died else None,
-    }
+) -> ReplayResult:
+    death = death_of(error)
+    how = {name: death[name] for name in ("reason", "exit_code", "signal")}
     there = requests == len(bundle.requests)
     same = there and all(how[name] == bundle.death[name] for name in how)
-    return Replayed(
+    return ReplayResult(
         verdict=Verdict.SAME if same else Verdict.DIFFERENT,
         requests=requests,
         steps=steps,
-        death={**how, "message": str(error)},
+        death={**how, "message": death["message"]},
     )
 
 

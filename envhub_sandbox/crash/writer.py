@@ -23,7 +23,7 @@ import secrets
 import shutil
 import tempfile
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from envhub_sandbox import folders
-from envhub_sandbox.crash.history import Recording, Requested, Steps, encoded
+from envhub_sandbox.crash.history import RecordedRequest, Recording, Steps, encoded
 from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.policy import Policy, Timeouts
@@ -58,7 +58,7 @@ class Crash:
     """What is known of one death.
 
     Attributes:
-        error: What the user is told.
+        error: What the user gets.
         label: Repository, commit and entry file.
         provenance: As ``provenance_of`` returns it.
         load: The arguments of the repository's ``make_env``.
@@ -79,7 +79,7 @@ class Crash:
     recording: Recording
 
 
-def keep(folder: Path, crash: Crash) -> Path:
+def write_bundle(folder: Path, crash: Crash) -> Path:
     """Write a bundle; returns its folder.
 
     Raises:
@@ -115,10 +115,8 @@ def _is_old(path: Path) -> bool:
 
 
 def _write(folder: Path, crash: Crash) -> None:
-    before, requests = _Requests(), _Requests()
     recording = crash.recording
-    before.add_all(recording.before)
-    requests.add_all(recording.requests)
+    requests = _Requests(recording)
     document = {
         "format": FORMAT,
         "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
@@ -135,15 +133,13 @@ def _write(folder: Path, crash: Crash) -> None:
             "dropped": recording.dropped,
             "mixed": recording.mixed,
             "steps": requests.steps,
-            "before": before.index,
             "requests": requests.index,
         },
     }
-    packets = [*before.packets, *requests.packets]
     content = {
         "bundle.json": json.dumps(document, indent=1, default=str).encode(),
         "arguments.bin": _packet(encoded(crash.load).frames),
-        "requests.bin": b"".join(map(_packet, packets)),
+        "requests.bin": b"".join(map(_packet, requests.packets)),
         "README.txt": str(_concealed(_in_words(crash), crash)).encode(),
         **{name: _array_file(rows) for name, rows in requests.arrays.items()},
     }
@@ -174,18 +170,15 @@ def _array_file(rows: list[Any]) -> bytes:
 
 
 class _Requests:
-    """An index of requests, and what it points to."""
+    """An index of requests, in order, and what it points to."""
 
-    def __init__(self) -> None:
+    def __init__(self, recording: Recording) -> None:
         self.index: list[dict[str, Any]] = []
         self.packets: list[Sequence[Buffer]] = []
         self.arrays: dict[str, list[Any]] = {}
         self._lengths: dict[str, int] = {}
         self.steps = 0
-
-    def add_all(self, requests: Iterable[Steps | Requested]) -> None:
-        """Add requests, in order."""
-        for request in requests:
+        for request in recording.requests:
             if isinstance(request, Steps):
                 self._add_steps(request.actions)
             else:
@@ -199,7 +192,7 @@ class _Requests:
         self.index.append({"steps": [start, start + len(actions)], "of": name})
         self.steps += len(actions)
 
-    def _add(self, request: Requested) -> None:
+    def _add(self, request: RecordedRequest) -> None:
         self.packets.append(request.frames)
         self.index.append(
             {"operation": request.operation, "exact": request.exact, "text": _text(request)}
@@ -207,7 +200,7 @@ class _Requests:
         self.steps += request.operation == "step"
 
 
-def _text(request: Requested) -> str:
+def _text(request: RecordedRequest) -> str:
     return one_line(repr(m.unpack(request.frames)), 200)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.crash.history import Recording
-from envhub_sandbox.crash.writer import Crash, keep
+from envhub_sandbox.crash.writer import Crash, write_bundle
 from envhub_sandbox.errors import (
     DependencyError,
     EnvHubError,
@@ -214,7 +214,7 @@ class Repository:
         )
         try:
             folder = self.policy.crash_folder or cache_root() / "crashes"
-            bundle = keep(Path(folder).absolute(), crash)
+            bundle = write_bundle(Path(folder).absolute(), crash)
         except Exception as problem:
             CRASHES.warning("%s: no crash bundle could be written: %s", self.label, problem)
         else:

@@ -53,7 +53,7 @@ def bundle(folder: Path, **options: Any) -> Path:
         shared=False,
         recording=history.recording(),
     )
-    return writer.keep(folder, crash)
+    return writer.write_bundle(folder, crash)
 
 
 def edit(folder: Path, *path: Any, value: Any) -> None:
@@ -342,7 +342,8 @@ def test_what_was_set_before_and_does_not_fit_is_said(tmp_path: Path) -> None:
     folder = bundle(tmp_path)
     setting = inside.packet(m.pack(m.SetAttr(0, "size", (1,))))
     (folder / "requests.bin").write_bytes(setting + (folder / "requests.bin").read_bytes())
-    edit(folder, "history", "before", value=[{"operation": "set_attr"}])
+    index = json.loads((folder / "bundle.json").read_text())["history"]["requests"]
+    edit(folder, "history", "requests", value=[{"operation": "set_attr"}, *index])
     env: Any = Recorder()
     for error in (ValueError("one value each"), TypeError("no"), ActionError("no")):
         env.set_attr = Mock(side_effect=error)
