@@ -16,7 +16,6 @@ import numpy as np
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.transport.lane import Request
-from envhub_sandbox.transport.values.tensors import to_tensor
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.manifest.manifest import EnvManifest
@@ -33,7 +32,7 @@ _LASTING = (m.Call, m.SetAttr, m.CallOwn, m.CallOne)
 _PASSING = frozenset({"reset", "step", "render"})
 """What is over with the next seed, also where one sub-environment does it alone."""
 _SLICED = (m.Reset, m.SetAttr, m.GetOne, m.CallOne)
-"""What each shard is sent another part of."""
+"""Each shard is sent another part of these."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,19 +55,6 @@ class Steps:
     """Steps in a row. ``actions`` is ``(steps, num_envs, *single_action_space.shape)``."""
 
     actions: Any
-
-
-@dataclass(frozen=True, slots=True)
-class _SentFrames:
-    """A request as it was sent: plain, so that it is decoded only when it is needed.
-
-    Attributes:
-        frames: Of each shard's message.
-        bounds: The slices of the shards.
-    """
-
-    frames: list[list[bytes]]
-    bounds: list[tuple[int, int]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,9 +100,9 @@ class History:
         size = 8 * int(np.prod(self._shape, dtype=np.int64)) if self._flat else 0
         self._unit = _ENTRY_BYTES + size
         self._capacity = min(limit, max(1, HISTORY_BYTES // self._unit))
-        self._log: deque[bytes | np.dtype[Any] | m.Step | _SentFrames | RecordedRequest] = deque()
+        self._log: deque[bytes | np.dtype[Any] | m.Step | RecordedRequest] = deque()
         self._append = self._log.append
-        self._lasting: dict[object, _SentFrames | RecordedRequest] = {}
+        self._lasting: dict[object, RecordedRequest] = {}
         self.step: Callable[[Any], None] = lambda actions: None
         if limit:
             self.step = self._flat_step if self._flat else self._any_step
@@ -187,24 +173,24 @@ class History:
             for entry in self._lasting.values():
                 self._add(entry)
 
-    def _keep_lasting(self, message: m.Message, made: _SentFrames | RecordedRequest) -> None:
+    def _keep_lasting(self, message: m.Message, made: RecordedRequest) -> None:
         name = message.name if isinstance(message, m.SetAttr) else None
-        key: object = _heads(made) if name is None else name
+        key: object = made.frames[0] if name is None else name
         self._lasting.pop(key, None)  # the last one counts, in its place
         self._lasting[key] = made
         if len(self._lasting) > _MOST_LASTING:
             del self._lasting[next(iter(self._lasting))]
             self._forgotten += 1
 
-    def _add(self, entry: m.Step | _SentFrames | RecordedRequest) -> None:
+    def _add(self, entry: m.Step | RecordedRequest) -> None:
         self._append(entry)
         self._room -= self._units(entry)
         if self._room < 0:
             self._evict()
 
     def _units(self, entry: object) -> int:
-        if isinstance(entry, (_SentFrames, RecordedRequest)):
-            return 1 + (_REQUEST_BYTES + _bytes(entry)) // self._unit
+        if isinstance(entry, RecordedRequest):
+            return 1 + (_REQUEST_BYTES + sum(map(len, entry.frames))) // self._unit
         return 1 + _size(entry.actions) // self._unit if isinstance(entry, m.Step) else 1
 
     def _evict(self) -> None:
@@ -246,7 +232,7 @@ class History:
             elif isinstance(entry, m.Step):
                 found.append(encoded(entry))
             elif entry is not None:
-                found.append(_requested(entry))
+                found.append(entry)
         return found
 
 
@@ -254,14 +240,13 @@ def _passes(message: m.Message) -> bool:
     return isinstance(message, m.CallOne) and message.name in _PASSING
 
 
-def _entry(request: Request) -> _SentFrames | RecordedRequest:
-    """What is kept of a request. What only pickle could carry is described at once."""
-    if not request.plain:
-        return encoded(_whole(request.messages, request.bounds))
-    kept = request.kept()
-    if not isinstance(request.messages[0], _SLICED):
-        kept = kept[:1]  # the others have been sent the same
-    return _SentFrames(kept, request.bounds)
+def _entry(request: Request) -> RecordedRequest:
+    """What is kept of a request: what one shard was sent, where that is all of it."""
+    first = request.messages[0]
+    is_whole = len(request.messages) == 1 or not isinstance(first, _SLICED)
+    if request.plain and is_whole:
+        return RecordedRequest(_operation(first), request.kept()[0], exact=True)
+    return encoded(_whole(request.messages, request.bounds))
 
 
 def _whole(messages: Sequence[m.Message], bounds: Sequence[tuple[int, int]]) -> m.Message:
@@ -287,34 +272,17 @@ def _whole(messages: Sequence[m.Message], bounds: Sequence[tuple[int, int]]) -> 
     return made
 
 
-def _requested(entry: _SentFrames | RecordedRequest) -> RecordedRequest:
-    """An entry as a recording has it."""
-    if isinstance(entry, RecordedRequest):
-        return entry
-    messages = [m.unpack(frames, tensors=to_tensor) for frames in entry.frames]
-    return encoded(_whole(messages, entry.bounds))
-
-
-def _heads(entry: _SentFrames | RecordedRequest) -> bytes:
-    """What tells it from others: all but large values."""
-    if isinstance(entry, RecordedRequest):
-        return entry.frames[0]
-    return b"".join(frames[0] for frames in entry.frames)
-
-
-def _bytes(entry: _SentFrames | RecordedRequest) -> int:
-    parts = [entry.frames] if isinstance(entry, RecordedRequest) else entry.frames
-    return sum(len(frame) for frames in parts for frame in frames)
-
-
 def encoded(message: m.Message) -> RecordedRequest:
     """A message as it can be kept: without anything pickled."""
-    name = type(message).__name__.lower()
     try:
         frames, exact = m.pack(message, pickler=_refuse), True
     except EnvHubError:
         frames, exact = _inert(message), False
-    return RecordedRequest(name, [bytes(frame) for frame in frames], exact)
+    return RecordedRequest(_operation(message), [bytes(frame) for frame in frames], exact)
+
+
+def _operation(message: m.Message) -> str:
+    return type(message).__name__.lower()
 
 
 def _inert(message: m.Message) -> list[Buffer]:

@@ -63,7 +63,7 @@ def test_what_shards_were_sent_is_kept_as_it_was_asked() -> None:
     assert_same(reset_of_all.seeds, [1, 2, 3])
     assert_same(reset_of_all.mask, np.array([True, False, True]))
     assert_same(set_for_all.values, (np.zeros(2), np.ones(2), np.full(2, 7.0)))
-    assert called == m.Call(0, "f", (1,), {})
+    assert called == m.Call(5, "f", (1,), {})
     assert called_one == m.CallOne(0, 3, 0, "g", (), {})
 
 
