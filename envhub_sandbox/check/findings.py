@@ -47,6 +47,16 @@ class Finding:
         place = f"{self.file}:{self.line}: " if self.line else f"{self.file}: " if self.file else ""
         return f"{place}{self.message}"
 
+    def document(self) -> dict[str, Any]:
+        """As plain data, but for its task."""
+        return {
+            "check": self.id,
+            "severity": self.check.severity.value,
+            "message": self.message,
+            "file": self.file or None,
+            "line": self.line or None,
+        }
+
     @property
     def check(self) -> Check:
         """What did not hold."""

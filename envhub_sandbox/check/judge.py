@@ -6,6 +6,7 @@ our own comparison found nothing, never because the repository says so.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -77,32 +78,12 @@ def judge(asked: JudgeOptions, report: Report | None = None) -> Report:
     snapshot = named(asked.reference, **where)
     report = Report(asked.reference) if report is None else report
     report.reference, report.commit = pinned(snapshot), snapshot.commit
-    report.asked = _how(asked)
-    _Judge(asked, snapshot, report).ask()
+    judging = _Judge(asked, snapshot, report)
+    report.asked = judging.how()
+    with contextlib.suppress(_StoppedError):
+        judging.ask()
     report.judged("deadline", [])
     return report
-
-
-def _how(asked: JudgeOptions) -> dict[str, str]:
-    """How it is judged, in the caller's words and ours."""
-    policy = policy_from(asked.arguments.get("policy"), asked.arguments.get("limits"))
-    limits = (_limit(name, value) for name, value in vars(policy.limits).items() if value)
-    return {
-        "judged at": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
-        "by": f"envhub-sandbox {__version__}",
-        "sandbox": str(asked.arguments.get("sandbox", "process")),
-        "profile": policy.profile,
-        "network": policy.network,
-        "limits": ", ".join(limits),
-        "plays": f"{asked.steps} steps each, seed {asked.seed}, {asked.resets} resets a round",
-    }
-
-
-def _limit(name: str, value: int) -> str:
-    words = name.replace("_", " ")
-    if name.endswith("_bytes"):
-        return f"{words.removesuffix(' bytes')} {size_text(value)}"
-    return f"{words} {value:,}"
 
 
 def _cause(error: EnvHubError) -> str:
@@ -115,26 +96,48 @@ def _cause(error: EnvHubError) -> str:
     return remote.type_name.rpartition(".")[2] if isinstance(remote, RemoteEnvError) else ""
 
 
+def _limit(name: str, value: int) -> str:
+    words = name.replace("_", " ")
+    if name.endswith("_bytes"):
+        return f"{words.removesuffix(' bytes')} {size_text(value)}"
+    return f"{words} {value:,}"
+
+
 class _Judge:
     def __init__(self, asked: JudgeOptions, snapshot: Snapshot, report: Report) -> None:
         self._asked, self._snapshot, self._report = asked, snapshot, report
+        self._policy = policy_from(asked.arguments.get("policy"), asked.arguments.get("limits"))
+        self._is_here = asked.arguments.get("sandbox", "process") == "process"
         self._files = parsing.read(snapshot)
+        entry = self._files.get(snapshot.path)
+        arguments = () if entry is None else entry.entries
+        self._takes_render_mode = any("render_mode" in text for text, _ in arguments)
         self._unrecorded = ""
+
+    def how(self) -> dict[str, str]:
+        """How it is judged, in the caller's words and ours."""
+        asked, policy = self._asked, self._policy
+        limits = (_limit(name, value) for name, value in vars(policy.limits).items() if value)
+        return {
+            "judged at": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+            "by": f"envhub-sandbox {__version__}",
+            "sandbox": str(asked.arguments.get("sandbox", "process")),
+            "profile": policy.profile,
+            "network": policy.network,
+            "limits": ", ".join(limits),
+            "plays": f"{asked.steps} steps each, seed {asked.seed}, {asked.resets} resets a round",
+        }
 
     def ask(self) -> None:
         self._read()
-        try:
-            self._resolve()
-            self._load()
-        except _StoppedError:
-            return
+        self._resolve()
+        self._load()
 
     def _read(self) -> None:
-        is_moving = self._snapshot.repo_type != "local" and (
-            self._snapshot.commit not in self._asked.reference
-        )
-        moving = [f"{self._asked.reference} may mean another commit tomorrow"] if is_moving else []
-        self._report.judged("pinned", moving)
+        reference, snapshot = self._asked.reference, self._snapshot
+        is_moving = snapshot.repo_type != "local" and snapshot.commit not in reference
+        moving = f"{reference} may mean another commit tomorrow"
+        self._report.judged("pinned", [moving] if is_moving else [])
         found = survey(self._snapshot, self._files).findings
         for finding in found:
             self._report.add(finding)
@@ -167,23 +170,13 @@ class _Judge:
         if not found:
             self._report.judged("imports", [])
 
-    @property
-    def _takes_render_mode(self) -> bool:
-        """Whether its make_env names such an argument, as far as its text says."""
-        entry = self._files.get(self._snapshot.path)
-        return entry is not None and any("render_mode" in text for text, _ in entry.entries)
-
-    @property
-    def _is_here(self) -> bool:
-        return bool(self._asked.arguments.get("sandbox", "process") == "process")
-
-    def make(self, **changes: Any) -> EnvSuites:
+    def make(self, *, record_denials: bool = False, **changes: Any) -> EnvSuites:
         """Its environments; of the very files that were read, or it cannot be judged."""
-        given = {**self._asked.arguments, "cfg": self._report.reference, **changes}
-        policy = policy_from(given.get("policy"), given.get("limits"))
         # a death that a restart hides would be no finding
-        given |= {"policy": replace(policy, restart="never"), "limits": None}
-        suites = make_env(**given)
+        record = record_denials or self._policy.record_denials
+        policy = replace(self._policy, restart="never", record_denials=record)
+        given = {**self._asked.arguments, "cfg": self._report.reference, **changes}
+        suites = make_env(**{**given, "policy": policy, "limits": None})
         if suites.provenance["commit"] != self._snapshot.commit:  # a folder of this machine
             suites.close()
             raise SnapshotError(f"{self._asked.reference} changed while it was judged; judge again")
@@ -211,31 +204,26 @@ class _Judge:
         self._report.waiting = [f"{suite} / {task}" for suite, task in tasks]
         for suite, task in tasks:
             self._asked.tell(f"{suite} / {task}")
-            asking = TaskJudge(
-                self._asked,
-                self._report,
-                self.make,
-                suites[suite][task],
-                (suite, task),
-                takes_render_mode=self._takes_render_mode,
-            )
+            env, takes = suites[suite][task], self._takes_render_mode
+            judging = self._asked, self._report, self.make
+            asking = TaskJudge(*judging, env, (suite, task), takes_render_mode=takes)
             with self._stopping(f"{suite} / {task}"):
                 asking.ask()
             self._denied(asking.denied(), f"{suite} / {task}")
             asking.film()
-            suites[suite][task].close()
+            env.close()
             self._report.waiting.pop(0)
 
     def _note_confinement(self, provenance: Mapping[str, Any] | None) -> None:
-        policy = policy_from(self._asked.arguments.get("policy"), None)
-        self._report.confinement = Confinement.of(policy.profile, provenance, self._unrecorded)
+        made = Confinement.of(self._policy.profile, provenance, self._unrecorded)
+        self._report.confinement = made
 
     def _unloaded(self, error: EnvHubError) -> None:
         if isinstance(error, (WorkerDiedError, WorkerTimeoutError)):
             self._report.judged("survives", [f"while it loaded: {error}"], cause=_cause(error))
         elif not isinstance(error, DependencyError):  # also a name that a terminal would obey
             self._report.judged("loads", [str(error)], cause=_cause(error))
-        elif not self._found("imports"):  # where it stands has been said already
+        elif all(one.id != "imports" for one in self._report.findings):  # else it has been said
             self._report.judged("imports", [str(error)])
 
     def _denied(self, denied: Iterable[str] | None, task: str = "") -> None:
@@ -249,14 +237,11 @@ class _Judge:
 
         That makes steps longer, so no time is measured in this play.
         """
-        given = self._asked.arguments
         if not self._is_here:
             self._unrecorded = "only --sandbox process has it recorded"
             return self.make(num_workers=1, validate=True)
-        policy = policy_from(given.get("policy"), given.get("limits"))
-        recording = {"policy": replace(policy, record_denials=True), "limits": None}
         try:
-            return self.make(num_workers=1, validate=True, **recording)
+            return self.make(record_denials=True, num_workers=1, validate=True)
         except SandboxUnavailableError as error:  # of the profile, too: then it is raised again
             self._unrecorded = str(error)
         return self.make(num_workers=1, validate=True)
@@ -280,6 +265,3 @@ class _Judge:
         else:
             for check in ("observation-space", "runs", "survives"):
                 self._report.judged(check, [], task)
-
-    def _found(self, check: str) -> bool:
-        return any(finding.id == check for finding in self._report.findings)

@@ -28,26 +28,16 @@ def document(report: Report, failures: Sequence[Finding]) -> dict[str, Any]:
         "reference": report.reference,
         "commit": report.commit,
         "passed": not failures,
-        "findings": [_finding(one, failures) for one in report.findings],
+        "findings": [
+            {**one.document(), "cure": one.cure, "task": one.task or None, "fails": one in failures}
+            for one in report.findings
+        ],
         "left_out": report.left_out,
         "unjudged": {"checks": report.unmade, "tasks": report.waiting},
         "held": [{"check": check, "task": task} for check, task in report.passed],
         "figures": report.figures,
         "confinement": None if report.confinement is None else report.confinement.document(),
         "provenance": report.provenance,
-    }
-
-
-def _finding(one: Finding, failures: Sequence[Finding]) -> dict[str, Any]:
-    return {
-        "check": one.id,
-        "severity": one.check.severity.value,
-        "message": one.message,
-        "cure": one.cure,
-        "task": one.task or None,
-        "file": one.file or None,
-        "line": one.line or None,
-        "fails": one in failures,
     }
 
 

@@ -94,10 +94,9 @@ class History:
 
     def __init__(self, manifest: EnvManifest, limit: int) -> None:
         space = manifest.single_action_space
-        self._num_envs = manifest.num_envs
         self._shape = (manifest.num_envs, *(space.shape or ()))
-        self._flat = isinstance(space, ARRAY_SPACES)
-        size = 8 * int(np.prod(self._shape, dtype=np.int64)) if self._flat else 0
+        is_flat = isinstance(space, ARRAY_SPACES)
+        size = 8 * int(np.prod(self._shape, dtype=np.int64)) if is_flat else 0
         self._unit = _ENTRY_BYTES + size
         self._capacity = min(limit, max(1, HISTORY_BYTES // self._unit))
         self._log: deque[bytes | np.dtype[Any] | m.Step | RecordedRequest] = deque()
@@ -105,7 +104,7 @@ class History:
         self._lasting: dict[object, RecordedRequest] = {}
         self.step: Callable[[Any], None] = lambda actions: None
         if limit:
-            self.step = self._flat_step if self._flat else self._any_step
+            self.step = self._flat_step if is_flat else self._any_step
         self.started()
 
     def started(self) -> None:

@@ -10,8 +10,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from envhub_sandbox.crash.bundle_writer import Crash, write_bundle
 from envhub_sandbox.crash.history import Recording
-from envhub_sandbox.crash.writer import Crash, write_bundle
 from envhub_sandbox.errors import (
     DependencyError,
     EnvHubError,

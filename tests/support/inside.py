@@ -20,7 +20,7 @@ import zmq
 
 from envhub_sandbox import folders
 from envhub_sandbox.check.play import denials
-from envhub_sandbox.crash import writer
+from envhub_sandbox.crash import bundle_writer
 from envhub_sandbox.dependencies import environments, guesses, interpreters, resolutions
 from envhub_sandbox.making import making
 from envhub_sandbox.sandboxes import remote
@@ -320,7 +320,7 @@ def living(ledger: Ledger) -> Any:
 
 def packet(frames: Sequence[Buffer]) -> bytes:
     """A message as a crash bundle keeps it."""
-    return writer._packet(frames)
+    return bundle_writer._packet(frames)
 
 
 def monitor_script() -> Path:

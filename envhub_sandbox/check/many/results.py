@@ -116,7 +116,7 @@ class Results:
         """
         running = self._folder / _RUNNING
         try:
-            with self._marked():
+            with self._locked():
                 (self._folder / _REPORTS).mkdir(exist_ok=True)
                 _remove(running)  # of a run that was killed
                 running.mkdir(mode=0o700)
@@ -130,7 +130,7 @@ class Results:
             raise FolderError(f"{self._folder}: results cannot be kept there: {error}") from error
 
     @contextlib.contextmanager
-    def _marked(self) -> Iterator[None]:
+    def _locked(self) -> Iterator[None]:
         self._folder.mkdir(parents=True, exist_ok=True)
         mark = self._folder / _MARK
         if not mark.exists() and any(self._folder.iterdir()):

@@ -19,7 +19,7 @@ _LARGEST = 1e100
 """What is larger is drawn as this: differences of the largest floats are no floats."""
 
 
-def bars(name: str, values: Sequence[float]) -> str:
+def bar_plot(name: str, values: Sequence[float]) -> str:
     """One bar for each number, from zero; of neighbours their mean, where there are too many.
 
     Args:
@@ -48,7 +48,7 @@ def bars(name: str, values: Sequence[float]) -> str:
     )
 
 
-def histogram(name: str, seconds: Sequence[float]) -> str:
+def histogram_plot(name: str, seconds: Sequence[float]) -> str:
     """How often something took how long, with logarithmic steps; the median and the 99 %."""
     known = np.maximum(finite(seconds), 1e-7)
     if not len(known):
@@ -75,7 +75,7 @@ def histogram(name: str, seconds: Sequence[float]) -> str:
     return _svg(name, [*shown, *_below(ends)])
 
 
-def course(name: str, values: Sequence[float], parts: Sequence[tuple[int, str]]) -> str:
+def line_plot(name: str, values: Sequence[float], parts: Sequence[tuple[int, str]]) -> str:
     """A line through numbers of bytes, and a mark where each part ends.
 
     Args:

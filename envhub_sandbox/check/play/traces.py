@@ -76,8 +76,8 @@ def play(
         like: Stop at the first step that differs from this one.
         observe: Called with the number of each step that was made; 0 is the reset.
     """
-    trace, ended = Trace(), np.zeros(env.num_envs, np.bool_)
-    counter: EpisodeCounter | None = EpisodeCounter(env.num_envs, env.num_envs * steps, mode)
+    counter, counts = EpisodeCounter(env.num_envs, env.num_envs * steps, mode), True
+    trace, ended = Trace(counted=counter.counted), np.zeros(env.num_envs, np.bool_)
     env.action_space.seed(seed if actions_seed is None else actions_seed)
     began = time.perf_counter()
     first = env.reset(seed=seed)[0]
@@ -98,24 +98,14 @@ def play(
         trace.spent.append(time.perf_counter() - begun)
         trace.steps.append(resumed + digest(result[:4]))  # infos may hold times
         ended = _judge(trace, result, ended, mode, number)
-        counter = _count(trace, counter, result)
+        if counts:
+            try:
+                counter.step(*result[1:])
+            except RolloutError:
+                counts = False
         observe(number)
     trace.times |= _times(trace.spent)
     return trace
-
-
-def _count(
-    trace: Trace, counter: EpisodeCounter | None, result: tuple[Any, ...]
-) -> EpisodeCounter | None:
-    """The counter, or None once there was something that it cannot count."""
-    if counter is None:
-        return None
-    try:
-        counter.step(*result[1:])
-    except RolloutError:
-        return None
-    trace.counted = counter.counted
-    return counter
 
 
 def _times(spent: list[float]) -> dict[str, float]:
@@ -159,8 +149,10 @@ def _look_at(trace: Trace, observations: Any, where: str) -> None:
 
 
 def _leaves(value: Any, without: Collection[str] = ()) -> Iterator[Any]:
-    """What stands in mappings, sequences and arrays of objects. Trust: input from the worker,
-    already decoded, and so bounded in depth and size."""
+    """What stands in mappings, sequences and arrays of objects.
+
+    Trust: input from the worker, already decoded, and so bounded in depth and size.
+    """
     if isinstance(value, Mapping):
         value = [value[name] for name in value if name not in without]
     elif isinstance(value, np.ndarray) and value.dtype == object:
@@ -184,14 +176,13 @@ def _unbounded(observations: Any) -> Iterator[str]:
 
 def _bytes_of(infos: Any) -> int:
     """What infos weigh, roughly; without the last observation of an episode."""
-    return sum(
-        leaf.nbytes
-        if isinstance(leaf, np.ndarray)
-        else len(leaf)
-        if isinstance(leaf, (str, bytes))
-        else 8
-        for leaf in _leaves(infos, _LAST)
-    )
+    return sum(map(_weight, _leaves(infos, _LAST)))
+
+
+def _weight(leaf: Any) -> int:
+    if isinstance(leaf, np.ndarray):
+        return leaf.nbytes
+    return len(leaf) if isinstance(leaf, (str, bytes)) else 8
 
 
 def _on_cpu(value: Any) -> Any:

@@ -124,18 +124,7 @@ def document(read: Static) -> dict[str, Any]:
             }
             for name, one in sorted(read.modules.items())
         ],
-        "findings": [of_finding(one) for one in read.findings],
-    }
-
-
-def of_finding(one: Finding) -> dict[str, Any]:
-    """A finding as plain data."""
-    return {
-        "check": one.id,
-        "severity": one.check.severity.value,
-        "message": one.message,
-        "file": one.file or None,
-        "line": one.line or None,
+        "findings": [one.document() for one in read.findings],
     }
 
 

@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from envhub_sandbox.crash.bundle_writer import FORMAT
 from envhub_sandbox.errors import BundleError, EnvHubError
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.policy import Limits, Policy
@@ -28,7 +29,6 @@ from envhub_worker.protocol.stream import PacketReader
 from envhub_worker.protocol.text import printable
 from envhub_worker.protocol.untrusted import FAULTS
 
-FORMAT = 1
 MAX_FILE_BYTES = 64 << 20
 MAX_DOCUMENT_BYTES = 16 << 20
 """``bundle.json``: an empty list takes two bytes there, and forty times as much in memory."""
@@ -96,7 +96,7 @@ def _bundle(folder: Path, document: dict[str, Any]) -> Bundle:
     return Bundle(
         label=one_line(_member(document, "label", str), 1000),
         reference=_reference(provenance),
-        files=_texts(_member(provenance, "files", dict)),
+        files=_files(_member(provenance, "files", dict)),
         death=_death(_member(document, "death", dict)),
         load=_load(folder),
         arguments=arguments,
@@ -244,10 +244,10 @@ def _member(mapping: dict[str, Any], name: str, kind: type[T]) -> T:
     return value
 
 
-def _texts(mapping: dict[str, Any]) -> dict[str, str]:
+def _files(mapping: dict[str, Any]) -> dict[str, str]:
     if not all(type(value) is str for value in mapping.values()):
         raise BundleError("its file hashes are not text")
-    return dict(mapping)
+    return mapping
 
 
 # --- what it asks of this machine --------------------------------------------------------------

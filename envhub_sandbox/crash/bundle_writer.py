@@ -10,11 +10,12 @@
         actions-<dtype>.npy   (steps, num_envs, ...), one file a dtype
 
 Nothing in it is pickled. It is built under another name and renamed into place; only its owner
-may read it; the oldest give way to the newest. ``reader`` reads it.
+may read it; the oldest give way to the newest. ``bundle_reader`` reads it.
 """
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -108,21 +109,20 @@ def _remove_oldest(folder: Path, newest: str) -> None:
 
 
 def _is_old(path: Path) -> bool:
-    try:
+    with contextlib.suppress(OSError):
         return time.time() - path.stat().st_mtime > _ABANDONED_AFTER_S
-    except OSError:
-        return False
+    return False
 
 
 def _write(folder: Path, crash: Crash) -> None:
     recording = crash.recording
-    requests = _Requests(recording)
+    requests, denied = _Requests(recording), crash.error.denied
     document = {
         "format": FORMAT,
         "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "label": crash.label,
         "death": {name: _concealed(text, crash) for name, text in death_of(crash.error).items()},
-        "denied": None if crash.error.denied is None else _denied(crash),
+        "denied": None if denied is None else [_concealed(one, crash) for one in denied],
         "provenance": crash.provenance,
         "make_env": _arguments(crash),
         "task": crash.task,
@@ -145,11 +145,6 @@ def _write(folder: Path, crash: Crash) -> None:
     }
     for name, data in content.items():
         folders.write_private(folder / name, data)
-
-
-def _denied(crash: Crash) -> list[str]:
-    """What was tried before; a path may hold anything."""
-    return [str(_concealed(one, crash)) for one in crash.error.denied or ()]
 
 
 def _concealed(value: Any, crash: Crash) -> Any:
@@ -211,12 +206,13 @@ def _packet(frames: Sequence[Buffer]) -> bytes:
 def death_of(error: WorkerDiedError | WorkerTimeoutError) -> dict[str, Any]:
     """How it ended, as data."""
     if isinstance(error, WorkerTimeoutError):
-        how: dict[str, Any] = {"reason": "timeout", "exit_code": None, "signal": None}
-        how |= {"detail": f"{error.timeout_s} s" if error.timeout_s else "", "output": ""}
+        detail = f"{error.timeout_s} s" if error.timeout_s else ""
+        how = {"reason": "timeout", "exit_code": None, "signal": None, "detail": detail}
+        output = ""
     else:
-        how = {"reason": error.reason, "exit_code": error.exit_code, "signal": error.signal}
-        how |= {"detail": error.detail, "output": error.log_tail}
-    return {**how, "request": error.request, "message": str(error)}
+        how = {name: getattr(error, name) for name in ("reason", "exit_code", "signal", "detail")}
+        output = error.log_tail
+    return {**how, "output": output, "request": error.request, "message": str(error)}
 
 
 def _arguments(crash: Crash) -> dict[str, Any]:
