@@ -130,12 +130,7 @@ class Report:
         return [one for one in found if one.check.severity.reaches(fail_on)]
 
     def stopped(self, seconds: float, at: str) -> None:
-        """A deadline has ended it: what was not judged is a finding.
-
-        Args:
-            seconds: Of the deadline.
-            at: What was done then.
-        """
+        """A deadline of so many seconds ended it at something: what was not judged is a finding."""
         made = {one.id for one in self.findings} | {check for check, _ in self.passed}
         self.unmade = [check for check in CHECKS if check not in made and check != "deadline"]
         left = [*self.unmade, *(f"all of {task}" for task in self.waiting)]

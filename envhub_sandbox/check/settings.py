@@ -73,14 +73,10 @@ def merged_settings(policy: Mapping[str, Any], given: Mapping[str, Any]) -> dict
 
 
 def read_settings(path: Path, known: Collection[str]) -> dict[str, Any]:
-    """The options in ``[check]`` of a caller's file, by their names in Python.
+    """The options in ``[check]`` of a caller's file, by their names in Python, of those ``known``.
 
     It is named, and never looked for: the folder that one is in may be a stranger's clone, and a
     file that lies there would let him say what he may do and what fails him.
-
-    Args:
-        path: The file.
-        known: The names that may stand there.
 
     Raises:
         PolicyError: The file cannot be read, or says what there is not.

@@ -290,12 +290,7 @@ def _is_more(name: str, value: Any) -> bool:
 
 
 def replayed_arguments(bundle: Bundle, *, granted: bool) -> dict[str, Any]:
-    """The arguments of ``make_env`` that make the environment again.
-
-    Args:
-        bundle: The bundle.
-        granted: Whether the user permits what ``wishes`` lists; otherwise it is left out.
-    """
+    """The arguments of ``make_env`` that make it again; ``wishes`` are left out unless granted."""
     policy = _known(Policy, _policy(bundle))
     usable = {name: policy[name] for name in _GRANTED if granted and name in policy}
     limits = _known(Limits, policy.get("limits"))

@@ -44,12 +44,7 @@ class ReplayResult:
 
 
 def replay(make: Callable[[], Any], bundle: Bundle) -> ReplayResult:
-    """Make the environment and repeat a bundle's requests.
-
-    Args:
-        make: Makes the environment: what ``make_env`` raises, it may raise.
-        bundle: What was asked.
-    """
+    """Make the environment, which may raise as ``make_env`` does, and repeat a bundle's requests."""
     try:
         env = make()
     except (WorkerDiedError, WorkerTimeoutError) as error:

@@ -12,12 +12,7 @@ Frame = NDArray[np.uint8]
 
 
 def shrunk(frame: Frame, side: int) -> Frame:
-    """A frame of which no side is longer than that: the mean of each block of pixels.
-
-    Args:
-        frame: uint8 ``(height, width, 3)``.
-        side: Pixels.
-    """
+    """A frame of which no side is longer than that: the mean of each block of pixels."""
     block = -(-max(frame.shape[:2]) // side)
     if block <= 1:
         return frame

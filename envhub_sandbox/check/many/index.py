@@ -102,12 +102,7 @@ def _cells(one: Result) -> tuple[str, ...]:
 def junit(
     results: Iterable[Result], report: Callable[[ListEntry], tuple[Report, list[Finding]] | None]
 ) -> str:
-    """A suite for each reference: its checks as test cases, or why there are none as an error.
-
-    Args:
-        results: All of them.
-        report: What was kept of a reference.
-    """
+    """A suite for each reference: its checks as test cases, or why there are none as an error."""
     root = ElementTree.Element("testsuites", name="envhub check")
     for one in ordered(results):
         found = report(one.listed) if one.has_report else None

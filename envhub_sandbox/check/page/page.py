@@ -116,9 +116,7 @@ def _plots(play: Play) -> Iterator[str]:
     drawn = [
         _plot(f"{of}, per episode", _mean(returns), bar_plot(f"{of} of each episode", returns)),
         _plot("Length of episodes", _mean(lengths), bar_plot("Length of each episode", lengths)),
-        _plot(
-            "Time of a step", _median(play.step_s), histogram_plot("Times of steps", play.step_s)
-        ),
+        _plot("Time of a step", _median(times), histogram_plot("Times of steps", times)),
         _plot("Memory", "", line_plot("Memory of its processes", play.memory, _parts(play))),
     ]
     if not play.episodes and play.step_s:

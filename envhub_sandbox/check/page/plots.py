@@ -20,12 +20,7 @@ _LARGEST = 1e100
 
 
 def bar_plot(name: str, values: Sequence[float]) -> str:
-    """One bar for each number, from zero; of neighbours their mean, where there are too many.
-
-    Args:
-        name: Of ours, for those who do not see it.
-        values: Any; those that are no finite number are left out.
-    """
+    """One bar for each finite number, from zero; of too many, one for the mean of neighbours."""
     known = finite(values)
     if not len(known):
         return ""
@@ -76,13 +71,7 @@ def histogram_plot(name: str, seconds: Sequence[float]) -> str:
 
 
 def line_plot(name: str, values: Sequence[float], parts: Sequence[tuple[int, str]]) -> str:
-    """A line through numbers of bytes, and a mark where each part ends.
-
-    Args:
-        name: Of ours.
-        values: Evenly apart.
-        parts: The number of values in each, and what to write at its end.
-    """
+    """A line through numbers of bytes; ``parts`` are how many, and a word for where they end."""
     known = finite(values)
     if len(known) < 2 or len(known) != len(values):
         return ""

@@ -28,14 +28,7 @@ def usage_per_round(
     resets: int,
     tell: Callable[[str], None],
 ) -> list[Usage]:
-    """What is held after each round of resets; a first round warms up. Empty if nothing counts.
-
-    Args:
-        begin: Resets all sub-environments, and steps them.
-        usage: What its jail holds.
-        resets: In each round.
-        tell: Called with the name of each round.
-    """
+    """What is held after each round of resets; a first round warms up. Empty if nothing counts."""
     seen = []
     for number in range(_ROUNDS + 1):
         tell(f"{resets} resets, round {number + 1} of {_ROUNDS + 1}")

@@ -108,11 +108,6 @@ def film(env: VectorEnv[Any, Any, Any], *, seed: int, seconds: float = _SECONDS)
     """Play again from the start, and look: bounded in frames and in time, encoded here.
 
     What fails is said in the film and is no finding: its checks have been made.
-
-    Args:
-        env: Is left open.
-        seed: Of the environment and of the actions.
-        seconds: After which no further step is made.
     """
     frames: list[Frame] = []
     lacks = ""

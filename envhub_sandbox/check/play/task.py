@@ -41,8 +41,7 @@ class TaskJudge:
     """Asks one environment every question about how it runs.
 
     Args:
-        asked: What is judged, and how.
-        report: Takes what is found.
+        asked, report: What is judged, and how; what is found.
         make: Makes all environments once more, in fresh processes, with these arguments changed.
         env: The environment, whose system calls may be recorded.
         key: Its suite and its task.

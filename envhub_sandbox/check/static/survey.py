@@ -67,12 +67,7 @@ class Survey:
 
 
 def survey(snapshot: Snapshot, parsed: Mapping[str, Parsed | None]) -> Survey:
-    """Look at every file of a repository.
-
-    Args:
-        snapshot: The repository.
-        parsed: What ``parsing.read`` read of it.
-    """
+    """Look at every file of a repository, and at what ``parsing.read`` read of it."""
     found = Survey()
     found.add(_papers(snapshot))
     found.add(_in_place(snapshot))

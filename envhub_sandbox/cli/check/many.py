@@ -154,11 +154,6 @@ class ListRun:
     def show(self, *, json: bool, junit: Path | None, github: bool) -> None:
         """Print what has come of it, and end with its code.
 
-        Args:
-            json: Print the index as JSON.
-            junit: JUnit's file.
-            github: Print annotations.
-
         Raises:
             UsageError: A file cannot be written.
             Exit: Not all passed.

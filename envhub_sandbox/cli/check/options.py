@@ -74,12 +74,7 @@ Again = Annotated[
 
 
 def refuse_the_judged(places: Mapping[str, Path | None], reference: str, where: str = "") -> None:
-    """No repository says how it is judged, and none holds what is found in it.
-
-    Args:
-        places: By the options that name them.
-        reference: What is judged.
-        where: Where that stands, for the error.
+    """No repository says how it is judged, and none holds what is found in it: refuse such places.
 
     Raises:
         UsageError: One lies in it.
