@@ -44,7 +44,7 @@ class ReplayResult:
 
 
 def replay(make: Callable[[], Any], bundle: Bundle) -> ReplayResult:
-    """Make the environment, which may raise as ``make_env`` does, and repeat a bundle's requests."""
+    """Make the environment, which may raise as ``make_env``, and repeat a bundle's requests."""
     try:
         env = make()
     except (WorkerDiedError, WorkerTimeoutError) as error:

@@ -259,8 +259,8 @@ class ListRun:
         asked = self.jobs or max(1, len(os.sched_getaffinity(0)) // 2)
         jobs = min(asked, budget // each)
         if self.jobs is not None and jobs < self.jobs:
-            limits = "see --memory and --memory-budget"
-            say(f"{jobs} at once: {needs}, of {size_text(budget)}; {limits}.")
+            of = f"{needs}, of {size_text(budget)}"
+            say(f"{jobs} at once: {of}; see --memory and --memory-budget.")
         return jobs
 
     def _digest(self, policy: bytes) -> str:
