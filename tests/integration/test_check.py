@@ -293,19 +293,6 @@ def test_a_name_that_a_terminal_would_obey_is_a_finding(tmp_path: Path) -> None:
     assert {one.id for one in report.findings} == {"loads"}
 
 
-@pytest.mark.parametrize(
-    ("options", "code", "says"),
-    [
-        (["--allow", "nothing"], 2, "there are requirements, imports"),
-        (["--fail-on", "never"], 2, "error, warning or note"),
-    ],
-)
-def test_wrong_options_say_what_there_is(options: list[str], code: int, says: str) -> None:
-    """Before anything is run."""
-    done = envhub("check", EXAMPLES / "cartpole", *options)
-    assert (done.returncode, says in " ".join(done.stderr.split())) == (code, True), done.stderr
-
-
 _WITHOUT_NAMESPACES = """
 import json, os, sys
 from pathlib import Path

@@ -44,6 +44,8 @@ class Page(HTMLParser):
         """As the parser calls it."""
         self.tags.append(("!", ((data, None),)))
 
+    handle_pi = handle_comment
+
     @property
     def names(self) -> set[str]:
         """Which tags there are."""

@@ -57,6 +57,11 @@ def keep(kept: Results, folder: Path, document: dict[str, Any] | None = None) ->
     return kept.keep(_ONE, document or told(), page, seconds=1.5, ended="2026-01-01T00:00:00+00:00")
 
 
+def edit(file: Path, old: str, new: str) -> None:
+    """Change what stands in a report."""
+    file.write_text(file.read_text().replace(old, new))
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Where results are kept."""
@@ -98,12 +103,10 @@ def test_what_was_judged_is_known_again(folder: Path) -> None:
         lambda json_, page: json_.write_bytes(b""),
         lambda json_, page: json_.write_bytes(b"[" * 100_000),
         lambda json_, page: json_.write_text("[1]"),
-        lambda json_, page: json_.write_text(
-            json_.read_text().replace('"passed": false', '"passed": true')
-        ),
-        lambda json_, page: json_.write_text(json_.read_text().replace('"runs"', '"nothing"')),
-        lambda json_, page: json_.write_text(json_.read_text().replace("1.5", "NaN")),
-        lambda json_, page: json_.write_text(json_.read_text().replace("repo@main", "other@main")),
+        lambda json_, page: edit(json_, '"passed": false', '"passed": true'),
+        lambda json_, page: edit(json_, '"runs"', '"nothing"'),
+        lambda json_, page: edit(json_, "1.5", "NaN"),
+        lambda json_, page: edit(json_, "repo@main", "other@main"),
         lambda json_, page: (json_.unlink(), json_.symlink_to(page)),
         lambda json_, page: (json_.unlink(), json_.symlink_to("/nowhere")),
         lambda json_, page: (json_.unlink(), json_.mkdir()),
