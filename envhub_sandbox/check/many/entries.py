@@ -21,7 +21,7 @@ MOST_BYTES = 1 << 20
 MOST = 2_000
 """References: a page of as many rows is one that people can read."""
 _LONGEST = 4_096
-_TOLD = 20
+_SHOWN = 20
 _SLUG = 48
 
 
@@ -76,9 +76,9 @@ def read_entries(file: IO[bytes], title: str) -> list[ListEntry]:
     found: dict[str, ListEntry] = {}
     wrong = list(_read_into(found, text))
     if wrong:
-        more = [f"and {len(wrong) - _TOLD} more"] if len(wrong) > _TOLD else []
-        told = "\n".join([*(f"{title}:{line}: {what}" for line, what in wrong[:_TOLD]), *more])
-        raise HubReferenceError(f"nothing was run, for the list cannot be read:\n{told}")
+        more = [f"and {len(wrong) - _SHOWN} more"] if len(wrong) > _SHOWN else []
+        lines = "\n".join([*(f"{title}:{line}: {what}" for line, what in wrong[:_SHOWN]), *more])
+        raise HubReferenceError(f"nothing was run, for the list cannot be read:\n{lines}")
     if not found:
         raise HubReferenceError(f"{title} has no reference in it: one a line")
     if len(found) > MOST:

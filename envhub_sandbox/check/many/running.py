@@ -26,7 +26,7 @@ _MOST_BYTES = 32 << 20
 """Of what one prints: a document, or what it complains of."""
 _TAIL_BYTES = 4_096
 PATIENCE_S = 20.0
-"""For one that is told to end: its jails have to go."""
+"""For one that has been asked to end: its jails have to go."""
 _KILLED_S = 20.0
 """For the kernel to end one, where that is not in a disk's hands."""
 T = TypeVar("T")
@@ -85,11 +85,11 @@ class _Running(Generic[T]):
         try:
             how = os.WEXITED | os.WNOHANG | os.WNOWAIT
             return os.waitid(os.P_PID, self._process.pid, how) is not None
-        except ChildProcessError:  # whoever started us has SIGCHLD ignored: nobody waits for it
+        except ChildProcessError:  # SIGCHLD is ignored since before we started
             return True
 
     def terminate(self) -> None:
-        """Tell it to end."""
+        """Ask it to end."""
         self._signal(os.kill, signal.SIGTERM)
 
     def kill(self) -> None:
@@ -167,9 +167,9 @@ def judgements(
     variables: Mapping[str, str],
     patience_s: float = PATIENCE_S,
 ) -> Generator[Outcome[T], None, None]:
-    """Run a command for each order, and tell in the order in which they end.
+    """Run a command for each order, and yield what came of each as it ends.
 
-    Whoever stops asking, or is interrupted, must close the iterator: then all are ended.
+    A caller that stops asking, or is interrupted, must close the iterator: then all are ended.
 
     Args:
         orders: What is asked for the next as soon as there is room for it.
@@ -179,7 +179,7 @@ def judgements(
         jobs: How many run at once.
         most_s: How long one may take.
         variables: Of the environment, beyond ours.
-        patience_s: For one that is told to end.
+        patience_s: For one that has been asked to end.
     """
     waiting = enumerate(orders)
     running: list[_Running[T]] = []
@@ -203,7 +203,7 @@ def judgements(
 
 
 def end(running: Iterable[_Running[T]], patience_s: float) -> None:
-    """End processes, and what they have started; whoever is impatient may interrupt again."""
+    """End processes, and what they have started; another interrupt ends the wait."""
     left = list(running)
     until = time.monotonic() + patience_s
     try:

@@ -75,7 +75,7 @@ class TaskJudge:
             raise
 
     def _ask(self) -> None:
-        """In the order in which one fault is told apart from what it causes."""
+        """In the order in which one fault is kept apart from what it causes."""
         mode = getattr(self._env.metadata.get("autoreset_mode"), "value", None)
         stated = mode in _MODES
         self._holds("autoreset-stated", stated, "the metadata does not say")

@@ -1,7 +1,7 @@
 """What is different between two commits, in terms of what a repository would do.
 
 A finding is the same where it stands in the same file, in a line that reads the same: lines that
-move are no change, and a line that was changed is told again.
+move are no change, and what stands in a changed line is a new finding.
 """
 
 from __future__ import annotations

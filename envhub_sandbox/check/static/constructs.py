@@ -56,7 +56,7 @@ _NAMES = {
     "pathlib.Path.home": _OUTSIDE,
 }
 _REFLECTED = ("os", "sys", "builtins", "importlib", "subprocess", "socket", "ctypes")
-"""Modules of which getattr may fetch what nobody wants to write down."""
+"""Modules of which getattr may fetch what an author does not want to write down."""
 _LONG_LINE = re.compile(r"^[^\n]{2000,}", re.MULTILINE)
 
 
@@ -68,7 +68,7 @@ def constructs(file: str, parsed: Parsed) -> Iterator[Finding]:
 
 
 def long_lines(file: str, text: str) -> Iterator[Finding]:
-    """Lines that nobody reads to their end: what stands there need not be seen."""
+    """Lines that are too long to be read to their end: what stands there need not be seen."""
     for found in _LONG_LINE.finditer(text):
         line = 1 + text.count("\n", 0, found.start())
         message = f"a line of {len(found[0])} characters"
