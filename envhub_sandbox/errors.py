@@ -48,7 +48,6 @@ the repository warns of is a ``RemoteEnvWarning``, whatever its category is ther
 from __future__ import annotations
 
 import multiprocessing
-import shlex
 import sys
 from functools import cache
 from typing import Any
@@ -60,7 +59,7 @@ from envhub_worker.protocol.errors import MessageTooLargeError as MessageTooLarg
 from envhub_worker.protocol.errors import ProtocolError as ProtocolError
 from envhub_worker.protocol.errors import RemoteProtocolError as RemoteProtocolError
 from envhub_worker.protocol.errors import VersionMismatchError as VersionMismatchError
-from envhub_worker.protocol.text import continued, quoted
+from envhub_worker.protocol.text import continued
 
 
 class HubReferenceError(EnvHubError, ValueError):
@@ -385,24 +384,3 @@ def name_source(error: EnvHubError, label: str) -> None:
         error.args = (f"{label}: {text}", *error.args[1:])
     if isinstance(error, (WorkerDiedError, WorkerTimeoutError)):
         error.repository = label
-
-
-def name_line(error: EnvHubError, where: str) -> None:
-    """Put the repository's own line at the end of an error's text, and the traceback below it."""
-    remote = error if isinstance(error, RemoteEnvError) else error.__cause__
-    assert isinstance(remote, RemoteEnvError)
-    remote.where = where
-    if where:
-        error.args = (f"{error.args[0]}\n{where}", *error.args[1:])
-    if remote.traceback:
-        note = f"In the environment:\n{quoted(remote.traceback.rstrip())}"
-        # before Python 3.11 only some shells and test runners show it
-        vars(error)["__notes__"] = [*getattr(error, "__notes__", ()), note]
-
-
-def name_bundle(error: WorkerDiedError | WorkerTimeoutError, bundle: str) -> None:
-    """Name a crash bundle in an error, and the command that tries it again."""
-    error.bundle = bundle
-    text = str(error.args[0]) if error.args else ""
-    command = f"envhub replay {shlex.quote(bundle)}"
-    error.args = (f"{text}\nTo try the same again: {command}", *error.args[1:])

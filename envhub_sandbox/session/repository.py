@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,7 +18,6 @@ from envhub_sandbox.errors import (
     EnvHubError,
     WorkerDiedError,
     WorkerTimeoutError,
-    name_bundle,
     name_source,
 )
 from envhub_sandbox.hub.snapshot import Snapshot
@@ -218,7 +218,9 @@ class Repository:
         except Exception as problem:
             CRASHES.warning("%s: no crash bundle could be written: %s", self.label, problem)
         else:
-            name_bundle(error, str(bundle))
+            error.bundle = str(bundle)
+            again = f"To try the same again: envhub replay {shlex.quote(error.bundle)}"
+            error.args = (f"{error.args[0]}\n{again}", *error.args[1:])
             CRASHES.info("%s: crash bundle %s", self.label, bundle)
 
 
