@@ -20,8 +20,7 @@ from envhub_sandbox import __version__
 from envhub_sandbox.api import make_env
 from envhub_sandbox.check.checks import CHECKS
 from envhub_sandbox.check.findings import Report
-from envhub_sandbox.check.play.confinement import Confinement
-from envhub_sandbox.check.play.denials import denial_findings
+from envhub_sandbox.check.play.confinement import Confinement, denial_findings
 from envhub_sandbox.check.play.task import TaskJudge
 from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.check.static.static import undeclared

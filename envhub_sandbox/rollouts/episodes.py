@@ -202,32 +202,22 @@ def success_of(infos: Any, index: int) -> bool | None:
     """
     if not isinstance(infos, Mapping):
         return None
-    final = infos.get("final_info")
-    for source in (final, infos):
-        found = _entry(source, "is_success", index)
-        if found is None and source is final:
-            found = _of_member(source, index)  # Gymnasium before 1.0: an array of dicts
+    for source in (infos.get("final_info"), infos):
+        found = _success_in(source, index)
         if isinstance(found, (bool, int, float, np.bool_, np.number)):
             return bool(found)
     return None
 
 
-def _entry(infos: Any, key: str, index: int) -> Any:
-    if not isinstance(infos, Mapping) or key not in infos:
-        return None
+def _success_in(infos: Any, index: int) -> Any:
     try:
-        mask = infos.get(f"_{key}")
+        if not isinstance(infos, Mapping):  # Gymnasium before 1.0: an array of dicts
+            return infos[index].get("is_success")
+        mask = infos.get("_is_success")
         if mask is not None and not mask[index]:
             return None
-        return np.asarray(_on_cpu(infos[key]))[index].item()
+        return np.asarray(_on_cpu(infos["is_success"]))[index].item()
     except (AttributeError, IndexError, KeyError, TypeError, ValueError):
-        return None
-
-
-def _of_member(infos: Any, index: int) -> Any:
-    try:
-        return infos[index].get("is_success")
-    except (AttributeError, IndexError, KeyError, TypeError):
         return None
 
 

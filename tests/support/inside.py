@@ -19,7 +19,7 @@ from typing import Any
 import zmq
 
 from envhub_sandbox import folders
-from envhub_sandbox.check.play import denials
+from envhub_sandbox.check.play import confinement
 from envhub_sandbox.crash import bundle_writer
 from envhub_sandbox.dependencies import environments, guesses, interpreters, resolutions
 from envhub_sandbox.making import making
@@ -206,7 +206,7 @@ def _running(env: Any) -> LoadedJail:
     return found
 
 
-HARMLESS_DENIALS = denials._HARMLESS
+HARMLESS_DENIALS = confinement._HARMLESS
 """What a recorded jail is denied that is no attempt of the repository's."""
 
 # --- the connection to another host ------------------------------------------------------------

@@ -1,8 +1,12 @@
-"""What confined a repository while it was judged, and what did not, for every form of a report."""
+"""What confined a repository while it was judged, and what it tried and was denied.
+
+The system call filter asks the jail's first process, so that nothing of it is the repository's
+word; but a path is read out of the memory of the process that asks, which may change it meanwhile.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +14,17 @@ from envhub_worker.protocol.text import printable
 
 _MOST, _LONGEST = 40, 300
 _WHOLE = "strict"
+_NETWORK = "socket AF_"
+_LOCAL = frozenset({"socket AF_UNIX", "socketpair AF_UNIX"})
+_DEEDS = {"connect": "connect to", "sendto": "send to"}
+_OTHER = " OTHER_PROCESS"
+_HARMLESS = frozenset(
+    {
+        *("mbind", "set_mempolicy", "set_mempolicy_home_node", "migrate_pages", "move_pages"),
+        *("setpriority", "ioprio_set", "io_uring_setup", "socket AF_NETLINK"),
+    }
+)
+"""What allocators, pools of threads and the C library try on their way, and do without."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,3 +87,25 @@ class Confinement:
 
 def _line(text: object) -> str:
     return " ".join(printable(str(text), _LONGEST).split())
+
+
+def denial_findings(denied: Iterable[str]) -> dict[str, list[str]]:
+    """The findings of each check, of what was denied. Trust: paths are a stranger's words."""
+    checks = ("denied-network", "denied-files", "denied-kernel", "limits-reached")
+    found: dict[str, list[str]] = {check: [] for check in checks}
+    for one in sorted(set(denied) - _HARMLESS):
+        check, text = _finding(one)
+        found[check].append(text)
+    return found
+
+
+def _finding(one: str) -> tuple[str, str]:
+    deed, _, path = one.partition(" ")
+    if path.startswith("/"):
+        return "denied-files", f"asked to {_DEEDS.get(deed, deed)} {path}, which is not its own"
+    if deed == "limit":
+        return "limits-reached", f"used up what limits permit of {path.lower()}"
+    if one.endswith(_OTHER):
+        return "denied-kernel", f"tried {deed} of a process that is not its own"
+    is_network = one.startswith(_NETWORK) and one not in _LOCAL
+    return "denied-network" if is_network else "denied-kernel", f"tried {one}, and was refused"

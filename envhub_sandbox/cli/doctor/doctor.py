@@ -14,13 +14,15 @@ import platform
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli.doctor import folders
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, show
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, describe, reported
 from envhub_sandbox.cli.shared.memory import free_bytes
@@ -135,7 +137,7 @@ def doctor(
                 "--server-key and --insecure-loopback are of a server: envhub doctor "
                 "tcp://HOST:PORT"
             )
-        with Bar(quiet=json) as bar, folders.scratch_folder() as folder:
+        with Bar(quiet=json) as bar, _scratch_folder() as folder:
             (folder / "idle").mkdir()
             (folder / "idle" / "env.py").write_text(_ENV_PY)
             trials = []
@@ -144,7 +146,7 @@ def doctor(
                 trials.append(examine(str(folder / "idle"), name))
             bar.begin("trying each layer")
             probed = probe()
-        cache = folders.cache_problem(by_others=profile != "strict" or not trials[0].available)
+        cache = _cache_problem(by_others=profile != "strict" or not trials[0].available)
         if json:
             here = {"host": host(), "versions": versions(), "engine": engine(), **resources(cache)}
             print_json({**here, "profiles": list(map(asdict, trials)), **probed})
@@ -156,6 +158,59 @@ def doctor(
                 out(f"The cache: {safe_line(cache, 1000)}")
         decisive = next(trial for trial in trials if trial.profile == profile)
         raise typer.Exit(decisive.code or (Exit.SNAPSHOT if cache else Exit.OK))
+
+
+@contextlib.contextmanager
+def _scratch_folder() -> Iterator[Path]:
+    """A folder for a repository and a cache: what is wrong with the caller's hides no layer.
+
+    Raises:
+        SandboxUnavailableError: There is no place for one.
+    """
+    from envhub_sandbox.hub.store import CACHE_VARIABLE
+
+    try:
+        made = tempfile.TemporaryDirectory(prefix="envhub-doctor-")
+    except OSError as error:
+        raise SandboxUnavailableError(
+            f"there is no folder for temporary files that can be written ({error.strerror}); set "
+            "TMPDIR to one, or start a read-only container with --tmpfs /tmp"
+        ) from error
+    before = os.environ.get(CACHE_VARIABLE)
+    with made as folder:
+        os.chmod(folder, 0o755)  # jails of another user read it
+        os.environ[CACHE_VARIABLE] = f"{folder}/cache"
+        try:
+            yield Path(folder)
+        finally:
+            os.environ.pop(CACHE_VARIABLE)
+            if before is not None:
+                os.environ[CACHE_VARIABLE] = before
+
+
+def _cache_problem(*, by_others: bool) -> str | None:
+    """Why the caller's cache is of no use, and what to do; None if it is.
+
+    Args:
+        by_others: Whether root's jails read it as another user: all but those with a private root.
+    """
+    from envhub_sandbox.hub.store import cache_root
+
+    try:
+        root = cache_root()
+    except SnapshotError as error:
+        return str(error)
+    there = next(path for path in (root, *root.parents) if path.exists())
+    cure = f"set ENVHUB_CACHE to another folder, such as {tempfile.gettempdir()}/envhub-cache"
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        return f"{root} cannot be written: {cure}"
+    closed = [path for path in (there, *there.parents) if not path.stat().st_mode & 0o001]
+    if os.geteuid() == 0 and by_others and closed:
+        return (
+            f"{root} cannot be read by the user of root's jails, since {closed[-1]} is closed to "
+            f"others: {cure}"
+        )
+    return None
 
 
 def host() -> dict[str, Any]:

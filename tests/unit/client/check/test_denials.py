@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from envhub_sandbox.check.play.denials import denial_findings
+from envhub_sandbox.check.play.confinement import denial_findings
 
 
 @pytest.mark.parametrize(
