@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -179,9 +181,8 @@ class TaskJudge:
         self._say("actions-ignored", self._unmoved(before, acted))
         took = min(trace.times["reset_s"] for trace in (again, other, acted))
         most = _RESET * self._asked.slow_step_s
-        self._holds(
-            "slow-resets", took <= most, f"a reset takes {took:.1f} s, where {most:g} s are set"
-        )
+        slow = f"a reset takes {took:.1f} s, where {most:g} s are set"
+        self._holds("slow-resets", took <= most, slow)
         self._tell("resets without a seed")
         at, is_drawn = before.differs_from(again), before.differs_from(other) == 0
         self._seeded(env, at, _UNSEEDED if is_drawn else 2)
@@ -189,7 +190,10 @@ class TaskJudge:
             self._say("endless", [])
         else:
             self._tell("on to the end of an episode")
-            self._on_to_an_end(env)
+            steps = self._asked.episode_steps
+            ended = self._ends(env, steps, time.monotonic() + _EPISODE_S)
+            if ended is not None:  # else there was no time to find out
+                self._holds("endless", ended, f"no episode ended in {steps:,} steps")
 
     def _seeded(self, env: Env, at: int | None, most: int) -> None:
         if at is not None:
@@ -220,18 +224,16 @@ class TaskJudge:
             if different:
                 yield f"{different} steps with other actions give the same results"
 
-    def _on_to_an_end(self, env: Env) -> None:
-        """Says nothing where there is no time to find out."""
-        until = time.monotonic() + _EPISODE_S
+    def _ends(self, env: Env, steps: int, until: float = math.inf) -> bool | None:
+        """Whether an episode ends within so many steps; None where the time was over before."""
         env.reset(seed=self._asked.seed)
-        for _ in range(self._asked.episode_steps):
+        for _ in range(steps):
             _, _, terminations, truncations, _ = env.step(env.action_space.sample())
             if np.any(terminations) or np.any(truncations):
-                self._say("endless", [])
-                return
+                return True
             if time.monotonic() > until:
-                return
-        self._say("endless", [f"no episode ended in {self._asked.episode_steps:,} steps"])
+                return None
+        return False
 
     # --- in the process that was played first --------------------------------------------------
 
@@ -240,20 +242,15 @@ class TaskJudge:
         if usage is None or not self._asked.resets:
             return
         resets, counting = self._asked.resets, self._play.counting(usage)
-        seen = leaks.usage_per_round(self._begin, counting, resets, self._tell)
+        steps = min(_BEGUN, self._asked.steps)
+        begin = partial(self._ends, self._env, steps)
+        seen = leaks.usage_per_round(begin, counting, resets, self._tell)
         if not seen:
             return  # a server on another host that does not count
         self._report.figures[self._name] |= {name: float(n) for name, n in seen[-1].items()}
         grown, words = leaks.leak(seen, resets) or ("", "")
         for check in leaks.LEAK_CHECKS:
             self._holds(check, check != grown, words)
-
-    def _begin(self) -> None:
-        self._env.reset(seed=self._asked.seed)
-        for _ in range(min(_BEGUN, self._asked.steps)):
-            _, _, terminations, truncations, _ = self._env.step(self._env.action_space.sample())
-            if np.any(terminations) or np.any(truncations):
-                return
 
     def _render(self) -> None:
         wrong: list[str] = []
