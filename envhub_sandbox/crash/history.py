@@ -158,7 +158,8 @@ class History:
         if isinstance(message, m.Reset) and message.mask is None:
             self._reset([one.seeds for one in request.messages if isinstance(one, m.Reset)])
         made = _entry(request)
-        if isinstance(message, _LASTING) and not _passes(message):
+        passes = isinstance(message, m.CallOne) and message.name in _PASSING
+        if isinstance(message, _LASTING) and not passes:
             self._keep_lasting(message, made)
         self._add(made)
 
@@ -233,10 +234,6 @@ class History:
             elif entry is not None:
                 found.append(entry)
         return found
-
-
-def _passes(message: m.Message) -> bool:
-    return isinstance(message, m.CallOne) and message.name in _PASSING
 
 
 def _entry(request: Request) -> RecordedRequest:

@@ -66,8 +66,10 @@ def replay(make: Callable[[], Any], bundle: Bundle) -> ReplayResult:
 
 def _ask(env: Any, message: m.Message) -> WorkerDiedError | WorkerTimeoutError | None:
     """Repeat one request; what the repository raises is its answer, as it was before."""
+    repeat = _REPEATED.get(type(message))  # none for what no history has
     try:
-        _REPEATED.get(type(message), _skip)(env, message)
+        if repeat is not None:
+            repeat(env, message)
     except (WorkerDiedError, WorkerTimeoutError) as error:
         return error
     except (RemoteEnvError, AttributeError):
@@ -97,10 +99,6 @@ def _reset(env: Any, message: m.Reset) -> None:
     env.reset(seed=message.seeds, options=options)
 
 
-def _set_attr(env: Any, message: m.SetAttr) -> None:
-    env.set_attr(message.name, list(message.values))
-
-
 def _call_own(env: Any, message: m.CallOwn) -> None:
     if _is_remote(env, message.name):
         getattr(env, message.name)(*message.args, **message.kwargs)
@@ -109,10 +107,6 @@ def _call_own(env: Any, message: m.CallOwn) -> None:
 def _get_own(env: Any, message: m.GetOwn) -> None:
     if _is_remote(env, message.name) or message.name == "np_random_seed":
         getattr(env, message.name)
-
-
-def _get_one(env: Any, message: m.GetOne) -> None:
-    _one(env, message, message.name)
 
 
 def _call_one(env: Any, message: m.CallOne) -> None:
@@ -145,20 +139,16 @@ def _is_remote(env: Any, name: str) -> bool:
     return not name.startswith("_") and name not in vars(env) and not hasattr(type(env), name)
 
 
-def _skip(env: Any, message: Any) -> None:
-    """It is no request that was ever recorded."""
-
-
 _REPEATED: dict[type[m.Message], Callable[[Any, Any], object]] = {
     m.Reset: _reset,
     m.Step: lambda env, message: env.step(message.actions),
     m.Call: lambda env, message: env.call(message.name, *message.args, **message.kwargs),
-    m.SetAttr: _set_attr,
+    m.SetAttr: lambda env, message: env.set_attr(message.name, list(message.values)),
     m.Render: lambda env, message: env.render(),
     m.CallOwn: _call_own,
     m.GetOwn: _get_own,
     m.CallOne: _call_one,
-    m.GetOne: _get_one,
+    m.GetOne: lambda env, message: _one(env, message, message.name),
     m.GetRandom: lambda env, message: env.np_random,
 }
 

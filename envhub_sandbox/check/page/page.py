@@ -111,13 +111,14 @@ def _plots(play: Play) -> Iterator[str]:
     returns = [episode.returns[0] for episode in play.episodes]
     lengths = [float(episode.length) for episode in play.episodes]
     times = play.step_s
+    parts = [(play.played, "played"), (len(play.memory) - play.played, "resets")]
     many = len(play.episodes[0].returns) if play.episodes else 1
     of = f"Return, component 1 of {many}" if many > 1 else "Return"
     drawn = [
         _plot(f"{of}, per episode", _mean(returns), bar_plot(f"{of} of each episode", returns)),
         _plot("Length of episodes", _mean(lengths), bar_plot("Length of each episode", lengths)),
         _plot("Time of a step", _median(times), histogram_plot("Times of steps", times)),
-        _plot("Memory", "", line_plot("Memory of its processes", play.memory, _parts(play))),
+        _plot("Memory", "", line_plot("Memory of its processes", play.memory, parts)),
     ]
     if not play.episodes and play.step_s:
         yield '<p class="dim">No episode ended while it was played: see --steps.</p>'
@@ -132,10 +133,6 @@ def _plot(name: str, figure: str, svg: str) -> str:
         return ""
     strong = f" <strong>{figure}</strong>" if figure else ""
     return f"<figure><figcaption>{name}{strong}</figcaption>{svg}</figure>"
-
-
-def _parts(play: Play) -> list[tuple[int, str]]:
-    return [(play.played, "played"), (len(play.memory) - play.played, "resets")]
 
 
 def _mean(values: Sequence[float]) -> str:
