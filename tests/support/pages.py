@@ -15,6 +15,20 @@ from envhub_sandbox.rollouts.episodes import Episode
 from envhub_sandbox.rollouts.pictures import png
 
 FRAME = np.full((4, 6, 3), 200, np.uint8)
+HOSTILE = (
+    "x\n::error::forged",
+    "x\r\n::add-mask::forged",
+    "<script>alert(1)</script> | [a](javascript:b) ![i](http://example.com/x) `c`",
+    "</title></style></td></a><img src=x onerror=alert(1)>",
+    "]]></failure></error></testcase><testcase name='forged'/>",
+    "\" onmouseover='alert(1)' x=\"",
+    "&lt;script&gt;&#60;script&#62;",
+    "<!-- --><svg/onload=alert(1)>]]>",
+    "javascript:alert(1) http://example.com/",
+    "\x1b[2J\x00\ufffe\u202e\ud800\x85<b>\r\n<i> %0A::error::forged",
+    "<" * 100_000,
+)
+"""What a repository may write into a report, to be more than text there."""
 
 
 class Page(HTMLParser):

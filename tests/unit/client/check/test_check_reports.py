@@ -14,14 +14,7 @@ from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.check.page.page import page
 from envhub_sandbox.check.play.confinement import Confinement
 from envhub_worker.protocol.text import printable
-
-_HOSTILE = (
-    "x\n::error::forged",
-    "x\r\n::add-mask::forged",
-    "<script>alert(1)</script> | [a](javascript:b) ![i](http://example.com/x) `c`",
-    "]]></failure></testcase><testcase name='forged'/>",
-    "\x1b[2J\x00\ufffe\ud800 %0A::error::forged",
-)
+from tests.support.pages import HOSTILE
 
 
 def report(text: str) -> Report:
@@ -32,7 +25,7 @@ def report(text: str) -> Report:
     return made
 
 
-@pytest.mark.parametrize("text", _HOSTILE)
+@pytest.mark.parametrize("text", HOSTILE)
 def test_a_workflow_command_is_one_line(text: str) -> None:
     """And begins where it begins; the control is the text itself, which has a line of its own."""
     [line] = reports.workflow_commands(report(text))
@@ -44,7 +37,7 @@ def test_a_workflow_command_is_one_line(text: str) -> None:
     assert head.count("::") == 1
 
 
-@pytest.mark.parametrize("text", _HOSTILE)
+@pytest.mark.parametrize("text", HOSTILE)
 def test_a_summary_has_no_strangers_markup(text: str) -> None:
     """One row of four cells, in which nothing is a tag, a link or an image."""
     made = report(text)
@@ -54,7 +47,7 @@ def test_a_summary_has_no_strangers_markup(text: str) -> None:
     assert not set("<>[]!`") & set(row)
 
 
-@pytest.mark.parametrize("text", _HOSTILE)
+@pytest.mark.parametrize("text", HOSTILE)
 def test_what_confined_it_is_text(text: str) -> None:
     """Of a server on another host: a line is one, a command is one, and a flood is cut."""
     made = Report("./walk:env.py")
@@ -87,7 +80,7 @@ def test_all_that_there_can_be_is_a_line_and_no_notice() -> None:
         assert made.confinement.document()["recorded"] is True
 
 
-@pytest.mark.parametrize("text", _HOSTILE)
+@pytest.mark.parametrize("text", HOSTILE)
 def test_junit_is_well_formed(text: str) -> None:
     """Two cases, whatever the text."""
     made = report(text)
@@ -99,7 +92,7 @@ def test_junit_is_well_formed(text: str) -> None:
     assert failure.text
 
 
-@pytest.mark.parametrize("text", _HOSTILE)
+@pytest.mark.parametrize("text", HOSTILE)
 def test_sarif_is_data(text: str) -> None:
     """A result of a rule that is there, at a place that is a URI."""
     made = report(text)

@@ -25,18 +25,9 @@ from envhub_sandbox.check.many.results import (
     link,
 )
 from envhub_worker.protocol.text import printable
-from tests.support.pages import Page, results_of
+from tests.support.pages import HOSTILE, Page, results_of
 
 _ONE = ListEntry("org/repo", "org/repo@main", 1)
-_HOSTILE = (
-    "<script>alert(1)</script>",
-    "</title></style></td></a><img src=x onerror=alert(1)>",
-    "\" onmouseover='alert(1)' x=\"",
-    "&lt;script&gt; <!-- --><svg/onload=alert(1)>]]></error></testcase>",
-    "javascript:alert(1) [a](javascript:b) | `c` ::error::forged\n::error::forged",
-    "\x1b[2J\x00\u202e\ud800\x85<b>\r\n<i>",
-    "<" * 100_000,
-)
 
 
 def told(text: str = "it broke", *, fails: bool = True) -> dict[str, Any]:
@@ -70,7 +61,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_a_report_is_read_as_it_was_written() -> None:
     """From its document, whatever a repository wrote into it."""
-    for text in (*_HOSTILE, ""):
+    for text in (*HOSTILE, ""):
         document = told(text)
         report, failures = reports.read_report(document)
         again = json.loads(json.dumps(reports.document(report, failures)))
@@ -198,7 +189,7 @@ def shape(page: Page) -> list[tuple[str, tuple[tuple[str, str | None], ...]]]:
     ]
 
 
-@pytest.mark.parametrize("text", _HOSTILE)
+@pytest.mark.parametrize("text", HOSTILE)
 def test_an_index_has_the_tags_of_ours_alone(text: str) -> None:
     """The very same as with a harmless text, and the text is there to read.
 
@@ -238,7 +229,7 @@ def test_an_index_shows_first_what_fails() -> None:
     assert document["counts"] == dict.fromkeys(words, 1)
 
 
-@pytest.mark.parametrize("text", _HOSTILE)
+@pytest.mark.parametrize("text", HOSTILE)
 def test_other_forms_are_well_formed_too(text: str) -> None:
     """JUnit's file, annotations and the summary of a workflow."""
     made = results_of(text)
