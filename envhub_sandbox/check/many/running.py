@@ -55,7 +55,7 @@ class Outcome(Generic[T]):
     said: str
 
 
-class _Running(Generic[T]):
+class _Job(Generic[T]):
     def __init__(
         self, order: T, folder: Path, command: Command[T], variables: Mapping[str, str]
     ) -> None:
@@ -182,7 +182,7 @@ def judgements(
         patience_s: For one that has been asked to end.
     """
     waiting = enumerate(orders)
-    running: list[_Running[T]] = []
+    running: list[_Job[T]] = []
     more = True
     try:
         while more or running:
@@ -190,7 +190,7 @@ def judgements(
                 number, order = next(waiting, (-1, None))
                 more = order is not None
                 if order is not None:
-                    running.append(_Running(order, folder / str(number), command, variables))
+                    running.append(_Job(order, folder / str(number), command, variables))
             time.sleep(_TICK_S)
             for job in tuple(running):
                 what = job.ended(most_s, patience_s)
@@ -202,7 +202,7 @@ def judgements(
         end(running, patience_s)
 
 
-def end(running: Iterable[_Running[T]], patience_s: float) -> None:
+def end(running: Iterable[_Job[T]], patience_s: float) -> None:
     """End processes, and what they have started; another interrupt ends the wait."""
     left = list(running)
     until = time.monotonic() + patience_s
