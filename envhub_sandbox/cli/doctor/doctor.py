@@ -1,6 +1,6 @@
 """``envhub doctor``: what this host can enforce, found out by doing it.
 
-Each profile is tried with a jail of its own, set up exactly as for a repository, self-test
+Each profile is tried with the environment of ``envhub init`` in a jail of its own, self-test
 included: nothing is concluded from versions or settings. A jail stops at the first layer that is
 missing, so the layers are also tried one by one, to name all of them at once.
 """
@@ -23,6 +23,7 @@ from typing import Annotated, Any
 
 import typer
 
+from envhub_sandbox.cli.init.starter import starter
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, show
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, describe, reported
 from envhub_sandbox.cli.shared.memory import free_bytes
@@ -30,29 +31,6 @@ from envhub_sandbox.cli.shared.progress import Bar
 from envhub_sandbox.cli.version import versions
 from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError, SnapshotError
 from envhub_worker.protocol.confinement import PROFILES
-
-_ENV_PY = '''"""Does nothing: `envhub doctor` runs it to see what confines it."""
-
-import gymnasium as gym
-import numpy as np
-
-
-class Idle(gym.Env):
-    observation_space = gym.spaces.Box(0, 1, (1,), np.float32)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        return np.zeros(1, np.float32), 0.0, False, False, {}
-
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Idle] * n_envs)
-'''
-
 
 _PROBE_S = 60.0
 
@@ -139,7 +117,7 @@ def doctor(
             )
         with Bar(quiet=json) as bar, _scratch_folder() as folder:
             (folder / "idle").mkdir()
-            (folder / "idle" / "env.py").write_text(_ENV_PY)
+            (folder / "idle" / "env.py").write_text(starter("idle", 2026)["env.py"])
             trials = []
             for name in PROFILES:
                 bar.begin(f"trying {name}")
