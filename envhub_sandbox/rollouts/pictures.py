@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 Frame = NDArray[np.uint8]
 
 
-def shrunk(frame: Frame, side: int) -> Frame:
+def small_picture(frame: Frame, side: int) -> Frame:
     """A frame of which no side is longer than that: the mean of each block of pixels."""
     block = -(-max(frame.shape[:2]) // side)
     if block <= 1:

@@ -33,7 +33,7 @@ _STYLES = {
 }
 
 
-def document(results: Iterable[Result]) -> dict[str, Any]:
+def index_document(results: Iterable[Result]) -> dict[str, Any]:
     """Everything, as plain data."""
     found = ordered(results)
     rows = [_row(one) for one in found]
@@ -73,7 +73,7 @@ def page(results: Sequence[Result]) -> str:
     """One page that needs nothing else and runs nothing."""
     title = f"envhub check: {counts(results)}"
     rows = [_cells(one) for one in ordered(results)]
-    return markup.document(title, [f"<h1>{title}</h1>", *markup.table(_HEADS, rows)])
+    return markup.markup_page(title, [f"<h1>{title}</h1>", *markup.table(_HEADS, rows)])
 
 
 def counts(results: Iterable[Result]) -> str:

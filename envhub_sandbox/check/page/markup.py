@@ -79,7 +79,7 @@ _POLICY = (
 """Of what a page may do, were there markup of a stranger's: not even look different."""
 
 
-def document(title: str, body: Iterable[str]) -> str:
+def markup_page(title: str, body: Iterable[str]) -> str:
     """A whole page in one file, of a body that is HTML of ours; the title may be a stranger's."""
     return "\n".join(
         [

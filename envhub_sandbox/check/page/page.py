@@ -13,7 +13,7 @@ import numpy as np
 
 from envhub_sandbox.check.checks import CHECKS
 from envhub_sandbox.check.findings import Finding, Report
-from envhub_sandbox.check.page.markup import data, document, facts, folded, table, text
+from envhub_sandbox.check.page.markup import data, facts, folded, markup_page, table, text
 from envhub_sandbox.check.page.plots import bar_plot, finite, histogram_plot, line_plot, number
 from envhub_sandbox.check.play.plays import Film, Play
 from envhub_worker.protocol.text import counted, duration_text, size_text
@@ -31,7 +31,7 @@ def page(report: Report, failures: Collection[Finding]) -> str:
     """The whole page. Trust: whatever stands in a report may be a stranger's text."""
     body = [*_head(report, failures), *_findings(report, failures), *_tasks(report)]
     body += [*_figures(report), *_held(report), *_judged(report), *_ran(report.provenance or {})]
-    return document(f"envhub check: {report.reference}", body)
+    return markup_page(f"envhub check: {report.reference}", body)
 
 
 def _head(report: Report, failures: Collection[Finding]) -> Iterator[str]:

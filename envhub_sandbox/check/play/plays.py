@@ -14,7 +14,7 @@ from gymnasium.vector import VectorEnv
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.rollouts import video
 from envhub_sandbox.rollouts.episodes import Episode
-from envhub_sandbox.rollouts.pictures import Frame, even, png, shrunk
+from envhub_sandbox.rollouts.pictures import Frame, even, png, small_picture
 from envhub_worker.protocol.text import printable
 
 _SIDE = 320
@@ -133,7 +133,7 @@ def _rendered(env: VectorEnv[Any, Any, Any], seed: int, ends: float) -> Iterator
     env.action_space.seed(seed)
     env.reset(seed=seed)
     for _ in range(_FRAMES):
-        yield even(shrunk(video.frame_of(env), _SIDE))
+        yield even(small_picture(video.frame_of(env), _SIDE))
         if monotonic() >= ends:
             return
         _, _, terminations, truncations, _ = env.step(env.action_space.sample())

@@ -63,7 +63,7 @@ _MOST_HIDDEN = 20
 """Of one file."""
 
 
-def kind_of(name: str, beginning: bytes, ending: bytes = b"") -> str:
+def kind_of_contents(name: str, beginning: bytes, ending: bytes = b"") -> str:
     """In a word or two: ``"Python"``, ``"text"``, ``"binary"``, or what is worth a look."""
     suffix = Path(name).suffix.lower()
     if beginning.lstrip().startswith(_LFS):

@@ -76,7 +76,7 @@ def survey(snapshot: Snapshot, parsed: Mapping[str, Parsed | None]) -> Survey:
     for record in sorted(snapshot.files, key=lambda one: one.path):
         path = snapshot.root / record.path
         ending = _bytes(path, contents.ENDING, max(record.size - contents.ENDING, 0))
-        kind = contents.kind_of(record.path, _bytes(path, contents.BEGINNING), ending)
+        kind = contents.kind_of_contents(record.path, _bytes(path, contents.BEGINNING), ending)
         found.files.append(File(record, kind))
         found.add(contents.of_kind(record.path, kind, is_folder=snapshot.repo_type == "local"))
         for one in contents.hidden(record.path, record.path, is_code=True):

@@ -159,9 +159,9 @@ def check(
         least, allowed = level(fail_on), _known(allow or ())
         if listed is not None:
             _refuse_beside_a_list(ref=ref, sarif=sarif, html=html)
-            from envhub_sandbox.cli.check import many
+            from envhub_sandbox.cli.check import list_run
 
-            run = many.ListRun(
+            run = list_run.ListRun(
                 file=listed,
                 output=output,
                 jobs=jobs,
@@ -171,7 +171,7 @@ def check(
                 make=make,
                 settings=settings,
                 policy=policy,
-                arguments=many.handed_on(ctx),
+                arguments=list_run.handed_on(ctx),
                 debug=debug,
             )
             run.judge()

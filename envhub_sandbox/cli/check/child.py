@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 
 from envhub_sandbox import parent
-from envhub_sandbox.check.many.running import PATIENCE_S
+from envhub_sandbox.check.many.judgements import PATIENCE_S
 
 
 def main() -> None:

@@ -222,7 +222,7 @@ def test_an_index_shows_first_what_fails() -> None:
     words = ["failed", "not judged", "waiting", "passed"]
     body = text[text.rindex("judged\n") :] if "judged\n" in text else text
     assert sorted(words, key=body.rindex) == words
-    document = index.document(made)
+    document = index.index_document(made)
     assert [row["verdict"] for row in document["results"]] == words
     titles = [line.partition("::")[2].partition("%0A")[0] for line in index.workflow_commands(made)]
     assert [title.rpartition("::")[2] for title in titles] == words[:3]
@@ -244,7 +244,7 @@ def test_other_forms_are_well_formed_too(text: str) -> None:
     rows = index.summary(made).splitlines()[4:]
     assert len(rows) == 4
     assert all(row.count("|") == 4 and not set("<>[]!`") & set(row) for row in rows)
-    json.dumps(index.document(made), allow_nan=False)
+    json.dumps(index.index_document(made), allow_nan=False)
 
 
 def test_an_index_is_bounded() -> None:

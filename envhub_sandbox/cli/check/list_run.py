@@ -17,6 +17,7 @@ import typer
 
 from envhub_sandbox.check.checks import CHECKS
 from envhub_sandbox.check.many import entries, index
+from envhub_sandbox.check.many.judgements import Outcome, judgements
 from envhub_sandbox.check.many.results import (
     FolderError,
     ForeignResultError,
@@ -24,7 +25,6 @@ from envhub_sandbox.check.many.results import (
     Results,
     Verdict,
 )
-from envhub_sandbox.check.many.running import Outcome, judgements
 from envhub_sandbox.check.settings import merged_settings, read_file
 from envhub_sandbox.cli.check.options import refuse_the_judged
 from envhub_sandbox.cli.shared import options as opt
@@ -164,7 +164,7 @@ class ListRun:
         if github:
             annotate(index.workflow_commands(results), index.summary(results))
         if json:
-            print_json(index.document(results))
+            print_json(index.index_document(results))
         elif not github:
             self._print(results)
         if self.exit is not Exit.OK:
@@ -230,7 +230,9 @@ class ListRun:
 
     def _write_index(self) -> None:
         results = list(self.of.values())
-        self._results.write("index.json", json.dumps(index.document(results), indent=2) + "\n")
+        self._results.write(
+            "index.json", json.dumps(index.index_document(results), indent=2) + "\n"
+        )
         self._results.write("index.html", index.page(results))
 
     def _listed(self) -> list[ListEntry]:

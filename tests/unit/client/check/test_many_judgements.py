@@ -11,7 +11,7 @@ from typing import Any
 import psutil
 import pytest
 
-from envhub_sandbox.check.many.running import Outcome, judgements
+from envhub_sandbox.check.many.judgements import Outcome, judgements
 from envhub_sandbox.errors import WorkerStartupError
 from tests.support.processes import eventually
 
