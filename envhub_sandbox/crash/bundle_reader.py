@@ -198,6 +198,8 @@ def _requests(folder: Path, index: list[Any]) -> Iterator[m.Message]:
             raise BundleError(f"it has more than {MAX_REQUESTS} requests")
         for actions in rows:
             yield m.Step(0, actions)
+    if next(packets, None) is not None:
+        raise BundleError("it has more requests than it says")
 
 
 def _slice(value: Any, length: int) -> slice:

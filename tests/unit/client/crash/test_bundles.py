@@ -108,6 +108,7 @@ def test_a_bundle_comes_back(tmp_path: Path) -> None:
         (("history", "requests", 1, "of"), "actions-object.npy"),
         (("history", "requests", 1, "of"), "actions-float32.npy"),
         (("history", "requests"), [{"operation": "reset"}] * 2),
+        (("history", "requests"), []),
         (("history", "dropped"), True),
     ],
 )
