@@ -91,12 +91,11 @@ class TaskJudge:
         self._tell("first play")
         first = self._played(self._env, mode, **seen)
         self._play.episodes = first.counted
-        self._say("observation-finite", first.unbounded)
-        self._say("rewards", first.bad_rewards)
-        self._say("infos", first.infos)
+        for check in ("observation-finite", "rewards", "infos"):
+            self._say(check, first.notes[check])
         self._large(first)
         if stated:
-            self._say("autoreset", first.autoreset)
+            self._say("autoreset", first.notes["autoreset"])
         self._tell("rendering")
         self._render()
         self._tell("one sub-environment by itself")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import time
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,6 +16,7 @@ from gymnasium.vector import VectorEnv
 from envhub_sandbox.rollouts.episodes import Episode, EpisodeCounter, RolloutError
 
 Env = VectorEnv[Any, Any, Any]
+_NOTED = 3
 _LAST = ("final_obs", "final_observation")
 
 
@@ -25,11 +27,8 @@ class Trace:
     Attributes:
         steps: A digest of the reset, and of every step.
         actions: A digest of the actions of every step.
-        bad_rewards: Steps with a reward that is no finite number, the first few.
-        unbounded: Resets and steps with an observation that is not finite, the first few.
+        notes: What was seen that no step should have, the first few for each check.
         heavy: Bytes of the infos of each step, for each sub-environment.
-        autoreset: What the autoreset mode would not permit, the first few.
-        infos: Infos that do not say which sub-environments they are of, the first few.
         episodes: How many ended.
         times: Seconds of the reset and of steps, for the report.
         counted: The episodes that ended, to be looked at; fewer, where its rewards are such that
@@ -39,15 +38,17 @@ class Trace:
 
     steps: list[str] = field(default_factory=list)
     actions: list[str] = field(default_factory=list)
-    bad_rewards: list[str] = field(default_factory=list)
-    unbounded: list[str] = field(default_factory=list)
+    notes: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     heavy: list[float] = field(default_factory=list)
-    autoreset: list[str] = field(default_factory=list)
-    infos: list[str] = field(default_factory=list)
     episodes: int = 0
     times: dict[str, float] = field(default_factory=dict)
     counted: list[Episode] = field(default_factory=list)
     spent: list[float] = field(default_factory=list)
+
+    def note(self, check: str, text: str) -> None:
+        """Keep what was seen, if there is not enough of it for the check."""
+        if len(self.notes[check]) < _NOTED:
+            self.notes[check].append(text)
 
     def differs_from(self, other: Trace) -> int | None:
         """The first step of both that differs, 0 for the reset; None if none does."""
@@ -125,27 +126,27 @@ def _judge(trace: Trace, result: tuple[Any, ...], ended: Any, mode: str | None, 
     _look_at(trace, observations, f"step {number}")
     trace.heavy.append(_bytes_of(infos) / max(len(rewards), 1))
     for text in _masks(infos, len(rewards)):
-        _note(trace.infos, f"step {number}: {text}")
+        trace.note("infos", f"step {number}: {text}")
     done = np.logical_or(np.asarray(terminations, bool), np.asarray(truncations, bool))
     trace.episodes += int(done.sum())
     if not np.isfinite(np.asarray(rewards, np.float64)).all():
-        _note(trace.bad_rewards, f"step {number}: {np.asarray(rewards).tolist()}")
+        trace.note("rewards", f"step {number}: {np.asarray(rewards).tolist()}")
     if mode == "NextStep":
         for index in np.flatnonzero(ended):
             if done[index] or np.any(np.asarray(rewards)[index]):
-                _note(
-                    trace.autoreset,
+                trace.note(
+                    "autoreset",
                     f"step {number}: sub-environment {index} had ended, and the step that resets "
                     "it has a reward or ends it again (NEXT_STEP)",
                 )
     if mode == "SameStep" and done.any() and "final_obs" not in infos:
-        _note(trace.autoreset, f"step {number}: an episode ended without 'final_obs' (SAME_STEP)")
+        trace.note("autoreset", f"step {number}: an episode ended without 'final_obs' (SAME_STEP)")
     return done
 
 
 def _look_at(trace: Trace, observations: Any, where: str) -> None:
     for found in itertools.islice(_unbounded(observations), 1):
-        _note(trace.unbounded, f"{where}: an observation has {found}")
+        trace.note("observation-finite", f"{where}: an observation has {found}")
 
 
 def _leaves(value: Any, without: Collection[str] = ()) -> Iterator[Any]:
@@ -203,11 +204,6 @@ def _masks(infos: Mapping[Any, Any], count: int) -> Iterator[str]:
             yield from _masks(value, count)
         elif isinstance(value, np.ndarray) and value.shape[:1] != (count,):
             yield f"{name[1:]!r} is {value.shape}, of {count} sub-environments"
-
-
-def _note(notes: list[str], text: str) -> None:
-    if len(notes) < 3:
-        notes.append(text)
 
 
 def digest(value: Any) -> str:
