@@ -175,7 +175,7 @@ class History:
 
     def _keep_lasting(self, message: m.Message, made: RecordedRequest) -> None:
         name = message.name if isinstance(message, m.SetAttr) else None
-        key: object = made.frames[0] if name is None else name
+        key: object = tuple(made.frames) if name is None else name
         self._lasting.pop(key, None)  # the last one counts, in its place
         self._lasting[key] = made
         if len(self._lasting) > _MOST_LASTING:
