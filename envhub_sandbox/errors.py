@@ -48,62 +48,18 @@ the repository warns of is a ``RemoteEnvWarning``, whatever its category is ther
 from __future__ import annotations
 
 import multiprocessing
-import shlex
 import sys
 from functools import cache
 from typing import Any
 
 from envhub_worker.protocol.confinement import Reason
-from envhub_worker.protocol.errors import (
-    EnvHubError,
-    LocalProtocolError,
-    MessageTooLargeError,
-    ProtocolError,
-    RemoteProtocolError,
-    VersionMismatchError,
-)
-from envhub_worker.protocol.text import continued, quoted
-
-__all__ = [
-    "ActionError",
-    "ActionTypeError",
-    "BundleError",
-    "DependencyError",
-    "EnvHubError",
-    "HubReferenceError",
-    "IndexUnavailableError",
-    "InterpreterUnavailableError",
-    "LoadError",
-    "LocalProtocolError",
-    "LockDriftError",
-    "LockError",
-    "MessageTooLargeError",
-    "MissingModuleError",
-    "PackageIntegrityError",
-    "PackagesTooLargeError",
-    "PolicyError",
-    "ProtocolError",
-    "RemoteEnvError",
-    "RemoteEnvWarning",
-    "RemoteProtocolError",
-    "RepositoryUnavailableError",
-    "RequirementError",
-    "ResolutionError",
-    "SandboxUnavailableError",
-    "ServerBusyError",
-    "SnapshotError",
-    "SnapshotIntegrityError",
-    "SnapshotTooLargeError",
-    "VersionMismatchError",
-    "WorkerDiedError",
-    "WorkerError",
-    "WorkerStartupError",
-    "WorkerTimeoutError",
-    "name_bundle",
-    "name_line",
-    "name_source",
-    "remote_error",
-]
+from envhub_worker.protocol.errors import EnvHubError as EnvHubError
+from envhub_worker.protocol.errors import LocalProtocolError as LocalProtocolError
+from envhub_worker.protocol.errors import MessageTooLargeError as MessageTooLargeError
+from envhub_worker.protocol.errors import ProtocolError as ProtocolError
+from envhub_worker.protocol.errors import RemoteProtocolError as RemoteProtocolError
+from envhub_worker.protocol.errors import VersionMismatchError as VersionMismatchError
+from envhub_worker.protocol.text import continued
 
 
 class HubReferenceError(EnvHubError, ValueError):
@@ -262,7 +218,7 @@ class WorkerDiedError(WorkerError):
         reason: ``"exit"``, ``"signal"``, ``"out-of-memory"``, ``"cpu-limit"``, ``"disk-limit"``;
             ``"protocol"``: it broke the rules of the wire; ``"zygote"``: the process that forks
             workers ended; ``"unavailable"``: it could not be confined; ``"killed"``: it was
-            closed, or given up; ``"idle"``: nobody had used it for long; ``"server"``: the worker
+            closed, or given up; ``"idle"``: it was unused for long; ``"server"``: the worker
             server ended; ``"connection"``: the one to another host was lost; ``"gone"``: the
             server does not know it any more.
         log_tail: The last lines of its output, control characters escaped.
@@ -301,7 +257,7 @@ class WorkerTimeoutError(WorkerError, TimeoutError, multiprocessing.TimeoutError
         request: The operation that was asked for (``"step"``), or None.
         timeout_s: How long it was waited for.
         worker: What the kernel says of its processes, one word each: ``"running"``,
-            ``"waiting"``, ``"stopped"`` or ``"gone"``. Empty if the server did not tell.
+            ``"waiting"``, ``"stopped"`` or ``"gone"``. Empty if the server did not say.
         repository: The repository, commit and entry file, as in ``org/repo@0123456789ab:env.py``.
         bundle: As with ``WorkerDiedError``, where the process was ended at once.
     """
@@ -362,55 +318,39 @@ class RemoteEnvWarning(UserWarning):
         return RemoteEnvWarning, (self.label, self.category, self.text)
 
 
+__all__ = [name for name in dir() if name.endswith(("Error", "Warning"))]
+
 _BUILTINS: tuple[type[Exception], ...] = (
-    ArithmeticError,
-    AssertionError,
-    AttributeError,
-    EOFError,
-    FileNotFoundError,
-    ImportError,
-    IndexError,
-    KeyError,
-    LookupError,
-    MemoryError,
-    ModuleNotFoundError,
-    NotImplementedError,
-    OSError,
-    OverflowError,
-    PermissionError,
-    RecursionError,
-    RuntimeError,
-    TimeoutError,
-    TypeError,
-    ValueError,
-    ZeroDivisionError,
+    *(ArithmeticError, AssertionError, AttributeError, EOFError, FileNotFoundError, ImportError),
+    *(IndexError, KeyError, LookupError, MemoryError, ModuleNotFoundError, NotImplementedError),
+    *(OSError, OverflowError, PermissionError, RecursionError, RuntimeError, TimeoutError),
+    *(TypeError, ValueError, ZeroDivisionError),
 )
 
 
-def _twin(kind: type[Exception], ours: type[EnvHubError] = RemoteEnvError) -> type[EnvHubError]:
+def _twin(ours: type[EnvHubError], kind: type[Exception]) -> Any:
     # str() must stay ours: KeyError would print a repr, OSError its errno pair.
     body = {
         "__doc__": f"The repository's code raised a {kind.__name__}.",
         "__module__": __name__,
         "__str__": Exception.__str__,
     }
-    prefix = "Load" if ours is LoadError else "Remote"
-    return type(f"{prefix}{kind.__name__}", (ours, kind), body)
+    return type(f"{_PREFIXES[ours]}{kind.__name__}", (ours, kind), body)
 
 
-_TWINS: dict[str, Any] = {builtin.__name__: _twin(builtin) for builtin in _BUILTINS}
-_LOADS: dict[str, Any] = {builtin.__name__: _twin(builtin, LoadError) for builtin in _BUILTINS}
-globals().update({twin.__name__: twin for twin in [*_TWINS.values(), *_LOADS.values()]})
+_PREFIXES: dict[type[EnvHubError], str] = {RemoteEnvError: "Remote", LoadError: "Load"}
+_TWINS = {(ours, kind.__name__): _twin(ours, kind) for ours in _PREFIXES for kind in _BUILTINS}
+globals().update({twin.__name__: twin for twin in _TWINS.values()})
 _GYMNASIUM = "gymnasium.error"
 
 
 @cache
 def _gymnasiums() -> dict[str, Any]:
     """Twins of Gymnasium's own errors, by full name; of those that are made of a text alone."""
-    module = sys.modules.get(_GYMNASIUM)  # whoever has an environment has it
+    module = sys.modules.get(_GYMNASIUM)  # there, where there is an environment
     base = getattr(module, "Error", Exception)
     return {
-        f"{_GYMNASIUM}.{name}": _twin(kind)
+        f"{_GYMNASIUM}.{name}": _twin(RemoteEnvError, kind)
         for name, kind in vars(module).items()
         if isinstance(kind, type) and issubclass(kind, base) and kind.__init__ is base.__init__
     }
@@ -418,12 +358,12 @@ def _gymnasiums() -> dict[str, Any]:
 
 def _builtin_of(cls: type[RemoteEnvError]) -> str:
     name = cls.__name__.removeprefix("Remote")
-    return name if name in _TWINS else f"{_GYMNASIUM}.{name}"
+    return name if (RemoteEnvError, name) in _TWINS else f"{_GYMNASIUM}.{name}"
 
 
 def remote_error(builtin: str, type_name: str, message: str, traceback: str = "") -> RemoteEnvError:
     """The exception for a remote failure: its class's twin, or plain ``RemoteEnvError``."""
-    twin = _TWINS.get(builtin, RemoteEnvError)
+    twin = _TWINS.get((RemoteEnvError, builtin), RemoteEnvError)
     for name in (builtin, type_name):
         if name.startswith(_GYMNASIUM) and _GYMNASIUM in sys.modules:
             twin = _gymnasiums().get(name, twin)
@@ -433,7 +373,7 @@ def remote_error(builtin: str, type_name: str, message: str, traceback: str = ""
 
 def load_error(builtin: str, message: str) -> LoadError:
     """The exception for a repository that raised while it was loaded, which is that builtin too."""
-    error: LoadError = _LOADS.get(builtin, LoadError)(message)
+    error: LoadError = _TWINS.get((LoadError, builtin), LoadError)(message)
     return error
 
 
@@ -444,24 +384,3 @@ def name_source(error: EnvHubError, label: str) -> None:
         error.args = (f"{label}: {text}", *error.args[1:])
     if isinstance(error, (WorkerDiedError, WorkerTimeoutError)):
         error.repository = label
-
-
-def name_line(error: EnvHubError, where: str) -> None:
-    """Put the repository's own line at the end of an error's text, and the traceback below it."""
-    remote = error if isinstance(error, RemoteEnvError) else error.__cause__
-    assert isinstance(remote, RemoteEnvError)
-    remote.where = where
-    if where:
-        error.args = (f"{error.args[0]}\n{where}", *error.args[1:])
-    if remote.traceback:
-        note = f"In the environment:\n{quoted(remote.traceback.rstrip())}"
-        # before Python 3.11 only some shells and test runners show it
-        vars(error)["__notes__"] = [*getattr(error, "__notes__", ()), note]
-
-
-def name_bundle(error: WorkerDiedError | WorkerTimeoutError, bundle: str) -> None:
-    """Tell of a crash bundle, and of the command that tries it again."""
-    error.bundle = bundle
-    text = str(error.args[0]) if error.args else ""
-    command = f"envhub replay {shlex.quote(bundle)}"
-    error.args = (f"{text}\nTo try the same again: {command}", *error.args[1:])

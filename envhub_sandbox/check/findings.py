@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import Counter
-from collections.abc import Collection
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from envhub_sandbox.check.checks import CHECKS, CURES, Check, Severity
-from envhub_sandbox.check.play.confinement import Walls
+from envhub_sandbox.check.play.confinement import Confinement
 from envhub_sandbox.check.play.plays import Play
 from envhub_worker.protocol.text import counted, duration_text, printable
 
@@ -47,6 +47,16 @@ class Finding:
         place = f"{self.file}:{self.line}: " if self.line else f"{self.file}: " if self.file else ""
         return f"{place}{self.message}"
 
+    def document(self) -> dict[str, Any]:
+        """As plain data, but for its task."""
+        return {
+            "check": self.id,
+            "severity": self.check.severity.value,
+            "message": self.message,
+            "file": self.file or None,
+            "line": self.line or None,
+        }
+
     @property
     def check(self) -> Check:
         """What did not hold."""
@@ -72,7 +82,7 @@ class Report:
         asked: How it was judged, by name, in words of ours.
         plays: What each task gave to look at.
         commit: Of what was judged; of a folder of this machine a hash of its content.
-        walls: What confined it; None where nothing of it ran.
+        confinement: What confined it; None where nothing of it ran.
         waiting: Tasks that have not been judged to their end.
         unmade: Checks that were not made of anything, where a deadline ended it.
     """
@@ -86,18 +96,17 @@ class Report:
     asked: dict[str, str] = field(default_factory=dict)
     plays: dict[str, Play] = field(default_factory=dict)
     commit: str = ""
-    walls: Walls | None = None
+    confinement: Confinement | None = None
     waiting: list[str] = field(default_factory=list)
     unmade: list[str] = field(default_factory=list)
     _kept: Counter[str] = field(default_factory=Counter, repr=False)
 
-    def judged(
-        self, check: str, found: Collection[str], task: str = "", *, cause: str = ""
-    ) -> None:
+    def judged(self, check: str, found: Iterable[str], task: str = "", *, cause: str = "") -> None:
         """A check was made: it found this, or nothing. Trust: texts from the worker."""
-        for message in found:
+        messages = list(found)
+        for message in messages:
             self.add(Finding(check, message, task, cause=cause))
-        if not found:
+        if not messages:
             self.passed.append((check, task))
 
     def add(self, finding: Finding) -> Finding | None:
@@ -106,13 +115,11 @@ class Report:
             self.left_out += 1
             return None
         self._kept[finding.id] += 1
-        kept = Finding(
-            finding.id,
-            printable(finding.message, _LONGEST),
-            printable(finding.task, 200),
-            printable(finding.file, 500),
-            finding.line,
-            finding.cause,
+        kept = replace(
+            finding,
+            message=printable(finding.message, _LONGEST),
+            task=printable(finding.task, 200),
+            file=printable(finding.file, 500),
         )
         insort(self.findings, kept, key=lambda one: one.check.severity.rank)
         return kept
@@ -123,12 +130,7 @@ class Report:
         return [one for one in found if one.check.severity.reaches(fail_on)]
 
     def stopped(self, seconds: float, at: str) -> None:
-        """A deadline has ended it: what was not judged is a finding.
-
-        Args:
-            seconds: Of the deadline.
-            at: What was done then.
-        """
+        """A deadline of so many seconds ended it at something: what was not judged is a finding."""
         made = {one.id for one in self.findings} | {check for check, _ in self.passed}
         self.unmade = [check for check in CHECKS if check not in made and check != "deadline"]
         left = [*self.unmade, *(f"all of {task}" for task in self.waiting)]

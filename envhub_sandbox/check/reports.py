@@ -9,8 +9,8 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 from xml.etree import ElementTree
 
 from envhub_sandbox.check.checks import CHECKS, Severity
@@ -28,46 +28,36 @@ def document(report: Report, failures: Sequence[Finding]) -> dict[str, Any]:
         "reference": report.reference,
         "commit": report.commit,
         "passed": not failures,
-        "findings": [_finding(one, failures) for one in report.findings],
+        "findings": [
+            {**one.document(), "cure": one.cure, "task": one.task or None, "fails": one in failures}
+            for one in report.findings
+        ],
         "left_out": report.left_out,
         "unjudged": {"checks": report.unmade, "tasks": report.waiting},
         "held": [{"check": check, "task": task} for check, task in report.passed],
         "figures": report.figures,
-        "confinement": None if report.walls is None else report.walls.document(),
+        "confinement": None if report.confinement is None else report.confinement.document(),
         "provenance": report.provenance,
     }
 
 
-def _finding(one: Finding, failures: Sequence[Finding]) -> dict[str, Any]:
-    return {
-        "check": one.id,
-        "severity": one.check.severity.value,
-        "message": one.message,
-        "cure": one.cure,
-        "task": one.task or None,
-        "file": one.file or None,
-        "line": one.line or None,
-        "fails": one in failures,
-    }
-
-
-def read(told: Mapping[str, Any]) -> tuple[Report, list[Finding]]:
+def read_report(document: Mapping[str, Any]) -> tuple[Report, list[Finding]]:
     """A report and what fails it, of what ``document`` has made and somebody may have changed.
 
     Raises:
         KeyError, TypeError, ValueError: It is no such document.
     """
-    report = Report(_str(told["reference"]), commit=_str(told["commit"]))
+    report = Report(_str(document["reference"]), commit=_str(document["commit"]))
     failures = []
-    for row in told["findings"]:
+    for row in document["findings"]:
         place = (_str(row["task"] or ""), _str(row["file"] or ""), int(row["line"] or 0))
         kept = report.add(Finding(CHECKS[row["check"]].id, _str(row["message"]), *place))
         failures += [kept] if kept is not None and row["fails"] is True else []
-    report.passed = [(CHECKS[row["check"]].id, _str(row["task"])) for row in told["held"]]
-    report.left_out = int(told["left_out"])
-    report.unmade = [CHECKS[check].id for check in told["unjudged"]["checks"]]
-    report.waiting = [_str(task) for task in told["unjudged"]["tasks"]]
-    if told["passed"] is not (not failures):
+    report.passed = [(CHECKS[row["check"]].id, _str(row["task"])) for row in document["held"]]
+    report.left_out = int(document["left_out"])
+    report.unmade = [CHECKS[check].id for check in document["unjudged"]["checks"]]
+    report.waiting = [_str(task) for task in document["unjudged"]["tasks"]]
+    if document["passed"] is not (not failures):
         raise ValueError("the findings are not what the verdict says")
     return report, failures
 
@@ -148,7 +138,7 @@ def sarif(report: Report, failures: Sequence[Finding]) -> str:
 
 def _result(one: Finding, failures: Sequence[Finding]) -> dict[str, Any]:
     where = f"{one.task}: " if one.task else ""
-    place: dict[str, Any] = {"artifactLocation": {"uri": _uri(one.file or "env.py")}}
+    place: dict[str, Any] = {"artifactLocation": {"uri": quote(one.file or "env.py")}}
     if one.line:
         place["region"] = {"startLine": one.line}
     return {
@@ -166,12 +156,6 @@ def _sarif_text(text: str) -> str:
     return plain.replace("{", "{{").replace("}", "}}")
 
 
-def _uri(path: str) -> str:
-    from urllib.parse import quote
-
-    return quote(path)
-
-
 def workflow_commands(report: Report) -> Iterator[str]:
     """GitHub's workflow commands, one a line: a stranger's text cannot begin another."""
     for one in report.findings:
@@ -180,9 +164,9 @@ def workflow_commands(report: Report) -> Iterator[str]:
         title = f"envhub check: {one.id}" + (f" ({one.task})" if one.task else "")
         text = f"{one.message}\n{one.cure}"
         yield workflow_command(_GITHUB[one.check.severity], title, text, place)
-    if report.walls is not None and report.walls.are_fewer:
-        told = "\n".join(report.walls.lines())
-        yield workflow_command("notice", "envhub check: what confined it", told)
+    if report.confinement is not None and report.confinement.is_partial:
+        words = "\n".join(report.confinement.lines())
+        yield workflow_command("notice", "envhub check: what confined it", words)
 
 
 def workflow_command(level: str, title: str, text: str, place: str = "") -> str:
@@ -201,8 +185,8 @@ def _property(text: str) -> str:
 def summary(report: Report, failures: Collection[Finding]) -> str:
     """A table for GitHub's step summary; a stranger's text is no markup there."""
     lines = [f"### envhub check: {report.verdict(failures)}", "", cell(report.reference), ""]
-    if report.walls is not None:
-        lines += [*(f"- {cell(line)}" for line in report.walls.lines()), ""]
+    if report.confinement is not None:
+        lines += [*(f"- {cell(line)}" for line in report.confinement.lines()), ""]
     if report.findings:
         lines += ["| | check | task | finding |", "| --- | --- | --- | --- |"]
     for one in report.findings:
@@ -216,8 +200,3 @@ def cell(text: str) -> str:
     return re.sub(
         r"[^a-zA-Z0-9 ,;=-]", lambda found: f"&#{ord(found[0])};", text.replace("\n", " ")
     )
-
-
-def write(path: Path, text: str) -> None:
-    """Write a report, in UTF-8 whatever the locale."""
-    path.write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Settings of a judgement that stand in files of the caller's: a policy, and options.
+"""How a repository is judged, and the files of the caller's that say so: a policy, and options.
 
 Nothing of the repository that is judged is read here: it has no say in how it is judged.
 """
@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox.errors import EnvHubError, PolicyError
 from envhub_sandbox.hub.local import split_local
@@ -22,19 +23,43 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+if TYPE_CHECKING:
+    from envhub_sandbox.vector.suites import EnvSuites
+
 _MOST_BYTES = 16 << 10
 
 
-def policy(path: Path) -> dict[str, Any]:
-    """What a caller's file permits: the fields of ``Policy``, limits as a table of their own.
+@dataclass(frozen=True, kw_only=True)
+class JudgeOptions:
+    """What is judged, and how.
 
-    Raises:
-        PolicyError: It cannot be read. Whether its fields are such is for ``make_env`` to say.
+    Attributes:
+        reference: The repository.
+        arguments: Of ``make_env``, beyond the reference.
+        seed, steps: Of each play.
+        resets: In a row, four times: what they leave behind is counted. 0 asks nothing.
+        slow_step_s: What half of the steps may take; a reset may take five times that.
+        episode_steps: In which some episode has to end, if 30 seconds suffice for them.
+        tasks: Chooses ``(suite, task)`` pairs of the environments.
+        tell: Called with what is done next.
+        pictures: Also gather what only a page shows: frames, and memory over time.
     """
-    return _read(path)
+
+    reference: str
+    arguments: Mapping[str, Any]
+    seed: int = 0
+    steps: int = 200
+    resets: int = 8
+    slow_step_s: float = 1.0
+    episode_steps: int = 10_000
+    tasks: Callable[[EnvSuites], list[tuple[str, Any]]] = field(
+        default=lambda suites: [(suite, task) for suite in suites for task in suites[suite]]
+    )
+    tell: Callable[[str], None] = lambda what: None
+    pictures: bool = False
 
 
-def merged(policy: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+def merged_settings(policy: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
     """A file's policy, changed by what was given as options, limit by limit.
 
     Raises:
@@ -47,20 +72,16 @@ def merged(policy: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any
     return {**policy, **given, **({"limits": both} if both else {})}
 
 
-def options(path: Path, known: Collection[str]) -> dict[str, Any]:
-    """The options in ``[check]`` of a caller's file, by their names in Python.
+def read_settings(path: Path, known: Collection[str]) -> dict[str, Any]:
+    """The options in ``[check]`` of a caller's file, by their names in Python, of those ``known``.
 
     It is named, and never looked for: the folder that one is in may be a stranger's clone, and a
     file that lies there would let him say what he may do and what fails him.
 
-    Args:
-        path: The file.
-        known: The names that may stand there.
-
     Raises:
         PolicyError: The file cannot be read, or says what there is not.
     """
-    table = _read(path).get("check", {})
+    table = read_file(path).get("check", {})
     if not isinstance(table, Mapping):
         raise PolicyError(f"check in {path} is a table: [check], with a line for each option")
     asked = {name.replace("-", "_"): value for name, value in table.items()}
@@ -78,11 +99,16 @@ def is_judged(path: Path, reference: str) -> bool:
     try:
         folder, _ = split_local(reference, DEFAULT_PATH)
     except EnvHubError:
-        return False  # nothing is judged: whoever reads it says why
+        return False  # nothing is judged: what reads it says why
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
-def _read(path: Path) -> dict[str, Any]:
+def read_file(path: Path) -> dict[str, Any]:
+    """A caller's TOML, such as the fields of a ``Policy``, which ``make_env`` then checks.
+
+    Raises:
+        PolicyError: It cannot be read.
+    """
     try:
         with path.open("rb") as file:
             data = file.read(_MOST_BYTES + 1)

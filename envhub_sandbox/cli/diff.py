@@ -14,7 +14,7 @@ from envhub_sandbox.cli.shared.progress import Bar
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
-    from envhub_sandbox.check.static.compare import Change
+    from envhub_sandbox.check.static.changes import Change
     from envhub_sandbox.hub.snapshot import Snapshot
     from envhub_sandbox.locks.fingerprint import Task
 
@@ -50,7 +50,7 @@ def diff(
     hub = {"token": token, "endpoint": endpoint, "hub_cache_dir": hub_cache_dir}
     with reported(debug=debug):
         least = None if fail_on is None else level(fail_on)
-        from envhub_sandbox.check.static import compare
+        from envhub_sandbox.check.static import changes
         from envhub_sandbox.check.static.static import static
         from envhub_sandbox.hub.snapshot import named
 
@@ -59,16 +59,16 @@ def diff(
             for ref in (then, now):
                 bar.begin(f"reading {ref}")
                 read.append(static(named(ref, **hub)))
-            found = compare.changes(read[0], read[1])
+            found = changes.changes(read[0], read[1])
             if run:
                 kwargs = opt.read_env_kwargs(env_kwargs or ())
                 tasks = []
                 for one in read:
                     bar.begin(f"loading {one.reference} in a sandbox")
                     tasks.append(_tasks(one.snapshot, kwargs, hub))
-                found += compare.environments(tasks[0], tasks[1])
+                found += changes.environments(tasks[0], tasks[1])
         if json:
-            print_json(compare.document(read[0], read[1], found))
+            print_json(changes.document(read[0], read[1], found))
         else:
             _print(read[0].reference, read[1].reference, found)
         if least is None and found:

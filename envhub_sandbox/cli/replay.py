@@ -13,8 +13,8 @@ from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
 from envhub_sandbox.cli.shared.progress import Bar
 
 if TYPE_CHECKING:
-    from envhub_sandbox.crash.reader import Bundle
-    from envhub_sandbox.crash.replay import Replayed
+    from envhub_sandbox.crash.bundle_reader import Bundle
+    from envhub_sandbox.crash.replay import ReplayResult
 
 BundleFolder = Annotated[
     Path,
@@ -78,7 +78,7 @@ class _Replay:
 
     def execute(self) -> None:
         """Read, check, repeat, print; the exit code is the verdict."""
-        from envhub_sandbox.crash.reader import load_bundle
+        from envhub_sandbox.crash.bundle_reader import load_bundle
         from envhub_sandbox.crash.replay import Verdict
 
         if self._sandbox == "none":
@@ -97,7 +97,7 @@ class _Replay:
         raise typer.Exit(codes.get(replayed.verdict, Exit.SURVIVED))
 
     def _refuse_wishes(self, bundle: Bundle) -> None:
-        from envhub_sandbox.crash.reader import wishes
+        from envhub_sandbox.crash.bundle_reader import wishes
 
         wanted = [wish for wish in wishes(bundle) if wish.partition("=")[0] not in self._given]
         if wanted and not self._grant:
@@ -106,7 +106,7 @@ class _Replay:
                 "yours, or you trust whoever gave you the bundle, add --grant"
             )
 
-    def _run(self, bundle: Bundle, bar: Bar) -> Replayed:
+    def _run(self, bundle: Bundle, bar: Bar) -> ReplayResult:
         from envhub_sandbox.crash.replay import replay
 
         bar.begin(f"loading {safe_line(bundle.label)}")
@@ -150,7 +150,7 @@ class _Replay:
         return env
 
     def _options(self, bundle: Bundle) -> dict[str, Any]:
-        from envhub_sandbox.crash.reader import replayed_arguments
+        from envhub_sandbox.crash.bundle_reader import replayed_arguments
 
         options = replayed_arguments(bundle, granted=self._grant)
         given = dict(self._given)
@@ -160,7 +160,7 @@ class _Replay:
 
     # --- what is printed -----------------------------------------------------------------------
 
-    def _print(self, bundle: Bundle, replayed: Replayed) -> None:
+    def _print(self, bundle: Bundle, replayed: ReplayResult) -> None:
         if self._as_json:
             print_json(self._document(bundle, replayed))
             return
@@ -172,7 +172,7 @@ class _Replay:
             out(safe_text(replayed.note))
         out(_SAID[replayed.verdict.value])
 
-    def _document(self, bundle: Bundle, replayed: Replayed) -> dict[str, Any]:
+    def _document(self, bundle: Bundle, replayed: ReplayResult) -> dict[str, Any]:
         return {
             "bundle": str(self._folder),
             "label": bundle.label,

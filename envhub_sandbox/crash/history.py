@@ -16,7 +16,6 @@ import numpy as np
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.transport.lane import Request
-from envhub_sandbox.transport.values.tensors import to_tensor
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.manifest.manifest import EnvManifest
@@ -28,16 +27,16 @@ _ENTRY_BYTES = 48
 _REQUEST_BYTES = 500
 """What Python's objects take beside the bytes of a step, and of another request."""
 _EVICTED = 64
-_PRELUDE = 256
+_MOST_LASTING = 256
 _LASTING = (m.Call, m.SetAttr, m.CallOwn, m.CallOne)
 _PASSING = frozenset({"reset", "step", "render"})
 """What is over with the next seed, also where one sub-environment does it alone."""
 _SLICED = (m.Reset, m.SetAttr, m.GetOne, m.CallOne)
-"""What each shard is sent another part of."""
+"""Each shard is sent another part of these."""
 
 
 @dataclass(frozen=True, slots=True)
-class Requested:
+class RecordedRequest:
     """Any request but a step whose actions are one array.
 
     Attributes:
@@ -58,49 +57,27 @@ class Steps:
     actions: Any
 
 
-@dataclass(frozen=True, slots=True)
-class _Held:
-    """A step whose actions are not one array; a copy of them."""
-
-    actions: Any
-
-
-@dataclass(frozen=True, slots=True)
-class _Sent:
-    """A request as it was sent: plain, so that what it held is told when somebody asks.
-
-    Attributes:
-        frames: Of each shard's message.
-        bounds: The slices of the shards.
-    """
-
-    frames: list[list[bytes]]
-    bounds: list[tuple[int, int]]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Recording:
     """A history, as it stood.
 
     Attributes:
         seeded: Whether every sub-environment was seeded, once, since the jail started.
-        before: What lasts beyond a reset: calls, and attributes that were set.
-        requests: Everything since the last reset that seeded all, or since the start.
+        requests: Everything since the last reset that seeded all, or since the start; before it
+            what lasts beyond a reset: calls, and attributes that were set.
         dropped: Requests that were forgotten in between, for their number or size.
         mixed: Whether some sub-environments have lost what lasts, by a transparent restart.
     """
 
     seeded: bool = False
-    before: tuple[Requested, ...] = ()
-    requests: tuple[Steps | Requested, ...] = ()
+    requests: tuple[Steps | RecordedRequest, ...] = ()
     dropped: int = 0
     mixed: bool = False
 
     @property
     def exact(self) -> bool:
         """Whether the same requests again are all there was."""
-        kept = [*self.before, *self.requests]
-        plain = all(not isinstance(one, Requested) or one.exact for one in kept)
+        plain = all(one.exact for one in self.requests if isinstance(one, RecordedRequest))
         return plain and not self.dropped and not self.mixed
 
 
@@ -117,35 +94,32 @@ class History:
 
     def __init__(self, manifest: EnvManifest, limit: int) -> None:
         space = manifest.single_action_space
-        self._num_envs = manifest.num_envs
         self._shape = (manifest.num_envs, *(space.shape or ()))
-        self._flat = isinstance(space, ARRAY_SPACES)
-        size = 8 * int(np.prod(self._shape, dtype=np.int64)) if self._flat else 0
+        is_flat = isinstance(space, ARRAY_SPACES)
+        size = 8 * int(np.prod(self._shape, dtype=np.int64)) if is_flat else 0
         self._unit = _ENTRY_BYTES + size
         self._capacity = min(limit, max(1, HISTORY_BYTES // self._unit))
-        self._log: deque[bytes | np.dtype[Any] | _Sent | Requested | _Held] = deque()
+        self._log: deque[bytes | np.dtype[Any] | m.Step | RecordedRequest] = deque()
         self._append = self._log.append
-        self._lasting: dict[object, _Sent | Requested] = {}
-        self.step: Callable[[Any], None] = _nothing
+        self._lasting: dict[object, RecordedRequest] = {}
+        self.step: Callable[[Any], None] = lambda actions: None
         if limit:
-            self.step = self._flat_step if self._flat else self._any_step
+            self.step = self._flat_step if is_flat else self._any_step
         self.started()
 
     def started(self) -> None:
-        """A fresh jail: whatever was asked of another is of no concern."""
+        """A fresh jail: what was asked of another is of no concern."""
         self._lasting.clear()
-        self._before: tuple[_Sent | Requested, ...] = ()
         self._forgotten = 0
         self._mixed = self._seeded = False
         self._restart()
 
     def revived(self) -> None:
-        """Some sub-environments are fresh: before all are seeded, nobody can say what follows.
+        """Some sub-environments are fresh: what follows is known again once all are seeded.
 
-        Attributes that were set, the fresh ones have lost, and the others have not.
+        The fresh ones have lost attributes that were set, the others have not.
         """
         self._mixed = self._mixed or bool(self._lasting)
-        self._before = ()
         self._seeded = False
         self._restart()
 
@@ -174,9 +148,7 @@ class History:
         self._dtype = dtype
 
     def _any_step(self, actions: Any) -> None:
-        held = _Held(_copied(actions))
-        self._append(held)
-        self._take_room(held)
+        self._add(m.Step(0, _copied(actions)))
 
     def requested(self, request: Request) -> None:
         """Record another request, as it was sent."""
@@ -186,10 +158,10 @@ class History:
         if isinstance(message, m.Reset) and message.mask is None:
             self._reset([one.seeds for one in request.messages if isinstance(one, m.Reset)])
         made = _entry(request)
-        if isinstance(message, _LASTING) and not _passes(message):
+        passes = isinstance(message, m.CallOne) and message.name in _PASSING
+        if isinstance(message, _LASTING) and not passes:
             self._keep_lasting(message, made)
-        self._append(made)
-        self._take_room(made)
+        self._add(made)
 
     def _reset(self, seeds: list[Any]) -> None:
         """A reset of all: what it seeds does not depend on anything before, but for attributes."""
@@ -197,31 +169,29 @@ class History:
         seeding = all(seed is not None for seed in each)
         if seeding or not self._seeded:
             self._seeded = seeding
-            self._before = tuple(self._lasting.values())
             self._restart()
+            for entry in self._lasting.values():
+                self._add(entry)
 
-    def _keep_lasting(self, message: m.Message, made: _Sent | Requested) -> None:
-        name = getattr(message, "name", "")
-        plain = isinstance(message, m.SetAttr) or not (
-            getattr(message, "args", ()) or getattr(message, "kwargs", {})
-        )
-        plain = plain and not isinstance(message, m.CallOne)  # each has one of that name
-        key: object = (type(message), name) if plain else _heads(made)
+    def _keep_lasting(self, message: m.Message, made: RecordedRequest) -> None:
+        name = message.name if isinstance(message, m.SetAttr) else None
+        key: object = tuple(made.frames) if name is None else name
         self._lasting.pop(key, None)  # the last one counts, in its place
         self._lasting[key] = made
-        if len(self._lasting) > _PRELUDE:
+        if len(self._lasting) > _MOST_LASTING:
             del self._lasting[next(iter(self._lasting))]
             self._forgotten += 1
 
-    def _take_room(self, entry: _Sent | Requested | _Held) -> None:
+    def _add(self, entry: m.Step | RecordedRequest) -> None:
+        self._append(entry)
         self._room -= self._units(entry)
         if self._room < 0:
             self._evict()
 
     def _units(self, entry: object) -> int:
-        if isinstance(entry, (_Sent, Requested)):
-            return 1 + (_REQUEST_BYTES + _bytes(entry)) // self._unit
-        return 1 + _size(entry.actions) // self._unit if isinstance(entry, _Held) else 1
+        if isinstance(entry, RecordedRequest):
+            return 1 + (_REQUEST_BYTES + sum(map(len, entry.frames))) // self._unit
+        return 1 + _size(entry.actions) // self._unit if isinstance(entry, m.Step) else 1
 
     def _evict(self) -> None:
         """Forget the oldest requests, some at a time."""
@@ -240,14 +210,13 @@ class History:
         """What is kept, in order."""
         return Recording(
             seeded=self._seeded,
-            before=tuple(map(_requested, self._before)),
             requests=tuple(self._runs()),
             dropped=self._dropped + self._forgotten,
             mixed=self._mixed,
         )
 
-    def _runs(self) -> list[Steps | Requested]:
-        found: list[Steps | Requested] = []
+    def _runs(self) -> list[Steps | RecordedRequest]:
+        found: list[Steps | RecordedRequest] = []
         run: list[bytes] = []
         dtype = self._first_dtype
         for entry in [*self._log, None]:
@@ -260,29 +229,20 @@ class History:
                 run = []
             if isinstance(entry, np.dtype):
                 dtype = entry
-            elif isinstance(entry, (_Sent, Requested)):
-                found.append(_requested(entry))
+            elif isinstance(entry, m.Step):
+                found.append(encoded(entry))
             elif entry is not None:
-                found.append(encoded(m.Step(0, entry.actions)))
+                found.append(entry)
         return found
 
 
-def _passes(message: m.Message) -> bool:
-    return isinstance(message, m.CallOne) and message.name in _PASSING
-
-
-def _nothing(actions: Any) -> None:
-    """Nothing is recorded."""
-
-
-def _entry(request: Request) -> _Sent | Requested:
-    """What is kept of a request. What only pickle could carry is described at once."""
-    if not request.plain:
-        return encoded(_whole(request.messages, request.bounds))
-    kept = request.kept()
-    if not isinstance(request.messages[0], _SLICED):
-        kept = kept[:1]  # the others have been sent the same
-    return _Sent(kept, request.bounds)
+def _entry(request: Request) -> RecordedRequest:
+    """What is kept of a request: what one shard was sent, where that is all of it."""
+    first = request.messages[0]
+    is_whole = len(request.messages) == 1 or not isinstance(first, _SLICED)
+    if request.plain and is_whole:
+        return RecordedRequest(_operation(first), request.kept()[0], exact=True)
+    return encoded(_whole(request.messages, request.bounds))
 
 
 def _whole(messages: Sequence[m.Message], bounds: Sequence[tuple[int, int]]) -> m.Message:
@@ -308,34 +268,17 @@ def _whole(messages: Sequence[m.Message], bounds: Sequence[tuple[int, int]]) -> 
     return made
 
 
-def _requested(entry: _Sent | Requested) -> Requested:
-    """An entry as a recording has it."""
-    if isinstance(entry, Requested):
-        return entry
-    messages = [m.unpack(frames, tensors=to_tensor) for frames in entry.frames]
-    return encoded(_whole(messages, entry.bounds))
-
-
-def _heads(entry: _Sent | Requested) -> bytes:
-    """What tells it from others: all but large values."""
-    if isinstance(entry, Requested):
-        return entry.frames[0]
-    return b"".join(frames[0] for frames in entry.frames)
-
-
-def _bytes(entry: _Sent | Requested) -> int:
-    parts = [entry.frames] if isinstance(entry, Requested) else entry.frames
-    return sum(len(frame) for frames in parts for frame in frames)
-
-
-def encoded(message: m.Message) -> Requested:
+def encoded(message: m.Message) -> RecordedRequest:
     """A message as it can be kept: without anything pickled."""
-    name = type(message).__name__.lower()
     try:
         frames, exact = m.pack(message, pickler=_refuse), True
     except EnvHubError:
         frames, exact = _inert(message), False
-    return Requested(name, [bytes(frame) for frame in frames], exact)
+    return RecordedRequest(_operation(message), [bytes(frame) for frame in frames], exact)
+
+
+def _operation(message: m.Message) -> str:
+    return type(message).__name__.lower()
 
 
 def _inert(message: m.Message) -> list[Buffer]:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-from envhub_sandbox.crash.reader import Bundle
+from envhub_sandbox.crash.bundle_reader import Bundle
+from envhub_sandbox.crash.bundle_writer import death_of
 from envhub_sandbox.errors import ActionError, RemoteEnvError, WorkerDiedError, WorkerTimeoutError
 from envhub_worker.protocol import messages as m
 
@@ -24,7 +25,7 @@ class Verdict(str, Enum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Replayed:
+class ReplayResult:
     """What a replay did.
 
     Attributes:
@@ -42,34 +43,14 @@ class Replayed:
     note: str = ""
 
 
-def replay(
-    make: Callable[[], Any], bundle: Bundle, tick: Callable[[int], None] = lambda done: None
-) -> Replayed:
-    """Make the environment and repeat a bundle's requests.
-
-    Args:
-        make: Makes the environment: what ``make_env`` raises, it may raise.
-        bundle: What was asked.
-        tick: Told how many requests have been repeated.
-    """
+def replay(make: Callable[[], Any], bundle: Bundle) -> ReplayResult:
+    """Make the environment, which may raise as ``make_env``, and repeat a bundle's requests."""
     try:
         env = make()
     except (WorkerDiedError, WorkerTimeoutError) as error:
         return _ended(error, bundle, 0, 0)
     if env is None:
-        return Replayed(verdict=Verdict.SURVIVED, requests=0, steps=0)
-    for message in bundle.before:
-        try:
-            ended = _ask(env, message)
-        except _UNFIT as error:
-            note = f"what had been set before does not fit this environment: {error}"
-            return Replayed(verdict=Verdict.DIFFERENT, requests=0, steps=0, note=note)
-        if ended is not None:
-            return _ended(ended, bundle, 0, 0)
-    return _repeat(env, bundle, tick)
-
-
-def _repeat(env: Any, bundle: Bundle, tick: Callable[[int], None]) -> Replayed:
+        return ReplayResult(verdict=Verdict.SURVIVED, requests=0, steps=0)
     steps = 0
     for done, message in enumerate(bundle.requests, start=1):
         steps += isinstance(message, m.Step)
@@ -77,17 +58,18 @@ def _repeat(env: Any, bundle: Bundle, tick: Callable[[int], None]) -> Replayed:
             ended = _ask(env, message)
         except _UNFIT as error:
             note = f"request {done} does not fit this environment: {error}"
-            return Replayed(verdict=Verdict.DIFFERENT, requests=done, steps=steps, note=note)
+            return ReplayResult(verdict=Verdict.DIFFERENT, requests=done, steps=steps, note=note)
         if ended is not None:
             return _ended(ended, bundle, done, steps)
-        tick(done)
-    return Replayed(verdict=Verdict.SURVIVED, requests=len(bundle.requests), steps=steps)
+    return ReplayResult(verdict=Verdict.SURVIVED, requests=len(bundle.requests), steps=steps)
 
 
 def _ask(env: Any, message: m.Message) -> WorkerDiedError | WorkerTimeoutError | None:
     """Repeat one request; what the repository raises is its answer, as it was before."""
+    repeat = _REPEATED.get(type(message))  # none for what no history has
     try:
-        _REPEATED.get(type(message), _skip)(env, message)
+        if repeat is not None:
+            repeat(env, message)
     except (WorkerDiedError, WorkerTimeoutError) as error:
         return error
     except (RemoteEnvError, AttributeError):
@@ -97,20 +79,16 @@ def _ask(env: Any, message: m.Message) -> WorkerDiedError | WorkerTimeoutError |
 
 def _ended(
     error: WorkerDiedError | WorkerTimeoutError, bundle: Bundle, requests: int, steps: int
-) -> Replayed:
-    died = isinstance(error, WorkerDiedError)
-    how = {
-        "reason": error.reason if isinstance(error, WorkerDiedError) else "timeout",
-        "exit_code": getattr(error, "exit_code", None) if died else None,
-        "signal": getattr(error, "signal", None) if died else None,
-    }
+) -> ReplayResult:
+    death = death_of(error)
+    how = {name: death[name] for name in ("reason", "exit_code", "signal")}
     there = requests == len(bundle.requests)
     same = there and all(how[name] == bundle.death[name] for name in how)
-    return Replayed(
+    return ReplayResult(
         verdict=Verdict.SAME if same else Verdict.DIFFERENT,
         requests=requests,
         steps=steps,
-        death={**how, "message": str(error)},
+        death={**how, "message": death["message"]},
     )
 
 
@@ -121,10 +99,6 @@ def _reset(env: Any, message: m.Reset) -> None:
     env.reset(seed=message.seeds, options=options)
 
 
-def _set_attr(env: Any, message: m.SetAttr) -> None:
-    env.set_attr(message.name, list(message.values))
-
-
 def _call_own(env: Any, message: m.CallOwn) -> None:
     if _is_remote(env, message.name):
         getattr(env, message.name)(*message.args, **message.kwargs)
@@ -133,10 +107,6 @@ def _call_own(env: Any, message: m.CallOwn) -> None:
 def _get_own(env: Any, message: m.GetOwn) -> None:
     if _is_remote(env, message.name) or message.name == "np_random_seed":
         getattr(env, message.name)
-
-
-def _get_one(env: Any, message: m.GetOne) -> None:
-    _one(env, message, message.name)
 
 
 def _call_one(env: Any, message: m.CallOne) -> None:
@@ -169,20 +139,16 @@ def _is_remote(env: Any, name: str) -> bool:
     return not name.startswith("_") and name not in vars(env) and not hasattr(type(env), name)
 
 
-def _skip(env: Any, message: Any) -> None:
-    """It is no request that was ever recorded."""
-
-
 _REPEATED: dict[type[m.Message], Callable[[Any, Any], object]] = {
     m.Reset: _reset,
     m.Step: lambda env, message: env.step(message.actions),
     m.Call: lambda env, message: env.call(message.name, *message.args, **message.kwargs),
-    m.SetAttr: _set_attr,
+    m.SetAttr: lambda env, message: env.set_attr(message.name, list(message.values)),
     m.Render: lambda env, message: env.render(),
     m.CallOwn: _call_own,
     m.GetOwn: _get_own,
     m.CallOne: _call_one,
-    m.GetOne: _get_one,
+    m.GetOne: lambda env, message: _one(env, message, message.name),
     m.GetRandom: lambda env, message: env.np_random,
 }
 

@@ -7,8 +7,7 @@ favour short ones.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -92,7 +91,7 @@ class EpisodeCounter:
     """Turns the results of vector steps into episodes. Steps nothing itself.
 
     Where the metadata does not state the autoreset mode, the first step that ends an episode
-    tells: infos with the final observation mean SAME_STEP, otherwise NEXT_STEP is assumed, which
+    shows: infos with the final observation mean SAME_STEP, otherwise NEXT_STEP is assumed, which
     is what Gymnasium's own wrappers assume.
 
     Args:
@@ -203,32 +202,22 @@ def success_of(infos: Any, index: int) -> bool | None:
     """
     if not isinstance(infos, Mapping):
         return None
-    final = infos.get("final_info")
-    for source in (final, infos):
-        found = _entry(source, "is_success", index)
-        if found is None and source is final:
-            found = _of_member(source, index)  # Gymnasium before 1.0: an array of dicts
+    for source in (infos.get("final_info"), infos):
+        found = _success_in(source, index)
         if isinstance(found, (bool, int, float, np.bool_, np.number)):
             return bool(found)
     return None
 
 
-def _entry(infos: Any, key: str, index: int) -> Any:
-    if not isinstance(infos, Mapping) or key not in infos:
-        return None
+def _success_in(infos: Any, index: int) -> Any:
     try:
-        mask = infos.get(f"_{key}")
+        if not isinstance(infos, Mapping):  # Gymnasium before 1.0: an array of dicts
+            return infos[index].get("is_success")
+        mask = infos.get("_is_success")
         if mask is not None and not mask[index]:
             return None
-        return np.asarray(_on_cpu(infos[key]))[index].item()
+        return np.asarray(_on_cpu(infos["is_success"]))[index].item()
     except (AttributeError, IndexError, KeyError, TypeError, ValueError):
-        return None
-
-
-def _of_member(infos: Any, index: int) -> Any:
-    try:
-        return infos[index].get("is_success")
-    except (AttributeError, IndexError, KeyError, TypeError):
         return None
 
 
@@ -237,15 +226,8 @@ def _on_cpu(values: Any) -> Any:
     return values.cpu() if callable(getattr(values, "cpu", None)) else values
 
 
-def chooser(policy: str, space: gym.Space[Any], seed: int) -> Callable[[], Any]:
-    """A function that gives the next batch of actions.
-
-    Args:
-        policy: ``"random"`` samples from the space, seeded; ``"zero"`` does as little as the
-            space allows.
-        space: The batched action space.
-        seed: For ``"random"``.
-    """
+def _chooser(policy: str, space: gym.Space[Any], seed: int) -> Callable[[], Any]:
+    """A function that gives the next batch of actions."""
     if policy == "zero":
         action = zero_action(space)
         return lambda: action
@@ -268,7 +250,8 @@ def rollout(
         env: Is left open.
         episodes: How many to count.
         seed: For ``reset`` and the policy: the same seed gives the same result.
-        policy: ``"random"`` or ``"zero"``.
+        policy: ``"random"`` samples from the space, seeded; ``"zero"`` does as little as the
+            space allows.
         max_steps: Vector steps after which to give up; None for no bound.
         observe: Called after the reset and after every step.
 
@@ -277,18 +260,22 @@ def rollout(
     """
     counter = EpisodeCounter(env.num_envs, episodes, autoreset_mode(env))
     result = Rollout(episodes=counter.counted)
-    begun = time.perf_counter()
-    with _known_space(env):
-        choose = chooser(policy, env.action_space, seed)
+    begun, taken = time.perf_counter(), 0
+    try:
+        choose = _chooser(policy, env.action_space, seed)
         env.reset(seed=seed)
         observe(counter)
-        taken = 0
         while not counter.finished and (max_steps is None or taken < max_steps):
             _step(env, choose(), counter, result)
             taken += 1
             if taken == 1:
                 result.first_step_s = time.perf_counter() - begun
             observe(counter)
+    except gym.error.CustomSpaceError as error:
+        raise RolloutError(
+            f"its action space is its own ({str(env.single_action_space)[:200]}), and no policy of "
+            "ours can make actions for it; drive it from Python"
+        ) from error
     result.steps, result.complete = counter.steps, counter.finished
     return result
 
@@ -302,14 +289,3 @@ def _step(
     _, rewards, terminations, truncations, infos = env.step(action)
     result.step_s += time.perf_counter() - begun
     counter.step(rewards, terminations, truncations, infos)
-
-
-@contextmanager
-def _known_space(env: VectorEnv[Any, Any, Any]) -> Iterator[None]:
-    try:
-        yield
-    except gym.error.CustomSpaceError as error:
-        raise RolloutError(
-            f"its action space is its own ({str(env.single_action_space)[:200]}), and no policy of "
-            "ours can make actions for it; drive it from Python"
-        ) from error

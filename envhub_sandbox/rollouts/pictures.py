@@ -11,13 +11,8 @@ from numpy.typing import NDArray
 Frame = NDArray[np.uint8]
 
 
-def shrunk(frame: Frame, side: int) -> Frame:
-    """A frame of which no side is longer than that: the mean of each block of pixels.
-
-    Args:
-        frame: uint8 ``(height, width, 3)``.
-        side: Pixels.
-    """
+def small_picture(frame: Frame, side: int) -> Frame:
+    """A frame of which no side is longer than that: the mean of each block of pixels."""
     block = -(-max(frame.shape[:2]) // side)
     if block <= 1:
         return frame
@@ -27,6 +22,12 @@ def shrunk(frame: Frame, side: int) -> Frame:
     blocks = frame[: height * down, : width * across].reshape(height, down, width, across, 3)
     small: Frame = blocks.mean((1, 3), np.float32).round().astype(np.uint8)
     return small
+
+
+def even(frame: Frame) -> Frame:
+    """A frame with even sides, as encoders need them: an odd one repeats its last row or column."""
+    height, width, _ = frame.shape
+    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
 
 def png(frame: Frame) -> bytes:

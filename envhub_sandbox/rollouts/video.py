@@ -10,13 +10,12 @@ import os
 from collections.abc import Generator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from envhub_sandbox.errors import EnvHubError, RemoteEnvError
+from envhub_sandbox.rollouts.pictures import Frame, even
 from envhub_worker.protocol.codec.inert import one_line
 
 MAX_SIDE = 4096
@@ -26,8 +25,6 @@ MIN_FPS = 0.1
 """Below, the times of frames are more than some containers can write."""
 MAX_FPS = 240.0
 SUFFIXES = (".mp4", ".mkv", ".mov")
-
-Frame = NDArray[np.uint8]
 
 
 class VideoError(EnvHubError):
@@ -97,8 +94,6 @@ def frame_of(env: Any) -> Frame:
 def first_frame(rendered: Any, render_mode: str | None) -> Frame:
     """The first sub-environment's frame: uint8 ``(height, width, 3)``, both sides even.
 
-    Encoders need even sides: an odd one repeats its last row or column.
-
     Args:
         rendered: What a vector environment's ``render`` returned.
         render_mode: To explain what came instead of a frame.
@@ -111,7 +106,8 @@ def first_frame(rendered: Any, render_mode: str | None) -> Frame:
     if batched and len(rendered):
         frame = rendered[0]
     if not isinstance(frame, np.ndarray):
-        raise VideoError(f"render() gave {_kind(frame)}, no frame. {_advice(render_mode)}")
+        gave = "None" if frame is None else f"a {type(frame).__name__}"
+        raise VideoError(f"render() gave {gave}, no frame. {_advice(render_mode)}")
     if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
         raise VideoError(
             f"render() gave {frame.dtype} of shape {frame.shape}; a video takes uint8 of shape "
@@ -120,11 +116,7 @@ def first_frame(rendered: Any, render_mode: str | None) -> Frame:
     height, width, _ = frame.shape
     if not (1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE):
         raise VideoError(f"a frame is {width}x{height} pixels; a video takes up to {MAX_SIDE}")
-    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-
-
-def _kind(frame: Any) -> str:
-    return "None" if frame is None else f"a {type(frame).__name__}"
+    return even(frame)
 
 
 def _advice(render_mode: str | None) -> str:
@@ -197,10 +189,5 @@ class VideoWriter:
     def __enter__(self) -> VideoWriter:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import singledispatch
 from typing import Any
 
 import gymnasium as gym
@@ -11,68 +10,51 @@ from gymnasium import spaces
 from gymnasium.error import CustomSpaceError
 
 
-@singledispatch
 def zero_action(space: gym.Space[Any]) -> Any:
     """A member of ``space`` that is zero, or as near to it as the space allows.
 
     Raises:
         gymnasium.error.CustomSpaceError: The space is none of Gymnasium's.
     """
-    if _is_one_of(space):
-        return 0, zero_action(space.spaces[0])  # type: ignore[attr-defined]
+    for kind, zero in _ZEROS.items():
+        if isinstance(space, kind):
+            return zero(space)
     raise CustomSpaceError(f"no zero action is known for {type(space).__name__}")
 
 
-def _is_one_of(space: gym.Space[Any]) -> bool:
-    kind = getattr(spaces, "OneOf", None)  # Gymnasium 0.29 has none
-    return kind is not None and isinstance(space, kind)
-
-
-@zero_action.register
-def _(space: spaces.Box) -> Any:
-    return np.array(np.clip(np.zeros(space.shape), space.low, space.high), space.dtype)
-
-
-@zero_action.register
-def _(space: spaces.Discrete) -> Any:
+def _of_discrete(space: spaces.Discrete) -> Any:
     kind = getattr(space, "dtype", None) or np.dtype(np.int64)
     return kind.type(min(max(0, int(space.start)), int(space.start) + int(space.n) - 1))
 
 
-@zero_action.register
-def _(space: spaces.MultiDiscrete) -> Any:
+def _of_multi_discrete(space: spaces.MultiDiscrete) -> Any:
     start = getattr(space, "start", np.zeros_like(space.nvec))  # Gymnasium 0.29 has none
     return np.clip(0, start, start + space.nvec - 1).astype(space.dtype)
 
 
-@zero_action.register
-def _(space: spaces.MultiBinary) -> Any:
-    return np.zeros(space.shape, space.dtype)
+def _of_sequence(space: spaces.Sequence) -> Any:
+    return gym.vector.utils.create_empty_array(space.feature_space, 0) if space.stack else ()
 
 
-@zero_action.register
-def _(space: spaces.Text) -> Any:
-    return space.character_list[0] * space.min_length if space.min_length else ""
-
-
-@zero_action.register
-def _(space: spaces.Dict) -> Any:
-    return {key: zero_action(member) for key, member in space.spaces.items()}
-
-
-@zero_action.register(spaces.Tuple)  # generic in some versions of Gymnasium, plain in others
-def _(space: Any) -> Any:
-    return tuple(zero_action(member) for member in space.spaces)
-
-
-@zero_action.register
-def _(space: spaces.Sequence) -> Any:
-    if not space.stack:
-        return ()
-    return gym.vector.utils.create_empty_array(space.feature_space, 0)
-
-
-@zero_action.register
-def _(space: spaces.Graph) -> Any:
+def _of_graph(space: spaces.Graph) -> Any:
     nodes = np.array([zero_action(space.node_space)])
     return spaces.GraphInstance(nodes=nodes, edges=None, edge_links=None)
+
+
+_ZEROS: dict[Any, Any] = {
+    spaces.Box: lambda space: np.array(
+        np.clip(np.zeros(space.shape), space.low, space.high), space.dtype
+    ),
+    spaces.Discrete: _of_discrete,
+    spaces.MultiDiscrete: _of_multi_discrete,
+    spaces.MultiBinary: lambda space: np.zeros(space.shape, space.dtype),
+    spaces.Text: lambda space: (
+        space.character_list[0] * space.min_length if space.min_length else ""
+    ),
+    spaces.Dict: lambda space: {key: zero_action(one) for key, one in space.spaces.items()},
+    spaces.Tuple: lambda space: tuple(map(zero_action, space.spaces)),
+    spaces.Sequence: _of_sequence,
+    spaces.Graph: _of_graph,
+    # Gymnasium 0.29 has none
+    getattr(spaces, "OneOf", ()): lambda space: (0, zero_action(space.spaces[0])),
+}

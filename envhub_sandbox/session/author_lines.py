@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import re
 
-from envhub_sandbox.errors import EnvHubError, RemoteEnvError, name_line
+from envhub_sandbox.errors import EnvHubError, RemoteEnvError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_worker.protocol.codec.inert import one_line
-from envhub_worker.protocol.text import printable
+from envhub_worker.protocol.text import printable, quoted
 
 _FRAME = re.compile(
     r'^(?P<margin>[ |+-]*)File "(?P<file>[^"\n]{1,4096})", line (?P<line>[0-9]{1,9})'
@@ -32,7 +32,13 @@ def add_author_line(error: EnvHubError, snapshot: Snapshot) -> None:
     where = _line(frames[-1], snapshot) if frames else ""
     named = _FRAME.sub(lambda found: _named(found, snapshot), remote.traceback)
     remote.traceback = printable(named, _TRACEBACK_CHARS)
-    name_line(error, where)
+    remote.where = where
+    if where:
+        error.args = (f"{error.args[0]}\n{where}", *error.args[1:])
+    if remote.traceback:
+        note = f"In the environment:\n{quoted(remote.traceback.rstrip())}"
+        # before Python 3.11 only some shells and test runners show it
+        vars(error)["__notes__"] = [note]
 
 
 def _place(found: re.Match[str], snapshot: Snapshot) -> str | None:

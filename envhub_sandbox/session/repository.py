@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -10,14 +11,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from envhub_sandbox.crash.bundle_writer import Crash, write_bundle
 from envhub_sandbox.crash.history import Recording
-from envhub_sandbox.crash.writer import Crash, keep
 from envhub_sandbox.errors import (
     DependencyError,
     EnvHubError,
     WorkerDiedError,
     WorkerTimeoutError,
-    name_bundle,
     name_source,
 )
 from envhub_sandbox.hub.snapshot import Snapshot
@@ -208,11 +208,13 @@ class Repository:
         )
         try:
             folder = self.policy.crash_folder or cache_root() / "crashes"
-            bundle = keep(Path(folder).absolute(), crash)
+            bundle = write_bundle(Path(folder).absolute(), crash)
         except Exception as problem:
             CRASHES.warning("%s: no crash bundle could be written: %s", self.label, problem)
         else:
-            name_bundle(error, str(bundle))
+            error.bundle = str(bundle)
+            again = f"To try the same again: envhub replay {shlex.quote(error.bundle)}"
+            error.args = (f"{error.args[0]}\n{again}", *error.args[1:])
             CRASHES.info("%s: crash bundle %s", self.label, bundle)
 
 

@@ -11,7 +11,8 @@ from pathlib import Path
 from unittest import mock
 
 from envhub_sandbox.check.findings import Report
-from envhub_sandbox.check.judge import Asked, judge
+from envhub_sandbox.check.judge import judge
+from envhub_sandbox.check.settings import JudgeOptions
 from tests.browser.texts import ODD
 from tests.support.repositories import write_repository
 
@@ -87,7 +88,9 @@ def declares(folder: Path, texts: list[str]) -> Report:
 def judged(folder: Path, steps: int = 8, *, pictures: bool = False) -> Report:
     """What a page is made of."""
     what = {"n_envs": 1}
-    asked = Asked(reference=str(folder), arguments=what, steps=steps, resets=1, pictures=pictures)
+    asked = JudgeOptions(
+        reference=str(folder), arguments=what, steps=steps, resets=1, pictures=pictures
+    )
     return judge(asked)
 
 

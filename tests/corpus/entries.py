@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.check.checks import Severity
-from envhub_sandbox.check.judge import Asked, judge
+from envhub_sandbox.check.judge import judge
+from envhub_sandbox.check.settings import JudgeOptions
 
 _BASE = """
 import gymnasium as gym
@@ -110,7 +111,9 @@ class Entry:
         timeouts = dict.fromkeys(("call_s", "reset_s", "step_s"), _TIMEOUT_S)
         arguments = {"n_envs": 2, "timeouts": timeouts, **self.arguments}
         settings = {"steps": 30, "resets": 2, "slow_step_s": _NEVER_S, **self.settings}
-        report = judge(Asked(reference=str(self.write(folder)), arguments=arguments, **settings))
+        report = judge(
+            JudgeOptions(reference=str(self.write(folder)), arguments=arguments, **settings)
+        )
         least = Severity.NOTE if self.told else Severity.WARNING
         return {one.id: one.text for one in report.failures(least)}
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.crash.reader import load_bundle, replayed_arguments, wishes
+from envhub_sandbox.crash.bundle_reader import load_bundle, replayed_arguments, wishes
 from envhub_sandbox.crash.replay import replay
 from envhub_sandbox.errors import BundleError, EnvHubError
 from tests.fuzz.oracle import demand

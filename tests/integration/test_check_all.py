@@ -7,12 +7,14 @@ import os
 import signal
 import subprocess
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import pytest
 
+from tests.corpus.entries import Entry
 from tests.integration.test_cli_run import envhub
 from tests.integration.test_cli_signals import COMMAND, below, gone
 from tests.support.pages import Page
@@ -20,28 +22,9 @@ from tests.support.processes import eventually
 from tests.support.repositories import write_repository
 
 _QUICK = ("--steps", "4", "--resets", "0", "--n-envs", "1", "--memory", "1G")
-_HONEST = """
-import gymnasium as gym
-import numpy as np
-
-class Count(gym.Env):
-    observation_space = gym.spaces.Box(0, 100, (1,), np.float32)
-    action_space = gym.spaces.Discrete(2)
-    count = 0
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.count = 0
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        self.count += 1
-        return np.array([self.count], np.float32), 1.0, self.count >= 10, False, {}
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Count] * n_envs)
-"""
-_BROKEN = _HONEST.replace("self.count += 1", "raise RuntimeError('it broke')")
+_HONEST = Entry(group="honest")
+_BREAKS = "def step(self, action):\n    raise RuntimeError('it broke')"
+_BROKEN = Entry(group="broken", env=_BREAKS)
 _STUCK = "import time\ntime.sleep(3600)\n"
 
 
@@ -65,8 +48,8 @@ def listed(folder: Path, *names: str) -> Path:
 
 def test_a_list_is_judged_and_then_what_has_changed(tmp_path: Path) -> None:
     """Each by itself; the second time what is another, and what has no verdict yet."""
-    write_repository(tmp_path / "honest", _HONEST, README__md="# Walk", LICENSE="MIT")
-    broken = write_repository(tmp_path / "broken", _BROKEN, README__md="# Walk", LICENSE="MIT")
+    _HONEST.write(tmp_path / "honest")
+    broken = _BROKEN.write(tmp_path / "broken")
     (tmp_path / "empty").mkdir()
     out, junit = tmp_path / "out", tmp_path / "junit.xml"
     options = ("--all", listed(tmp_path, "honest", "broken", "empty"), "--output", out, *_QUICK)
@@ -89,7 +72,7 @@ def test_a_list_is_judged_and_then_what_has_changed(tmp_path: Path) -> None:
     assert "it broke" in (out / str(failed["page"])).read_text()
     assert json.loads((out / str(failed["report"])).read_text())["passed"] is False
 
-    write_repository(broken, _BROKEN.replace("it broke", "it broke again"))
+    replace(_BROKEN, env=_BREAKS.replace("it broke", "it broke again")).write(broken)
     second = envhub("check", *options)
     assert second.returncode == 1, second.stderr
     assert verdicts(out) == {"honest": "passed", "broken": "failed", "empty": "not judged"}

@@ -13,7 +13,8 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.findings import Report
-from envhub_sandbox.check.judge import Asked, judge
+from envhub_sandbox.check.judge import judge
+from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.hub.snapshot import named
 from tests.hub.olah_server import GitRepository, OlahServer
 
@@ -97,7 +98,7 @@ def test_a_folder_is_judged_as_its_commit(
     for ref, given in places.items():
         with make_env(ref, **given) as suites:
             ran.append(suites.env.reset(seed=0)[1]["ran"][0])
-        asked = Asked(reference=ref, arguments={"n_envs": 1, **given}, steps=3, resets=0)
+        asked = JudgeOptions(reference=ref, arguments={"n_envs": 1, **given}, steps=3, resets=0)
         reports.append(judge(asked))
     assert ran[0] == ran[1]
     assert set(ran[0].split(",")) == {*_NAMES, "beside", "without_source"}

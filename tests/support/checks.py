@@ -60,27 +60,28 @@ finding, processes before threads, open files and memory.
 A terminal shows what is done and for how long. In a log, whatever takes 10 seconds has a line, and
 again after 20, 40 and so on.
 
-What it tried and was denied is told by the first process of the jail, which the system call filter
-asks instead of refusing by itself (`Policy.record_denials`), with `sandbox="process"` alone. What
-allocators and the C library try on their way is left out. Of signals, priorities and the like it is
-told when they name a process that is not the jail's own: one that lives outside of it, or a number
-that nobody in it can have had; what nobody has any more may have been a child, and is left out.
+The first process of the jail reports what the repository tried and was denied: the system call
+filter asks it instead of refusing by itself (`Policy.record_denials`), with `sandbox="process"`
+alone. What allocators and the C library try on their way is left out. Signals, priorities and the
+like are reported when they name a process that is not the jail's own: one that lives outside of it,
+or a number that no process in it can have had. A number that was in use before may have been a
+child's, and is left out.
 
-Limits that are used up are told where they are so when the worker server looks, from outside: after
-the plays of a task. Processes that were refused are also counted by the jail's control group, where
-the server may make one. What was filled and emptied again is not seen, nor what stays below.
+Limits are reported if they are used up when the worker server looks, from outside: after the plays
+of a task. Processes that were refused are also counted by the jail's control group, where the
+server may make one. What was filled and emptied again is not seen, nor what stays below.
 
-Of files that process sees each opening and change by name, and lets the kernel decide: what is
-told is that a path was asked for that is not the jail's own, read from the memory of who asks, and
-no more is known. Told is all that would change something, connecting or sending to a socket's file,
-and reading homes, secrets of the system and other processes (libraries look for configurations in
-many another place). A link in its own folders is told as where it leads, up to sixteen folders
-down, and another thread may have changed it since. Not seen are: who only looks whether a file is
-there; what is changed by an open descriptor; a datagram that `sendmsg` sends to a socket's file;
-under `no-userns` modes, owners and times, which seem to change. At most 32 paths are told, and 64
-attempts in all. It is told of a repository that does not load, too, and of one whose process dies:
-the worker server, which hears of each attempt before who makes it goes on, remembers them until the
-jail is closed. Recorded is the first play of each task alone.
+That process sees each opening and change of a file by name, and lets the kernel decide. The finding
+says that a path was asked for that is not the jail's own; it is read from the memory of the process
+that asks, and no more is known. Reported are all attempts that would change something, connecting
+or sending to a socket's file, and reading homes, secrets of the system and other processes
+(libraries look for configurations in many other places). A link in its own folders is reported as
+the place where it leads, up to sixteen folders down; another thread may have changed it since. Not
+seen are: looking whether a file is there; changes by an open descriptor; a datagram that `sendmsg`
+sends to a socket's file; under `no-userns` modes, owners and times, which seem to change. At most
+32 paths are reported, and 64 attempts in all, also of a repository that does not load, and of one
+whose process dies: the worker server learns of each attempt before the process goes on, and
+remembers it until the jail is closed. Only the first play of each task is recorded.
 
 `--policy FILE` is TOML with the fields of `Policy`, and a table `[limits]`. Where you judge often,
 `--settings envhub.toml` has options in `[check]`:

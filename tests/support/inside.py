@@ -18,8 +18,8 @@ from typing import Any
 
 import zmq
 
-from envhub_sandbox.check.play import denials
-from envhub_sandbox.crash import writer
+from envhub_sandbox.check.play import confinement
+from envhub_sandbox.crash import bundle_writer
 from envhub_sandbox.dependencies import environments, guesses, interpreters, resolutions
 from envhub_sandbox.making import making
 from envhub_sandbox.sandboxes import remote
@@ -212,7 +212,7 @@ def _running(env: Any) -> LoadedJail:
     return found
 
 
-HARMLESS_DENIALS = denials._HARMLESS
+HARMLESS_DENIALS = confinement._HARMLESS
 """What a recorded jail is denied that is no attempt of the repository's."""
 
 # --- the connection to another host ------------------------------------------------------------
@@ -326,7 +326,7 @@ def living(ledger: Ledger) -> Any:
 
 def packet(frames: Sequence[Buffer]) -> bytes:
     """A message as a crash bundle keeps it."""
-    return writer._packet(frames)
+    return bundle_writer._packet(frames)
 
 
 def monitor_script() -> Path:

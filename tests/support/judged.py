@@ -14,7 +14,8 @@ from typing import Any
 
 from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.findings import Finding
-from envhub_sandbox.check.judge import Asked, judge
+from envhub_sandbox.check.judge import judge
+from envhub_sandbox.check.settings import JudgeOptions
 from tests.support.samples import SAMPLES, sample
 
 HOSTILE = SAMPLES.parent / "attacks" / "hostile"
@@ -185,7 +186,7 @@ def told_of(payload: str, attack: Attack) -> list[Finding]:
         "timeouts": _TIMEOUTS,
     }
     resets = 2 if attack.stage == "reset" else 0
-    asked = Asked(reference=str(HOSTILE), arguments=arguments, steps=1, resets=resets)
+    asked = JudgeOptions(reference=str(HOSTILE), arguments=arguments, steps=1, resets=resets)
     return [one for one in judge(asked).findings if one.file in ("", f"payloads/{payload}.py")]
 
 
@@ -226,7 +227,7 @@ def failing(name: str) -> list[Finding]:
     """What fails of a sample."""
     arguments = {"n_envs": 2, "timeouts": _TIMEOUTS}
     reference = f"{sample(name)}{ENTRIES.get(name, '')}"
-    report = judge(Asked(reference=reference, arguments=arguments, steps=10, resets=2))
+    report = judge(JudgeOptions(reference=reference, arguments=arguments, steps=10, resets=2))
     return report.failures(Severity.ERROR)
 
 

@@ -13,7 +13,8 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from envhub_sandbox.check.judge import Asked, judge
+from envhub_sandbox.check.judge import judge
+from envhub_sandbox.check.settings import JudgeOptions
 from tests.support.judged import ENTRIES, HONEST
 from tests.support.samples import sample
 
@@ -160,7 +161,9 @@ def told_of(reference: str, fault: str = "") -> set[str]:
     """The checks that find something; how long steps take is asked only where that is the fault."""
     arguments = {"n_envs": 2, "timeouts": dict.fromkeys(("call_s", "reset_s", "step_s"), 60.0)}
     slow_s = _SLOW_S / 2 if fault and FAULTS[fault].check == "slow-steps" else _NEVER_S
-    asked = Asked(reference=reference, arguments=arguments, steps=10, resets=2, slow_step_s=slow_s)
+    asked = JudgeOptions(
+        reference=reference, arguments=arguments, steps=10, resets=2, slow_step_s=slow_s
+    )
     return {one.id for one in judge(asked).findings}
 
 

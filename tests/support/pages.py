@@ -7,14 +7,28 @@ from html.parser import HTMLParser
 import numpy as np
 
 from envhub_sandbox.check.findings import Finding, Report
-from envhub_sandbox.check.many.lines import Listed
+from envhub_sandbox.check.many.entries import ListEntry
 from envhub_sandbox.check.many.results import Result, Verdict
-from envhub_sandbox.check.play.confinement import walls
+from envhub_sandbox.check.play.confinement import Confinement
 from envhub_sandbox.check.play.plays import Film, Play
 from envhub_sandbox.rollouts.episodes import Episode
 from envhub_sandbox.rollouts.pictures import png
 
 FRAME = np.full((4, 6, 3), 200, np.uint8)
+HOSTILE = (
+    "x\n::error::forged",
+    "x\r\n::add-mask::forged",
+    "<script>alert(1)</script> | [a](javascript:b) ![i](http://example.com/x) `c`",
+    "</title></style></td></a><img src=x onerror=alert(1)>",
+    "]]></failure></error></testcase><testcase name='forged'/>",
+    "\" onmouseover='alert(1)' x=\"",
+    "&lt;script&gt;&#60;script&#62;",
+    "<!-- --><svg/onload=alert(1)>]]>",
+    "javascript:alert(1) http://example.com/",
+    "\x1b[2J\x00\ufffe\u202e\ud800\x85<b>\r\n<i> %0A::error::forged",
+    "<" * 100_000,
+)
+"""What a repository may write into a report, to be more than text there."""
 
 
 class Page(HTMLParser):
@@ -44,6 +58,8 @@ class Page(HTMLParser):
         """As the parser calls it."""
         self.tags.append(("!", ((data, None),)))
 
+    handle_pi = handle_comment
+
     @property
     def names(self) -> set[str]:
         """Which tags there are."""
@@ -68,7 +84,7 @@ def report_of(text: str) -> Report:
     }
     made.asked = {"sandbox": text}
     missing = {"layer": text, "enforced": False, "detail": text}
-    made.walls = walls("strict", {"profile": "no-userns", "layers": [missing]}, text)
+    made.confinement = Confinement.of("strict", {"profile": "no-userns", "layers": [missing]}, text)
     film = Film((png(FRAME), png(FRAME)), b"a video", frames=2, fps=25.0, lacks=text)
     made.plays[text] = Play({"observations": text}, memory=[1 << 20, 2 << 20], film=film)
     made.plays[text].step_s = [0.001, 0.002]
@@ -81,7 +97,7 @@ def report_of(text: str) -> Report:
 
 def results_of(text: str) -> list[Result]:
     """Results in which every word is somebody's."""
-    one = Listed(text, f"{text}@main", 1)
+    one = ListEntry(text, f"{text}@main", 1)
     return [
         Result(
             listed=one,

@@ -110,7 +110,6 @@ _NO_FILES = (
     "envhub_sandbox/check/checks.py",
     "envhub_sandbox/check/static/survey.py",
     "envhub_sandbox/cli/init/starter.py",
-    "envhub_sandbox/cli/doctor/doctor.py",
     "envhub_sandbox/locks/lockfile.py",
 )
 # Nor is this: parts of other formats, and what is said after success.

@@ -7,14 +7,14 @@ escaped as in the page of one report, and no address is made of it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 from xml.etree import ElementTree
 
 from envhub_sandbox.check import reports
 from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.findings import Finding, Report
-from envhub_sandbox.check.many.lines import Listed
+from envhub_sandbox.check.many.entries import ListEntry
 from envhub_sandbox.check.many.results import Result, Verdict, link
 from envhub_sandbox.check.page import markup
 from envhub_worker.protocol.text import counted, duration_text, printable
@@ -33,10 +33,11 @@ _STYLES = {
 }
 
 
-def document(results: Iterable[Result]) -> dict[str, Any]:
+def index_document(results: Iterable[Result]) -> dict[str, Any]:
     """Everything, as plain data."""
-    rows = [_row(one) for one in ordered(results)]
-    return {"format": _FORMAT, "counts": _counts(row["verdict"] for row in rows), "results": rows}
+    found = ordered(results)
+    rows = [_row(one) for one in found]
+    return {"format": _FORMAT, "counts": _counts(found), "results": rows}
 
 
 def ordered(results: Iterable[Result]) -> list[Result]:
@@ -45,20 +46,19 @@ def ordered(results: Iterable[Result]) -> list[Result]:
     return sorted(results, key=lambda one: order.index(one.verdict))
 
 
-def _counts(verdicts: Iterable[str]) -> dict[str, int]:
-    found = Counter(verdicts)
-    return {one.value: found[one.value] for one in Verdict}
+def _counts(results: Iterable[Result]) -> dict[str, int]:
+    found = Counter(one.verdict for one in results)
+    return {one.value: found[one] for one in Verdict}
 
 
 def _row(one: Result) -> dict[str, Any]:
+    found = one.found
     return {
         "reference": one.listed.reference,
         "line": one.listed.line,
         "verdict": one.verdict.value,
         "commit": one.commit or None,
-        "findings": {level.value: (one.found or {}).get(level.value, 0) for level in Severity}
-        if one.has_report
-        else None,
+        "findings": None if found is None else {name: found.get(name, 0) for name in _LEVELS},
         "fails": list(dict.fromkeys(check for check, _ in one.fails)),
         "why": one.why,
         "seconds": round(one.seconds, 3),
@@ -71,15 +71,14 @@ def _row(one: Result) -> dict[str, Any]:
 
 def page(results: Sequence[Result]) -> str:
     """One page that needs nothing else and runs nothing."""
-    title = f"envhub check: {told(results)}"
+    title = f"envhub check: {counts(results)}"
     rows = [_cells(one) for one in ordered(results)]
-    return markup.document(title, [f"<h1>{title}</h1>", *markup.table(_HEADS, rows)])
+    return markup.markup_page(title, [f"<h1>{title}</h1>", *markup.table(_HEADS, rows)])
 
 
-def told(results: Iterable[Result]) -> str:
-    """How many there are of each verdict."""
-    counts = _counts(one.verdict.value for one in results)
-    return ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
+def counts(results: Iterable[Result]) -> str:
+    """How many there are of each verdict, in words."""
+    return ", ".join(f"{count} {verdict}" for verdict, count in _counts(results).items() if count)
 
 
 def _cells(one: Result) -> tuple[str, ...]:
@@ -88,12 +87,12 @@ def _cells(one: Result) -> tuple[str, ...]:
     if one.has_report:
         reference = f'<a href="{markup.text(link(one.listed, "html"))}">{reference}</a>'
     why = "".join(f'<span class="cure">{markup.text(line)}</span>' for line in one.why)
-    found = one.found or {}
-    told = [counted(found[level], level) for level in _LEVELS if found.get(level)]
+    found: Mapping[str, int] = one.found or {}
+    levels = [counted(found[level], level) for level in _LEVELS if found.get(level)]
     return (
         f'<span class="whole {_STYLES[one.verdict]}">{one.verdict.value}</span>',
         f"<strong>{reference}</strong>{why}",
-        ", ".join(told) or ("none" if one.has_report else ""),
+        ", ".join(levels) or ("none" if one.has_report else ""),
         f'<span class="whole">{duration_text(one.seconds)}</span>' if one.ended else "",
         f"{markup.text(one.ended[:16].replace('T', ' '))} UTC" if one.ended else "",
         f'<span class="mono">{markup.text(one.commit[:_SHORT])}</span>' if one.commit else "",
@@ -101,14 +100,9 @@ def _cells(one: Result) -> tuple[str, ...]:
 
 
 def junit(
-    results: Iterable[Result], report: Callable[[Listed], tuple[Report, list[Finding]] | None]
+    results: Iterable[Result], report: Callable[[ListEntry], tuple[Report, list[Finding]] | None]
 ) -> str:
-    """A suite for each reference: its checks as test cases, or why there are none as an error.
-
-    Args:
-        results: All of them.
-        report: What was kept of a reference.
-    """
+    """A suite for each reference: its checks as test cases, or why there are none as an error."""
     root = ElementTree.Element("testsuites", name="envhub check")
     for one in ordered(results):
         found = report(one.listed) if one.has_report else None
@@ -142,7 +136,7 @@ def workflow_commands(results: Iterable[Result]) -> Iterator[str]:
 
 def summary(results: Sequence[Result]) -> str:
     """A table for GitHub's step summary; a stranger's text is no markup there."""
-    lines = [f"### envhub check: {told(results)}", "", "| | reference | |", "| --- | --- | --- |"]
+    lines = [f"### envhub check: {counts(results)}", "", "| | reference | |", "| --- | --- | --- |"]
     for one in ordered(results):
         cells = (printable(one.listed.reference, _LONGEST), "; ".join(one.why))
         lines.append(f"| {one.verdict.value} | {' | '.join(map(reports.cell, cells))} |")

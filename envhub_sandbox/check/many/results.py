@@ -22,7 +22,7 @@ from typing import Any
 
 from envhub_sandbox.check import reports
 from envhub_sandbox.check.findings import Finding, Report
-from envhub_sandbox.check.many.lines import Listed
+from envhub_sandbox.check.many.entries import ListEntry
 from envhub_sandbox.sources.parsing import content
 from envhub_sandbox.system.files import write_whole
 from envhub_sandbox.system.locks import held
@@ -68,7 +68,7 @@ class Result:
         said: Why it was not judged, or not to its end. Trust: partly a stranger's text.
     """
 
-    listed: Listed
+    listed: ListEntry
     verdict: Verdict = Verdict.WAITING
     commit: str = ""
     found: Mapping[str, int] | None = None
@@ -116,7 +116,7 @@ class Results:
         """
         running = self._folder / _RUNNING
         try:
-            with self._marked():
+            with self._locked():
                 (self._folder / _REPORTS).mkdir(exist_ok=True)
                 _remove(running)  # of a run that was killed
                 running.mkdir(mode=0o700)
@@ -125,12 +125,12 @@ class Results:
                 finally:
                     _remove(running)
         except BrokenPipeError:
-            raise  # nobody reads what is printed meanwhile
+            raise  # what is printed meanwhile has no reader any more
         except OSError as error:
             raise FolderError(f"{self._folder}: results cannot be kept there: {error}") from error
 
     @contextlib.contextmanager
-    def _marked(self) -> Iterator[None]:
+    def _locked(self) -> Iterator[None]:
         self._folder.mkdir(parents=True, exist_ok=True)
         mark = self._folder / _MARK
         if not mark.exists() and any(self._folder.iterdir()):
@@ -145,23 +145,23 @@ class Results:
                 raise FolderError(why) from None
             yield
 
-    def kept(self, listed: Listed) -> Result | None:
+    def kept(self, listed: ListEntry) -> Result | None:
         """What came of a reference when it was judged before, in this way; None if it was not.
 
         Raises:
             ForeignResultError: What is there is cut off, changed, or none of ours.
         """
-        told = self._told(listed)
-        return None if told is None else told[0]
+        found = self._read(listed)
+        return None if found is None else found[0]
 
-    def report(self, listed: Listed) -> tuple[Report, list[Finding]] | None:
+    def report(self, listed: ListEntry) -> tuple[Report, list[Finding]] | None:
         """The report that ``kept`` speaks of, if there is one."""
         with contextlib.suppress(ForeignResultError):
-            if (told := self._told(listed)) is not None:
-                return told[1:]
+            if (found := self._read(listed)) is not None:
+                return found[1:]
         return None
 
-    def _told(self, listed: Listed) -> tuple[Result, Report, list[Finding]] | None:
+    def _read(self, listed: ListEntry) -> tuple[Result, Report, list[Finding]] | None:
         path = self._path(listed, "json")
         if not os.path.lexists(path):
             return None
@@ -169,13 +169,13 @@ class Results:
         if data is None:
             raise ForeignResultError(f"{path} is no file of ours")
         try:
-            told = json.loads(data)
-            how = told["judgement"]
+            document = json.loads(data)
+            how = document["judgement"]
             if how["settings"] != self._settings:
                 return None
             if how["reference"] != listed.meaning or how["page"] != self._digest(listed):
                 raise ValueError("not of this reference, or without its page")
-            report, failures = reports.read(told)
+            report, failures = reports.read_report(document)
             seconds, ended = _seconds(how["seconds"]), str(how["ended"])[:40]
         except (KeyError, TypeError, ValueError, RecursionError) as error:
             raise ForeignResultError(f"{path} is cut off, or was changed ({error})") from error
@@ -183,7 +183,13 @@ class Results:
         return result, report, failures
 
     def keep(
-        self, listed: Listed, told: Mapping[str, Any], page: Path, *, seconds: float, ended: str
+        self,
+        listed: ListEntry,
+        document: Mapping[str, Any],
+        page: Path,
+        *,
+        seconds: float,
+        ended: str,
     ) -> Result:
         """Keep a report as ``check --json`` has printed it, and take its page.
 
@@ -192,7 +198,7 @@ class Results:
             OSError: It cannot be written.
         """
         try:
-            report, failures = reports.read(told)
+            report, failures = reports.read_report(document)
         except (KeyError, TypeError, ValueError) as error:
             raise ForeignResultError(f"this is no report: {error}") from error
         data = content(page, MOST_BYTES)
@@ -206,11 +212,11 @@ class Results:
             "seconds": round(seconds, 3),
             "ended": ended,
         }
-        text = json.dumps({**told, "judgement": how}, indent=2, allow_nan=False)
+        text = json.dumps({**document, "judgement": how}, indent=2, allow_nan=False)
         _write(self._path(listed, "json"), text.encode())
         return _result(listed, report, failures, seconds=seconds, ended=ended)
 
-    def forget(self, listed: Listed) -> None:
+    def forget(self, listed: ListEntry) -> None:
         """Let it be judged again."""
         self._path(listed, "json").unlink(missing_ok=True)
 
@@ -218,15 +224,15 @@ class Results:
         """Write a file about all of them."""
         _write(self._folder / name, text.encode("utf-8", "backslashreplace"))
 
-    def _digest(self, listed: Listed) -> str | None:
+    def _digest(self, listed: ListEntry) -> str | None:
         data = content(self._path(listed, "html"), MOST_BYTES)
         return None if data is None else hashlib.sha256(data).hexdigest()
 
-    def _path(self, listed: Listed, kind: str) -> Path:
+    def _path(self, listed: ListEntry, kind: str) -> Path:
         return self._folder / link(listed, kind)
 
 
-def link(listed: Listed, kind: str) -> str:
+def link(listed: ListEntry, kind: str) -> str:
     """Where a reference's ``html`` or ``json`` lies in the folder."""
     return f"{_REPORTS}/{listed.name}.{kind}"
 
@@ -235,7 +241,7 @@ _write = partial(write_whole, mode=0o666, durable=True)
 
 
 def _result(
-    listed: Listed, report: Report, failures: list[Finding], *, seconds: float, ended: str
+    listed: ListEntry, report: Report, failures: list[Finding], *, seconds: float, ended: str
 ) -> Result:
     unjudged = report.is_unjudged(failures)
     return Result(

@@ -79,13 +79,8 @@ _POLICY = (
 """Of what a page may do, were there markup of a stranger's: not even look different."""
 
 
-def document(title: str, body: Iterable[str]) -> str:
-    """A whole page of what is HTML already, in one file that needs no other.
-
-    Args:
-        title: May be a stranger's.
-        body: HTML of ours.
-    """
+def markup_page(title: str, body: Iterable[str]) -> str:
+    """A whole page in one file, of a body that is HTML of ours; the title may be a stranger's."""
     return "\n".join(
         [
             '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',

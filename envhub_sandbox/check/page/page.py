@@ -13,8 +13,8 @@ import numpy as np
 
 from envhub_sandbox.check.checks import CHECKS
 from envhub_sandbox.check.findings import Finding, Report
-from envhub_sandbox.check.page.markup import data, document, facts, folded, table, text
-from envhub_sandbox.check.page.plots import bars, course, finite, histogram, number
+from envhub_sandbox.check.page.markup import data, facts, folded, markup_page, table, text
+from envhub_sandbox.check.page.plots import bar_plot, finite, histogram_plot, line_plot, number
 from envhub_sandbox.check.play.plays import Film, Play
 from envhub_worker.protocol.text import counted, duration_text, size_text
 
@@ -31,7 +31,7 @@ def page(report: Report, failures: Collection[Finding]) -> str:
     """The whole page. Trust: whatever stands in a report may be a stranger's text."""
     body = [*_head(report, failures), *_findings(report, failures), *_tasks(report)]
     body += [*_figures(report), *_held(report), *_judged(report), *_ran(report.provenance or {})]
-    return document(f"envhub check: {report.reference}", body)
+    return markup_page(f"envhub check: {report.reference}", body)
 
 
 def _head(report: Report, failures: Collection[Finding]) -> Iterator[str]:
@@ -110,13 +110,15 @@ def _pictures(film: Film) -> Iterator[str]:
 def _plots(play: Play) -> Iterator[str]:
     returns = [episode.returns[0] for episode in play.episodes]
     lengths = [float(episode.length) for episode in play.episodes]
+    times = play.step_s
+    parts = [(play.played, "played"), (len(play.memory) - play.played, "resets")]
     many = len(play.episodes[0].returns) if play.episodes else 1
     of = f"Return, component 1 of {many}" if many > 1 else "Return"
     drawn = [
-        _plot(f"{of}, per episode", _mean(returns), bars(f"{of} of each episode", returns)),
-        _plot("Length of episodes", _mean(lengths), bars("Length of each episode", lengths)),
-        _plot("Time of a step", _median(play.step_s), histogram("Times of steps", play.step_s)),
-        _plot("Memory", "", course("Memory of its processes", play.memory, _parts(play))),
+        _plot(f"{of}, per episode", _mean(returns), bar_plot(f"{of} of each episode", returns)),
+        _plot("Length of episodes", _mean(lengths), bar_plot("Length of each episode", lengths)),
+        _plot("Time of a step", _median(times), histogram_plot("Times of steps", times)),
+        _plot("Memory", "", line_plot("Memory of its processes", play.memory, parts)),
     ]
     if not play.episodes and play.step_s:
         yield '<p class="dim">No episode ended while it was played: see --steps.</p>'
@@ -129,12 +131,8 @@ def _plots(play: Play) -> Iterator[str]:
 def _plot(name: str, figure: str, svg: str) -> str:
     if not svg:
         return ""
-    told = f" <strong>{figure}</strong>" if figure else ""
-    return f"<figure><figcaption>{name}{told}</figcaption>{svg}</figure>"
-
-
-def _parts(play: Play) -> list[tuple[int, str]]:
-    return [(play.played, "played"), (len(play.memory) - play.played, "resets")]
+    strong = f" <strong>{figure}</strong>" if figure else ""
+    return f"<figure><figcaption>{name}{strong}</figcaption>{svg}</figure>"
 
 
 def _mean(values: Sequence[float]) -> str:
@@ -182,9 +180,9 @@ def _held(report: Report) -> Iterator[str]:
 
 def _judged(report: Report) -> Iterator[str]:
     if report.asked:
-        told = () if report.walls is None else report.walls.lines()
+        walls = () if report.confinement is None else report.confinement.lines()
         yield "<h2>How it was judged</h2>"
-        yield from facts([*report.asked.items(), *(("confined by", line) for line in told)])
+        yield from facts([*report.asked.items(), *(("confined by", line) for line in walls)])
 
 
 def _ran(provenance: Mapping[str, Any]) -> Iterator[str]:
@@ -192,8 +190,8 @@ def _ran(provenance: Mapping[str, Any]) -> Iterator[str]:
         return
     yield "<h2>What ran</h2>"
     interpreter = _pairs(provenance.get("interpreter"))
-    told = [(f"{name}, as it says", value) for name, value in interpreter]
-    yield from facts([*((name, provenance.get(name)) for name in _RAN), *told])
+    says = [(f"{name}, as it says", value) for name, value in interpreter]
+    yield from facts([*((name, provenance.get(name)) for name in _RAN), *says])
     layers = [
         tuple(text(layer.get(name)) for name in ("layer", "enforced", "detail"))
         for layer in provenance.get("layers") or ()
@@ -211,6 +209,6 @@ def _ran(provenance: Mapping[str, Any]) -> Iterator[str]:
             yield from folded(f"{said} ({len(pairs)})", facts(pairs[:_MOST_PAIRS], _LONGEST_WORD))
 
 
-def _pairs(told: object) -> list[tuple[str, Any]]:
+def _pairs(value: object) -> list[tuple[str, Any]]:
     """Trust: the worker's own words."""
-    return list(told.items()) if isinstance(told, Mapping) else []
+    return list(value.items()) if isinstance(value, Mapping) else []

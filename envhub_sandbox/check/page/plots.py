@@ -19,13 +19,8 @@ _LARGEST = 1e100
 """What is larger is drawn as this: differences of the largest floats are no floats."""
 
 
-def bars(name: str, values: Sequence[float]) -> str:
-    """One bar for each number, from zero; of neighbours their mean, where there are too many.
-
-    Args:
-        name: Of ours, for those who do not see it.
-        values: Any; those that are no finite number are left out.
-    """
+def bar_plot(name: str, values: Sequence[float]) -> str:
+    """One bar for each finite number, from zero; of too many, one for the mean of neighbours."""
     known = finite(values)
     if not len(known):
         return ""
@@ -48,7 +43,7 @@ def bars(name: str, values: Sequence[float]) -> str:
     )
 
 
-def histogram(name: str, seconds: Sequence[float]) -> str:
+def histogram_plot(name: str, seconds: Sequence[float]) -> str:
     """How often something took how long, with logarithmic steps; the median and the 99 %."""
     known = np.maximum(finite(seconds), 1e-7)
     if not len(known):
@@ -75,14 +70,8 @@ def histogram(name: str, seconds: Sequence[float]) -> str:
     return _svg(name, [*shown, *_below(ends)])
 
 
-def course(name: str, values: Sequence[float], parts: Sequence[tuple[int, str]]) -> str:
-    """A line through numbers of bytes, and a mark where each part ends.
-
-    Args:
-        name: Of ours.
-        values: Evenly apart.
-        parts: The number of values in each, and what to write at its end.
-    """
+def line_plot(name: str, values: Sequence[float], parts: Sequence[tuple[int, str]]) -> str:
+    """A line through numbers of bytes; ``parts`` are how many, and a word for where they end."""
     known = finite(values)
     if len(known) < 2 or len(known) != len(values):
         return ""

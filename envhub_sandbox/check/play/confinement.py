@@ -1,20 +1,34 @@
-"""What confined a repository while it was judged, and what did not, for every form of a report."""
+"""What confined a repository while it was judged, and what it tried and was denied.
+
+The system call filter asks the jail's first process, so that nothing of it is the repository's
+word; but a path is read out of the memory of the process that asks, which may change it meanwhile.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import islice
 from typing import Any
 
 from envhub_worker.protocol.text import printable
 
 _MOST, _LONGEST = 40, 300
 _WHOLE = "strict"
+_NETWORK = "socket AF_"
+_LOCAL = frozenset({"socket AF_UNIX", "socketpair AF_UNIX"})
+_DEEDS = {"connect": "connect to", "sendto": "send to"}
+_OTHER = " OTHER_PROCESS"
+_HARMLESS = frozenset(
+    {
+        *("mbind", "set_mempolicy", "set_mempolicy_home_node", "migrate_pages", "move_pages"),
+        *("setpriority", "ioprio_set", "io_uring_setup", "socket AF_NETLINK"),
+    }
+)
+"""What allocators, pools of threads and the C library try on their way, and do without."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Walls:
+class Confinement:
     """The confinement of one judgement.
 
     Attributes:
@@ -25,12 +39,25 @@ class Walls:
     """
 
     asked: str
-    profile: str = ""
-    missing: tuple[tuple[str, str], ...] = ()
-    unrecorded: str = ""
+    profile: str
+    missing: tuple[tuple[str, str], ...]
+    unrecorded: str
+
+    @classmethod
+    def of(cls, asked: str, provenance: Mapping[str, Any] | None, unrecorded: str) -> Confinement:
+        """Of what ran. Trust: a server on another host may have said which layers hold."""
+        ran = provenance or {}
+        layers = ran.get("layers") or ()
+        missing = [one for one in layers if one.get("enforced") is not True][:_MOST]
+        return cls(
+            asked=asked,
+            profile=ran.get("profile") or "",
+            missing=tuple((_line(one.get("layer")), _line(one.get("detail"))) for one in missing),
+            unrecorded=_line(unrecorded),
+        )
 
     @property
-    def are_fewer(self) -> bool:
+    def is_partial(self) -> bool:
         """Whether a person should know that there was less than there can be."""
         return (self.profile or self.asked) != _WHOLE or bool(self.unrecorded)
 
@@ -58,21 +85,27 @@ class Walls:
         }
 
 
-def walls(asked: str, provenance: Mapping[str, Any] | None, unrecorded: str) -> Walls:
-    """Of what ran. Trust: a server on another host may have said which layers hold."""
-    told = provenance or {}
-    missing = (one for one in told.get("layers") or () if one.get("enforced") is not True)
-    return Walls(
-        asked=asked,
-        profile=told.get("profile") or "",
-        missing=tuple(_named(one) for one in islice(missing, _MOST)),
-        unrecorded=_line(unrecorded),
-    )
-
-
-def _named(layer: Mapping[str, Any]) -> tuple[str, str]:
-    return _line(layer.get("layer")), _line(layer.get("detail"))
-
-
 def _line(text: object) -> str:
     return " ".join(printable(str(text), _LONGEST).split())
+
+
+def denial_findings(denied: Iterable[str]) -> dict[str, list[str]]:
+    """The findings of each check, of what was denied. Trust: paths are a stranger's words."""
+    checks = ("denied-network", "denied-files", "denied-kernel", "limits-reached")
+    found: dict[str, list[str]] = {check: [] for check in checks}
+    for one in sorted(set(denied) - _HARMLESS):
+        check, text = _finding(one)
+        found[check].append(text)
+    return found
+
+
+def _finding(one: str) -> tuple[str, str]:
+    deed, _, path = one.partition(" ")
+    if path.startswith("/"):
+        return "denied-files", f"asked to {_DEEDS.get(deed, deed)} {path}, which is not its own"
+    if deed == "limit":
+        return "limits-reached", f"used up what limits permit of {path.lower()}"
+    if one.endswith(_OTHER):
+        return "denied-kernel", f"tried {deed} of a process that is not its own"
+    is_network = one.startswith(_NETWORK) and one not in _LOCAL
+    return "denied-network" if is_network else "denied-kernel", f"tried {one}, and was refused"

@@ -14,7 +14,7 @@ MODES = ("rgb_array", "rgb_array_list", "ansi")
 FILMED = ("rgb_array", "rgb_array_list")
 
 
-def others(env: VectorEnv[Any, Any, Any]) -> list[str]:
+def other_modes(env: VectorEnv[Any, Any, Any]) -> list[str]:
     """The modes that it declares and is not in. Trust: input from the worker."""
     declared = env.metadata.get("render_modes")
     given = declared if isinstance(declared, (list, tuple)) else ()
@@ -22,7 +22,7 @@ def others(env: VectorEnv[Any, Any, Any]) -> list[str]:
     return [mode for mode in MODES if mode in named and mode != env.render_mode]
 
 
-def wrong(env: VectorEnv[Any, Any, Any]) -> Iterator[str]:
+def wrong_frames(env: VectorEnv[Any, Any, Any]) -> Iterator[str]:
     """What its mode does not permit, of the first sub-environment that gives it."""
     mode = env.render_mode
     if mode not in MODES:

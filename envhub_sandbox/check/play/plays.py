@@ -14,7 +14,7 @@ from gymnasium.vector import VectorEnv
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.rollouts import video
 from envhub_sandbox.rollouts.episodes import Episode
-from envhub_sandbox.rollouts.pictures import Frame, png, shrunk
+from envhub_sandbox.rollouts.pictures import Frame, even, png, small_picture
 from envhub_worker.protocol.text import printable
 
 _SIDE = 320
@@ -55,10 +55,10 @@ class Play:
     Attributes:
         facts: Its spaces and what else it says of itself, by name. Trust: the worker's words.
         episodes: Those that ended in the first play.
-        step_s: Seconds of each step of the second play, which nobody watched.
+        step_s: Seconds of each step of the second play, which is not observed.
         memory: Bytes that its jail held, from outside: while it was played, and then after each
             round of resets; ``played`` says how many are of the play.
-        film: None where nobody asked for one, or it says that it renders nothing.
+        film: None where none was asked for, or it says that it renders nothing.
     """
 
     facts: Mapping[str, str] = field(default_factory=dict)
@@ -72,15 +72,15 @@ class Play:
         """The same function, of which the memory is noted each time."""
 
         def counted() -> dict[str, int]:
-            told = usage()
-            if "memory_bytes" in told:
-                self.memory.append(told["memory_bytes"])
-            return told
+            used = usage()
+            if "memory_bytes" in used:
+                self.memory.append(used["memory_bytes"])
+            return used
 
         return counted
 
     def sampling(self, usage: Callable[[], dict[str, int]], steps: int) -> Callable[[int], None]:
-        """A function that notes the memory after some of so many steps; it is told which one."""
+        """A function that notes the memory after some of so many steps; given its number."""
         counted, every = self.counting(usage), -(-steps // _SAMPLES)
 
         def seen(number: int) -> None:
@@ -108,11 +108,6 @@ def film(env: VectorEnv[Any, Any, Any], *, seed: int, seconds: float = _SECONDS)
     """Play again from the start, and look: bounded in frames and in time, encoded here.
 
     What fails is said in the film and is no finding: its checks have been made.
-
-    Args:
-        env: Is left open.
-        seed: Of the environment and of the actions.
-        seconds: After which no further step is made.
     """
     frames: list[Frame] = []
     lacks = ""
@@ -138,16 +133,10 @@ def _rendered(env: VectorEnv[Any, Any, Any], seed: int, ends: float) -> Iterator
     env.action_space.seed(seed)
     env.reset(seed=seed)
     for _ in range(_FRAMES):
-        yield _even(shrunk(video.frame_of(env), _SIDE))
+        yield even(small_picture(video.frame_of(env), _SIDE))
         if monotonic() >= ends:
             return
         _, _, terminations, truncations, _ = env.step(env.action_space.sample())
         ended = np.logical_or(np.asarray(terminations, bool), np.asarray(truncations, bool))
         if disabled and ended.any():
             env.reset(options={"reset_mask": ended})
-
-
-def _even(frame: Frame) -> Frame:
-    """Encoders need even sides."""
-    height, width, _ = frame.shape
-    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,6 +16,7 @@ from gymnasium.vector import VectorEnv
 from envhub_sandbox.rollouts.episodes import Episode, EpisodeCounter, RolloutError
 
 Env = VectorEnv[Any, Any, Any]
+_NOTED = 3
 _LAST = ("final_obs", "final_observation")
 
 
@@ -24,29 +27,28 @@ class Trace:
     Attributes:
         steps: A digest of the reset, and of every step.
         actions: A digest of the actions of every step.
-        bad_rewards: Steps with a reward that is no finite number, the first few.
-        unbounded: Resets and steps with an observation that is not finite, the first few.
+        notes: What was seen that no step should have, the first few for each check.
         heavy: Bytes of the infos of each step, for each sub-environment.
-        autoreset: What the autoreset mode would not permit, the first few.
-        infos: Infos that do not say which sub-environments they are of, the first few.
         episodes: How many ended.
-        times: Seconds: of the reset and of steps, for who reads it; no check asks for them.
+        times: Seconds of the reset and of steps, for the report.
         counted: The episodes that ended, to be looked at; fewer, where its rewards are such that
-            nobody can count.
+            they cannot be counted.
         spent: Seconds of each step.
     """
 
     steps: list[str] = field(default_factory=list)
     actions: list[str] = field(default_factory=list)
-    bad_rewards: list[str] = field(default_factory=list)
-    unbounded: list[str] = field(default_factory=list)
+    notes: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     heavy: list[float] = field(default_factory=list)
-    autoreset: list[str] = field(default_factory=list)
-    infos: list[str] = field(default_factory=list)
     episodes: int = 0
     times: dict[str, float] = field(default_factory=dict)
     counted: list[Episode] = field(default_factory=list)
     spent: list[float] = field(default_factory=list)
+
+    def note(self, check: str, text: str) -> None:
+        """Keep what was seen, if there is not enough of it for the check."""
+        if len(self.notes[check]) < _NOTED:
+            self.notes[check].append(text)
 
     def differs_from(self, other: Trace) -> int | None:
         """The first step of both that differs, 0 for the reset; None if none does."""
@@ -73,10 +75,10 @@ def play(
         steps: Vector steps.
         actions_seed: Of the actions alone.
         like: Stop at the first step that differs from this one.
-        observe: Is called with the number of each step that was made; 0 is the reset.
+        observe: Called with the number of each step that was made; 0 is the reset.
     """
-    trace, ended = Trace(), np.zeros(env.num_envs, np.bool_)
-    counter: EpisodeCounter | None = EpisodeCounter(env.num_envs, env.num_envs * steps, mode)
+    counter, counts = EpisodeCounter(env.num_envs, env.num_envs * steps, mode), True
+    trace, ended = Trace(counted=counter.counted), np.zeros(env.num_envs, np.bool_)
     env.action_space.seed(seed if actions_seed is None else actions_seed)
     began = time.perf_counter()
     first = env.reset(seed=seed)[0]
@@ -97,24 +99,14 @@ def play(
         trace.spent.append(time.perf_counter() - begun)
         trace.steps.append(resumed + digest(result[:4]))  # infos may hold times
         ended = _judge(trace, result, ended, mode, number)
-        counter = _count(trace, counter, result)
+        if counts:
+            try:
+                counter.step(*result[1:])
+            except RolloutError:
+                counts = False
         observe(number)
     trace.times |= _times(trace.spent)
     return trace
-
-
-def _count(
-    trace: Trace, counter: EpisodeCounter | None, result: tuple[Any, ...]
-) -> EpisodeCounter | None:
-    """The counter, or None once there was something that it cannot count."""
-    if counter is None:
-        return None
-    try:
-        counter.step(*result[1:])
-    except RolloutError:
-        return None
-    trace.counted = counter.counted
-    return counter
 
 
 def _times(spent: list[float]) -> dict[str, float]:
@@ -134,60 +126,70 @@ def _judge(trace: Trace, result: tuple[Any, ...], ended: Any, mode: str | None, 
     _look_at(trace, observations, f"step {number}")
     trace.heavy.append(_bytes_of(infos) / max(len(rewards), 1))
     for text in _masks(infos, len(rewards)):
-        _note(trace.infos, f"step {number}: {text}")
+        trace.note("infos", f"step {number}: {text}")
     done = np.logical_or(np.asarray(terminations, bool), np.asarray(truncations, bool))
     trace.episodes += int(done.sum())
     if not np.isfinite(np.asarray(rewards, np.float64)).all():
-        _note(trace.bad_rewards, f"step {number}: {np.asarray(rewards).tolist()}")
+        trace.note("rewards", f"step {number}: {np.asarray(rewards).tolist()}")
     if mode == "NextStep":
         for index in np.flatnonzero(ended):
             if done[index] or np.any(np.asarray(rewards)[index]):
-                _note(
-                    trace.autoreset,
+                trace.note(
+                    "autoreset",
                     f"step {number}: sub-environment {index} had ended, and the step that resets "
                     "it has a reward or ends it again (NEXT_STEP)",
                 )
     if mode == "SameStep" and done.any() and "final_obs" not in infos:
-        _note(trace.autoreset, f"step {number}: an episode ended without 'final_obs' (SAME_STEP)")
+        trace.note("autoreset", f"step {number}: an episode ended without 'final_obs' (SAME_STEP)")
     return done
 
 
 def _look_at(trace: Trace, observations: Any, where: str) -> None:
-    found = next(_unbounded(observations), None)
-    if found is not None:
-        _note(trace.unbounded, f"{where}: an observation has {found}")
+    for found in itertools.islice(_unbounded(observations), 1):
+        trace.note("observation-finite", f"{where}: an observation has {found}")
 
 
-def _unbounded(value: Any) -> Iterator[str]:
-    """What is not finite in observations. Trust: input from the worker, already decoded."""
-    if isinstance(value, Mapping):
-        for one in value.values():
-            yield from _unbounded(one)
-    elif isinstance(value, (list, tuple)):
-        for one in value:
-            yield from _unbounded(one)
-    elif hasattr(value, "tolist") and hasattr(value, "cpu"):  # a tensor
-        yield from _unbounded(value.cpu().numpy())
-    elif isinstance(value, np.ndarray) and value.dtype == object:
-        yield from _unbounded(list(value.flat))
-    elif isinstance(value, (float, np.ndarray, np.generic)):
-        array = np.asarray(value)
-        if array.dtype.kind in "fc" and not np.isfinite(array).all():
-            yield "NaN" if np.isnan(array).any() else "infinity"
-
-
-def _bytes_of(value: Any) -> int:
-    """What an info weighs, roughly; without the last observation of an episode.
+def _leaves(value: Any, without: Collection[str] = ()) -> Iterator[Any]:
+    """What stands in mappings, sequences and arrays of objects.
 
     Trust: input from the worker, already decoded, and so bounded in depth and size.
     """
     if isinstance(value, Mapping):
-        return sum(_bytes_of(value[name]) for name in value if name not in _LAST)
-    if isinstance(value, np.ndarray) and value.dtype != object:
-        return value.nbytes
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return sum(map(_bytes_of, value))
-    return len(value) if isinstance(value, (str, bytes)) else 8
+        value = [value[name] for name in value if name not in without]
+    elif isinstance(value, np.ndarray) and value.dtype == object:
+        value = list(value.flat)
+    if isinstance(value, (list, tuple)):
+        for one in value:
+            yield from _leaves(one, without)
+    else:
+        yield value
+
+
+def _unbounded(observations: Any) -> Iterator[str]:
+    """What is not finite in observations."""
+    for leaf in _leaves(observations):
+        value = _on_cpu(leaf)
+        if isinstance(value, (float, np.ndarray, np.generic)):
+            array = np.asarray(value)
+            if array.dtype.kind in "fc" and not np.isfinite(array).all():
+                yield "NaN" if np.isnan(array).any() else "infinity"
+
+
+def _bytes_of(infos: Any) -> int:
+    """What infos weigh, roughly; without the last observation of an episode."""
+    return sum(map(_weight, _leaves(infos, _LAST)))
+
+
+def _weight(leaf: Any) -> int:
+    if isinstance(leaf, np.ndarray):
+        return leaf.nbytes
+    return len(leaf) if isinstance(leaf, (str, bytes)) else 8
+
+
+def _on_cpu(value: Any) -> Any:
+    """A tensor as an array; everything else as it is."""
+    is_tensor = hasattr(value, "tolist") and hasattr(value, "cpu")
+    return value.cpu().numpy() if is_tensor else value
 
 
 def _masks(infos: Mapping[Any, Any], count: int) -> Iterator[str]:
@@ -204,11 +206,6 @@ def _masks(infos: Mapping[Any, Any], count: int) -> Iterator[str]:
             yield f"{name[1:]!r} is {value.shape}, of {count} sub-environments"
 
 
-def _note(notes: list[str], text: str) -> None:
-    if len(notes) < 3:
-        notes.append(text)
-
-
 def digest(value: Any) -> str:
     """Equal for what is equal bit for bit: arrays, numbers, texts, and what holds them."""
     hashed = hashlib.sha256()
@@ -217,6 +214,7 @@ def digest(value: Any) -> str:
 
 
 def _feed(hashed: Any, value: Any) -> None:
+    value = _on_cpu(value)
     if isinstance(value, np.ndarray) and value.dtype != object:
         hashed.update(f"array {value.dtype.str} {value.shape}".encode())
         hashed.update(np.ascontiguousarray(value).tobytes())
@@ -229,7 +227,5 @@ def _feed(hashed: Any, value: Any) -> None:
         hashed.update(f"items {len(value)}".encode())
         for one in value:
             _feed(hashed, one)
-    elif hasattr(value, "tolist") and hasattr(value, "cpu"):  # a tensor
-        _feed(hashed, value.cpu().numpy())
     else:
         hashed.update(f"{type(value).__name__} {value!r}".encode("utf-8", "replace"))

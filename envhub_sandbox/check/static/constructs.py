@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator
 
 from envhub_sandbox.check.findings import Finding
-from envhub_sandbox.sources.parsing import Named, Parsed
+from envhub_sandbox.sources.parsing import Parsed
 
 _NETWORK, _PROCESS, _DYNAMIC, _PICKLE, _NATIVE, _OUTSIDE, _OBSCURE = (
     f"source-{kind}"
@@ -56,7 +56,7 @@ _NAMES = {
     "pathlib.Path.home": _OUTSIDE,
 }
 _REFLECTED = ("os", "sys", "builtins", "importlib", "subprocess", "socket", "ctypes")
-"""Modules of which getattr may fetch what nobody wants to write down."""
+"""Modules of which getattr may fetch what an author does not want to write down."""
 _LONG_LINE = re.compile(r"^[^\n]{2000,}", re.MULTILINE)
 
 
@@ -68,7 +68,7 @@ def constructs(file: str, parsed: Parsed) -> Iterator[Finding]:
 
 
 def long_lines(file: str, text: str) -> Iterator[Finding]:
-    """Lines that nobody reads to their end: what stands there need not be seen."""
+    """Lines that are too long to be read to their end: what stands there need not be seen."""
     for found in _LONG_LINE.finditer(text):
         line = 1 + text.count("\n", 0, found.start())
         message = f"a line of {len(found[0])} characters"
@@ -77,15 +77,11 @@ def long_lines(file: str, text: str) -> Iterator[Finding]:
 
 def _imported(parsed: Parsed) -> Iterator[tuple[int, str, str]]:
     for one in parsed.imports:
-        for name in _firsts(one):
+        # below 0: names of modules; 0: names out of one; above: relative
+        modules = one.names if one.level < 0 else () if one.level else (one.module,)
+        for name in (module.partition(".")[0] for module in modules):
             if check := _MODULES.get(name):
                 yield one.line, check, f"imports {name}"
-
-
-def _firsts(one: Named) -> list[str]:
-    if one.level < 0:
-        return [name.partition(".")[0] for name in one.names]
-    return [] if one.level else [one.module.partition(".")[0]]
 
 
 def _named(parsed: Parsed) -> Iterator[tuple[int, str, str]]:

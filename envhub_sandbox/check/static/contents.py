@@ -1,6 +1,6 @@
 """What the bytes of a repository's files are: text, Python, machine code, pickles, archives.
 
-Told by their beginnings and their names; nothing is opened in any other sense. Reading is bounded
+Their beginnings and their names decide; nothing is opened in any other sense. Reading is bounded
 by file and in all.
 """
 
@@ -15,7 +15,7 @@ from pathlib import Path
 from envhub_sandbox.check.findings import Finding
 
 BEGINNING = 8192
-"""Bytes by which a file's kind is told."""
+"""Bytes that decide what kind a file is."""
 ENDING = (1 << 16) + 22
 """Bytes in which a zip archive's end is looked for, whatever stands before it; so Python does."""
 LARGE = 10 << 20
@@ -63,7 +63,7 @@ _MOST_HIDDEN = 20
 """Of one file."""
 
 
-def kind_of(name: str, beginning: bytes, ending: bytes = b"") -> str:
+def kind_of_contents(name: str, beginning: bytes, ending: bytes = b"") -> str:
     """In a word or two: ``"Python"``, ``"text"``, ``"binary"``, or what is worth a look."""
     suffix = Path(name).suffix.lower()
     if beginning.lstrip().startswith(_LFS):
@@ -113,14 +113,14 @@ def of_kind(name: str, kind: str, *, is_folder: bool) -> Iterator[Finding]:
 def hidden(name: str, text: str, *, is_code: bool) -> Iterator[Finding]:
     """Characters that are shown as nothing, as another order, or as other letters."""
     pattern = _HIDDEN_IN_CODE if is_code else _HIDDEN
-    line, counted, told = 1, 0, set()
+    line, counted, seen = 1, 0, set()
     for found in pattern.finditer(text):
         line += text.count("\n", counted, found.start())
         counted = found.start()
-        if (line, found[0]) not in told:
-            told.add((line, found[0]))
+        if (line, found[0]) not in seen:
+            seen.add((line, found[0]))
             yield Finding("source-hidden", _called(found[0]), file=name, line=line)
-        if len(told) >= _MOST_HIDDEN:
+        if len(seen) >= _MOST_HIDDEN:
             return
 
 

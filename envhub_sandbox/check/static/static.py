@@ -1,8 +1,15 @@
-"""What a repository would do, in one piece: its files, entry, imports, packages and findings."""
+"""What a repository would do, in one piece: its files, entry, imports, packages and findings.
+
+``undeclared`` says which of the imports nothing declares.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from importlib import metadata
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from packaging.requirements import Requirement
@@ -10,13 +17,14 @@ from packaging.utils import canonicalize_name
 
 from envhub_sandbox.check.findings import Finding
 from envhub_sandbox.check.static.survey import File, survey
+from envhub_sandbox.dependencies import host
 from envhub_sandbox.dependencies.declared import Declared, declared
 from envhub_sandbox.dependencies.resolve import WORKERS
 from envhub_sandbox.errors import RequirementError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.session.recipe import pinned
-from envhub_sandbox.sources import imports, parsing
-from envhub_sandbox.sources.imports import Import
+from envhub_sandbox.sources import parsing
+from envhub_sandbox.sources.imports import Import, imports
 from envhub_worker.protocol.text import printable
 
 _LONGEST = 500
@@ -76,7 +84,7 @@ def static(snapshot: Snapshot) -> Static:
         snapshot=snapshot,
         files=surveyed.files,
         entries=() if entry is None else entry.entries,
-        imports=imports.imports(snapshot, parsed),
+        imports=imports(snapshot, parsed),
         declared=says,
         findings=sorted(map(_printable, findings), key=lambda one: one.check.severity.rank),
     )
@@ -84,7 +92,7 @@ def static(snapshot: Snapshot) -> Static:
 
 def _printable(one: Finding) -> Finding:
     file, message = printable(one.file, _LONGEST), printable(one.message, _LONGEST)
-    return Finding(one.id, message, file=file, line=one.line)
+    return replace(one, file=file, message=message)
 
 
 def document(read: Static) -> dict[str, Any]:
@@ -116,16 +124,44 @@ def document(read: Static) -> dict[str, Any]:
             }
             for name, one in sorted(read.modules.items())
         ],
-        "findings": [of_finding(one) for one in read.findings],
+        "findings": [one.document() for one in read.findings],
     }
 
 
-def of_finding(one: Finding) -> dict[str, Any]:
-    """A finding as plain data."""
-    return {
-        "check": one.id,
-        "severity": one.check.severity.value,
-        "message": one.message,
-        "file": one.file or None,
-        "line": one.line or None,
-    }
+def undeclared(
+    found: list[Import],
+    stated: Mapping[str, Requirement],
+    packages: Path | None,
+    taken: Mapping[str, str] = MappingProxyType({}),
+) -> list[Finding]:
+    """The imports that nothing declared brings along.
+
+    Args:
+        found: What is imported.
+        stated: What the repository declares, by canonical name.
+        packages: The environment that was made of it; None where this interpreter serves.
+        taken: Modules that were installed although nothing declares them, and what needs them.
+    """
+    brought = _of_this_interpreter({} if packages else stated)
+    if packages:
+        brought |= {path.name.partition(".")[0] for path in packages.iterdir()}
+    missing = [one for one in found if one.name not in brought or one.name in taken]
+    named = {one.name for one in missing}
+    found_at = [(f"{one.name} is imported", one.file, one.line) for one in missing]
+    found_at += [(where, "", 0) for module, where in taken.items() if module not in named]
+    return [
+        Finding("imports", f"{what}, and nothing declares it", "", file, line)
+        for what, file, line in found_at
+    ]
+
+
+def _of_this_interpreter(declared: Mapping[str, Requirement]) -> set[str]:
+    wanted = [*map(Requirement, WORKERS), *declared.values()]
+    return {module for one in host.brought(wanted) for module in _modules(one)}
+
+
+def _modules(found: metadata.Distribution) -> set[str]:
+    """What a distribution lets one import; Python 3.10 itself overlooks some of it."""
+    named = (found.read_text("top_level.txt") or "").split()
+    tops = {file.parts[0] for file in found.files or () if file.suffix in (".py", ".so")}
+    return {*named, *(top.partition(".")[0] for top in tops)}

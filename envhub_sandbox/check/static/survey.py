@@ -67,12 +67,7 @@ class Survey:
 
 
 def survey(snapshot: Snapshot, parsed: Mapping[str, Parsed | None]) -> Survey:
-    """Look at every file of a repository.
-
-    Args:
-        snapshot: The repository.
-        parsed: What ``parsing.read`` read of it.
-    """
+    """Look at every file of a repository, and at what ``parsing.read`` read of it."""
     found = Survey()
     found.add(_papers(snapshot))
     found.add(_in_place(snapshot))
@@ -81,10 +76,11 @@ def survey(snapshot: Snapshot, parsed: Mapping[str, Parsed | None]) -> Survey:
     for record in sorted(snapshot.files, key=lambda one: one.path):
         path = snapshot.root / record.path
         ending = _bytes(path, contents.ENDING, max(record.size - contents.ENDING, 0))
-        kind = contents.kind_of(record.path, _bytes(path, contents.BEGINNING), ending)
+        kind = contents.kind_of_contents(record.path, _bytes(path, contents.BEGINNING), ending)
         found.files.append(File(record, kind))
         found.add(contents.of_kind(record.path, kind, is_folder=snapshot.repo_type == "local"))
-        found.add(_in_name(record))
+        for one in contents.hidden(record.path, record.path, is_code=True):
+            found.add([Finding(one.id, f"its name {one.message}", file=record.path)])
         if record.path in parsed:
             found.add(_in_code(record, parsed[record.path]))
         if parsed.get(record.path) is not None:
@@ -104,11 +100,6 @@ def _bytes(path: Path, most: int, start: int = 0) -> bytes:
             return file.read(most)
     except OSError:
         return b""
-
-
-def _in_name(record: FileRecord) -> Iterator[Finding]:
-    for one in contents.hidden(record.path, record.path, is_code=True):
-        yield Finding(one.id, f"its name {one.message}", file=record.path)
 
 
 def _in_text(record: FileRecord, path: Path, *, is_code: bool) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""``envhub check``: judge a repository that nobody trusts yet, for people and for CI."""
+"""``envhub check``: judge a repository before it is trusted, for people and for CI."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.check import options as own
-from envhub_sandbox.cli.check import outside
 from envhub_sandbox.cli.check.deadline import DeadlineReached, deadline_alarm
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
-from envhub_sandbox.cli.shared.findings import STYLES, annotate, level, show_finding
+from envhub_sandbox.cli.shared.findings import STYLES, annotate, level, show_finding, write_report
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_sandbox.cli.shared.select import select
 from envhub_worker.protocol.text import counted
@@ -35,7 +34,7 @@ def _with_settings(ctx: typer.Context, path: Path | None) -> Path | None:
         from envhub_sandbox.check import settings
 
         with reported(debug=False):
-            ctx.default_map = settings.options(path, own.SETTINGS)
+            ctx.default_map = settings.read_settings(path, own.SETTINGS)
     return path
 
 
@@ -160,9 +159,9 @@ def check(
         least, allowed = level(fail_on), _known(allow or ())
         if listed is not None:
             _refuse_beside_a_list(ref=ref, sarif=sarif, html=html)
-            from envhub_sandbox.cli.check import many
+            from envhub_sandbox.cli.check import list_run
 
-            wanted = many.Wanted(
+            run = list_run.ListRun(
                 file=listed,
                 output=output,
                 jobs=jobs,
@@ -172,16 +171,17 @@ def check(
                 make=make,
                 settings=settings,
                 policy=policy,
-                arguments=many.handed_on(ctx),
+                arguments=list_run.handed_on(ctx),
                 debug=debug,
             )
-            many.print_judged(many.judge_all(wanted), json=json, junit=junit, github=github)
+            run.judge()
+            run.show(json=json, junit=junit, github=github)
             return
         if ref is None:
             raise UsageError("name a repository, or a list of them: --all FILE --output DIR")
         if any(opt.is_typed(ctx, name) for name in own.OF_A_LIST):
             raise UsageError("--output, --jobs, --memory-budget and --again are for --all FILE")
-        outside.refuse_the_judged({"--settings": settings, "--policy": policy}, ref)
+        own.refuse_the_judged({"--settings": settings, "--policy": policy}, ref)
         report = _judge(
             make,
             policy,
@@ -195,32 +195,29 @@ def check(
             pictures=html is not None,
         )
         failures = report.failures(least, allowed)
-        _write(report, failures, junit=junit, sarif=sarif, html=html)
-        if github:
-            from envhub_sandbox.check import reports
+        _write(report, failures, junit, sarif, html)
+        from envhub_sandbox.check import reports
 
-            _print_walls(report)
+        if github:
+            _print_confinement(report)
             annotate(reports.workflow_commands(report), reports.summary(report, failures))
         if json:
-            from envhub_sandbox.check.reports import document
-
-            print_json(document(report, failures))
+            print_json(reports.document(report, failures))
         elif not github:
             _print(report, failures)
         if failures:
             raise typer.Exit(Exit.UNJUDGED if report.is_unjudged(failures) else Exit.ENVIRONMENT)
 
 
-def _refuse_beside_a_list(**options: object) -> None:
-    for name, value in options.items():
-        if value is None:
-            continue
-        if name == "ref":
-            raise UsageError(f"a list, by --all, or one repository, {value}: not both")
-        raise UsageError(
-            f"--{name} is about one repository; with --all each has its page and its JSON in "
-            "--output DIR, and --junit FILE is about all"
-        )
+def _refuse_beside_a_list(*, ref: str | None, **files: Path | None) -> None:
+    if ref is not None:
+        raise UsageError(f"a list, by --all, or one repository, {ref}: not both")
+    for name, path in files.items():
+        if path is not None:
+            raise UsageError(
+                f"--{name} is about one repository; with --all each has its page and its JSON in "
+                "--output DIR, and --junit FILE is about all"
+            )
 
 
 def _known(names: Sequence[str]) -> Sequence[str]:
@@ -235,16 +232,18 @@ def _known(names: Sequence[str]) -> Sequence[str]:
 def _judge(
     make: opt.MakeOptions, policy: Path | None, deadline_s: float, *, quiet: bool, **play: Any
 ) -> Report:
-    """What comes of it until the deadline; ``play`` is what else ``Asked`` says."""
+    """What comes of it until the deadline; ``play`` is what else ``JudgeOptions`` says."""
     arguments = make.arguments()
     del arguments["cfg"]
-    arguments["prewarm"] = 0  # a jail that nobody has asked for yet would be one more at once
+    arguments["prewarm"] = 0  # a jail started ahead would be one more at once
     from envhub_sandbox.check import settings
     from envhub_sandbox.check.findings import Report
-    from envhub_sandbox.check.judge import Asked, judge
+    from envhub_sandbox.check.judge import judge
 
     if policy is not None:
-        arguments["policy"] = settings.merged(settings.policy(policy), arguments["policy"])
+        arguments["policy"] = settings.merged_settings(
+            settings.read_file(policy), arguments["policy"]
+        )
 
     report, doing = Report(make.ref), ["starting"]
     with Bar(quiet=quiet, long_s=_LONG_S) as bar:
@@ -253,7 +252,7 @@ def _judge(
             doing.append(what)
             bar.begin(what)
 
-        asked = Asked(reference=make.ref, arguments=arguments, tell=tell, **play)
+        asked = settings.JudgeOptions(reference=make.ref, arguments=arguments, tell=tell, **play)
         try:
             with deadline_alarm(deadline_s):
                 judge(asked, report)
@@ -262,29 +261,19 @@ def _judge(
     return report
 
 
-def _write(
-    report: Report,
-    failures: list[Finding],
-    *,
-    junit: Path | None,
-    sarif: Path | None,
-    html: Path | None,
-) -> None:
+def _write(report: Report, failures: list[Finding], *files: Path | None) -> None:
+    """The files of ``--junit``, ``--sarif`` and ``--html``."""
     from envhub_sandbox.check import reports
     from envhub_sandbox.check.page import page
 
-    for path, form in ((junit, reports.junit), (sarif, reports.sarif), (html, page.page)):
-        if path is None:
-            continue
-        try:
-            reports.write(path, form(report, failures))
-        except OSError as error:
-            raise UsageError(f"the report cannot be written: {error}") from error
+    for path, form in zip(files, (reports.junit, reports.sarif, page.page), strict=True):
+        if path is not None:
+            write_report(path, form(report, failures))
 
 
-def _print_walls(report: Report) -> None:
+def _print_confinement(report: Report) -> None:
     """In the log of a workflow, too."""
-    for line in () if report.walls is None else report.walls.lines():
+    for line in () if report.confinement is None else report.confinement.lines():
         out(safe_line(line, 500), "dim")
 
 
@@ -301,5 +290,5 @@ def _print(report: Report, failures: list[Finding]) -> None:
             f"{1e3 * figures['step_slowest_s']:.1f} ms",
             "dim",
         )
-    _print_walls(report)
+    _print_confinement(report)
     say(f"{report.verdict(failures)}.")

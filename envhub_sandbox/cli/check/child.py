@@ -1,14 +1,14 @@
 """``envhub check REF`` as one of a list: it ends when the process that started it does.
 
 ``python -I -m envhub_sandbox.cli.check.child PIDFD check ...``: no Ctrl-C of a terminal reaches it,
-and whoever kills its parent by force leaves nobody else who would end it.
+and where its parent is killed by force, nothing else would end it.
 """
 
 from __future__ import annotations
 
 import sys
 
-from envhub_sandbox.check.many.running import PATIENCE_S
+from envhub_sandbox.check.many.judgements import PATIENCE_S
 from envhub_sandbox.system import processes
 
 

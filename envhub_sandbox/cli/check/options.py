@@ -1,11 +1,14 @@
-"""Options of ``envhub check`` that are about a list, and which may stand in the caller's file."""
+"""Options of ``envhub check`` about a list, and which options may stand in the caller's file."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from envhub_sandbox.cli.shared.exits import UsageError
 
 SETTINGS = (
     *("steps", "resets", "slow_step", "seed", "fail_on", "allow", "policy", "n_envs"),
@@ -68,3 +71,19 @@ Again = Annotated[
         "--again", help="With --all: judge all of them, as if nothing was.", rich_help_panel=_PANEL
     ),
 ]
+
+
+def refuse_the_judged(places: Mapping[str, Path | None], reference: str, where: str = "") -> None:
+    """No repository says how it is judged, and none holds what is found in it: refuse such places.
+
+    Raises:
+        UsageError: One lies in it.
+    """
+    from envhub_sandbox.check.settings import is_judged
+
+    for option, path in places.items():
+        if path is not None and is_judged(path, reference):
+            raise UsageError(
+                f"{option} {path} lies in what is judged, {reference}{where}, and no repository "
+                "has a say in that: take a place outside"
+            )

@@ -1,6 +1,6 @@
 """``envhub doctor``: what this host can enforce, found out by doing it.
 
-Each profile is tried with a jail of its own, set up exactly as for a repository, self-test
+Each profile is tried with the environment of ``envhub init`` in a jail of its own, self-test
 included: nothing is concluded from versions or settings. A jail stops at the first layer that is
 missing, so the layers are also tried one by one, to name all of them at once.
 """
@@ -14,13 +14,16 @@ import platform
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli.doctor import places
+from envhub_sandbox.cli.init.starter import starter
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, show
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, describe, reported
 from envhub_sandbox.cli.shared.memory import free_bytes
@@ -29,34 +32,11 @@ from envhub_sandbox.cli.version import versions
 from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError, SnapshotError
 from envhub_worker.protocol.confinement import PROFILES
 
-_ENV_PY = '''"""Does nothing: `envhub doctor` runs it to see what confines it."""
-
-import gymnasium as gym
-import numpy as np
-
-
-class Idle(gym.Env):
-    observation_space = gym.spaces.Box(0, 1, (1,), np.float32)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        return np.zeros(1, np.float32), 0.0, False, False, {}
-
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Idle] * n_envs)
-'''
-
-
 _PROBE_S = 60.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class Finding:
+@dataclass(frozen=True)
+class Trial:
     """What came of one profile.
 
     Attributes:
@@ -69,11 +49,11 @@ class Finding:
     """
 
     profile: str
-    available: bool
-    layers: list[dict[str, Any]]
-    first_step_s: float | None
-    problem: str | None
-    code: Exit
+    available: bool = False
+    layers: list[dict[str, Any]] = field(default_factory=list)
+    first_step_s: float | None = None
+    problem: str | None = None
+    code: Exit = Exit.OK
 
 
 def doctor(
@@ -135,28 +115,80 @@ def doctor(
                 "--server-key and --insecure-loopback are of a server: envhub doctor "
                 "tcp://HOST:PORT"
             )
-        with Bar(quiet=json) as bar, places.of_its_own() as folder:
+        with Bar(quiet=json) as bar, _scratch_folder() as folder:
             (folder / "idle").mkdir()
-            (folder / "idle" / "env.py").write_text(_ENV_PY)
-            findings = []
+            (folder / "idle" / "env.py").write_text(starter("idle", 2026)["env.py"])
+            trials = []
             for name in PROFILES:
                 bar.begin(f"trying {name}")
-                findings.append(examine(str(folder / "idle"), name))
+                trials.append(examine(str(folder / "idle"), name))
             bar.begin("trying each layer")
             probed = probe()
-        cache = places.cache_problem(by_others=profile != "strict" or not findings[0].available)
+        cache = _cache_problem(by_others=profile != "strict" or not trials[0].available)
         if json:
-            profiles = [asdict(finding) for finding in findings]
-            told = {"versions": versions(), "engine": engine(), **resources(cache)}
-            print_json({"host": host(), **told, "profiles": profiles, **probed})
+            here = {"host": host(), "versions": versions(), "engine": engine(), **resources(cache)}
+            print_json({**here, "profiles": list(map(asdict, trials)), **probed})
         else:
-            _print(findings)
+            _print(trials)
             _print_missing(probed)
             if cache is not None:
                 out()
                 out(f"The cache: {safe_line(cache, 1000)}")
-        decisive = next(finding for finding in findings if finding.profile == profile)
+        decisive = next(trial for trial in trials if trial.profile == profile)
         raise typer.Exit(decisive.code or (Exit.SNAPSHOT if cache else Exit.OK))
+
+
+@contextlib.contextmanager
+def _scratch_folder() -> Iterator[Path]:
+    """A folder for a repository and a cache: what is wrong with the caller's hides no layer.
+
+    Raises:
+        SandboxUnavailableError: There is no place for one.
+    """
+    from envhub_sandbox.hub.store import CACHE_VARIABLE
+
+    try:
+        made = tempfile.TemporaryDirectory(prefix="envhub-doctor-")
+    except OSError as error:
+        raise SandboxUnavailableError(
+            f"there is no folder for temporary files that can be written ({error.strerror}); set "
+            "TMPDIR to one, or start a read-only container with --tmpfs /tmp"
+        ) from error
+    before = os.environ.get(CACHE_VARIABLE)
+    with made as folder:
+        os.chmod(folder, 0o755)  # jails of another user read it
+        os.environ[CACHE_VARIABLE] = f"{folder}/cache"
+        try:
+            yield Path(folder)
+        finally:
+            os.environ.pop(CACHE_VARIABLE)
+            if before is not None:
+                os.environ[CACHE_VARIABLE] = before
+
+
+def _cache_problem(*, by_others: bool) -> str | None:
+    """Why the caller's cache is of no use, and what to do; None if it is.
+
+    Args:
+        by_others: Whether root's jails read it as another user: all but those with a private root.
+    """
+    from envhub_sandbox.hub.store import cache_root
+
+    try:
+        root = cache_root()
+    except SnapshotError as error:
+        return str(error)
+    there = next(path for path in (root, *root.parents) if path.exists())
+    cure = f"set ENVHUB_CACHE to another folder, such as {tempfile.gettempdir()}/envhub-cache"
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        return f"{root} cannot be written: {cure}"
+    closed = [path for path in (there, *there.parents) if not path.stat().st_mode & 0o001]
+    if os.geteuid() == 0 and by_others and closed:
+        return (
+            f"{root} cannot be read by the user of root's jails, since {closed[-1]} is closed to "
+            f"others: {cure}"
+        )
+    return None
 
 
 def host() -> dict[str, Any]:
@@ -182,7 +214,7 @@ def engine() -> dict[str, Any]:
 
 
 def resources(problem: str | None) -> dict[str, Any]:
-    """Bytes that are free: of memory, None where the kernel does not tell, and for the cache."""
+    """Bytes that are free: of memory, None where the kernel does not say, and for the cache."""
     from envhub_sandbox.hub.store import cache_root
 
     disk: dict[str, Any] = {"folder": None, "free_bytes": None, "problem": problem}
@@ -195,7 +227,7 @@ def resources(problem: str | None) -> dict[str, Any]:
 def probe() -> dict[str, Any]:
     """What came of each layer by itself: ``layers``, an ``apparmor_profile`` or None, and ``gpu``.
 
-    ``gpu`` are the device nodes that ``gpu=True`` grants, or None where nobody could look.
+    ``gpu`` are the device nodes that ``gpu=True`` grants, or None where that cannot be seen.
     """
     from envhub_sandbox.sandboxes.process import BOOTSTRAP
 
@@ -206,11 +238,11 @@ def probe() -> dict[str, Any]:
     except (OSError, subprocess.SubprocessError, ValueError):
         # what the profiles say still stands
         return {"layers": [], "apparmor_profile": None, "gpu": None}
-    told = {name: found[name] for name in ("layers", "apparmor_profile")}
-    return {**told, "gpu": found["host"]["gpu"]}
+    kept = {name: found[name] for name in ("layers", "apparmor_profile")}
+    return {**kept, "gpu": found["host"]["gpu"]}
 
 
-def examine(folder: str, profile: str) -> Finding:
+def examine(folder: str, profile: str) -> Trial:
     """Run the idle environment under a profile."""
     from envhub_sandbox.api import make_env
 
@@ -225,46 +257,30 @@ def examine(folder: str, profile: str) -> Finding:
     except EnvHubError as error:
         missing = isinstance(error, SandboxUnavailableError)
         problem = describe(error).replace(f"{folder}:env.py: ", "")
-        return _finding(profile, problem=problem, code=Exit.SANDBOX if missing else Exit.WORKER)
-    return _finding(profile, layers=layers, first_step_s=taken)
+        return Trial(profile, problem=problem, code=Exit.SANDBOX if missing else Exit.WORKER)
+    return Trial(profile, available=True, layers=layers, first_step_s=taken)
 
 
-def _finding(
-    profile: str,
-    *,
-    layers: list[dict[str, Any]] | None = None,
-    first_step_s: float | None = None,
-    problem: str | None = None,
-    code: Exit = Exit.OK,
-) -> Finding:
-    return Finding(
-        profile=profile,
-        available=problem is None,
-        layers=layers or [],
-        first_step_s=first_step_s,
-        problem=problem,
-        code=code,
-    )
-
-
-def _print(findings: list[Finding]) -> None:
+def _print(trials: list[Trial]) -> None:
     facts = host()
     user = "root" if facts["root"] else "a plain user"
     out(f"{facts['system']} on {facts['machine']}, as {user}, {facts['python']}")
-    for finding in findings:
+    for trial in trials:
         out()
-        if finding.problem is not None:
-            out(f"{finding.profile}: not available here", "bold red")
-            for line in safe_text(finding.problem).splitlines():
-                out(f"  {line}")
+        if trial.problem is not None:
+            out(f"{trial.profile}: not available here", "bold red")
+            _indented(trial.problem, "  ")
             continue
-        out(
-            f"{finding.profile}: available (first step after {finding.first_step_s:.2f} s)",
-            "bold green",
-        )
-        for layer in finding.layers:
+        took = f"first step after {trial.first_step_s:.2f} s"
+        out(f"{trial.profile}: available ({took})", "bold green")
+        for layer in trial.layers:
             mark = "holds" if layer.get("enforced") else "none"
             show(f"  {mark:6} {safe_line(layer.get('layer'))}", layer.get("detail"), width=26)
+
+
+def _indented(text: str, margin: str) -> None:
+    for line in safe_text(text).splitlines():
+        out(f"{margin}{line}")
 
 
 def _print_missing(probed: dict[str, Any]) -> None:
@@ -278,8 +294,7 @@ def _print_missing(probed: dict[str, Any]) -> None:
         out("Layers that are missing here, each tried by itself:", "bold")
     for layer in missing:
         out(f"  {safe_line(layer['layer'])}: {safe_line(layer['detail'])}")
-        for line in safe_text(layer["fix"]).splitlines():
-            out(f"    {line}")
+        _indented(layer["fix"], "    ")
     if probed["apparmor_profile"]:
         out()
         out("An AppArmor profile that permits user namespaces to this interpreter:")

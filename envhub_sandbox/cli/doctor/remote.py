@@ -31,8 +31,8 @@ def examine(server: RemoteSandbox, profile: str, *, json: bool) -> Exit:
     facts = ask(server)
     code, problem = _verdict(facts, profile)
     if json:
-        told = {**asdict(facts), "endpoint": server.endpoint}
-        print_json({"server": told, "profile": profile, "problem": problem, "code": code})
+        server_facts = {**asdict(facts), "endpoint": server.endpoint}
+        print_json({"server": server_facts, "profile": profile, "problem": problem, "code": code})
     else:
         print_facts(server, facts, problem)
     return code

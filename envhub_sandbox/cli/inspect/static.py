@@ -11,7 +11,7 @@ import typer
 
 from envhub_sandbox.cli.shared.console import print_json, show
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
-from envhub_sandbox.cli.shared.findings import level, show_finding
+from envhub_sandbox.cli.shared.findings import level, show_finding, write_report
 from envhub_sandbox.cli.shared.options import is_typed
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_worker.protocol.text import size_text
@@ -79,10 +79,7 @@ def _write(
     from envhub_sandbox.check.findings import Report
     from envhub_sandbox.session.recipe import pinned
 
-    try:
-        reports.write(path, reports.sarif(Report(pinned(snapshot), list(findings)), failures))
-    except OSError as error:
-        raise UsageError(f"the report cannot be written: {error}") from error
+    write_report(path, reports.sarif(Report(pinned(snapshot), list(findings)), failures))
 
 
 def _print(read: Static) -> None:

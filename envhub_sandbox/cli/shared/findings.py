@@ -51,6 +51,18 @@ def level(name: str) -> Severity:
     return Severity(name)
 
 
+def write_report(path: Path, text: str) -> None:
+    """Write a report, in UTF-8 whatever the locale.
+
+    Raises:
+        UsageError: It cannot be written.
+    """
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"the report cannot be written: {error}") from error
+
+
 def annotate(commands: Iterable[str], summary: str) -> None:
     """Print GitHub's workflow commands, and append to its step's summary."""
     for line in commands:

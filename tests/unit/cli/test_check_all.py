@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 import typer
 from typer.testing import CliRunner, Result
 
-from envhub_sandbox.check.many.lines import Listed
+from envhub_sandbox.check.many.entries import ListEntry
+from envhub_sandbox.check.many.judgements import Outcome
 from envhub_sandbox.check.many.results import Result as Judgement
-from envhub_sandbox.check.many.results import Results, Verdict
-from envhub_sandbox.check.many.running import Ended
+from envhub_sandbox.check.many.results import Verdict
 from envhub_sandbox.cli.app import app
-from envhub_sandbox.cli.check import many
+from envhub_sandbox.cli.check import list_run
 from envhub_sandbox.cli.check.check import check
 from envhub_sandbox.cli.check.options import OF_A_LIST, SETTINGS
 from envhub_sandbox.cli.shared.exits import Exit
@@ -29,12 +30,12 @@ def started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, 
     def judgements(orders, command, *, folder, jobs, **_):  # type: ignore[no-untyped-def]
         for number, order in enumerate(orders):
             found.append((jobs, command(order, folder / str(number), 7)))
-            yield Ended(
+            yield Outcome(
                 order=order, folder=folder, code=3, seconds=1.0, out=b"", said="Error: not there"
             )
 
-    monkeypatch.setattr(many, "judgements", judgements)
-    monkeypatch.setattr(many, "free_bytes", lambda: 64 << 30)
+    monkeypatch.setattr(list_run, "judgements", judgements)
+    monkeypatch.setattr(list_run, "free_bytes", lambda: 64 << 30)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "list").write_text("org/repo\n./env\n")
     (tmp_path / "env").mkdir()
@@ -72,13 +73,13 @@ def test_a_file_says_what_one_may_type_about_a_list(
 ) -> None:
     """And what is typed counts more. For one repository the same file is no mistake."""
     seconds: list[float] = []
-    faked = many.judgements
+    faked = list_run.judgements
 
     def judgements(orders, command, *, most_s, **more):  # type: ignore[no-untyped-def]
         seconds.append(most_s)
         yield from faked(orders, command, **more)
 
-    monkeypatch.setattr(many, "judgements", judgements)
+    monkeypatch.setattr(list_run, "judgements", judgements)
     says = "[check]\njobs = 5\nmemory-budget = '6G'\ndeadline = 9\nmemory = '1G'\n"
     Path("settings.toml").write_text(says)
     arguments = ("--all", "list", "--output", "out", "--settings", "settings.toml")
@@ -100,10 +101,18 @@ def test_every_option_is_handed_on_or_about_the_list() -> None:
     command = typer.main.get_command(app)
     [found] = [one for name, one in command.commands.items() if name == "check"]  # type: ignore[attr-defined]
     names = {one.name for one in found.params}
-    assert names > many.OF_THE_LIST
+    of_the_list = list_run.OF_THE_LIST
+    assert names > of_the_list
     assert names > set(SETTINGS)
-    assert set(OF_A_LIST) < many.OF_THE_LIST
-    assert names - many.OF_THE_LIST > {"steps", "fail_on", "allow", "timeout", "memory", "profile"}
+    assert set(OF_A_LIST) < of_the_list
+    assert names - of_the_list > {
+        "steps",
+        "fail_on",
+        "allow",
+        "timeout",
+        "memory",
+        "profile",
+    }
     assert check.__doc__ is not None
 
 
@@ -179,11 +188,13 @@ def test_limits_stay_within_the_budget(
         ([Verdict.UNJUDGED, Verdict.FAILED], Exit.ENVIRONMENT),
     ],
 )
-def test_what_fails_counts_most(verdicts: list[Verdict], code: Exit, tmp_path: Path) -> None:
+def test_what_fails_counts_most(verdicts: list[Verdict], code: Exit) -> None:
     """As docs/ci.md says."""
-    listed = [Listed(f"a/{number}", f"a/{number}", number) for number in range(2)]
-    of = {
-        one: Judgement(listed=one, verdict=verdict)
+    listed = [ListEntry(f"a/{number}", f"a/{number}", number) for number in range(2)]
+    results = [
+        Judgement(listed=one, verdict=verdict)
         for one, verdict in zip(listed, verdicts, strict=True)
-    }
-    assert many.Judged(Results(tmp_path, ""), of).exit is code
+    ]
+    given = dict.fromkeys(one.name for one in fields(list_run.ListRun) if one.init)
+    given |= {"of": dict(zip(listed, results, strict=True))}
+    assert list_run.ListRun(**given).exit is code

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from envhub_sandbox.check.static.compare import changes
+from envhub_sandbox.check.static.changes import changes
 from envhub_sandbox.check.static.static import static
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.hub.hashing import GIT_SHA1, digest_of

@@ -24,41 +24,17 @@ _FOLDERS = st.sampled_from(
 _LEAVES = st.sampled_from(
     (
         *("a.py", "b.py", "c.pyc", "d.txt", "pyvenv.cfg", ".gitignore", ".gitattributes", "-e.py"),
-        *(
-            "f g.py",
-            ".gitmodules",
-            ".DS_Store",
-            "\u00e9.py",
-            "e\u0301.py",
-            "A.py",
-            "[a].py",
-            "*.py",
-        ),
+        *("f g.py", ".gitmodules", ".DS_Store", "\u00e9.py", "e\u0301.py", "A.py", "[a].py"),
+        "*.py",
     )
 )
 _PATHS = st.builds(str.__add__, _FOLDERS, _LEAVES)
 _RULES = st.sampled_from(
     (
-        *(
-            "*",
-            "*.py",
-            "!*.py",
-            "__pycache__/",
-            ".venv",
-            "/lib/",
-            "**/*.pyc",
-            ".git*",
-            "\\*.py",
-            "a.py",
-        ),
+        *("*", "*.py", "!*.py", "__pycache__/", ".venv", "/lib/", "**/*.pyc", ".git*", "a.py"),
         *("*.py ident", "*.py -ident", "*.py working-tree-encoding=UTF-16", "*.py eol=crlf"),
-        *(
-            "* text=auto eol=crlf",
-            "*.py filter=lfs",
-            "*.txt filter=mine",
-            "[attr]x ident",
-            "*.py x",
-        ),
+        *("* text=auto eol=crlf", "*.py filter=lfs", "*.txt filter=mine", "[attr]x ident"),
+        *("*.py x", "\\*.py"),
         *(".gitattributes working-tree-encoding=UTF-16", ".gitattributes ident", "*.py binary"),
         *("*.py working-tree-encoding=SHIFT_JIS", "*.py text", "*.py !ident", "*.py export-ignore"),
     )

@@ -12,16 +12,9 @@ from envhub_sandbox.check import reports
 from envhub_sandbox.check.checks import CHECKS, Severity
 from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.check.page.page import page
-from envhub_sandbox.check.play.confinement import walls
+from envhub_sandbox.check.play.confinement import Confinement
 from envhub_worker.protocol.text import printable
-
-_HOSTILE = (
-    "x\n::error::forged",
-    "x\r\n::add-mask::forged",
-    "<script>alert(1)</script> | [a](javascript:b) ![i](http://example.com/x) `c`",
-    "]]></failure></testcase><testcase name='forged'/>",
-    "\x1b[2J\x00\ufffe\ud800 %0A::error::forged",
-)
+from tests.support.pages import HOSTILE
 
 
 def report(text: str) -> Report:
@@ -32,7 +25,7 @@ def report(text: str) -> Report:
     return made
 
 
-@pytest.mark.parametrize("text", _HOSTILE)
+@pytest.mark.parametrize("text", HOSTILE)
 def test_a_workflow_command_is_one_line(text: str) -> None:
     """And begins where it begins; the control is the text itself, which has a line of its own."""
     [line] = reports.workflow_commands(report(text))
@@ -44,7 +37,7 @@ def test_a_workflow_command_is_one_line(text: str) -> None:
     assert head.count("::") == 1
 
 
-@pytest.mark.parametrize("text", _HOSTILE)
+@pytest.mark.parametrize("text", HOSTILE)
 def test_a_summary_has_no_strangers_markup(text: str) -> None:
     """One row of four cells, in which nothing is a tag, a link or an image."""
     made = report(text)
@@ -54,15 +47,15 @@ def test_a_summary_has_no_strangers_markup(text: str) -> None:
     assert not set("<>[]!`") & set(row)
 
 
-@pytest.mark.parametrize("text", _HOSTILE)
+@pytest.mark.parametrize("text", HOSTILE)
 def test_what_confined_it_is_text(text: str) -> None:
     """Of a server on another host: a line is one, a command is one, and a flood is cut."""
     made = Report("./walk:env.py")
     layers = [{"layer": text, "enforced": False, "detail": text}] * 1_000
     held = {"layer": "seccomp", "enforced": True, "detail": ""}
     provenance = {"profile": "container", "layers": [held, *layers]}
-    made.walls = walls("strict", provenance, text * 1_000)
-    lines = list(made.walls.lines())
+    made.confinement = Confinement.of("strict", provenance, text * 1_000)
+    lines = list(made.confinement.lines())
     assert lines[0] == "profile container, within a container; strict was asked for"
     assert (len(lines), max(map(len, lines)) < 1_000) == (42, True)
     assert all(len(line.splitlines()) == 1 and printable(line) == line for line in lines)
@@ -80,14 +73,14 @@ def test_all_that_there_can_be_is_a_line_and_no_notice() -> None:
     """As where it did not load, so that nobody knows which layers held."""
     made = Report("./walk:env.py")
     for profile in ("strict", ""):
-        made.walls = walls("strict", {"profile": profile, "layers": []}, "")
-        [line] = made.walls.lines()
+        made.confinement = Confinement.of("strict", {"profile": profile, "layers": []}, "")
+        [line] = made.confinement.lines()
         assert line.startswith("profile strict, as asked for")
         assert list(reports.workflow_commands(made)) == []
-        assert made.walls.document()["recorded"] is True
+        assert made.confinement.document()["recorded"] is True
 
 
-@pytest.mark.parametrize("text", _HOSTILE)
+@pytest.mark.parametrize("text", HOSTILE)
 def test_junit_is_well_formed(text: str) -> None:
     """Two cases, whatever the text."""
     made = report(text)
@@ -99,7 +92,7 @@ def test_junit_is_well_formed(text: str) -> None:
     assert failure.text
 
 
-@pytest.mark.parametrize("text", _HOSTILE)
+@pytest.mark.parametrize("text", HOSTILE)
 def test_sarif_is_data(text: str) -> None:
     """A result of a rule that is there, at a place that is a URI."""
     made = report(text)
@@ -170,7 +163,7 @@ def test_the_most_severe_stands_first_in_every_form() -> None:
     order = ["runs", "seeding", "slow-steps", "denied-files", "card", "licence"]
     told = reports.document(made, failures)
     assert [one["check"] for one in told["findings"]] == order
-    assert [one.id for one in reports.read(told)[0].findings] == order
+    assert [one.id for one in reports.read_report(told)[0].findings] == order
     cases = [one.attrib["name"] for one in ElementTree.fromstring(reports.junit(made, failures))]
     assert cases == [*order, "loads"]
     [run] = json.loads(reports.sarif(made, failures))["runs"]
@@ -248,7 +241,7 @@ def test_what_was_not_judged_is_told_in_every_form() -> None:
     told = reports.document(made, [])
     assert told["unjudged"]["tasks"] == ["a / 0", "b / 1"]
     assert not set(told["unjudged"]["checks"]) & {"runs", "card", "loads", "deadline"}
-    again, _ = reports.read({**told, "passed": True})
+    again, _ = reports.read_report({**told, "passed": True})
     assert (again.unmade, again.waiting) == (made.unmade, made.waiting)
     root = ElementTree.fromstring(reports.junit(made, []))
     skipped = [one.attrib for one in root if one.find("skipped") is not None]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from envhub_sandbox.check.play.denials import sorted_out
+from envhub_sandbox.check.play.confinement import denial_findings
 
 
 @pytest.mark.parametrize(
@@ -26,7 +26,7 @@ def test_attempts_are_sorted(
     denied: tuple[str, ...], network: int, files: int, kernel: int, limits: int
 ) -> None:
     """By what they reach for; what libraries do without is none."""
-    found = sorted_out(denied)
+    found = denial_findings(denied)
     assert {check: len(texts) for check, texts in found.items()} == {
         "denied-network": network,
         "denied-files": files,

@@ -15,7 +15,7 @@ import pytest
 from envhub_sandbox.check import reports
 from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.check.many import index, results
-from envhub_sandbox.check.many.lines import Listed
+from envhub_sandbox.check.many.entries import ListEntry
 from envhub_sandbox.check.many.results import (
     FolderError,
     ForeignResultError,
@@ -25,18 +25,9 @@ from envhub_sandbox.check.many.results import (
     link,
 )
 from envhub_worker.protocol.text import printable
-from tests.support.pages import Page, results_of
+from tests.support.pages import HOSTILE, Page, results_of
 
-_ONE = Listed("org/repo", "org/repo@main", 1)
-_HOSTILE = (
-    "<script>alert(1)</script>",
-    "</title></style></td></a><img src=x onerror=alert(1)>",
-    "\" onmouseover='alert(1)' x=\"",
-    "&lt;script&gt; <!-- --><svg/onload=alert(1)>]]></error></testcase>",
-    "javascript:alert(1) [a](javascript:b) | `c` ::error::forged\n::error::forged",
-    "\x1b[2J\x00\u202e\ud800\x85<b>\r\n<i>",
-    "<" * 100_000,
-)
+_ONE = ListEntry("org/repo", "org/repo@main", 1)
 
 
 def told(text: str = "it broke", *, fails: bool = True) -> dict[str, Any]:
@@ -57,6 +48,11 @@ def keep(kept: Results, folder: Path, document: dict[str, Any] | None = None) ->
     return kept.keep(_ONE, document or told(), page, seconds=1.5, ended="2026-01-01T00:00:00+00:00")
 
 
+def edit(file: Path, old: str, new: str) -> None:
+    """Change what stands in a report."""
+    file.write_text(file.read_text().replace(old, new))
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Where results are kept."""
@@ -65,9 +61,9 @@ def folder(tmp_path: Path) -> Path:
 
 def test_a_report_is_read_as_it_was_written() -> None:
     """From its document, whatever a repository wrote into it."""
-    for text in (*_HOSTILE, ""):
+    for text in (*HOSTILE, ""):
         document = told(text)
-        report, failures = reports.read(document)
+        report, failures = reports.read_report(document)
         again = json.loads(json.dumps(reports.document(report, failures)))
         assert [one["check"] for one in again["findings"]] == ["runs", "card"]
         assert [one["fails"] for one in again["findings"]] == [True, False]
@@ -86,7 +82,7 @@ def test_what_was_judged_is_known_again(folder: Path) -> None:
     )
     assert Results(folder, "as ever").kept(_ONE) == made
     assert Results(folder, "otherwise").kept(_ONE) is None
-    assert Results(folder, "as ever").kept(Listed("org/x", "org/x@main", 1)) is None
+    assert Results(folder, "as ever").kept(ListEntry("org/x", "org/x@main", 1)) is None
     Results(folder, "as ever").forget(_ONE)
     assert Results(folder, "as ever").kept(_ONE) is None
 
@@ -98,12 +94,10 @@ def test_what_was_judged_is_known_again(folder: Path) -> None:
         lambda json_, page: json_.write_bytes(b""),
         lambda json_, page: json_.write_bytes(b"[" * 100_000),
         lambda json_, page: json_.write_text("[1]"),
-        lambda json_, page: json_.write_text(
-            json_.read_text().replace('"passed": false', '"passed": true')
-        ),
-        lambda json_, page: json_.write_text(json_.read_text().replace('"runs"', '"nothing"')),
-        lambda json_, page: json_.write_text(json_.read_text().replace("1.5", "NaN")),
-        lambda json_, page: json_.write_text(json_.read_text().replace("repo@main", "other@main")),
+        lambda json_, page: edit(json_, '"passed": false', '"passed": true'),
+        lambda json_, page: edit(json_, '"runs"', '"nothing"'),
+        lambda json_, page: edit(json_, "1.5", "NaN"),
+        lambda json_, page: edit(json_, "repo@main", "other@main"),
         lambda json_, page: (json_.unlink(), json_.symlink_to(page)),
         lambda json_, page: (json_.unlink(), json_.symlink_to("/nowhere")),
         lambda json_, page: (json_.unlink(), json_.mkdir()),
@@ -195,7 +189,7 @@ def shape(page: Page) -> list[tuple[str, tuple[tuple[str, str | None], ...]]]:
     ]
 
 
-@pytest.mark.parametrize("text", _HOSTILE)
+@pytest.mark.parametrize("text", HOSTILE)
 def test_an_index_has_the_tags_of_ours_alone(text: str) -> None:
     """The very same as with a harmless text, and the text is there to read.
 
@@ -228,18 +222,18 @@ def test_an_index_shows_first_what_fails() -> None:
     words = ["failed", "not judged", "waiting", "passed"]
     body = text[text.rindex("judged\n") :] if "judged\n" in text else text
     assert sorted(words, key=body.rindex) == words
-    document = index.document(made)
+    document = index.index_document(made)
     assert [row["verdict"] for row in document["results"]] == words
     titles = [line.partition("::")[2].partition("%0A")[0] for line in index.workflow_commands(made)]
     assert [title.rpartition("::")[2] for title in titles] == words[:3]
     assert document["counts"] == dict.fromkeys(words, 1)
 
 
-@pytest.mark.parametrize("text", _HOSTILE)
+@pytest.mark.parametrize("text", HOSTILE)
 def test_other_forms_are_well_formed_too(text: str) -> None:
     """JUnit's file, annotations and the summary of a workflow."""
     made = results_of(text)
-    report, failures = reports.read(told(text))
+    report, failures = reports.read_report(told(text))
     root = ElementTree.fromstring(index.junit(made, lambda _: (report, failures)))
     assert [one.attrib["errors"] for one in root] == ["0", "1", "1", "0"]
     assert root.attrib["errors"] == "2"
@@ -250,12 +244,15 @@ def test_other_forms_are_well_formed_too(text: str) -> None:
     rows = index.summary(made).splitlines()[4:]
     assert len(rows) == 4
     assert all(row.count("|") == 4 and not set("<>[]!`") & set(row) for row in rows)
-    json.dumps(index.document(made), allow_nan=False)
+    json.dumps(index.index_document(made), allow_nan=False)
 
 
 def test_an_index_is_bounded() -> None:
     """However much is said of however many."""
     one = Result(
-        listed=Listed("x" * 4_096, "y", 1), verdict=Verdict.UNJUDGED, said="<" * 100_000, ended="z"
+        listed=ListEntry("x" * 4_096, "y", 1),
+        verdict=Verdict.UNJUDGED,
+        said="<" * 100_000,
+        ended="z",
     )
     assert len(index.page([one] * 2_000)) < 20_000_000

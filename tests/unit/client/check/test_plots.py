@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from envhub_sandbox.check.page.plots import bars, course, histogram, number
+from envhub_sandbox.check.page.plots import bar_plot, histogram_plot, line_plot, number
 
 _NUMBERS: dict[str, list[float]] = {
     "one": [3.0],
@@ -20,9 +20,9 @@ _NUMBERS: dict[str, list[float]] = {
     "many": [float(value % 17) for value in range(10_000)],
 }
 _DRAWN: dict[str, Callable[[Sequence[float]], str]] = {
-    "bars": lambda values: bars("x", values),
-    "histogram": lambda values: histogram("x", values),
-    "course": lambda values: course("x", values, [(len(values) - 1, "a"), (1, "b")]),
+    "bars": lambda values: bar_plot("x", values),
+    "histogram": lambda values: histogram_plot("x", values),
+    "course": lambda values: line_plot("x", values, [(len(values) - 1, "a"), (1, "b")]),
 }
 
 
@@ -75,7 +75,9 @@ def test_nothing_is_drawn_of_nothing(kind: str) -> None:
 
 def test_bars_stand_for_their_numbers() -> None:
     """Twice as much is twice as high, and below zero is below."""
-    high, low, below = (one for one in ElementTree.fromstring(bars("x", [4, 2, -2])) if len(one))
+    high, low, below = (
+        one for one in ElementTree.fromstring(bar_plot("x", [4, 2, -2])) if len(one)
+    )
     assert float(high.attrib["height"]) == pytest.approx(2 * float(low.attrib["height"]), abs=0.2)
     assert float(below.attrib["height"]) == pytest.approx(float(low.attrib["height"]), abs=0.2)
     ground = float(low.attrib["y"]) + float(low.attrib["height"])
@@ -86,7 +88,9 @@ def test_bars_stand_for_their_numbers() -> None:
 def test_every_step_is_counted_once() -> None:
     """The fastest and the slowest, too."""
     seconds = [0.001 * value for value in range(1, 400)]
-    titles = [one[0].text for one in ElementTree.fromstring(histogram("x", seconds)) if len(one)]
+    titles = [
+        one[0].text for one in ElementTree.fromstring(histogram_plot("x", seconds)) if len(one)
+    ]
     assert sum(int(str(title).rpartition(" ")[2]) for title in titles) == len(seconds)
 
 

@@ -15,7 +15,9 @@ def test_a_policy_is_a_file(tmp_path: Path) -> None:
     """Options change what it says, limit by limit, and nothing else of it."""
     file = tmp_path / "policy.toml"
     file.write_text('network = "loopback"\n[limits]\nprocesses = 9\nopen_files = 64\n')
-    made = policy_from(settings.merged(settings.policy(file), {"limits": {"processes": 12}}), None)
+    made = policy_from(
+        settings.merged_settings(settings.read_file(file), {"limits": {"processes": 12}}), None
+    )
     assert (made.network, made.limits.processes, made.limits.open_files) == ("loopback", 12, 64)
     assert made == policy_from(
         {"network": "loopback", "limits": {"processes": 12, "open_files": 64}}, None
@@ -37,20 +39,20 @@ def test_what_is_no_policy_is_refused(text: str, says: str, tmp_path: Path) -> N
     file = tmp_path / "policy.toml"
     file.write_text(text)
     with pytest.raises(PolicyError, match=says):
-        policy_from(settings.merged(settings.policy(file), {}), None)
+        policy_from(settings.merged_settings(settings.read_file(file), {}), None)
 
 
 def test_a_policy_that_is_not_there_is_told(tmp_path: Path) -> None:
     """And not taken for one that says nothing."""
     with pytest.raises(PolicyError, match="cannot be read"):
-        settings.policy(tmp_path / "nowhere.toml")
+        settings.read_file(tmp_path / "nowhere.toml")
 
 
 def options(folder: Path, text: str) -> dict[str, object]:
     """What a caller's file comes to."""
     file = folder / "envhub.toml"
     file.write_text(text)
-    return settings.options(file, ["steps", "fail_on"])
+    return settings.read_settings(file, ["steps", "fail_on"])
 
 
 def test_options_stand_in_a_file(tmp_path: Path) -> None:

@@ -16,9 +16,14 @@ import pytest
 from gymnasium import spaces
 
 from envhub_sandbox.cli.shared.console import safe_line
-from envhub_sandbox.crash import reader, writer
+from envhub_sandbox.crash import bundle_reader, bundle_writer
+from envhub_sandbox.crash.bundle_reader import (
+    MAX_DOCUMENT_BYTES,
+    load_bundle,
+    replayed_arguments,
+    wishes,
+)
 from envhub_sandbox.crash.history import History
-from envhub_sandbox.crash.reader import MAX_DOCUMENT_BYTES, load_bundle, replayed_arguments, wishes
 from envhub_sandbox.crash.replay import Verdict, replay
 from envhub_sandbox.errors import ActionError, BundleError, WorkerDiedError
 from envhub_sandbox.policy import Limits, Policy, Timeouts
@@ -30,14 +35,14 @@ COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
 
 def bundle(folder: Path, **options: Any) -> Path:
-    """A bundle of a reset and three steps, as ``writer`` writes it."""
+    """A bundle of a reset and three steps, as ``bundle_writer`` writes it."""
     manifest: Any = SimpleNamespace(single_action_space=spaces.Discrete(5), num_envs=2)
     history = History(manifest, 100)
     history.requested(requested(m.Reset(0, [1, 2], None, None)))
     for number in range(3):
         history.step(np.array([number, number]))
     given = {"policy": Policy(), "timeouts": Timeouts(), "python": None, "endpoint": None}
-    crash = writer.Crash(
+    crash = bundle_writer.Crash(
         error=WorkerDiedError("it died", exit_code=7, request="step"),
         label="org/repo",
         provenance={
@@ -53,7 +58,7 @@ def bundle(folder: Path, **options: Any) -> Path:
         shared=False,
         recording=history.recording(),
     )
-    return writer.keep(folder, crash)
+    return bundle_writer.write_bundle(folder, crash)
 
 
 def edit(folder: Path, *path: Any, value: Any) -> None:
@@ -103,6 +108,7 @@ def test_a_bundle_comes_back(tmp_path: Path) -> None:
         (("history", "requests", 1, "of"), "actions-object.npy"),
         (("history", "requests", 1, "of"), "actions-float32.npy"),
         (("history", "requests"), [{"operation": "reset"}] * 2),
+        (("history", "requests"), []),
         (("history", "dropped"), True),
     ],
 )
@@ -130,7 +136,7 @@ def _nested(folder: Path) -> None:
 
 def _huge(folder: Path) -> None:
     with open(folder / "requests.bin", "r+b") as file:
-        file.truncate(reader.MAX_FILE_BYTES + 1)
+        file.truncate(bundle_reader.MAX_FILE_BYTES + 1)
 
 
 def _noise(folder: Path) -> None:
@@ -207,7 +213,7 @@ def test_nothing_in_a_bundle_is_executed(tmp_path: Path) -> None:
 
 def test_repetition_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A small file cannot stand for an endless number of steps."""
-    monkeypatch.setattr(reader, "MAX_REQUESTS", 100)
+    monkeypatch.setattr(bundle_reader, "MAX_REQUESTS", 100)
     folder = bundle(tmp_path)
     again = {"steps": [0, 3], "of": "actions-int64.npy"}
     edit(folder, "history", "requests", value=[{"operation": "reset"}, *[again] * 33])
@@ -342,7 +348,8 @@ def test_what_was_set_before_and_does_not_fit_is_said(tmp_path: Path) -> None:
     folder = bundle(tmp_path)
     setting = inside.packet(m.pack(m.SetAttr(0, "size", (1,))))
     (folder / "requests.bin").write_bytes(setting + (folder / "requests.bin").read_bytes())
-    edit(folder, "history", "before", value=[{"operation": "set_attr"}])
+    index = json.loads((folder / "bundle.json").read_text())["history"]["requests"]
+    edit(folder, "history", "requests", value=[{"operation": "set_attr"}, *index])
     env: Any = Recorder()
     for error in (ValueError("one value each"), TypeError("no"), ActionError("no")):
         env.set_attr = Mock(side_effect=error)

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_sandbox.crash import history
-from envhub_sandbox.crash.history import History, Recording, Requested, Steps
+from envhub_sandbox.crash.history import History, RecordedRequest, Recording, Steps
 from envhub_worker.protocol import messages as m
 from tests.support.compare import assert_same
 from tests.support.wire import requested
@@ -53,8 +53,8 @@ def test_what_shards_were_sent_is_kept_as_it_was_asked() -> None:
     values[0][:] = 9.0
     recording = kept.recording()
     assert recording.exact
-    found = [m.unpack(one.frames) for one in recording.requests if isinstance(one, Requested)]
-    assert [one.operation for one in recording.requests if isinstance(one, Requested)] == [
+    found = [m.unpack(one.frames) for one in recording.requests if isinstance(one, RecordedRequest)]
+    assert [one.operation for one in recording.requests if isinstance(one, RecordedRequest)] == [
         *("reset", "setattr", "call", "callone"),
     ]
     reset_of_all, set_for_all, called, called_one = found
@@ -63,7 +63,7 @@ def test_what_shards_were_sent_is_kept_as_it_was_asked() -> None:
     assert_same(reset_of_all.seeds, [1, 2, 3])
     assert_same(reset_of_all.mask, np.array([True, False, True]))
     assert_same(set_for_all.values, (np.zeros(2), np.ones(2), np.full(2, 7.0)))
-    assert called == m.Call(0, "f", (1,), {})
+    assert called == m.Call(5, "f", (1,), {})
     assert called_one == m.CallOne(0, 3, 0, "g", (), {})
 
 
@@ -75,7 +75,7 @@ def actions_of(recording: Recording) -> list[Any]:
 
 def names_of(recording: Recording) -> list[str]:
     """What was asked beside plain steps."""
-    return [one.operation for one in recording.requests if isinstance(one, Requested)]
+    return [one.operation for one in recording.requests if isinstance(one, RecordedRequest)]
 
 
 def test_requests_come_back_in_order() -> None:
@@ -87,11 +87,11 @@ def test_requests_come_back_in_order() -> None:
     ask(kept, m.Render(0))
     kept.step(np.array([4, 4]))
     first, steps, render, last = kept.recording().requests
-    assert isinstance(first, Requested)
+    assert isinstance(first, RecordedRequest)
     assert_same(m.unpack(first.frames), m.Reset(0, [1, 2], None, None))
     assert isinstance(steps, Steps)
     assert_same(steps.actions, np.array([[0, 1], [2, 3]]))
-    assert isinstance(render, Requested)
+    assert isinstance(render, RecordedRequest)
     assert isinstance(last, Steps)
     assert kept.recording().exact
 
@@ -120,14 +120,14 @@ def test_the_caller_may_change_his_actions() -> None:
     nested.step(parts)
     parts["a"][:] = 0
     [request] = nested.recording().requests
-    assert isinstance(request, Requested)
+    assert isinstance(request, RecordedRequest)
     step: Any = m.unpack(request.frames)
     assert_same(step.actions, {"a": np.array([1, 2])})
     options = {"level": [1]}
     ask(flat, m.Reset(0, None, options, np.array([True, False])))
     options["level"].append(2)
     last = flat.recording().requests[-1]
-    assert isinstance(last, Requested)
+    assert isinstance(last, RecordedRequest)
     kept: Any = m.unpack(last.frames)
     assert kept.options == {"level": [1]}
 
@@ -167,17 +167,19 @@ def test_attributes_and_calls_outlast_a_reset() -> None:
     ask(kept, m.Call(0, "task", (), {}))
     ask(kept, m.SetAttr(0, "a", (2, 2)))
     reset(kept, [1, 2])
-    before: list[Any] = [m.unpack(one.frames) for one in kept.recording().before]
-    assert [(type(one).__name__, one.name) for one in before] == [
+    found = [one for one in kept.recording().requests if isinstance(one, RecordedRequest)]
+    *before, last = [m.unpack(one.frames) for one in found]
+    assert isinstance(last, m.Reset)
+    assert [(type(one).__name__, one.name) for one in before] == [  # type: ignore[attr-defined]
         ("Call", "add"),
         ("Call", "add"),
         ("Call", "task"),
         ("SetAttr", "a"),
     ]
-    assert before[-1].values == (2, 2)
+    assert before[-1] == m.SetAttr(0, "a", (2, 2))
     kept.started()
     reset(kept, [1, 2])
-    assert kept.recording().before == ()
+    assert names_of(kept.recording()) == ["reset"]
 
 
 @given(limit=st.integers(1, 40), steps=st.integers(0, 200))
@@ -215,7 +217,7 @@ def test_what_only_pickle_could_carry_is_described() -> None:
     kept = made()
     ask(kept, m.Call(0, "add", (object(),), {}))
     [request] = kept.recording().requests
-    assert isinstance(request, Requested)
+    assert isinstance(request, RecordedRequest)
     assert not kept.recording().exact
     assert "remote object" in repr(m.unpack(request.frames))
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from envhub_sandbox.rollouts.pictures import png, shrunk
+from envhub_sandbox.rollouts.pictures import png, small_picture
 
 
 def pixels(data: bytes) -> NDArray[np.uint8]:
@@ -40,14 +40,14 @@ def test_a_png_has_the_very_pixels(shape: tuple[int, ...]) -> None:
 def test_what_is_small_stays() -> None:
     """Nothing is enlarged."""
     frame = np.zeros((5, 8, 3), np.uint8)
-    assert shrunk(frame, 8) is frame
+    assert small_picture(frame, 8) is frame
 
 
 def test_a_pixel_is_the_mean_of_those_that_it_stands_for() -> None:
     """Two by two of them."""
     frame = np.zeros((4, 6, 3), np.uint8)
     frame[:2, :2, 1] = [[0, 100], [200, 255]]
-    small = shrunk(frame, 3)
+    small = small_picture(frame, 3)
     assert small.shape == (2, 3, 3)
     assert small[0, 0].tolist() == [0, 139, 0]
     assert not small[1:].any()
@@ -56,6 +56,6 @@ def test_a_pixel_is_the_mean_of_those_that_it_stands_for() -> None:
 @pytest.mark.parametrize("size", [(1, 4096), (4096, 1), (2, 321), (4096, 4096), (319, 4095)])
 def test_no_side_is_longer_and_none_is_nothing(size: tuple[int, int]) -> None:
     """Also of frames that nobody would render."""
-    small = shrunk(np.zeros((*size, 3), np.uint8), 320)
+    small = small_picture(np.zeros((*size, 3), np.uint8), 320)
     assert min(small.shape[:2]) >= 1
     assert max(small.shape[:2]) <= 320

@@ -6,11 +6,13 @@ import builtins
 import copy
 import pickle
 import re
+from unittest.mock import Mock
 
 import gymnasium as gym
 import pytest
 
 from envhub_sandbox import errors
+from envhub_sandbox.session.author_lines import point_out
 from envhub_sandbox.transport.replies import check, death, expect, raised, refusal
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import REASONS
@@ -62,16 +64,18 @@ class Both(gym.error.Error, ValueError):
         (Own, gym.error.InvalidAction),
         (Both, ValueError),
         (gym.error.Error, gym.error.Error),
+        (KeyError, KeyError),
     ],
 )
 def test_errors_are_gymnasiums_nearest(raises: type[Exception], kind: type[Exception]) -> None:
     """A worker names the ancestor, and a table in the client has its twin; so has a pickle."""
     error = raised(described(raises("no"), "step"))
+    assert isinstance(error, errors.RemoteEnvError)
     for found in (error, pickle.loads(pickle.dumps(error)), copy.copy(error)):
         assert isinstance(found, kind)
-        assert isinstance(found, errors.RemoteEnvError)
         assert type(found) is type(error)
-        assert str(found).endswith("no")
+        assert str(found).strip("'").endswith("no")
+        assert (str(found), found.traceback) == (str(error), error.traceback)
 
 
 @pytest.mark.parametrize("name", ["KeyboardInterrupt", "SystemExit", "Oops", "", "print", "open"])
@@ -102,15 +106,23 @@ def test_long_texts_are_cut() -> None:
 @pytest.mark.parametrize(
     ("reply", "expected"),
     [
-        (a_raised(stage="import", builtin="ModuleNotFoundError"), errors.DependencyError),
+        (a_raised(stage="import", builtin="ModuleNotFoundError"), errors.MissingModuleError),
         (a_raised(stage="import", builtin="SyntaxError"), errors.LoadError),
         (a_raised(stage="make_env"), errors.LoadError),
         (a_raised(stage="return"), errors.LoadError),
     ],
 )
 def test_failures_to_load_say_so(reply: m.Raised, expected: type[Exception]) -> None:
-    """What fails before there is an environment is an error of loading."""
-    assert isinstance(raised(reply), expected)
+    """What fails before there is an environment is an error of loading, as its pickle is."""
+    error = raised(reply)
+    assert isinstance(error, expected)
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+
+def test_a_missing_package_is_an_import_error() -> None:
+    """As it would be in this process, and of the very class where a module is missing."""
+    assert {errors.DependencyError, ModuleNotFoundError} < set(errors.MissingModuleError.mro())
+    assert issubclass(errors.DependencyError, ImportError)
 
 
 @pytest.mark.parametrize("name", ["ValueError", "RuntimeError", "KeyError", "FileNotFoundError"])
@@ -122,15 +134,6 @@ def test_failures_to_load_are_the_builtin_that_they_were(name: str) -> None:
     assert str(error).endswith("mypkg.Oops: no")
     assert isinstance(error.__cause__, getattr(builtins, name))
     assert type(pickle.loads(pickle.dumps(error))) is type(error)
-
-
-def test_a_missing_package_is_an_import_error() -> None:
-    """As it would be in this process, and of the very class where a module is missing."""
-    assert issubclass(errors.DependencyError, ImportError)
-    error = raised(a_raised(stage="import", builtin="ModuleNotFoundError"))
-    assert isinstance(error, errors.DependencyError)
-    assert isinstance(error, ModuleNotFoundError)
-    assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
 LOADER = "envhub_worker.runner.loader"
@@ -283,7 +286,7 @@ def test_a_strangers_lines_cannot_be_taken_for_ours(stage: str, builtin: str) ->
     if not isinstance(error, errors.RemoteEnvError) and error.__cause__ is None:
         shown = [str(error)]
     else:
-        errors.name_line(error, "")
+        point_out(error, Mock(root="/nowhere", known_as=lambda name: None))
         shown = [str(error), str(error.__cause__ or error), *vars(error)["__notes__"]]
     shown.append(str(errors.RemoteEnvWarning("repo", "Oops", _IMITATION)))
     for text in shown:

@@ -1,4 +1,4 @@
-"""The list: one reference a line, and all that is wrong with it told before anything is run."""
+"""The list: one reference a line, and what is wrong with it is said before anything is run."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ MOST_BYTES = 1 << 20
 MOST = 2_000
 """References: a page of as many rows is one that people can read."""
 _LONGEST = 4_096
-_TOLD = 20
+_SHOWN = 20
 _SLUG = 48
 
 
 @dataclass(frozen=True)
-class Listed:
+class ListEntry:
     """One reference of a list.
 
     Attributes:
@@ -54,7 +54,7 @@ class Listed:
         return f"{slug}-{digest}" if slug else digest
 
 
-def read(file: IO[bytes], title: str) -> list[Listed]:
+def read_entries(file: IO[bytes], title: str) -> list[ListEntry]:
     """The references of a list. Empty lines, and those that begin with ``#``, are none.
 
     Args:
@@ -73,12 +73,12 @@ def read(file: IO[bytes], title: str) -> list[Listed]:
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
         raise HubReferenceError(f"{title}:{line}: this is not UTF-8") from None
-    found: dict[str, Listed] = {}
+    found: dict[str, ListEntry] = {}
     wrong = list(_read_into(found, text))
     if wrong:
-        more = [f"and {len(wrong) - _TOLD} more"] if len(wrong) > _TOLD else []
-        told = "\n".join([*(f"{title}:{line}: {what}" for line, what in wrong[:_TOLD]), *more])
-        raise HubReferenceError(f"nothing was run, for the list cannot be read:\n{told}")
+        more = [f"and {len(wrong) - _SHOWN} more"] if len(wrong) > _SHOWN else []
+        lines = "\n".join([*(f"{title}:{line}: {what}" for line, what in wrong[:_SHOWN]), *more])
+        raise HubReferenceError(f"nothing was run, for the list cannot be read:\n{lines}")
     if not found:
         raise HubReferenceError(f"{title} has no reference in it: one a line")
     if len(found) > MOST:
@@ -86,7 +86,7 @@ def read(file: IO[bytes], title: str) -> list[Listed]:
     return list(found.values())
 
 
-def _read_into(found: dict[str, Listed], text: str) -> Iterator[tuple[int, str]]:
+def _read_into(found: dict[str, ListEntry], text: str) -> Iterator[tuple[int, str]]:
     """Take every line; yield where something is wrong, and what."""
     for number, line in enumerate(re.split("\r\n|\r|\n", text), 1):
         written = line.strip()
@@ -98,7 +98,7 @@ def _read_into(found: dict[str, Listed], text: str) -> Iterator[tuple[int, str]]
             hint = "; a comment has a line of its own" if " #" in written else ""
             yield number, printable(f"{error}{hint}", _LONGEST)
             continue
-        first = found.setdefault(meaning, Listed(reference, meaning, number))
+        first = found.setdefault(meaning, ListEntry(reference, meaning, number))
         if first.line != number:
             yield number, f"{reference} stands in line {first.line} already, as {first.reference}"
 

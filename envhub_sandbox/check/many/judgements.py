@@ -26,7 +26,7 @@ _MOST_BYTES = 32 << 20
 """Of what one prints: a document, or what it complains of."""
 _TAIL_BYTES = 4_096
 PATIENCE_S = 20.0
-"""For one that is told to end: its jails have to go."""
+"""For one that has been asked to end: its jails have to go."""
 _KILLED_S = 20.0
 """For the kernel to end one, where that is not in a disk's hands."""
 T = TypeVar("T")
@@ -34,7 +34,7 @@ Command = Callable[[T, Path, int], list[str]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ended(Generic[T]):
+class Outcome(Generic[T]):
     """What has become of a process.
 
     Attributes:
@@ -55,7 +55,7 @@ class Ended(Generic[T]):
     said: str
 
 
-class _Running(Generic[T]):
+class _Job(Generic[T]):
     def __init__(
         self, order: T, folder: Path, command: Command[T], variables: Mapping[str, str]
     ) -> None:
@@ -85,11 +85,11 @@ class _Running(Generic[T]):
         try:
             how = os.WEXITED | os.WNOHANG | os.WNOWAIT
             return os.waitid(os.P_PID, self._process.pid, how) is not None
-        except ChildProcessError:  # whoever started us has SIGCHLD ignored: nobody waits for it
+        except ChildProcessError:  # SIGCHLD is ignored since before we started
             return True
 
     def terminate(self) -> None:
-        """Tell it to end."""
+        """Ask it to end."""
         self._signal(os.kill, signal.SIGTERM)
 
     def kill(self) -> None:
@@ -107,7 +107,7 @@ class _Running(Generic[T]):
             self._process.wait(_KILLED_S)
         return self._process.returncode
 
-    def ended(self, most_s: float, patience_s: float) -> Ended[T] | None:
+    def ended(self, most_s: float, patience_s: float) -> Outcome[T] | None:
         """What has become of it, if it has ended; one that takes or says too much is ended."""
         why = ""
         if not self.has_ended:
@@ -117,7 +117,7 @@ class _Running(Generic[T]):
             end([self], patience_s)
         self.kill()
         code = self.reap()
-        return Ended(
+        return Outcome(
             order=self.order,
             folder=self._folder,
             code=None if why else code,
@@ -166,10 +166,10 @@ def judgements(
     most_s: float,
     variables: Mapping[str, str],
     patience_s: float = PATIENCE_S,
-) -> Generator[Ended[T], None, None]:
-    """Run a command for each order, and tell in the order in which they end.
+) -> Generator[Outcome[T], None, None]:
+    """Run a command for each order, and yield what came of each as it ends.
 
-    Whoever stops asking, or is interrupted, must close the iterator: then all are ended.
+    A caller that stops asking, or is interrupted, must close the iterator: then all are ended.
 
     Args:
         orders: What is asked for the next as soon as there is room for it.
@@ -179,10 +179,10 @@ def judgements(
         jobs: How many run at once.
         most_s: How long one may take.
         variables: Of the environment, beyond ours.
-        patience_s: For one that is told to end.
+        patience_s: For one that has been asked to end.
     """
     waiting = enumerate(orders)
-    running: list[_Running[T]] = []
+    running: list[_Job[T]] = []
     more = True
     try:
         while more or running:
@@ -190,7 +190,7 @@ def judgements(
                 number, order = next(waiting, (-1, None))
                 more = order is not None
                 if order is not None:
-                    running.append(_Running(order, folder / str(number), command, variables))
+                    running.append(_Job(order, folder / str(number), command, variables))
             time.sleep(_TICK_S)
             for job in tuple(running):
                 what = job.ended(most_s, patience_s)
@@ -202,8 +202,8 @@ def judgements(
         end(running, patience_s)
 
 
-def end(running: Iterable[_Running[T]], patience_s: float) -> None:
-    """End processes, and what they have started; whoever is impatient may interrupt again."""
+def end(running: Iterable[_Job[T]], patience_s: float) -> None:
+    """End processes, and what they have started; another interrupt ends the wait."""
     left = list(running)
     until = time.monotonic() + patience_s
     try:

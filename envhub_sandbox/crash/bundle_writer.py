@@ -10,11 +10,12 @@
         actions-<dtype>.npy   (steps, num_envs, ...), one file a dtype
 
 Nothing in it is pickled. It is built under another name and renamed into place; only its owner
-may read it; the oldest give way to the newest. ``reader`` reads it.
+may read it; the oldest give way to the newest. ``bundle_reader`` reads it.
 """
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -23,7 +24,7 @@ import secrets
 import shutil
 import tempfile
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -31,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from envhub_sandbox.crash.history import Recording, Requested, Steps, encoded
+from envhub_sandbox.crash.history import RecordedRequest, Recording, Steps, encoded
 from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.policy import Policy, Timeouts
@@ -58,7 +59,7 @@ class Crash:
     """What is known of one death.
 
     Attributes:
-        error: What the user is told.
+        error: What the user gets.
         label: Repository, commit and entry file.
         provenance: As ``provenance_of`` returns it.
         load: The arguments of the repository's ``make_env``.
@@ -79,7 +80,7 @@ class Crash:
     recording: Recording
 
 
-def keep(folder: Path, crash: Crash) -> Path:
+def write_bundle(folder: Path, crash: Crash) -> Path:
     """Write a bundle; returns its folder.
 
     Raises:
@@ -108,23 +109,20 @@ def _remove_oldest(folder: Path, newest: str) -> None:
 
 
 def _is_old(path: Path) -> bool:
-    try:
+    with contextlib.suppress(OSError):
         return time.time() - path.stat().st_mtime > _ABANDONED_AFTER_S
-    except OSError:
-        return False
+    return False
 
 
 def _write(folder: Path, crash: Crash) -> None:
-    before, requests = _Requests(), _Requests()
     recording = crash.recording
-    before.add_all(recording.before)
-    requests.add_all(recording.requests)
+    requests, denied = _Requests(recording), crash.error.denied
     document = {
         "format": FORMAT,
         "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "label": crash.label,
         "death": {name: _concealed(text, crash) for name, text in death_of(crash.error).items()},
-        "denied": None if crash.error.denied is None else _denied(crash),
+        "denied": None if denied is None else [_concealed(one, crash) for one in denied],
         "provenance": crash.provenance,
         "make_env": _arguments(crash),
         "task": crash.task,
@@ -135,25 +133,18 @@ def _write(folder: Path, crash: Crash) -> None:
             "dropped": recording.dropped,
             "mixed": recording.mixed,
             "steps": requests.steps,
-            "before": before.index,
             "requests": requests.index,
         },
     }
-    packets = [*before.packets, *requests.packets]
     content = {
         "bundle.json": json.dumps(document, indent=1, default=str).encode(),
         "arguments.bin": _packet(encoded(crash.load).frames),
-        "requests.bin": b"".join(map(_packet, packets)),
+        "requests.bin": b"".join(map(_packet, requests.packets)),
         "README.txt": str(_concealed(_in_words(crash), crash)).encode(),
         **{name: _array_file(rows) for name, rows in requests.arrays.items()},
     }
     for name, data in content.items():
         folders.write_private(folder / name, data)
-
-
-def _denied(crash: Crash) -> list[str]:
-    """What was tried before; a path may hold anything."""
-    return [str(_concealed(one, crash)) for one in crash.error.denied or ()]
 
 
 def _concealed(value: Any, crash: Crash) -> Any:
@@ -174,18 +165,15 @@ def _array_file(rows: list[Any]) -> bytes:
 
 
 class _Requests:
-    """An index of requests, and what it points to."""
+    """An index of requests, in order, and what it points to."""
 
-    def __init__(self) -> None:
+    def __init__(self, recording: Recording) -> None:
         self.index: list[dict[str, Any]] = []
         self.packets: list[Sequence[Buffer]] = []
         self.arrays: dict[str, list[Any]] = {}
         self._lengths: dict[str, int] = {}
         self.steps = 0
-
-    def add_all(self, requests: Iterable[Steps | Requested]) -> None:
-        """Add requests, in order."""
-        for request in requests:
+        for request in recording.requests:
             if isinstance(request, Steps):
                 self._add_steps(request.actions)
             else:
@@ -199,7 +187,7 @@ class _Requests:
         self.index.append({"steps": [start, start + len(actions)], "of": name})
         self.steps += len(actions)
 
-    def _add(self, request: Requested) -> None:
+    def _add(self, request: RecordedRequest) -> None:
         self.packets.append(request.frames)
         self.index.append(
             {"operation": request.operation, "exact": request.exact, "text": _text(request)}
@@ -207,7 +195,7 @@ class _Requests:
         self.steps += request.operation == "step"
 
 
-def _text(request: Requested) -> str:
+def _text(request: RecordedRequest) -> str:
     return one_line(repr(m.unpack(request.frames)), 200)
 
 
@@ -218,12 +206,13 @@ def _packet(frames: Sequence[Buffer]) -> bytes:
 def death_of(error: WorkerDiedError | WorkerTimeoutError) -> dict[str, Any]:
     """How it ended, as data."""
     if isinstance(error, WorkerTimeoutError):
-        how: dict[str, Any] = {"reason": "timeout", "exit_code": None, "signal": None}
-        how |= {"detail": f"{error.timeout_s} s" if error.timeout_s else "", "output": ""}
+        detail = f"{error.timeout_s} s" if error.timeout_s else ""
+        how = {"reason": "timeout", "exit_code": None, "signal": None, "detail": detail}
+        output = ""
     else:
-        how = {"reason": error.reason, "exit_code": error.exit_code, "signal": error.signal}
-        how |= {"detail": error.detail, "output": error.log_tail}
-    return {**how, "request": error.request, "message": str(error)}
+        how = {name: getattr(error, name) for name in ("reason", "exit_code", "signal", "detail")}
+        output = error.log_tail
+    return {**how, "output": output, "request": error.request, "message": str(error)}
 
 
 def _arguments(crash: Crash) -> dict[str, Any]:

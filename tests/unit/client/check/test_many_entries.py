@@ -8,17 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.check.many import lines
-from envhub_sandbox.check.many.lines import Listed
+from envhub_sandbox.check.many import entries
+from envhub_sandbox.check.many.entries import ListEntry
 from envhub_sandbox.errors import HubReferenceError
 
 _COMMIT = "0123456789" * 4
 
 
-def read(text: str | bytes) -> list[Listed]:
+def read(text: str | bytes) -> list[ListEntry]:
     """The references of a list."""
     data = text.encode() if isinstance(text, str) else text
-    return lines.read(io.BytesIO(data), "list.txt")
+    return entries.read_entries(io.BytesIO(data), "list.txt")
 
 
 def test_one_reference_a_line(tmp_path: Path) -> None:
@@ -104,12 +104,12 @@ def test_the_same_folder_by_another_way_is_told(tmp_path: Path) -> None:
 )
 def test_a_name_is_never_a_path(meaning: str) -> None:
     """Whatever a reference is called: letters, digits and dashes, and short."""
-    name = Listed("x", meaning, 1).name
+    name = ListEntry("x", meaning, 1).name
     assert re.fullmatch(r"[a-z0-9]([a-z0-9-]{0,70}[a-z0-9])?", name)
 
 
 def test_no_two_have_the_same_name() -> None:
     """Though what people know of them is the same, or differs in case alone."""
     meanings = ["org/a-b@main", "org/a_b@main", "org/A-b@main", "org/a-b@dev", "/x/org/a-b:env.py"]
-    names = {Listed("x", meaning, 1).name for meaning in meanings}
+    names = {ListEntry("x", meaning, 1).name for meaning in meanings}
     assert len({name.lower() for name in names}) == len(meanings)

@@ -6,11 +6,12 @@ import contextlib
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
 
-from envhub_sandbox.check.many.running import Ended, judgements
+from envhub_sandbox.check.many.judgements import Outcome, judgements
 from envhub_sandbox.errors import WorkerStartupError
 from tests.support.processes import eventually
 
@@ -35,22 +36,18 @@ _PROGRAMS = {
 }
 
 
+_HOW: dict[str, Any] = {"jobs": 2, "most_s": 300.0, "variables": {}}
+
+
 def command(order: str, place: Path, _: int = -1) -> list[str]:
     """What is run for an order, in its folder."""
-    return [
-        sys.executable,
-        "-I",
-        "-c",
-        f"import os; os.chdir({str(place)!r})\n{_PROGRAMS[order]}",
-    ]
+    program = f"import os; os.chdir({str(place)!r})\n{_PROGRAMS[order]}"
+    return [sys.executable, "-I", "-c", program]
 
 
-def run(folder: Path, *orders: str, jobs: int = 2, most_s: float = 300.0) -> dict[str, Ended[str]]:
+def run(folder: Path, *orders: str, **how: Any) -> dict[str, Outcome[str]]:
     """What becomes of orders."""
-    found = judgements(
-        orders, command, folder=folder, jobs=jobs, most_s=most_s, variables={"ENVHUB_X": "1"}
-    )
-    with contextlib.closing(found):
+    with contextlib.closing(judgements(orders, command, folder=folder, **{**_HOW, **how})) as found:
         return {one.order: one for one in found}
 
 
@@ -85,7 +82,7 @@ def test_there_are_never_more_than_there_may_be(jobs: int, tmp_path: Path) -> No
         most.append(begun - ended)
         return command("well", place)
 
-    found = judgements(range(7), counted, folder=tmp_path, jobs=jobs, most_s=300, variables={})
+    found = judgements(range(7), counted, folder=tmp_path, **{**_HOW, "jobs": jobs})
     for one in found:
         assert one.code == 0
         ended += 1
@@ -108,36 +105,19 @@ def of_group(process: psutil.Process, group: int) -> bool:
 
 def test_what_cannot_be_started_is_told(tmp_path: Path) -> None:
     """In words of its own: the folder of results is not at fault."""
-    found = judgements(
-        ["x"],
-        lambda *_: [str(tmp_path / "nothing")],
-        folder=tmp_path,
-        jobs=1,
-        most_s=1.0,
-        variables={},
-    )
+    found = judgements(["x"], lambda *_: [str(tmp_path / "nothing")], folder=tmp_path, **_HOW)
     with pytest.raises(WorkerStartupError, match="no judgement can be started: No such file"):
         next(found)
 
 
 def test_whoever_stops_leaves_none(tmp_path: Path) -> None:
     """Nor what they have started, however stubborn it is."""
-    found = judgements(
-        ["well", "stubborn", "hang"],
-        command,
-        folder=tmp_path,
-        jobs=3,
-        most_s=300.0,
-        variables={},
-        patience_s=1.0,
-    )
+    how = {**_HOW, "jobs": 3, "patience_s": 1.0}
+    found = judgements(["well", "stubborn", "hang"], command, folder=tmp_path, **how)
     assert next(found).order == "well"
     assert eventually(lambda: (tmp_path / "1" / "ready").exists())
-    below = [
-        one
-        for one in psutil.Process().children(recursive=True)
-        if str(tmp_path) in " ".join(one.cmdline())
-    ]
+    children = psutil.Process().children(recursive=True)
+    below = [one for one in children if str(tmp_path) in " ".join(one.cmdline())]
     assert len(below) == 3, "the control: two of ours, and one of theirs"
     found.close()
     assert eventually(lambda: not any(map(runs, below)))

@@ -1,7 +1,7 @@
 """What is different between two commits, in terms of what a repository would do.
 
 A finding is the same where it stands in the same file, in a line that reads the same: lines that
-move are no change, and a line that was changed is told again.
+move are no change, and what stands in a changed line is a new finding.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 
 from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.findings import Finding
-from envhub_sandbox.check.static.static import Static, of_finding
+from envhub_sandbox.check.static.static import Static
 from envhub_sandbox.hub.hashing import differing
 from envhub_sandbox.hub.listing import FileRecord
 from envhub_sandbox.locks.drift import of_tasks
@@ -176,7 +176,7 @@ def document(then: Static, now: Static, found: list[Change]) -> dict[str, Any]:
                 "what": one.what,
                 "change": one.how,
                 "text": one.text,
-                "finding": one.finding and of_finding(one.finding),
+                "finding": one.finding and one.finding.document(),
             }
             for one in found
         ],

@@ -2,7 +2,7 @@
 
 Only regular files of bounded size are read, nothing is unpickled, and every value is checked for
 its type before it is used. What a bundle asks of this machine beyond what an ordinary run gets
-is told by ``wishes`` and granted only by the user.
+is listed by ``wishes`` and granted only by the user.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from envhub_sandbox.crash.bundle_writer import FORMAT
 from envhub_sandbox.errors import BundleError, EnvHubError
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.policy import Limits, Policy
@@ -28,7 +29,6 @@ from envhub_worker.protocol.stream import PacketReader
 from envhub_worker.protocol.text import printable
 from envhub_worker.protocol.untrusted import FAULTS
 
-FORMAT = 1
 MAX_FILE_BYTES = 64 << 20
 MAX_DOCUMENT_BYTES = 16 << 20
 """``bundle.json``: an empty list takes two bytes there, and forty times as much in memory."""
@@ -54,7 +54,6 @@ class Bundle:
         task: ``suite``, ``task``, ``num_envs``, ``shards``, ``lane``; None before ``make_env``
             had returned.
         doubts: Why the same requests may not have the same effect, one sentence each.
-        before: What had been set before the requests.
         requests: What was asked, in order; the last one was never answered.
     """
 
@@ -66,7 +65,6 @@ class Bundle:
     arguments: dict[str, Any]
     task: dict[str, Any] | None
     doubts: tuple[str, ...]
-    before: tuple[m.Message, ...]
     requests: tuple[m.Message, ...]
 
     @property
@@ -94,21 +92,17 @@ def _bundle(folder: Path, document: dict[str, Any]) -> Bundle:
     provenance = _member(document, "provenance", dict)
     history = _member(document, "history", dict)
     arguments = _member(document, "make_env", dict)
-    packets = _packets(folder, "requests.bin")
-    before = tuple(_requests(folder, _member(history, "before", list), packets))
-    requests = tuple(_requests(folder, _member(history, "requests", list), packets))
     task = document.get("task")
     return Bundle(
         label=one_line(_member(document, "label", str), 1000),
         reference=_reference(provenance),
-        files=_texts(_member(provenance, "files", dict)),
+        files=_files(_member(provenance, "files", dict)),
         death=_death(_member(document, "death", dict)),
         load=_load(folder),
         arguments=arguments,
         task=None if task is None else _task(task),
         doubts=tuple(_doubts(document, history, arguments)),
-        before=before,
-        requests=requests,
+        requests=tuple(_requests(folder, _member(history, "requests", list))),
     )
 
 
@@ -181,7 +175,8 @@ def _packets(folder: Path, name: str) -> Iterator[m.Message]:
         yield m.unpack(packet.frames, tensors=to_tensor)
 
 
-def _requests(folder: Path, index: list[Any], packets: Iterator[m.Message]) -> Iterator[m.Message]:
+def _requests(folder: Path, index: list[Any]) -> Iterator[m.Message]:
+    packets = _packets(folder, "requests.bin")
     arrays: dict[str, Any] = {}
     left = MAX_REQUESTS
     for entry in index:
@@ -189,7 +184,10 @@ def _requests(folder: Path, index: list[Any], packets: Iterator[m.Message]) -> I
             raise BundleError("a request is not a mapping")
         if "steps" not in entry:
             left -= 1
-            yield _next(packets)
+            try:
+                yield next(packets)
+            except StopIteration:
+                raise BundleError("it has fewer requests than it says") from None
             continue
         name = _member(entry, "of", str)
         if name not in arrays:
@@ -200,13 +198,8 @@ def _requests(folder: Path, index: list[Any], packets: Iterator[m.Message]) -> I
             raise BundleError(f"it has more than {MAX_REQUESTS} requests")
         for actions in rows:
             yield m.Step(0, actions)
-
-
-def _next(packets: Iterator[m.Message]) -> m.Message:
-    found = next(packets, None)
-    if found is None:
-        raise BundleError("it has fewer requests than it says")
-    return found
+    if next(packets, None) is not None:
+        raise BundleError("it has more requests than it says")
 
 
 def _slice(value: Any, length: int) -> slice:
@@ -253,10 +246,10 @@ def _member(mapping: dict[str, Any], name: str, kind: type[T]) -> T:
     return value
 
 
-def _texts(mapping: dict[str, Any]) -> dict[str, str]:
+def _files(mapping: dict[str, Any]) -> dict[str, str]:
     if not all(type(value) is str for value in mapping.values()):
         raise BundleError("its file hashes are not text")
-    return dict(mapping)
+    return mapping
 
 
 # --- what it asks of this machine --------------------------------------------------------------
@@ -299,12 +292,7 @@ def _is_more(name: str, value: Any) -> bool:
 
 
 def replayed_arguments(bundle: Bundle, *, granted: bool) -> dict[str, Any]:
-    """The arguments of ``make_env`` that make the environment again.
-
-    Args:
-        bundle: The bundle.
-        granted: Whether the user permits what ``wishes`` tells; otherwise it is left out.
-    """
+    """The arguments of ``make_env`` that make it again; ``wishes`` are left out unless granted."""
     policy = _known(Policy, _policy(bundle))
     usable = {name: policy[name] for name in _GRANTED if granted and name in policy}
     limits = _known(Limits, policy.get("limits"))
@@ -331,7 +319,7 @@ def _known(cls: type[Any], value: Any) -> dict[str, Any]:
 
 
 def _timeouts(bundle: Bundle) -> dict[str, Any]:
-    """Those that were used, except that nobody waits for ever."""
+    """Those that were used, but for those without an end."""
     timeouts = bundle.arguments.get("timeouts")
     names = ("startup_s", "reset_s", "step_s", "call_s")
     found = timeouts if isinstance(timeouts, dict) else {}
