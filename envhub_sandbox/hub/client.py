@@ -24,7 +24,7 @@ from urllib.parse import parse_qsl, quote, urlsplit
 
 from envhub_sandbox.errors import HubReferenceError, SnapshotError, SnapshotIntegrityError
 from envhub_sandbox.hub.answers import HostileAnswerError, bounded_body, guarded, streamed
-from envhub_sandbox.hub.failures import HubFailure, Subject, conceal, explain
+from envhub_sandbox.hub.failures import Subject, chain, conceal, explain
 from envhub_sandbox.hub.grammar import is_commit
 from envhub_sandbox.hub.hashing import GIT_SHA1, SHA256
 from envhub_sandbox.hub.listing import FileRecord
@@ -223,11 +223,12 @@ class HubClient:
         except Exception as error:
             secrets = self._secrets()
             conceal(error, secrets)
-            hostile = _in_chain(error, HostileAnswerError)
-            if hostile is not None:
+            hostile = [one for one in chain(error) if isinstance(one, HostileAnswerError)]
+            if hostile:
                 raise SnapshotIntegrityError(
-                    f"{'/'.join(repo)}@{revision} on {self.public_endpoint}: {hostile}. Nothing of "
-                    "it was used. Check that the endpoint is a Hugging Face Hub, or use another"
+                    f"{'/'.join(repo)}@{revision} on {self.public_endpoint}: {hostile[0]}. "
+                    "Nothing of it was used. Check that the endpoint is a Hugging Face Hub, or use "
+                    "another"
                 ) from error
             subject = Subject(*repo, revision, self.public_endpoint)
             raise explain(error, subject, secrets) from error
@@ -239,14 +240,6 @@ class HubClient:
         login = login_of(self.endpoint)
         secrets = (token, *self._login().values(), login and login[1])
         return tuple(secret for secret in secrets if secret)
-
-
-def _in_chain(error: BaseException | None, kind: type[Exception]) -> BaseException | None:
-    seen: list[BaseException] = []
-    while error is not None and error not in seen and not isinstance(error, kind):
-        seen.append(error)
-        error = error.__cause__ or error.__context__
-    return error if isinstance(error, kind) else None
 
 
 def _next_page(url: str | None, query: dict[str, str]) -> dict[str, str] | None:
@@ -313,6 +306,3 @@ def _xet_disabled() -> Iterator[None]:
             yield
         finally:
             constants.HF_HUB_DISABLE_XET = before
-
-
-__all__ = ["HubClient", "HubFailure", "Repository", "checked_endpoint", "checked_token"]

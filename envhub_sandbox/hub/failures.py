@@ -173,21 +173,22 @@ def redact(text: str, secrets: tuple[str, ...]) -> str:
 
 def conceal(error: BaseException, secrets: tuple[str, ...]) -> None:
     """Take the secrets out of the texts of an exception and its causes: tracebacks show them."""
-    for link in _chain(error):
+    for link in chain(error):
         link.args = tuple(
             redact(value, secrets) if isinstance(value, str) else value for value in link.args
         )
 
 
 def _classify(error: BaseException) -> tuple[Kind, BaseException]:
-    for link in _chain(error):
+    for link in chain(error):
         kind = _kind_of(link)
         if kind is not None:
             return kind, link
     return Kind.OTHER, error
 
 
-def _chain(error: BaseException | None) -> Iterator[BaseException]:
+def chain(error: BaseException | None) -> Iterator[BaseException]:
+    """An exception, and what it came of."""
     seen: set[int] = set()
     while error is not None and id(error) not in seen:
         seen.add(id(error))

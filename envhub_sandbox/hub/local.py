@@ -17,12 +17,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from envhub_sandbox.errors import RepositoryUnavailableError, SnapshotError
+from envhub_sandbox.errors import (
+    RepositoryUnavailableError,
+    SnapshotError,
+    SnapshotTooLargeError,
+)
 from envhub_sandbox.hub.checkout import Checkout, read_checkout
 from envhub_sandbox.hub.hashing import SHA256, Mismatch, copy_verified, digest_of
-from envhub_sandbox.hub.listing import MAX_DEPTH, FileRecord
+from envhub_sandbox.hub.listing import (
+    MAX_DEPTH,
+    FileRecord,
+    SnapshotLimits,
+    check_names,
+    within_limits,
+)
 
 _GIT = ".git"
+_ALL_COUNTS = (
+    "It is in no git checkout, so every file in it counts. Move away what does not belong to the "
+    "repository, or run 'git init' there and name it in .gitignore"
+)
 
 
 class LocalFile(NamedTuple):
@@ -82,6 +96,38 @@ class LocalFolder:
             SnapshotError: A link leaves the folder, is broken or leads to a loop.
         """
         return (one for one in self._found() if isinstance(one, LocalFile))
+
+    def listed(
+        self, limits: SnapshotLimits
+    ) -> tuple[tuple[LocalFile, ...], tuple[FileRecord, ...]]:
+        """The files of the snapshot, within limits, and their records, by reading all of them.
+
+        Raises:
+            SnapshotTooLargeError: Over the limits.
+            SnapshotError: As with ``files``; or a file cannot be read, or has a name that the Hub
+                cannot have.
+        """
+        try:
+            found = within_limits(self.files(), limits, str(self))
+        except OSError as error:
+            raise SnapshotError(f"{self}: it cannot be read: {error}") from error
+        except SnapshotTooLargeError as error:
+            if self.checkout is None:
+                error.args = (f"{error}. {_ALL_COUNTS}",)
+            raise
+        records = hash_files(found, str(self))
+        check_names(records, str(self))
+        return found, records
+
+    def why_left_out(self, path: str) -> tuple[str, str] | None:
+        """What to say of a file that is there, and that git would not commit."""
+        for one in self.left_out():
+            if f"{path}/".startswith(f"{one.path.rstrip('/')}/"):
+                what = f"has the file {path!r}, but git would not commit it"
+                if one.is_repository:
+                    return what, f"{one.path} is a git repository of its own; name that one"
+                return what, f"Run 'git add --force {path}', or take it out of .gitignore"
+        return None
 
     def left_out(self) -> Iterator[LeftOut]:
         """Yield what lies here and is not in the snapshot; empty folders aside."""

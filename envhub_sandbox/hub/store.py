@@ -30,15 +30,17 @@ from urllib.parse import urlsplit
 
 from envhub_sandbox import folders
 from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
+from envhub_sandbox.hub.cache import BUILDING, draft
+from envhub_sandbox.hub.cache import CACHE_VARIABLE as CACHE_VARIABLE
+from envhub_sandbox.hub.cache import cache_root as cache_root
+from envhub_sandbox.hub.cache import remove_tree as remove_tree
 from envhub_sandbox.hub.hashing import Mismatch, digest_of
 from envhub_sandbox.hub.listing import FileRecord
 from envhub_sandbox.log import SNAPSHOT
 from envhub_sandbox.system.files import write_whole
 from envhub_sandbox.system.shared_lock import sharers
 
-CACHE_VARIABLE = "ENVHUB_CACHE"
 _FORMAT = 1
-_BUILDING = ".building-"
 _ABANDONED_AFTER_S = 24 * 3600.0
 _FILE_MODE = 0o444
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
@@ -98,25 +100,6 @@ class _Entry(NamedTuple):
             found.st_ctime_ns,
             found.st_ino,
         )
-
-
-def cache_root() -> Path:
-    """``$ENVHUB_CACHE``, or the user's cache folder for ``envhub-sandbox``.
-
-    Raises:
-        SnapshotError: The user has none.
-    """
-    chosen = os.environ.get(CACHE_VARIABLE)
-    if chosen:
-        return Path(os.path.abspath(os.path.expanduser(chosen)))
-    import platformdirs
-
-    try:
-        return Path(platformdirs.user_cache_dir("envhub-sandbox", appauthor=False))
-    except RuntimeError:
-        raise SnapshotError(
-            f"this user has no home, and so no folder for a cache; set {CACHE_VARIABLE} to a folder"
-        ) from None
 
 
 def repository_folder(endpoint: str, repo_type: str, repo_id: str) -> Path:
@@ -255,21 +238,25 @@ def publish(
     ``copy(record, target)`` writes the target and must raise unless it wrote what the record
     says. ``note`` is kept in the record (where the snapshot is from). Nothing stays if it fails.
     """
-    building = _begin(slot)
     try:
-        tree = building / "tree"
-        _fill(tree, files, copy)
-        document = {"format": _FORMAT, **note, "fetched": time.strftime("%FT%TZ", time.gmtime())}
-        _write_record(building, tree, document, list(files))
-        building.chmod(folders.SHARED_MODE)
-        with _one_at_a_time(slot.folder):
-            _move_remains(slot)
-            with _another_may_have_won():
-                os.rename(building, slot.home)
+        folders.make(slot.folder)
+        _refuse_shared_store(slot.folder)
+        _remove_abandoned(slot.folder)
+        with draft(slot.folder) as building:
+            tree = building / "tree"
+            _fill(tree, files, copy)
+            fetched = time.strftime("%FT%TZ", time.gmtime())
+            document = {"format": _FORMAT, **note, "fetched": fetched}
+            _write_record(building, tree, document, list(files))
+            building.chmod(folders.SHARED_MODE)
+            with _one_at_a_time(slot.folder):
+                _move_remains(slot)
+                _rename(building, slot.home)
     except OSError as error:
-        raise _not_writable(slot.folder, error) from error
-    finally:
-        remove_tree(building)
+        raise SnapshotError(
+            f"the snapshot store {slot.folder} cannot be written: {error}. Free space or fix its "
+            f"permissions, or set {CACHE_VARIABLE} to another folder"
+        ) from error
 
 
 @contextlib.contextmanager
@@ -292,22 +279,9 @@ def _move_remains(slot: Slot) -> None:
         load(slot)
     except HalfDeletedError as error:
         SNAPSHOT.warning("%s. It has been made again", str(error).partition(". Nothing of it")[0])
-        aside = tempfile.mkdtemp(prefix=_BUILDING, dir=slot.folder)
+        aside = tempfile.mkdtemp(prefix=BUILDING, dir=slot.folder)
         os.rename(slot.home, aside)
         os.utime(aside)
-
-
-def _begin(slot: Slot) -> Path:
-    try:
-        folders.make(slot.folder)
-        _refuse_shared_store(slot.folder)
-        _remove_abandoned(slot.folder)
-        # 0700 until it is complete: its files have the umask's modes while they are written
-        building = Path(tempfile.mkdtemp(prefix=_BUILDING, dir=slot.folder))
-        building.chmod(folders.PRIVATE_MODE)
-    except OSError as error:
-        raise _not_writable(slot.folder, error) from error
-    return building
 
 
 def remove(home: Path) -> dict[int, str]:
@@ -359,7 +333,7 @@ def _refuse_shared_store(place: Path) -> None:
 
 def _remove_abandoned(folder: Path) -> None:
     oldest = time.time() - _ABANDONED_AFTER_S
-    for path in folder.glob(f"{_BUILDING}*"):
+    for path in folder.glob(f"{BUILDING}*"):
         with contextlib.suppress(OSError):
             if path.stat().st_mtime < oldest:
                 remove_tree(path)
@@ -392,39 +366,12 @@ def _write_record(
     write_whole(home / "record.json", json.dumps({**document, "files": rows}).encode())
 
 
-@contextlib.contextmanager
-def _another_may_have_won() -> Iterator[None]:
+def _rename(building: Path, home: Path) -> None:
     try:
-        yield
+        os.rename(building, home)
     except OSError as error:
-        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
+        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):  # another has put it there first
             raise
-
-
-def _not_writable(folder: Path, error: OSError) -> SnapshotError:
-    return SnapshotError(
-        f"the snapshot store {folder} cannot be written: {error}. Free space or fix its "
-        f"permissions, or set {CACHE_VARIABLE} to another folder"
-    )
-
-
-def remove_tree(path: Path) -> None:
-    """Remove a folder of the store, whose own folders are read-only; nothing if it is gone.
-
-    Without recursion, as ``shutil.rmtree`` has it: of a package, a stranger chose how deep it is.
-    """
-    found = [] if path.is_symlink() else [str(path)]
-    for folder in found:  # which grows
-        with contextlib.suppress(OSError):
-            os.chmod(folder, 0o700)
-            with os.scandir(folder) as items:
-                found += [item.path for item in items if item.is_dir(follow_symlinks=False)]
-    for folder in reversed(found):
-        with contextlib.suppress(OSError):
-            for name in os.listdir(folder):
-                with contextlib.suppress(OSError):
-                    os.unlink(os.path.join(folder, name))
-            os.rmdir(folder)
 
 
 def commits(folder: Path) -> list[StoredCommit]:
