@@ -24,9 +24,9 @@ from envhub_sandbox.check.play.confinement import walls
 from envhub_sandbox.check.play.task import Asked, TaskJudge
 from envhub_sandbox.check.static.survey import survey
 from envhub_sandbox.check.static.undeclared import undeclared
-from envhub_sandbox.dependencies.choice import chosen
 from envhub_sandbox.dependencies.declared import declared
 from envhub_sandbox.dependencies.pipeline import packages_for
+from envhub_sandbox.dependencies.request import chosen
 from envhub_sandbox.errors import (
     DependencyError,
     EnvHubError,

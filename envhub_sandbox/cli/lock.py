@@ -18,7 +18,7 @@ from envhub_sandbox.cli.shared.progress import Bar
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.choice import Choice
+    from envhub_sandbox.dependencies.request import Choice
     from envhub_sandbox.hub.snapshot import Snapshot
     from envhub_sandbox.locks.lockfile import LockFile
 
@@ -154,7 +154,7 @@ def _old(path: Path, upgrade: bool) -> LockFile | None:
 
 
 def _choice(given: Any, old: LockFile | None) -> Choice:
-    from envhub_sandbox.dependencies.choice import chosen
+    from envhub_sandbox.dependencies.request import chosen
     from envhub_sandbox.locks import making
 
     if given == "auto":

@@ -56,10 +56,9 @@ class Bounds:
             PackagesTooLargeError: It is.
         """
         if size > self.bytes:
-            told = f"{size_text(size)}; at most {size_text(self.bytes)}"
             raise PackagesTooLargeError(
-                f"{what} {told} are installed. No environment was made. If you want it, set "
-                f"{BYTES_VARIABLE} to more bytes"
+                f"{what} {size_text(size)}; at most {size_text(self.bytes)} are installed. No "
+                f"environment was made. If you want it, set {BYTES_VARIABLE} to more bytes"
             )
         if files > self.files:
             raise PackagesTooLargeError(
@@ -87,7 +86,10 @@ class Watch:
     def __init__(self, bounds: Bounds, folder: Path, places: Sequence[Path]) -> None:
         self.bounds = bounds
         self._folder = folder
-        self._places = [_existing(place) for place in (folder, *places)]
+        self._places = [
+            next(path for path in (place, *place.parents) if path.exists())
+            for place in (folder, *places)
+        ]
         self._announced = 0
 
     def hear(self, line: str) -> None:
@@ -105,7 +107,8 @@ class Watch:
         self.bounds.check(self._announced, 0, "its packages are downloads of")
         self.bounds.check(*measured(self._folder), "its packages have")
         for place in self._places:
-            free = _free(place)
+            found = os.statvfs(place)
+            free = found.f_bavail * found.f_frsize
             if free < LEFT_FREE:
                 raise DependencyError(
                     f"the disk of {place} is full: {free // 2**20} MiB are left, and nothing is "
@@ -153,12 +156,3 @@ def walk(folder: Path) -> Iterator[Path]:
                 if item.is_dir(follow_symlinks=False):
                     waiting.append(item.path)
                 yield Path(item.path)
-
-
-def _existing(place: Path) -> Path:
-    return next(path for path in (place, *place.parents) if path.exists())
-
-
-def _free(place: Path) -> int:
-    found = os.statvfs(place)
-    return found.f_bavail * found.f_frsize

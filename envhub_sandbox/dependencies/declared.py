@@ -12,7 +12,6 @@ from __future__ import annotations
 import codecs
 import os
 import re
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,27 +21,23 @@ from packaging.requirements import InvalidRequirement, Requirement
 from packaging.specifiers import InvalidSpecifier, SpecifierSet
 from packaging.utils import canonicalize_name
 
-from envhub_sandbox.dependencies.files import LOOKED_AT, PROJECT, SCRIPT, requirements_file
-from envhub_sandbox.dependencies.sources import of_git
+from envhub_sandbox.dependencies.builds.sources import of_git
 from envhub_sandbox.errors import RequirementError
 from envhub_sandbox.option_names import option_name
+from envhub_sandbox.sources import toml
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
+PROJECT = "pyproject.toml"
 MAX_BYTES = 256 * 1024
 MAX_REQUIREMENTS = 1000
 MAX_FILES = 16
 """That a ``requirements.txt`` leads to."""
 MAX_LINE = 2000
-MAX_DOTS = 2000
-"""In TOML: the time that its parser takes grows with the square of the parts of a key."""
 
 _HASH = re.compile(r"--hash[= ](sha256:[0-9a-f]{64}|sha384:[0-9a-f]{96}|sha512:[0-9a-f]{128})")
 _QUOTED = re.compile(r"'[^']*'|\"[^\"]*\"")
-_CLOSES = "# ///"
+_SCRIPT, _CLOSES = "# /// script", "# ///"
+_LOOKED_AT = 1024 * 1024
+"""Bytes at the beginning of an entry file in which metadata is looked for."""
 _INCLUDES = re.compile(r"(-r|--requirement|-c|--constraint)[ =]\s*(\S+)")
 _ITSELF = re.compile(r"(?:(?:-e|--editable)[ =]\s*)?\./?(?:\[([\w.,\s-]{0,200})\])?")
 _BYTE_ORDER_MARKS = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
@@ -98,7 +93,9 @@ def declared(root: Path, entry: str) -> Declared | None:
     if script is not None:
         return script
     project = _project(root / PROJECT)
-    listed = requirements_file(root, entry)
+    beside = os.path.join(os.path.dirname(entry), "requirements.txt")
+    names = (beside, "requirements.txt")
+    listed = next((name for name in names if (root / name).is_file()), None)
     if listed is not None:
         python = "" if project is None else project.python
         wanted, constraints = read(root, listed)
@@ -269,15 +266,15 @@ def _script(path: Path, name: str) -> Declared | None:
     """The metadata in an entry file, after https://peps.python.org/pep-0723/."""
     try:
         with path.open("rb") as file:
-            lines = file.read(LOOKED_AT).decode("utf-8", "replace").splitlines()
+            lines = file.read(_LOOKED_AT).decode("utf-8", "replace").splitlines()
     except OSError as error:
         raise RequirementError(f"{name} cannot be read: {error}") from error
-    starts = [number for number, line in enumerate(lines) if line.rstrip() == SCRIPT]
+    starts = [number for number, line in enumerate(lines) if line.rstrip() == _SCRIPT]
     blocks = [block for block in (_block(lines, start) for start in starts) if block is not None]
     if not blocks:
         return None
     if len(blocks) > 1:
-        raise RequirementError(f"{name} has {len(blocks)} blocks {SCRIPT!r}; one is permitted")
+        raise RequirementError(f"{name} has {len(blocks)} blocks {_SCRIPT!r}; one is permitted")
     where = f"the script metadata of {name}"
     data = _toml(blocks[0], where)
     python = _specifier(data.get("requires-python", ""), where)
@@ -289,7 +286,7 @@ def _block(lines: Sequence[str], start: int) -> str | None:
     inside: list[str] = []
     closed = None
     for line in lines[start + 1 :]:
-        if line.rstrip() == SCRIPT or not (line == "#" or line.startswith("# ")):
+        if line.rstrip() == _SCRIPT or not (line == "#" or line.startswith("# ")):
             break
         if line.rstrip() == _CLOSES:
             closed = len(inside)
@@ -309,13 +306,10 @@ def _project(path: Path) -> Declared | None:
 
 
 def _toml(text: str, where: str) -> dict[str, Any]:
-    if len(text) > MAX_BYTES or text.count(".") > MAX_DOTS:
-        raise RequirementError(f"{where} is too long: {len(text)} characters. {_advice()}")
     try:
-        data: dict[str, Any] = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise RequirementError(f"{where} is no TOML: {str(error)[:200]}. {_advice()}") from error
-    return data
+        return toml.loads(text, MAX_BYTES)
+    except ValueError as error:
+        raise RequirementError(f"{where} is no TOML: {error}. {_advice()}") from error
 
 
 def _list(found: object, where: str) -> tuple[Wanted, ...]:

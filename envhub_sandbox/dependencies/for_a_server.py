@@ -15,7 +15,6 @@ and ends with it, also where that was killed: nobody would measure, and nobody w
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import os
 import resource
@@ -30,13 +29,20 @@ from typing import Any
 from packaging.utils import canonicalize_name
 
 from envhub_sandbox import parent
-from envhub_sandbox.dependencies import bounds, environments, interpreters, pipeline, uv
-from envhub_sandbox.dependencies.choice import DATE
+from envhub_sandbox.dependencies import (
+    bounds,
+    environments,
+    interpreters,
+    pipeline,
+    resolutions,
+    uv,
+)
 from envhub_sandbox.dependencies.declared import Wanted, parse_requirement
-from envhub_sandbox.dependencies.guesses import Guess
-from envhub_sandbox.dependencies.request import PackageRequest
+from envhub_sandbox.dependencies.modules import Guess
+from envhub_sandbox.dependencies.request import DATE, PackageRequest
 from envhub_sandbox.errors import DependencyError, PackagesTooLargeError, RequirementError
-from envhub_sandbox.hub.store import CACHE_VARIABLE, remove_tree
+from envhub_sandbox.hub.cache import CACHE_VARIABLE, remove_tree
+from envhub_sandbox.system import locks
 from envhub_worker.protocol.text import printable
 
 BLOCK_BYTES = 4096
@@ -96,7 +102,7 @@ def _made(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
     resource.setrlimit(resource.RLIMIT_FSIZE, (bound, bound))
     request = _request(order)
     # a client could have it ask any host that it reaches, and what a build takes is in no account
-    pipeline.BUILDER = None
+    resolutions.BUILDER = None
     if not request.always and pipeline.HERE.meets(request):
         return {"own": True}
     made = pipeline.HERE.make(request, lambda line: _say({"told": line[:_WHERE_CHARS]}))
@@ -225,24 +231,14 @@ def _charged(folder: Path) -> int:
 
 @contextlib.contextmanager
 def _alone(folder: Path) -> Iterator[int]:
-    """Nobody else makes packages in this folder: a server that was killed may have left one."""
+    """Hold the lock of a client's folder: a killed server may have left a process there."""
     folder.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    try:
-        until = time.monotonic() + _WAIT_S
-        while True:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                if time.monotonic() > until:
-                    raise DependencyError("another process makes packages there; ask again") from (
-                        None
-                    )
-                time.sleep(_LOOK_S)
+    with contextlib.ExitStack() as stack:
+        try:
+            descriptor = stack.enter_context(locks.held(folder / "lock", wait_s=_WAIT_S))
+        except TimeoutError:
+            raise DependencyError("another process makes packages there; ask again") from None
         yield descriptor
-    finally:
-        os.close(descriptor)
 
 
 def _uv_cache(order: Mapping[str, Any]) -> Path:

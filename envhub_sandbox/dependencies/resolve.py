@@ -3,30 +3,33 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
-import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
 from envhub_sandbox.dependencies import index, interpreters, uv
+from envhub_sandbox.dependencies.builds.sources import Source
 from envhub_sandbox.dependencies.declared import Wanted, parse_requirement
 from envhub_sandbox.dependencies.request import PackageRequest
-from envhub_sandbox.dependencies.sources import Source
-from envhub_sandbox.errors import PackageIntegrityError, RequirementError, ResolutionError
+from envhub_sandbox.errors import (
+    DependencyError,
+    PackageIntegrityError,
+    RequirementError,
+    ResolutionError,
+)
 from envhub_sandbox.option_names import option_name
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from envhub_sandbox.sources import toml
 
 WORKERS = ("cloudpickle>=3", "gymnasium>=0.26", "msgpack>=1.0.5", "numpy>=1.26")
 """What the worker's jails import besides: the repository's versions must be among these.
 Gymnasium may be older in a jail than outside."""
 _RESOLVE_S = 600.0
+_TORCH = ("torch", "torchvision", "torchaudio")
+_CPU_INDEX = ("--torch-backend", "cpu")
 _PIN = re.compile(r"([a-z0-9][a-z0-9.-]*)==([A-Za-z0-9.!+_-]+) \\")
 _IS_PYTHON = re.compile(
     r"does not satisfy Python|with a matching Python|no usable wheels|requires? Python"
@@ -47,6 +50,14 @@ class Lock:
 
     text: str
     options: tuple[str, ...] = ()
+
+    @property
+    def has_cuda(self) -> bool:
+        """Whether PyTorch is among them, with packages of NVIDIA's."""
+        pins = self.packages
+        return any(pin.startswith("torch==") for pin in pins) and any(
+            pin.startswith(("nvidia-", "cuda-")) for pin in pins
+        )
 
     @property
     def digest(self) -> str:
@@ -174,7 +185,7 @@ def sources_of(
         lambda line: None,
         {"uv.toml": settings},
     )
-    rows = tomllib.loads(text).get("packages", [])
+    rows = toml.loads(text, len(text), generated=True).get("packages", [])
     return [
         Source(row["name"], row["version"], sdist["url"], sdist["hashes"]["sha256"])
         for row in rows
@@ -198,14 +209,9 @@ def is_about_python(error: ResolutionError) -> bool:
     return _IS_PYTHON.search(str(error)) is not None
 
 
-def needs_other_python(error: ResolutionError) -> bool:
-    """Whether a version of Python is asked for that this is not."""
-    return _NEEDS_PYTHON.search(str(error)) is not None
-
-
 def without_wheels(error: ResolutionError) -> list[str]:
-    """Packages that have no wheel, as far as uv's text says."""
-    return _NO_WHEELS.findall(str(error))
+    """Packages without a wheel, as far as uv's text says; none if it asks for another Python."""
+    return [] if _NEEDS_PYTHON.search(str(error)) else _NO_WHEELS.findall(str(error))
 
 
 def _pins(text: str) -> list[tuple[str, str, list[str]]]:
@@ -274,3 +280,53 @@ def advice(asked: str, tried: Sequence[str], error: ResolutionError) -> str:
         "install what fits into an interpreter of your own and give that with "
         f"{option_name('python', 'PATH')}"
     )
+
+
+def without_cuda(
+    request: PackageRequest,
+    lock: Lock,
+    resolved: Callable[[PackageRequest, Sequence[str]], Lock],
+) -> Lock:
+    """The same without CUDA, where jails have no GPU and the index has such builds of PyTorch.
+
+    Which builds there are, only the index knows, and many mirrors have none of these: that is no
+    error, and the versions that were chosen first stay.
+
+    Args:
+        request: What is asked for.
+        lock: Its versions.
+        resolved: Gives versions for a request, with further options for uv.
+    """
+    if request.gpu or not lock.has_cuda or os.environ.get("UV_TORCH_BACKEND"):
+        return lock
+    for asked, options in _ways_without_cuda(request, lock):
+        try:
+            found = resolved(asked, options)
+        except DependencyError:
+            continue
+        if not found.has_cuda:
+            return found
+    return lock
+
+
+def _ways_without_cuda(
+    request: PackageRequest, lock: Lock
+) -> Iterator[tuple[PackageRequest, Sequence[str]]]:
+    """The same versions of the user's own index; and of PyTorch's, where he has chosen none."""
+    rows = (pin.partition("==") for pin in lock.packages)
+    held = tuple(
+        parse_requirement(f"{name}=={version.partition('+')[0]}+cpu", "the choice of no CUDA")
+        for name, _, version in rows
+        if name in _TORCH
+    )
+    yield replace(request, constraints=(*request.constraints, *held)), ()
+    if not index.is_chosen():
+        yield request, _CPU_INDEX
+
+
+def torch_options(lock: Lock) -> tuple[str, ...]:
+    """What uv needs to find these versions again, where only they are known."""
+    without = any(
+        pin.partition("==")[0] in _TORCH and pin.endswith("+cpu") for pin in lock.packages
+    )
+    return _CPU_INDEX if without and not index.is_chosen() else ()

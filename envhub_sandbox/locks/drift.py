@@ -60,17 +60,14 @@ def with_files(lock: LockFile, snapshot: Snapshot) -> LockFile:
 
 def _of_files(then: LockFile, now: LockFile) -> Iterator[str]:
     if then.repository != now.repository:
-        names = ["a local folder" if one == LOCAL else one for one in _two(then, now)]
+        both = (then.repository, now.repository)
+        names = ["a local folder" if one == LOCAL else one for one in both]
         yield f"repository: {names[0]} was locked, this is {names[1]}"
     if then.commit != now.commit:
         yield f"commit: {then.commit[:18]} was locked, this is {now.commit[:18]}"
     if then.entry != now.entry:
         yield f"entry file: {then.entry} was locked, this is {now.entry}"
     yield from _of_digests(then.files, now.files)
-
-
-def _two(then: LockFile, now: LockFile) -> tuple[str, str]:
-    return then.repository, now.repository
 
 
 def _of_digests(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[str]:
@@ -110,7 +107,7 @@ def _of_package(then: Package, now: Package) -> Iterator[str]:
     if then.version != now.version:
         yield f"package {then.name}: {then.version} was locked, this is {now.version}"
         return
-    before, after = (one.origin.identity if one.origin else "" for one in (then, now))
+    before, after = (one.origin.source.identity if one.origin else "" for one in (then, now))
     if before != after:
         yield f"package {then.name}: built of {before or 'no source'}, this of {after or 'none'}"
     there = {wheel.sha256 for wheel in now.wheels}

@@ -15,14 +15,14 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.dependencies import interpreters
-from envhub_sandbox.dependencies.choice import DATE
 from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
+from envhub_sandbox.dependencies.request import DATE
 from envhub_sandbox.errors import LockError, RequirementError
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.locks import pylock, toml
+from envhub_sandbox.locks import pylock
 from envhub_sandbox.locks.fingerprint import Task
-from envhub_sandbox.locks.pylock import Package, quoted
+from envhub_sandbox.locks.pylock import Package, quoted, table
 from envhub_sandbox.system.files import write_whole
 
 FORMAT = 1
@@ -136,17 +136,16 @@ def read(path: str | os.PathLike[str]) -> LockFile:
     where = f"the lock {os.fspath(path)}"
     try:
         with open(path, "rb") as file:
-            data = file.read(toml.MAX_CHARACTERS + 1)
+            data = file.read(pylock.MAX_CHARACTERS + 1)
         text = data.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise LockError(f"{where} cannot be read: {error}. 'envhub lock REF' writes one") from error
-    document = toml.loads(text, where)
+    document = pylock.document(text, where)
     packages = pylock.read(document, where)
     if not packages:
         raise LockError(f"{where} has no packages")
-    tool = document.get("tool")
-    ours = tool.get("envhub") if isinstance(tool, dict) else None
-    if not isinstance(ours, dict) or ours.get("format") != FORMAT:
+    ours = table(table(document, "tool"), "envhub")
+    if ours.get("format") != FORMAT:
         raise LockError(
             f"{where} has no [tool.envhub] of format {FORMAT}: it was written by another program, "
             "or by another release of this one. 'envhub lock REF' writes one"

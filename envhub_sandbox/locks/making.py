@@ -6,10 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from envhub_sandbox.dependencies.choice import Choice
 from envhub_sandbox.dependencies.declared import Wanted, parse_requirement
-from envhub_sandbox.dependencies.pipeline import resolution_for
-from envhub_sandbox.dependencies.request import request_of
+from envhub_sandbox.dependencies.request import Choice, request_of
+from envhub_sandbox.dependencies.resolutions import resolution_for
 from envhub_sandbox.errors import LockError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.locks import lockfile, pylock

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox.errors import DependencyError, LockError, PolicyError, name_source
@@ -11,7 +11,10 @@ from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.option_names import option_name
 
 if TYPE_CHECKING:  # they cost time, and mostly there is no lock
+    from envhub_sandbox.dependencies.builds.sources import WheelOrigin
+    from envhub_sandbox.dependencies.interpreters import Interpreter
     from envhub_sandbox.dependencies.pipeline import PackageSet
+    from envhub_sandbox.dependencies.resolve import Lock
     from envhub_sandbox.locks.lockfile import LockFile
     from envhub_worker.protocol.manifest.manifest import Manifest
 
@@ -50,7 +53,6 @@ def provided(snapshot: Snapshot, lock: LockFile) -> PackageSet:
     from envhub_sandbox.dependencies import environments, progress
     from envhub_sandbox.dependencies.pipeline import PackageSet
     from envhub_sandbox.locks import drift, lockfile, pylock
-    from envhub_sandbox.locks.built import with_wheels
 
     drift.refuse(drift.files_and_commit(lock, snapshot), snapshot.label)
     try:
@@ -58,12 +60,40 @@ def provided(snapshot: Snapshot, lock: LockFile) -> PackageSet:
         drift.refuse(drift.runner(lock, lockfile.Runner.of(interpreter)), snapshot.label)
         with progress.shown("packages") as tell:
             locked = [one.origin for one in lock.packages if one.origin is not None]
-            pins = with_wheels(pylock.pins(lock.packages), locked, interpreter, tell)
+            pins = _with_wheels(pylock.pins(lock.packages), locked, interpreter, tell)
             made = environments.provide(pins, interpreter, tell)
             return PackageSet.of(made)
     except (DependencyError, LockError) as error:
         name_source(error, snapshot.label)
         raise
+
+
+def _with_wheels(
+    lock: Lock,
+    locked: Sequence[WheelOrigin],
+    interpreter: Interpreter,
+    tell: Callable[[str], None],
+) -> Lock:
+    """The lock with wheels of what has none: kept, or built again of the locked sources.
+    Raises ``DependencyError`` where one cannot be built, or its source is another.
+    """
+    from envhub_sandbox.dependencies import environments
+    from envhub_sandbox.dependencies.builds import wheel_store
+    from envhub_sandbox.dependencies.resolutions import build
+    from envhub_sandbox.dependencies.resolve import Lock
+
+    if not locked or environments.ready(environments.key_of(lock, interpreter)) is not None:
+        return lock
+    wheels = build([one.source for one in locked], interpreter, tell)
+    text, options = lock.text, list(lock.options)
+    for origin, wheel in zip(locked, wheels, strict=True):
+        built = wheel_store.describe(wheel)
+        assert built is not None
+        if built.wheel != origin.wheel:
+            tell(f"{origin.source.name} was built again, and not to the same bytes")
+        text = text.replace(f"sha256:{origin.wheel}", f"sha256:{built.wheel}")
+        options += ["--find-links", str(wheel.parent)]
+    return Lock(text, tuple(options))
 
 
 def checker(

@@ -9,6 +9,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.sources.parsing import Named, Parsed
@@ -106,3 +108,18 @@ def _own(name: str, folder: str, files: set[str]) -> str:
             if candidate in files:
                 return candidate
     return ""
+
+
+def of_module(name: str) -> list[str]:
+    """The distributions that bring a module, the usual one first; empty where none is known."""
+    table = _table()
+    while name and name not in table:
+        name = name.rpartition(".")[0]
+    return table.get(name, [])
+
+
+@cache
+def _table() -> dict[str, list[str]]:
+    text = Path(__file__).with_name("modules.txt").read_text("utf-8")
+    rows = [line.split() for line in text.splitlines() if not line.startswith("#")]
+    return {module: names or [module] for module, *names in rows}

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from packaging.requirements import Requirement
 
 from envhub_sandbox.check.findings import Finding
-from envhub_sandbox.dependencies import host
+from envhub_sandbox.dependencies import installed
 from envhub_sandbox.dependencies.resolve import WORKERS
 from envhub_sandbox.sources.imports import Import
 
@@ -49,7 +49,7 @@ def _in_folder(packages: Path) -> set[str]:
 
 def _of_this_interpreter(declared: Mapping[str, Requirement]) -> set[str]:
     wanted = [*map(Requirement, WORKERS), *declared.values()]
-    return {module for one in host.brought(wanted) for module in _modules(one)}
+    return {module for one in installed.brought(wanted) for module in _modules(one)}
 
 
 def _modules(found: metadata.Distribution) -> set[str]:

@@ -7,14 +7,11 @@ import os
 import subprocess
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from envhub_sandbox import errors, parent
-from envhub_sandbox.dependencies.builds.project import Project
 from envhub_sandbox.dependencies.builds.wheels import MAX_BYTES
-from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.errors import DependencyError
 from envhub_worker.protocol.text import printable
 
@@ -31,33 +28,15 @@ class BuildFailedError(DependencyError):
     """The build backend failed, or was ended; the text is what it printed last."""
 
 
-@dataclass(frozen=True)
-class Order:
-    """What is built, and with what.
-
-    Attributes:
-        source: The folder of the sources.
-        project: How they say that they are built.
-        packages: The folder of the packages for that.
-        interpreter: What the wheel is for.
-        runtime: What runs the jail's own code: an interpreter and a folder of packages.
-        known: What the backend is known to need besides what the sources say.
-        environment: Further variables for the build.
-    """
-
-    source: Path
-    project: Project
-    packages: Path
-    interpreter: Interpreter
-    runtime: tuple[str, str]
-    known: tuple[str, ...]
-    environment: Mapping[str, str]
-
-
-def build(order: Order, folder: Path) -> Path | tuple[str, ...]:
+def build(order: Mapping[str, Any], folder: Path) -> Path | tuple[str, ...]:
     """A wheel below an empty folder, or what the build backend needs besides.
 
     Nothing of either has been looked at: they are a stranger's.
+
+    Args:
+        order: What is built, and with what, as ``making/builder.py`` reads it; limits, profile and
+            what the jail may read are added here.
+        folder: Of this build alone.
 
     Raises:
         BuildFailedError: It failed.
@@ -72,23 +51,16 @@ def build(order: Order, folder: Path) -> Path | tuple[str, ...]:
     return folder / "wheel" / os.path.basename(name)
 
 
-def _run(order: Order, folder: Path) -> dict[str, Any]:
-    told = {
-        "source": str(order.source),
-        "packages": str(order.packages),
-        "readable": [str(order.source), str(order.packages), str(folder / "tools")],
-        "python": order.interpreter.path,
-        "runtime": order.runtime,
-        "backend": order.project.backend,
-        "backend_path": order.project.backend_path,
-        "known": order.known,
-        "environment": dict(order.environment),
+def _run(order: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    whole = {
+        **order,
+        "readable": [order["source"], order["packages"], str(folder / "tools")],
         "limits": LIMITS,
         "wall_s": WALL_S,
         "max_bytes": MAX_BYTES,
         "profile": os.environ.get(PROFILE_VARIABLE) or "strict",
     }
-    (folder / "order.json").write_text(json.dumps(told))
+    (folder / "order.json").write_text(json.dumps(whole))
     with parent.pidfd() as ourselves:
         done = subprocess.run(
             [sys.executable, "-I", "-m", _PROGRAM, str(folder), str(ourselves)],

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.dependencies.declared import MAX_BYTES, MAX_DOTS, Wanted, parse_requirement
+from envhub_sandbox.dependencies.declared import MAX_BYTES, Wanted, parse_requirement
 from envhub_sandbox.errors import RequirementError
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from envhub_sandbox.sources import toml
 
 _LEGACY = ("setuptools", "wheel")
 _LEGACY_BACKEND = "setuptools.build_meta:__legacy__"
@@ -66,11 +61,10 @@ def _table(path: Path, where: str) -> dict[str, Any]:
     with path.open("rb") as file:
         data = file.read(MAX_BYTES + 1)
     try:
-        text = data.decode("utf-8-sig")
-        if len(data) > MAX_BYTES or text.count(".") > MAX_DOTS:
+        if len(data) > MAX_BYTES:
             raise ValueError("it is too long")
-        table = tomllib.loads(text).get("build-system", {})
-    except (ValueError, RecursionError) as error:
+        table = toml.loads(data.decode("utf-8-sig"), MAX_BYTES).get("build-system", {})
+    except ValueError as error:
         raise RequirementError(f"{where} cannot be read: {str(error)[:200]}") from error
     if not isinstance(table, dict):
         raise RequirementError(f"{where} is no table")

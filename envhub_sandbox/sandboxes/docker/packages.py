@@ -25,7 +25,7 @@ from envhub_sandbox.sandboxes.docker.engines import (
 from envhub_sandbox.sandboxes.docker.image import INTERPRETER
 
 if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.host import Described
+    from envhub_sandbox.dependencies.installed import Described
     from envhub_sandbox.dependencies.interpreters import Interpreter
 
 # without site, so that nothing of what is installed there runs: its metadata is read
@@ -60,12 +60,12 @@ class ImageTarget:
         """Whether the image has all of it; raises as ``inside``."""
         from packaging.utils import canonicalize_name
 
-        from envhub_sandbox.dependencies import host
+        from envhub_sandbox.dependencies import installed
 
         interpreter, there = self._inside()
         names = set(map(canonicalize_name, there))
         known = all(one.is_among(names) for one in request.guesses)
-        return known and host.lacks(request, there, interpreter.version) is None
+        return known and installed.first_unmet(request, there, interpreter.version) is None
 
     def make(self, request: PackageRequest, tell: Callable[[str], None]) -> PackageSet:
         """An environment of this machine, to be mounted; its interpreter is the image's.
@@ -86,7 +86,7 @@ def inside(engine: Engine, image: str) -> tuple[Interpreter, dict[str, Described
     Raises:
         SandboxUnavailableError: It is none of ours.
     """
-    from envhub_sandbox.dependencies.host import Described
+    from envhub_sandbox.dependencies.installed import Described
     from envhub_sandbox.dependencies.interpreters import Interpreter, release
 
     try:

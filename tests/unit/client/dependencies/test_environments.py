@@ -16,12 +16,11 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.dependencies import bounds, environments, uv_cache
+from envhub_sandbox.dependencies import bounds, environments, uv
 from envhub_sandbox.dependencies import index as index_settings
-from envhub_sandbox.dependencies.choice import chosen
 from envhub_sandbox.dependencies.environments import Environment
 from envhub_sandbox.dependencies.pipeline import ThisMachine
-from envhub_sandbox.dependencies.request import request_of
+from envhub_sandbox.dependencies.request import chosen, request_of
 from envhub_sandbox.errors import (
     DependencyError,
     IndexUnavailableError,
@@ -399,7 +398,7 @@ def test_what_another_uv_unpacks_is_left_to_it(
     """Its temporary folders look like those of one that was ended; then nobody is at work."""
     make_wheel(index.folder, "wanted")
     (tmp_path / "uv/.tmpours").mkdir(parents=True)
-    monkeypatch.setattr(uv_cache, "WAIT_S", 0.0)
+    monkeypatch.setattr(uv, "CACHE_WAIT_S", 0.0)
     index.hold("/files/wanted")
     with ThreadPoolExecutor(1) as pool:
         making = pool.submit(made, repository(tmp_path / "repo", "wanted"))
@@ -416,7 +415,7 @@ def test_what_another_uv_unpacks_is_left_to_it(
 
 def refused() -> None:
     """An installation of nothing, which is refused."""
-    with contextlib.suppress(PackageIntegrityError), uv_cache.cleared_after_refusal(["none==1"]):
+    with contextlib.suppress(PackageIntegrityError), uv.cleared_after_refusal(["none==1"]):
         (index_settings.uv_cache() / ".tmpours").touch()
         raise PackageIntegrityError("another hash")
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from envhub_sandbox.dependencies import host, interpreters
+from envhub_sandbox.dependencies import installed, interpreters
 from envhub_sandbox.dependencies.declared import parse_requirement
-from envhub_sandbox.dependencies.guesses import Guess
-from envhub_sandbox.dependencies.host import Described
+from envhub_sandbox.dependencies.installed import Described
+from envhub_sandbox.dependencies.modules import Guess
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import InterpreterUnavailableError
 from envhub_sandbox.sandboxes.docker import packages
@@ -43,7 +43,7 @@ def test_what_an_image_has_is_read_off_its_metadata(
     line: str, python: str, lacking: str | None
 ) -> None:
     """With the markers of the image's Python, and nothing of this one."""
-    assert host.lacks(declares(line), THERE, python) == lacking
+    assert installed.first_unmet(declares(line), THERE, python) == lacking
 
 
 def test_what_it_imports_is_in_the_image_or_made(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,7 @@
-"""What a repository imports and may not declare, with the distribution that brings each module.
+"""The modules that a repository imports: what brings each, and what to do where one is missing.
 
-Which one that is says its own pyproject.toml, or a table of ours, ``modules.txt``; never an index:
-anybody may publish a package under a module's name.
+Which distribution brings one says its own pyproject.toml, or a table of ours,
+``sources/modules.txt``; never an index: anybody may publish a package under a module's name.
 """
 
 from __future__ import annotations
@@ -13,23 +13,25 @@ import re
 import sys
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from envhub_sandbox.dependencies import remembered
+from envhub_sandbox.errors import RequirementError
+from envhub_sandbox.hub.cache import cache_root, keep, recall
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.hub.store import cache_root
+from envhub_sandbox.option_names import option_name
 from envhub_worker.protocol.text import printable
 
 if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.declared import Wanted
-    from envhub_sandbox.sources.imports import Import
+    from envhub_sandbox.dependencies.declared import Declared, Wanted
 
 _FORMAT = 1
 _READ: dict[tuple[Path, str], tuple[tuple[str, str, int], ...]] = {}
 _MOST = 64
+_SHOWN = 20
+_MISSING = re.compile(r"No module named '([\w.]+)'")
 _WORKERS = {"cloudpickle", "gymnasium", "msgpack", "numpy", "farama_notifications"}
 """Modules that are in every jail."""
 _GYMNASIUM = (
@@ -110,29 +112,14 @@ def _of_id(text: str) -> tuple[str, str, list[str]] | None:
 
 
 def _of_module(name: str, extras: Mapping[str, Wanted]) -> tuple[str, str, list[str]] | None:
+    from envhub_sandbox.sources.imports import of_module
+
     distributions = of_module(name)
     names = list(map(_canonical, distributions or [name.partition(".")[0]]))
     own = next((str(extras[one].requirement) for one in names if one in extras), None)
     if own is None and not distributions:
         return None
     return name.partition(".")[0], own or distributions[0], names
-
-
-def of_module(name: str) -> list[str]:
-    """The distributions that bring a module, the usual one first; empty where none is known."""
-    table = _table()
-    while name:
-        if name in table:
-            return table[name]
-        name = name.rpartition(".")[0]
-    return []
-
-
-@cache
-def _table() -> dict[str, list[str]]:
-    text = Path(__file__).with_name("modules.txt").read_text("utf-8")
-    rows = [line.split() for line in text.splitlines() if not line.startswith("#")]
-    return {module: names or [module] for module, *names in rows}
 
 
 def _canonical(name: str) -> str:
@@ -162,13 +149,13 @@ def _recalled(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
     folder = cache_root() / "imports"
     facts = json.dumps([_FORMAT, sys.version_info[:2], snapshot.commit, snapshot.path])
     key = hashlib.sha256(facts.encode()).hexdigest()
-    text = remembered.recall(folder, key)
+    text = recall(folder, key)
     try:
         rows = json.loads(text or "")
         return tuple((str(name), str(file), int(line)) for name, file, line in rows)
     except (ValueError, TypeError):
         rows = _parsed(snapshot)
-        remembered.keep(folder, key, json.dumps(rows))
+        keep(folder, key, json.dumps(rows))
         return tuple(rows)
 
 
@@ -176,9 +163,95 @@ def _parsed(snapshot: Snapshot) -> list[tuple[str, str, int]]:
     from envhub_sandbox.sources import imports, parsing
 
     files = parsing.read(snapshot)
-    found = [row for row in map(_row, imports.imports(snapshot, files)) if row[0] not in _WORKERS]
+    found = [(one.module, one.file, one.line) for one in imports.imports(snapshot, files)]
+    found = [row for row in found if row[0] not in _WORKERS]
     return [*found, *(row for row in imports.ids(snapshot, files) if _of_id(row[0]))]
 
 
-def _row(one: Import) -> tuple[str, str, int]:
-    return one.module, one.file, one.line
+@dataclass(frozen=True)
+class MissingModule:
+    """Advice for a repository whose import fails.
+
+    Attributes:
+        snapshot: Its files.
+        place: The sandbox's name.
+        where: Where its packages were to come from, as ``Choice`` has it.
+        python: The interpreter that the caller named.
+        own: Whether it ran in an environment that was made for it.
+    """
+
+    snapshot: Snapshot
+    place: str
+    where: str
+    python: str | Path | None
+    own: bool
+
+    def advice(self, said: str = "") -> str:
+        """What the repository declares, where it imports the module, and what helps.
+
+        Args:
+            said: The error's text, which names the module.
+        """
+        from envhub_sandbox.dependencies.declared import declared
+
+        module = found[1] if (found := _MISSING.search(said)) else ""
+        try:
+            says = declared(self.snapshot.root, self.snapshot.path)
+        except RequirementError as error:
+            return f"What it declares cannot be taken: {error}"
+        return f"{_what(says, self.snapshot)}.{self._where(module)} {self._cure(module, says)}"
+
+    def _where(self, module: str) -> str:
+        for name, file, line in read(self.snapshot) if module else ():
+            if name.partition(".")[0] == module.partition(".")[0]:
+                return f" {printable(file, 200)}, line {line} imports {name}."
+        return ""
+
+    def _cure(self, module: str, says: Declared | None) -> str:
+        from envhub_sandbox.sources.imports import of_module
+
+        name = next(iter(of_module(module)), "NAME-OF-THE-PACKAGE")
+        extra = option_name("dependencies", {"extra": [name]})
+        if self.place in ("docker", "remote"):
+            return self._elsewhere(extra)
+        if self.python is not None:
+            return f"It ran in {self.python}: install the package there, or leave out that argument"
+        if self.own:
+            return f"It ran in an environment of its own; the package joins it with {extra}"
+        here = f"It ran in this interpreter ({sys.executable})"
+        if self.where == "host" and says is not None and says.wanted:
+            host = option_name("dependencies", "host")
+            return f"{here}, as {host} says; leave that out, and it gets an environment of its own"
+        return f"{here}; it gets an environment of its own, and the package in it, with {extra}"
+
+    def _elsewhere(self, extra: str) -> str:
+        where = "in a container" if self.place == "docker" else "on another host"
+        if self.own:
+            return f"It ran {where}, with packages of its own; this one joins them with {extra}"
+        if self.place == "docker":
+            image = option_name("sandbox", "docker:IMAGE")
+            return (
+                f"It ran {where}, with the image's packages: it gets others with {extra}, or "
+                f"with an image that has them (envhub image build REF, then {image})"
+            )
+        return (
+            f"It ran {where}, with the packages of its server: its operator installs the package "
+            "into the server's interpreter, or starts the server with --dependencies, and the "
+            f"package comes with {extra}"
+        )
+
+
+def _what(found: Declared | None, snapshot: Snapshot) -> str:
+    if found is not None and found.wanted:
+        names = [str(wanted.requirement) for wanted in found.wanted]
+        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+        return f"Its {found.source} declares {', '.join(names[:_SHOWN])}{more}"
+    from envhub_sandbox.dependencies.declared import not_read
+
+    seen = not_read(snapshot.root, snapshot.path)
+    if seen:
+        return (
+            f"It has {', '.join(seen)}, which may say what it needs and was not read: "
+            "requirements.txt, [project] of pyproject.toml and the metadata of a script are"
+        )
+    return "It declares no packages"

@@ -1,14 +1,14 @@
-"""Whether an interpreter has all that a repository declares, so that nothing is to be installed.
+"""What is installed in an interpreter, by its metadata, and whether that is all that is declared.
 
-The metadata of what is installed is read, and nothing is imported.
+Nothing is imported.
 """
 
 from __future__ import annotations
 
 import platform
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from importlib import metadata
+from typing import NamedTuple
 
 from packaging.markers import default_environment
 from packaging.requirements import InvalidRequirement, Requirement
@@ -16,31 +16,26 @@ from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 from packaging.version import InvalidVersion
 
+from envhub_sandbox.dependencies.interpreters import release
 from envhub_sandbox.dependencies.request import PackageRequest
 
 
-@dataclass(frozen=True)
-class Described:
-    """A distribution of an interpreter elsewhere.
-
-    Attributes:
-        version: Its version.
-        requires: What it needs.
-    """
+class Described(NamedTuple):
+    """A distribution of an interpreter elsewhere: its version, and what it needs."""
 
     version: str
     requires: Sequence[str]
 
 
-def lacks(
+def first_unmet(
     request: PackageRequest,
     there: Mapping[str, Described] | None = None,
     version: str | None = None,
 ) -> str | None:
     """The first requirement that an interpreter does not meet, of those asked for or of theirs.
 
-    None if it meets them all. Where hashes or a repository are given it never does: nobody knows
-    any more what its packages were made of.
+    None if it meets them all. Where hashes or a repository are given it never does: the metadata
+    does not say what its packages were made of.
 
     Args:
         request: What is required.
@@ -48,8 +43,7 @@ def lacks(
         version: That one's version.
     """
     python = SpecifierSet(request.supports)
-    # a Python that was built from a checkout has a plus at the end, which is no version
-    found = version or platform.python_version().rstrip("+")
+    found = version or release(platform.python_version())
     if not python.contains(found, prereleases=True):
         return f"python{request.supports}"
     hashed = next((one for one in request.wanted if one.hashes or one.requirement.url), None)
