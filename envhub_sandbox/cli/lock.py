@@ -198,10 +198,11 @@ def _reference(ref: str | None, locked: LockFile, file: Path) -> str:
 
 
 def _now(locked: LockFile, snapshot: Snapshot, *, no_index: bool) -> LockFile:
+    from envhub_sandbox.dependencies import interpreters
     from envhub_sandbox.locks import lockfile, making
     from envhub_sandbox.locks.drift import with_files
 
-    here = lockfile.Runner.of(lockfile.runner_here(locked))
+    here = lockfile.Runner.of(interpreters.find(locked.runner.python))
     now = replace(with_files(locked, snapshot), runner=here)
     return now if no_index else replace(now, packages=making.relisted(locked).packages)
 

@@ -80,15 +80,7 @@ class Declared:
 
 
 def declared(root: Path, entry: str) -> Declared | None:
-    """What the files say; None where they say nothing.
-
-    Args:
-        root: The verified files.
-        entry: The entry file, as the snapshot names it.
-
-    Raises:
-        RequirementError: They say something that cannot be taken.
-    """
+    """What the files say; None where they say nothing. Raises ``RequirementError``."""
     script = _script(root / entry, entry)
     if script is not None:
         return script
@@ -134,11 +126,7 @@ def not_read(root: Path, entry: str) -> list[str]:
 
 
 def parse_requirement(text: str, where: str) -> Wanted:
-    """A requirement that somebody wrote, with the hashes behind it.
-
-    Raises:
-        RequirementError: It is none that can be taken.
-    """
+    """A requirement that somebody wrote, with the hashes behind it. Raises ``RequirementError``."""
     plain, *hashes = map(str.strip, re.split(r"(?<=\s)(?=--hash[= ])", text))
     if len(plain) > MAX_LINE:
         raise RequirementError(f"{where} has {len(plain)} characters; at most {MAX_LINE} are read")
@@ -181,9 +169,6 @@ def read(root: Path, name: str) -> tuple[list[Wanted], list[Wanted]]:
     """The plain requirements in a ``requirements.txt``, and the constraints.
 
     Further files of the repository that it names (``-r``, ``-c``) are read, too.
-
-    Raises:
-        RequirementError: It holds something else, or is no text.
     """
     wanted: list[Wanted] = []
     constraints: list[Wanted] = []

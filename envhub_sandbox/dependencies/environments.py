@@ -101,11 +101,7 @@ def key_of(lock: Lock, interpreter: Interpreter) -> str:
 
 
 def ready(key: str) -> Environment | None:
-    """The environment of this name, if it has been made.
-
-    Raises:
-        DependencyError: Others can write where it lies.
-    """
+    """The environment of this name, if it has been made. Raises ``DependencyError``."""
     found = _read(root() / key)
     if found is not None:
         _refuse_shared(found.home)
@@ -117,12 +113,7 @@ def provide(
 ) -> Environment:
     """The environment for a lock and an interpreter; made if there is none, and marked as used.
 
-    Whoever asks for the same at once waits for the one that makes it.
-
-    Raises:
-        IndexUnavailableError, PackageIntegrityError: As with uv.
-        PackagesTooLargeError: It is over the bounds of this machine.
-        DependencyError: It cannot be made, or others can write where it lies.
+    A second process that asks for the same at once waits for the first. Raises ``DependencyError``.
     """
     key = key_of(lock, interpreter)
     made = ready(key)

@@ -22,7 +22,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +63,8 @@ def main(words: Sequence[str] | None = None) -> int:
         if "check" in words:
             uv.command()
             return 0
-        ended = _pidfd(words)
+        given = [word.partition("=")[2] for word in words if word.startswith(_PIDFD)]
+        ended = int(given[0]) if given else None  # of the process which started this one
         order = json.load(sys.stdin)
         os.environ[CACHE_VARIABLE] = order["folder"]
         os.environ["UV_CACHE_DIR"] = str(_uv_cache(order))
@@ -77,12 +78,6 @@ def main(words: Sequence[str] | None = None) -> int:
     if said:
         _say(said)
     return 0
-
-
-def _pidfd(words: Sequence[str]) -> int | None:
-    """That of the process which started this one."""
-    given = [word.partition("=")[2] for word in words if word.startswith(_PIDFD)]
-    return int(given[0]) if given else None
 
 
 def _say(what: Mapping[str, Any]) -> None:
@@ -131,6 +126,7 @@ def _request(order: Mapping[str, Any]) -> PackageRequest:
             "the client asks for versions of Python that are none, for an interpreter by its path, "
             "or for a date that is none"
         ) from error
+    left_out = ((name, "without, of the client") for [name] in order["without"])
     return PackageRequest(
         "what the client asks for",
         _wanted(order["requirements"]),
@@ -144,17 +140,13 @@ def _request(order: Mapping[str, Any]) -> PackageRequest:
         ),
         constraints=_wanted(order["constraints"]),
         override=_wanted(order["override"]),
-        without=tuple(one.requirement.name for one in _wanted(_named(order["without"]))),
+        without=tuple(one.requirement.name for one in _wanted(left_out)),
         gpu=order["gpu"],
     )
 
 
 def _wanted(rows: Iterable[Sequence[str]]) -> tuple[Wanted, ...]:
     return tuple(parse_requirement(text, printable(where, _WHERE_CHARS)) for text, where in rows)
-
-
-def _named(rows: Iterable[Sequence[str]]) -> Iterator[Sequence[str]]:
-    return ((name, "without, of the client") for [name] in rows)
 
 
 # --- who watches --------------------------------------------------------------------------------
@@ -266,14 +258,11 @@ def _make_room(order: Mapping[str, Any]) -> None:
     if _charged(folder) > order["bytes"] // 2:
         remove_tree(_uv_cache(order))
         remove_tree(folder / "resolutions")
-    for environment in _removable(keep):
+    removable = [one for one in reversed(environments.every()) if one.key not in keep]
+    for environment in removable:
         if _charged(folder) <= order["bytes"] // 2:
             return
         environments.remove(environment)
-
-
-def _removable(keep: Collection[str]) -> list[environments.Environment]:
-    return [one for one in reversed(environments.every()) if one.key not in keep]
 
 
 if __name__ == "__main__":

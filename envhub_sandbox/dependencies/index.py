@@ -38,11 +38,7 @@ _YES = ("1", "true", "yes", "on")
 
 
 def environment(variables: Mapping[str, str] | None = None) -> dict[str, str]:
-    """The environment that uv runs in.
-
-    Args:
-        variables: The user's; those of this process by default.
-    """
+    """The environment that uv runs in, of the user's variables (those of this process)."""
     given = os.environ if variables is None else variables
     kept = {name: value for name, value in given.items() if value and _KEPT.fullmatch(name)}
     if not any(name in kept for name in _CHOOSE_AN_INDEX):

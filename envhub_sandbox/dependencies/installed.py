@@ -35,12 +35,8 @@ def first_unmet(
     """The first requirement that an interpreter does not meet, of those asked for or of theirs.
 
     None if it meets them all. Where hashes or a repository are given it never does: the metadata
-    does not say what its packages were made of.
-
-    Args:
-        request: What is required.
-        there: What an interpreter elsewhere has; by default it is this one.
-        version: That one's version.
+    does not say what its packages were made of. The interpreter is this one, unless another's
+    packages (``there``) and version are given.
     """
     python = SpecifierSet(request.supports)
     found = version or release(platform.python_version())
@@ -49,8 +45,8 @@ def first_unmet(
     hashed = next((one for one in request.wanted if one.hashes or one.requirement.url), None)
     if hashed is not None:
         return str(hashed.requirement)
-    installed = _Installed() if there is None else _InstalledElsewhere(there, found)
-    for wanted, met_by in installed.reached(one.requirement for one in request.wanted):
+    there_or_here = _Installed() if there is None else _Installed(there, found)
+    for wanted, met_by in there_or_here.reached(one.requirement for one in request.wanted):
         if met_by is None or not _is_among(met_by, wanted.specifier):
             return str(wanted)
     return None
@@ -63,10 +59,18 @@ def brought(requirements: Iterable[Requirement]) -> list[metadata.Distribution]:
 
 
 class _Installed:
-    def __init__(self) -> None:
+    """What an interpreter has: this one, or one elsewhere of that version."""
+
+    def __init__(self, elsewhere: Mapping[str, Described] | None = None, version: str = "") -> None:
         self._met: set[tuple[str, frozenset[str]]] = set()
-        self._found: dict[str, metadata.Distribution | Described | None] = {}
+        self._is_here = elsewhere is None
+        self._found: dict[str, metadata.Distribution | Described | None] = {
+            canonicalize_name(name): one for name, one in (elsewhere or {}).items()
+        }
         self._environment = {str(k): str(v) for k, v in default_environment().items()}
+        if version:
+            minor = ".".join(version.split(".")[:2])
+            self._environment |= {"python_full_version": version, "python_version": minor}
 
     def reached(
         self, requirements: Iterable[Requirement]
@@ -95,23 +99,13 @@ class _Installed:
         return any(wanted.marker.evaluate(environment) for environment in each)
 
     def _distribution(self, name: str) -> metadata.Distribution | Described | None:
-        if name not in self._found:
+        key = canonicalize_name(name)
+        if self._is_here and key not in self._found:
             try:
-                self._found[name] = metadata.distribution(name)
+                self._found[key] = metadata.distribution(name)
             except (metadata.PackageNotFoundError, ValueError):
-                self._found[name] = None
-        return self._found[name]
-
-
-class _InstalledElsewhere(_Installed):
-    def __init__(self, there: Mapping[str, Described], version: str) -> None:
-        super().__init__()
-        self._there = {canonicalize_name(name): one for name, one in there.items()}
-        minor = ".".join(version.split(".")[:2])
-        self._environment |= {"python_full_version": version, "python_version": minor}
-
-    def _distribution(self, name: str) -> Described | None:
-        return self._there.get(canonicalize_name(name))
+                self._found[key] = None
+        return self._found.get(key)
 
 
 def _is_among(found: metadata.Distribution | Described, versions: SpecifierSet) -> bool:

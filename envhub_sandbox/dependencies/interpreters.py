@@ -91,9 +91,6 @@ def find(asked: str, declared: str = "", *, fetch: bool = False) -> Interpreter:
             empty for none.
         declared: The versions that the repository runs in.
         fetch: Whether uv may download one where none is at hand.
-
-    Raises:
-        InterpreterUnavailableError: There is none.
     """
     if os.sep in asked:
         return _at(os.path.abspath(os.path.expanduser(asked)))
@@ -133,21 +130,13 @@ def _fetch(wanted: SpecifierSet) -> None:
 
 
 def check_versions(asked: str) -> None:
-    """Refuse what is neither a version, nor versions, nor a path.
-
-    Raises:
-        ValueError: It is none of these.
-    """
+    """Refuse what is neither a version, nor versions, nor a path. Raises ``ValueError``."""
     if os.sep not in asked:
         versions(asked)
 
 
 def versions(asked: str) -> SpecifierSet:
-    """What a caller asks for: one version, or several.
-
-    Raises:
-        ValueError: It is neither.
-    """
+    """What a caller asks for: one version, or several. Raises ``ValueError``: it is neither."""
     try:
         return SpecifierSet(f"=={Version(asked)}.*" if asked.count(".") < 2 else f"=={asked}")
     except (InvalidVersion, InvalidSpecifier):

@@ -6,6 +6,7 @@ Which distribution brings one says its own pyproject.toml, or a table of ours,
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -51,12 +52,8 @@ _GYMNASIUM = (
 
 @dataclass(frozen=True)
 class Guess:
-    """A module that is imported, and what brings it.
-
-    Attributes:
-        module: Its name.
-        wanted: The requirement, with the place of the import.
-        brought_by: Canonical names of distributions, any of which brings it.
+    """A module that is imported, with the requirement that brings it (and the place of the import),
+    and the canonical names of distributions, any of which does.
     """
 
     module: str
@@ -112,18 +109,16 @@ def _of_id(text: str) -> tuple[str, str, list[str]] | None:
 
 
 def _of_module(name: str, extras: Mapping[str, Wanted]) -> tuple[str, str, list[str]] | None:
+    from packaging.utils import canonicalize_name
+
     from envhub_sandbox.sources.imports import of_module
 
     distributions = of_module(name)
-    names = list(map(_canonical, distributions or [name.partition(".")[0]]))
+    names = list(map(str, map(canonicalize_name, distributions or [name.partition(".")[0]])))
     own = next((str(extras[one].requirement) for one in names if one in extras), None)
     if own is None and not distributions:
         return None
     return name.partition(".")[0], own or distributions[0], names
-
-
-def _canonical(name: str) -> str:
-    return re.sub(r"[-_.]+", "-", name).lower()
 
 
 def is_here(guess: Guess) -> bool:
@@ -149,14 +144,12 @@ def _recalled(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
     folder = cache_root() / "imports"
     facts = json.dumps([_FORMAT, sys.version_info[:2], snapshot.commit, snapshot.path])
     key = hashlib.sha256(facts.encode()).hexdigest()
-    text = recall(folder, key)
-    try:
-        rows = json.loads(text or "")
+    with contextlib.suppress(ValueError, TypeError):
+        rows = json.loads(recall(folder, key) or "")
         return tuple((str(name), str(file), int(line)) for name, file, line in rows)
-    except (ValueError, TypeError):
-        rows = _parsed(snapshot)
-        keep(folder, key, json.dumps(rows))
-        return tuple(rows)
+    rows = _parsed(snapshot)
+    keep(folder, key, json.dumps(rows))
+    return tuple(rows)
 
 
 def _parsed(snapshot: Snapshot) -> list[tuple[str, str, int]]:
@@ -187,10 +180,8 @@ class MissingModule:
     own: bool
 
     def advice(self, said: str = "") -> str:
-        """What the repository declares, where it imports the module, and what helps.
-
-        Args:
-            said: The error's text, which names the module.
+        """What the repository declares, where it imports the module that ``said`` names, and what
+        helps.
         """
         from envhub_sandbox.dependencies.declared import declared
 

@@ -61,11 +61,7 @@ class PackageTarget(Protocol):
 
 
 class ThisMachine:
-    """The interpreters of this machine.
-
-    Args:
-        upgrade: Choose versions again, although it is known which were chosen before.
-    """
+    """The interpreters of this machine; with ``upgrade``, versions are chosen again."""
 
     def __init__(self, *, upgrade: bool = False) -> None:
         self._upgrade = upgrade
@@ -95,10 +91,7 @@ def packages_for(
 ) -> PackageSet | None:
     """The packages that a repository runs with; None for those that the place has.
 
-    Progress is shown where somebody looks.
-
-    Raises:
-        DependencyError: They cannot be made; the text says what to change.
+    Progress is shown on a terminal. Raises ``DependencyError``, with what to change.
     """
     try:
         request = request_of(snapshot, choice, gpu=gpu)

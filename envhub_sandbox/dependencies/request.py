@@ -62,13 +62,8 @@ def chosen(
 ) -> tuple[Choice, str | Path | None]:
     """The choice, and the interpreter whose packages are used, if it is one of the caller's.
 
-    Args:
-        dependencies: As ``make_env`` takes it.
-        python: Likewise; it wins over ``"auto"``.
-
-    Raises:
-        PolicyError: It is none of these, or both say something else.
-        RequirementError: A further requirement is none.
+    Both as ``make_env`` takes them; ``python`` wins over ``"auto"``. Raises ``PolicyError`` and
+    ``RequirementError``.
     """
     if isinstance(dependencies, Mapping):
         if python is not None:
@@ -207,11 +202,7 @@ class PackageRequest:
 
 
 def request_of(snapshot: Snapshot, choice: Choice, *, gpu: bool = False) -> PackageRequest | None:
-    """What a repository is to have; None where the place's own packages are used as they are.
-
-    Raises:
-        RequirementError: What the repository declares cannot be taken.
-    """
+    """What a repository is to have; None where the place's own packages are used as they are."""
     if choice.where == "host":
         return None
     auto, found = choice.where == "auto", None

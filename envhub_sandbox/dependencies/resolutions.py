@@ -37,12 +37,8 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Resolution:
-    """What was chosen for a request.
-
-    Attributes:
-        lock: The versions.
-        interpreter: What they are for.
-        taken: Modules that are imported and not declared, and were installed for it.
+    """Versions and the interpreter that they are for; and the modules that are imported and not
+    declared, and were installed for it.
     """
 
     lock: Lock
@@ -71,9 +67,8 @@ def resolution_for(
 ) -> Resolution:
     """Versions for an interpreter of this machine: remembered, or chosen.
 
-    Raises:
-        ResolutionError: There are none; the text says what to change.
-        DependencyError: There is no interpreter, no index, or no uv.
+    Raises ``ResolutionError``, with what to change, or ``DependencyError`` where there is no
+    interpreter, no index or no uv.
     """
     first = interpreters.find(request.python, request.supports, fetch=request.fetch_python)
     key = key_of(request, first)
@@ -190,14 +185,8 @@ def _built_from_git(
 def versions_for(
     request: PackageRequest, resolved: Callable[[PackageRequest], Lock]
 ) -> tuple[Lock, tuple[Guess, ...]]:
-    """Versions, and what was taken that nothing else brings.
-
-    Args:
-        request: What is asked for.
-        resolved: Gives versions for a request, without its guesses.
-
-    Raises:
-        ResolutionError: There are none.
+    """Versions, and what was taken that nothing else brings; ``resolved`` gives them without
+    guesses.
     """
     taken = request.guesses
     if request.wanted or not taken:

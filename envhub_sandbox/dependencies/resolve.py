@@ -41,11 +41,8 @@ _HASH = re.compile(r"    --hash=(sha(?:256|384|512):[0-9a-f]+)( \\)?")
 
 @dataclass(frozen=True)
 class Lock:
-    """Every package, pinned, with the hashes of its wheels.
-
-    Attributes:
-        text: As pip's ``--require-hashes`` reads it.
-        options: For uv: where the index does not have all of them.
+    """Every package, pinned, with the hashes of its wheels, as pip's ``--require-hashes`` reads it;
+    and options for uv where the index does not have all of them.
     """
 
     text: str
@@ -117,10 +114,8 @@ def resolve(
         refresh: Ask the index anew for what uv has seen a moment ago.
         tell: Gets each line of uv's progress.
 
-    Raises:
-        ResolutionError: There is no solution.
-        PackageIntegrityError: A version is there, but not with a hash that was asked for.
-        DependencyError: There is no uv, or it failed.
+    Raises ``ResolutionError``; and ``PackageIntegrityError`` for a version that is there, but not
+    with a hash that was asked for.
     """
     words = [*uv.NO_BUILDS, "--generate-hashes", *options, *(["--refresh"] if refresh else [])]
     text = _compiled(request, target, words, tell)
@@ -169,9 +164,6 @@ def sources_of(
     """The source distributions that are chosen for packages without wheels. Nothing is built.
 
     What each needs is not known yet: it counts once there is a wheel of it.
-
-    Raises:
-        ResolutionError: There is no solution either.
     """
     tables = "".join(
         f'[[dependency-metadata]]\nname = "{name}"\nrequires-dist = []\n' for name in names
@@ -259,12 +251,8 @@ def _what_is_required(said: str, every: Sequence[Wanted]) -> str:
 
 
 def advice(asked: str, tried: Sequence[str], error: ResolutionError) -> str:
-    """What to do where nothing satisfies all requirements.
-
-    Args:
-        asked: The Python that the caller asks for; empty for none.
-        tried: Versions of the interpreters that were tried.
-        error: Of the first of them.
+    """What to do where nothing satisfies all requirements, by the Python that was asked for, the
+    versions that were tried, and the error of the first of them.
     """
     others = ""
     needed = _NEEDS_PYTHON.findall(str(error))
@@ -290,12 +278,7 @@ def without_cuda(
     """The same without CUDA, where jails have no GPU and the index has such builds of PyTorch.
 
     Which builds there are, only the index knows, and many mirrors have none of these: that is no
-    error, and the versions that were chosen first stay.
-
-    Args:
-        request: What is asked for.
-        lock: Its versions.
-        resolved: Gives versions for a request, with further options for uv.
+    error, and the versions that were chosen first stay. ``resolved`` takes further options for uv.
     """
     if request.gpu or not lock.has_cuda or os.environ.get("UV_TORCH_BACKEND"):
         return lock

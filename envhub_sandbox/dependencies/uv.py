@@ -190,11 +190,7 @@ def _listen(stream: IO[str], lines: list[str], tell: Callable[[str], None]) -> N
 
 
 def command() -> str:
-    """uv's path.
-
-    Raises:
-        DependencyError: It is not installed, or too old.
-    """
+    """uv's path. Raises ``DependencyError``: it is not installed, or too old."""
     found: str | None
     try:
         from uv import find_uv_bin  # it knows where pip has put it, which need not be on PATH
@@ -256,9 +252,6 @@ def cleared_after_refusal(pins: Sequence[str]) -> Iterator[None]:
 
     uv unpacks a download in its cache before it installs it, and keeps what it had unpacked when
     it was ended: a wheel that is too large would stay, and be found there the next time.
-
-    Args:
-        pins: ``name==version`` of each.
     """
     begun = time.time()
     try:

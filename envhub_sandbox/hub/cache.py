@@ -38,11 +38,7 @@ def cache_root() -> Path:
 
 @contextlib.contextmanager
 def draft(folder: Path, prefix: str = BUILDING) -> Iterator[Path]:
-    """A new folder (0700) to be filled and then renamed into place; otherwise it is removed.
-
-    Raises:
-        OSError: It cannot be made.
-    """
+    """A new folder (0700) to be filled and then renamed into place; otherwise it is removed."""
     made = Path(tempfile.mkdtemp(prefix=prefix, dir=folder))
     try:
         made.chmod(folders.PRIVATE_MODE)

@@ -53,11 +53,7 @@ def default_endpoint() -> str:
 
 
 def checked_endpoint(endpoint: str | None) -> str:
-    """The endpoint without a trailing slash.
-
-    Raises:
-        HubReferenceError: It is not an http(s) URL.
-    """
+    """The endpoint without a trailing slash. Raises ``HubReferenceError``."""
     chosen = default_endpoint() if endpoint is None else endpoint.rstrip("/")
     shown = without_login(chosen)
     if "@" in shown:
@@ -73,11 +69,7 @@ def checked_endpoint(endpoint: str | None) -> str:
 
 
 def checked_token(token: str | bool | None) -> str | bool | None:
-    """The token, stripped; the text of an error never shows it.
-
-    Raises:
-        HubReferenceError: It cannot be sent in an HTTP header, whose error would print it.
-    """
+    """The token, stripped; the text of an error never shows it. Raises ``HubReferenceError``."""
     if not isinstance(token, str):
         return token
     stripped = token.strip()
@@ -258,7 +250,12 @@ def _record_of(item: Any, repo: Repository) -> FileRecord | None:
         size, digest = (lfs["size"], lfs["oid"]) if lfs else (item["size"], item["oid"])
         kind, length = (SHA256, 64) if lfs else (GIT_SHA1, 40)
         digest = digest.removeprefix("sha256:")
-        if type(path) is str and type(size) is int and size >= 0 and _is_hex(digest, length):
+        if (
+            type(path) is str
+            and type(size) is int
+            and size >= 0
+            and re.fullmatch(rf"[0-9a-f]{{{length}}}", digest)
+        ):
             path.encode()  # A lone surrogate cannot be a file's name.
             return FileRecord(path, size, f"{kind}:{digest}")
         raise ValueError("a field is not what it should be")
@@ -267,10 +264,6 @@ def _record_of(item: Any, repo: Repository) -> FileRecord | None:
             f"{repo.repo_id}: the Hub's listing has an entry that cannot be read ({error!r}); "
             "check that the endpoint is a Hugging Face Hub"
         ) from error
-
-
-def _is_hex(text: str, length: int) -> bool:
-    return re.fullmatch(rf"[0-9a-f]{{{length}}}", text) is not None
 
 
 def _with_xet_or_without(download: Any, **arguments: Any) -> str:

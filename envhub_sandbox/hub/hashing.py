@@ -41,11 +41,7 @@ def _start(kind: str, size: int) -> _Hash:
 
 
 def digest_of(source: Path, kind: str, size: int) -> str:
-    """The digest of a file that should have ``size`` bytes, for example ``"sha256:..."``.
-
-    Raises:
-        Mismatch: It is not a regular file, or cannot be read.
-    """
+    """The digest of a file that should have ``size`` bytes, for example ``"sha256:..."``."""
     running = _start(kind, size)
     with _open_regular(source) as stream:
         for chunk in _chunks(stream):

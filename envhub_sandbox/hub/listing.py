@@ -115,11 +115,7 @@ _File = TypeVar("_File", bound=_Sized)
 
 
 def within_limits(files: Iterable[_File], limits: SnapshotLimits, title: str) -> tuple[_File, ...]:
-    """Collect the files, sorted by path, and stop as soon as a limit is passed.
-
-    Raises:
-        SnapshotTooLargeError: The text names the limit and how to raise it.
-    """
+    """The files, sorted by path; ``SnapshotTooLargeError`` as soon as a limit is passed."""
     taken: list[_File] = []
     total = 0
     for file in files:

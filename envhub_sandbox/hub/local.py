@@ -40,13 +40,8 @@ _ALL_COUNTS = (
 
 
 class LocalFile(NamedTuple):
-    """A file of a folder.
-
-    Attributes:
-        path: Its name in the snapshot.
-        source: Where its bytes are.
-        size: In bytes.
-        link: The text of a link that git would commit, which is then its content.
+    """A file of a folder: its name in the snapshot, where its bytes are, and its size; or the text
+    of a link that git would commit, which is then its content.
     """
 
     path: str
@@ -56,12 +51,8 @@ class LocalFile(NamedTuple):
 
 
 class LeftOut(NamedTuple):
-    """What lies in a checkout and is in no commit of it.
-
-    Attributes:
-        path: Its name; of a folder with a slash at its end.
-        is_repository: It is a repository of its own, of which git commits a pointer. Otherwise
-            git ignores it.
+    """What lies in a checkout and is in no commit of it; a folder has a slash at its end. It is
+    ignored, or a repository of its own, of which git commits a pointer.
     """
 
     path: str
@@ -70,11 +61,8 @@ class LeftOut(NamedTuple):
 
 @dataclass(frozen=True)
 class LocalFolder:
-    """A folder of this machine.
-
-    Attributes:
-        root: Its path, without links.
-        checkout: What git says of it; None where every file counts.
+    """A folder of this machine, without links in its path; every file counts where git says nothing
+    of it.
     """
 
     root: Path
@@ -90,23 +78,15 @@ class LocalFolder:
         return cls(root, read_checkout(root))
 
     def files(self) -> Iterator[LocalFile]:
-        """Yield the files of the snapshot. Names are relative, with ``/``.
-
-        Raises:
-            SnapshotError: A link leaves the folder, is broken or leads to a loop.
+        """The files of the snapshot, with ``/`` in their names. A link that leaves the folder is
+        refused.
         """
         return (one for one in self._found() if isinstance(one, LocalFile))
 
     def listed(
         self, limits: SnapshotLimits
     ) -> tuple[tuple[LocalFile, ...], tuple[FileRecord, ...]]:
-        """The files of the snapshot, within limits, and their records, by reading all of them.
-
-        Raises:
-            SnapshotTooLargeError: Over the limits.
-            SnapshotError: As with ``files``; or a file cannot be read, or has a name that the Hub
-                cannot have.
-        """
+        """The files of the snapshot, within limits, and their records, by reading all of them."""
         try:
             found = within_limits(self.files(), limits, str(self))
         except OSError as error:
@@ -213,11 +193,7 @@ def _is_empty_folder(path: Path) -> bool:
 
 
 def split_local(text: str, path: str) -> tuple[Path, str]:
-    """The folder and entry of ``./env``, ``./env:sub/env.py`` or ``./env/other.py``.
-
-    Raises:
-        RepositoryUnavailableError: There is no such folder, or the file is not Python's.
-    """
+    """The folder and entry of ``./env``, ``./env:sub/env.py`` or ``./env/other.py``."""
     folder = Path(os.path.abspath(os.path.expanduser(text)))
     if folder.is_dir():
         return folder, os.path.normpath(path)

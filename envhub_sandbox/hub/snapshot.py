@@ -237,11 +237,7 @@ class _Candidate:
         return store.repository_folder(self.hub.public_endpoint, *self.repo)
 
     def stored(self) -> Snapshot | None:
-        """The pinned commit, if it is in the store. No request.
-
-        Raises:
-            HalfDeletedError: Parts of it are gone.
-        """
+        """The pinned commit, if it is in the store. No request. Raises ``HalfDeletedError``."""
         slot = self._slot(self.ref.revision or "")
         files = store.load(slot)
         return None if files is None else self._finished(slot, files)

@@ -255,7 +255,7 @@ def publish(
     except OSError as error:
         raise SnapshotError(
             f"the snapshot store {slot.folder} cannot be written: {error}. Free space or fix its "
-            f"permissions, or set {CACHE_VARIABLE} to another folder"
+            "permissions, or set ENVHUB_CACHE to another folder"
         ) from error
 
 
@@ -285,11 +285,7 @@ def _move_remains(slot: Slot) -> None:
 
 
 def remove(home: Path) -> dict[int, str]:
-    """Remove a snapshot. Not while others use it, who share a lock of its folder.
-
-    Returns:
-        These, as ``sharers`` does; none where it was removed.
-    """
+    """Remove a snapshot, unless others use it (share a lock of its folder); these are returned."""
     with contextlib.suppress(FileNotFoundError):
         descriptor = os.open(home, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
@@ -327,7 +323,7 @@ def _refuse_shared_store(place: Path) -> None:
     if why:
         raise SnapshotError(
             f"the snapshot store {root} is not trusted, since other users can change what is in "
-            f"it: {why}; or set {CACHE_VARIABLE} to a folder of your own"
+            f"it: {why}; or set ENVHUB_CACHE to a folder of your own"
         )
 
 

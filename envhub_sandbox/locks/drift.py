@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from envhub_sandbox.errors import LockDriftError
@@ -17,20 +17,19 @@ _SHOWN = 30
 
 def differences(then: LockFile, now: LockFile) -> list[str]:
     """Whatever differs, a line each."""
+    spaces: Iterator[str] = iter(())
+    if then.spaces and now.spaces and then.spaces.arguments == now.spaces.arguments:
+        spaces = of_tasks(then.spaces.tasks, now.spaces.tasks)
     return [
         *_of_files(then, now),
         *_of_runner(then.runner, now.runner),
         *_of_packages(then.packages, now.packages),
-        *_of_spaces(then, now),
+        *spaces,
     ]
 
 
 def refuse(found: Sequence[str], label: str) -> None:
-    """Raise what has drifted, if anything has.
-
-    Raises:
-        LockDriftError: Something has.
-    """
+    """Raise what has drifted, if anything has. Raises ``LockDriftError``: something has."""
     if not found:
         return
     more = [f"and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else []
@@ -67,17 +66,13 @@ def _of_files(then: LockFile, now: LockFile) -> Iterator[str]:
         yield f"commit: {then.commit[:18]} was locked, this is {now.commit[:18]}"
     if then.entry != now.entry:
         yield f"entry file: {then.entry} was locked, this is {now.entry}"
-    yield from _of_digests(then.files, now.files)
-
-
-def _of_digests(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[str]:
-    for name in sorted({*then, *now}):
+    for name in sorted({*then.files, *now.files}):
         shown = printable(name, 200)
-        if name not in now:
+        if name not in now.files:
             yield f"file {shown}: gone"
-        elif name not in then:
+        elif name not in then.files:
             yield f"file {shown}: new"
-        elif then[name] != now[name]:
+        elif then.files[name] != now.files[name]:
             yield f"file {shown}: other content"
 
 
@@ -120,13 +115,6 @@ def _of_package(then: Package, now: Package) -> Iterator[str]:
             )
 
 
-def _of_spaces(then: LockFile, now: LockFile) -> Iterator[str]:
-    if then.spaces is None or now.spaces is None:
-        return
-    if then.spaces.arguments == now.spaces.arguments:
-        yield from of_tasks(then.spaces.tasks, now.spaces.tasks)
-
-
 def of_tasks(then: Sequence[Task], now: Sequence[Task]) -> Iterator[str]:
     """What differs in environments."""
     before, after = ({task.name: task for task in tasks} for tasks in (then, now))
@@ -138,16 +126,13 @@ def of_tasks(then: Sequence[Task], now: Sequence[Task]) -> Iterator[str]:
         if old.mode != new.mode:
             yield f"environment {shown}: autoreset mode {old.mode or 'none'}, now {new.mode}"
         if old.spaces != new.spaces:
-            yield f"environment {shown}: {_of_texts(old, new)}"
-
-
-def _of_texts(old: Task, new: Task) -> str:
-    told = [
-        f"{what} were {before}, now {after}"
-        for what, before, after in (
-            ("observations", old.observations, new.observations),
-            ("actions", old.actions, new.actions),
-        )
-        if before != after
-    ]
-    return "; ".join(told) or "other bounds or types in its spaces, which read the same"
+            said = [
+                f"{what} were {before}, now {after}"
+                for what, before, after in (
+                    ("observations", old.observations, new.observations),
+                    ("actions", old.actions, new.actions),
+                )
+                if before != after
+            ]
+            text = "; ".join(said) or "other bounds or types in its spaces, which read the same"
+            yield f"environment {shown}: {text}"

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.request import DATE
@@ -31,6 +30,7 @@ MAX_TASKS = 4096
 MAX_TEXT = 4096
 LOCAL = "local"
 """The repository of a folder of this machine: its path is nobody else's."""
+_REQUIREMENTS = ("extra", "only", "override", "without")
 _COMMIT = re.compile(r"[0-9a-f]{40}|local-[0-9a-f]+")
 _PYTHON = re.compile(r"3\.\d{1,3}")
 _WORD = re.compile(r"[a-z0-9_]{1,40}")
@@ -57,12 +57,7 @@ class Runner:
 
 @dataclass(frozen=True)
 class Spaces:
-    """What a repository's ``make_env`` returned.
-
-    Attributes:
-        arguments: The ``env_kwargs`` that it was given, as ``arguments_text`` writes them.
-        tasks: Its environments.
-    """
+    """What a repository's ``make_env`` returned for arguments (as ``arguments_text`` writes)."""
 
     arguments: str
     tasks: tuple[Task, ...]
@@ -128,11 +123,7 @@ def arguments_text(env_kwargs: Mapping[str, Any] | None) -> str | None:
 
 
 def read(path: str | os.PathLike[str]) -> LockFile:
-    """A lock file.
-
-    Raises:
-        LockError: It cannot be read, or is none of ours.
-    """
+    """A lock file. Raises ``LockError``: it cannot be read, or is none of ours."""
     where = f"the lock {os.fspath(path)}"
     try:
         with open(path, "rb") as file:
@@ -174,13 +165,10 @@ class _Reader:
                 text(self._ours, "machine", _WORD),
             ),
             packages=packages,
-            extra=self._requirements("extra"),
-            only=self._requirements("only") if "only" in self._ours else None,
-            override=self._requirements("override"),
-            without=self._requirements("without"),
             inferred=self._texts("inferred"),
             exclude_newer=newer,
             spaces=self._spaces(),
+            **{name: self._requirements(name) for name in _REQUIREMENTS if name in self._ours},
         )
 
     def _text(
@@ -263,17 +251,11 @@ def written(lock: LockFile) -> str:
         facts["exclude-newer"] = lock.exclude_newer
     ours = ["", "[tool.envhub]", f"format = {FORMAT}"]
     ours += [f"{name} = {quoted(value)}" for name, value in facts.items()]
-    lists = {
-        "extra": lock.extra,
-        "only": lock.only,
-        "override": lock.override or None,
-        "without": lock.without or None,
-        "inferred": lock.inferred or None,
-    }
+    lists = {name: getattr(lock, name) for name in (*_REQUIREMENTS, "inferred")}
     ours += [
         f"{name} = [{', '.join(map(quoted, texts))}]"
         for name, texts in lists.items()
-        if texts is not None
+        if texts or name == "extra" or (name == "only" and texts is not None)
     ]
     ours += ["", "[tool.envhub.files]"]
     ours += [f"{quoted(name)} = {quoted(digest)}" for name, digest in sorted(lock.files.items())]
@@ -294,21 +276,8 @@ def _task_line(task: Task) -> str:
 
 
 def write(lock: LockFile, path: Path) -> None:
-    """Write a lock file; whoever reads it meanwhile reads the old one.
-
-    Raises:
-        LockError: It cannot be written.
-    """
+    """Write a lock file; whoever reads it meanwhile reads the old one. Raises ``LockError``."""
     try:
         write_whole(path, written(lock).encode(), mode=0o666)
     except (OSError, UnicodeEncodeError) as error:
         raise LockError(f"the lock {path} cannot be written: {error}") from error
-
-
-def runner_here(lock: LockFile) -> Interpreter:
-    """An interpreter of this machine of the kind that is locked.
-
-    Raises:
-        InterpreterUnavailableError: There is none.
-    """
-    return interpreters.find(lock.runner.python)

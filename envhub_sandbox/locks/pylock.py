@@ -82,9 +82,7 @@ def pins(packages: Sequence[Package]) -> Lock:
 def described(lock: Lock, python: str) -> tuple[Package, ...]:
     """The pins with their files, as the index has them now, for the interpreter at this path.
 
-    Raises:
-        PackageIntegrityError: No file of a package is one that the pins permit.
-        DependencyError: As with uv.
+    Raises ``PackageIntegrityError`` where no file of a package is one that the pins permit.
     """
     versions = [line.partition(" ")[0] for line in lock.text.splitlines()]
     found = listed(versions, python, lock.options)
@@ -109,11 +107,7 @@ def described(lock: Lock, python: str) -> tuple[Package, ...]:
 def listed(
     versions: Sequence[str], python: str, options: Sequence[str] = (), *, refresh: bool = False
 ) -> tuple[Package, ...]:
-    """What the index has of each ``name==version``.
-
-    Raises:
-        DependencyError: As with uv.
-    """
+    """What the index has of each ``name==version``. Raises ``DependencyError``: as with uv."""
     text = uv.run(
         [
             *("pip", "compile", "-", *uv.NO_BUILDS, "--no-deps", "--format", "pylock.toml"),
@@ -130,11 +124,7 @@ def listed(
 
 
 def document(text: str, where: str) -> dict[str, Any]:
-    """The TOML of a lock file.
-
-    Raises:
-        LockError: It is none, or too long.
-    """
+    """The TOML of a lock file. Raises ``LockError``: it is none, or too long."""
     try:
         return toml.loads(text, MAX_CHARACTERS, generated=True)
     except ValueError as error:
@@ -142,11 +132,7 @@ def document(text: str, where: str) -> dict[str, Any]:
 
 
 def read(document: Mapping[str, Any], where: str) -> tuple[Package, ...]:
-    """The packages in a lock file, sorted by name.
-
-    Raises:
-        LockError: It is none, or holds something else than wheels of an index.
-    """
+    """The packages in a lock file, sorted by name. Raises ``LockError``."""
     if document.get("lock-version") != "1.0":
         raise LockError(f"{where} is no lock file of version 1.0")
     given = document.get("packages")

@@ -22,11 +22,8 @@ if TYPE_CHECKING:  # they cost time, and mostly there is no lock
 def opened(
     path: str | os.PathLike[str], sandbox: object, python: object, dependencies: object
 ) -> LockFile:
-    """The lock of these arguments of ``make_env``.
-
-    Raises:
-        LockError: It cannot be read.
-        PolicyError: The other arguments say something else.
+    """The lock of these arguments of ``make_env``; ``PolicyError`` if the others say something
+    else.
     """
     if python is not None or dependencies != "auto":
         raise PolicyError(
@@ -46,17 +43,15 @@ def opened(
 def provided(snapshot: Snapshot, lock: LockFile) -> PackageSet:
     """The environment of its packages; made if there is none.
 
-    Raises:
-        LockDriftError: The files or the interpreter are others.
-        DependencyError: It cannot be made; a package that was replaced is one of these.
+    Raises ``LockDriftError`` where the files or the interpreter are others.
     """
-    from envhub_sandbox.dependencies import environments, progress
+    from envhub_sandbox.dependencies import environments, interpreters, progress
     from envhub_sandbox.dependencies.pipeline import PackageSet
     from envhub_sandbox.locks import drift, lockfile, pylock
 
     drift.refuse(drift.files_and_commit(lock, snapshot), snapshot.label)
     try:
-        interpreter = lockfile.runner_here(lock)
+        interpreter = interpreters.find(lock.runner.python)
         drift.refuse(drift.runner(lock, lockfile.Runner.of(interpreter)), snapshot.label)
         with progress.shown("packages") as tell:
             locked = [one.origin for one in lock.packages if one.origin is not None]

@@ -73,14 +73,11 @@ class _Reached:
         for one in parsed.imports:
             if one.required and (not one.within or one.within in self._used):
                 for module, own in _targets(one, file, self._names):
-                    self._add(module, own, file, one.line)
-
-    def _add(self, module: str, own: str, file: str, line: int) -> None:
-        name = module.partition(".")[0]
-        if own in self._parsed:
-            self.files.add(own)
-        elif not own and name and name not in sys.stdlib_module_names:
-            self.imports.add(Import(name, file, line, module))
+                    name = module.partition(".")[0]
+                    if own in self._parsed:
+                        self.files.add(own)
+                    elif not own and name and name not in sys.stdlib_module_names:
+                        self.imports.add(Import(name, file, one.line, module))
 
 
 def _targets(one: Named, file: str, files: set[str]) -> Iterator[tuple[str, str]]:

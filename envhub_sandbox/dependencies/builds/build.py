@@ -46,16 +46,9 @@ def build_wheels(
 ) -> list[Path]:
     """A wheel of each: kept from before, or built in a jail without network.
 
-    Args:
-        sources: What there is no wheel of.
-        interpreter: What they are for.
-        tell: Gets a line for each thing that happens.
-        choose: Gives versions of what they are built with.
-
-    Raises:
-        ResolutionError: One cannot be built; the text says why, and what is missing here.
-        DependencyError: As with downloads; and where sources or a wheel are refused, or this host
-            has no jail to build in.
+    ``choose`` gives versions of what they are built with. Raises ``ResolutionError`` where one
+    cannot be built, with what is missing here; ``DependencyError`` where sources or a wheel are
+    refused, or this host has no jail.
     """
     if not _UNDER_WAY.get():
         _BUILDS.set(itertools.count(1))
@@ -147,11 +140,7 @@ class _Build:
         self._project = project.read(tree, _title(source))
 
     def wheel(self) -> Path:
-        """Built, checked and kept.
-
-        Raises:
-            ResolutionError: It cannot be built; the text is of the last try.
-        """
+        """Built, checked and kept. Raises ``ResolutionError``."""
         further: tuple[str, ...] = ()
         while True:
             try:
@@ -185,7 +174,8 @@ class _Build:
             folder.chmod(0o755)
             found = jail.build(self._order(packages, known), folder)
             if isinstance(found, Path):
-                return self._kept(found, lock)
+                wheels.check(found, self._source.name, self._source.version, self._interpreter)
+                return wheel_store.keep(found, self._source, lock, self._interpreter)
             known = (*known, *found)
         raise jail.BuildFailedError("its backend never has all that it needs")
 
@@ -201,6 +191,8 @@ class _Build:
         return environments.provide(lock, self._interpreter, self._tell).packages, lock.digest
 
     def _order(self, packages: Path, known: tuple[str, ...]) -> dict[str, object]:
+        # without ``.git`` nothing else says a version to those that ask git for it
+        version = {"SETUPTOOLS_SCM_PRETEND_VERSION": f"0+g{self._source.commit[:12]}"}
         return {
             "source": str(self._tree),
             "packages": str(packages),
@@ -209,7 +201,7 @@ class _Build:
             "backend": self._project.backend,
             "backend_path": self._project.backend_path,
             "known": (*(str(one.requirement) for one in self._project.requires), *known),
-            "environment": self._variables(),
+            "environment": version if self._source.commit else {},
         }
 
     def _runtime(self) -> tuple[str, str]:
@@ -221,16 +213,6 @@ class _Build:
         )
         environment = environments.provide(lock, self._interpreter, self._tell)
         return environment.python, str(environment.packages)
-
-    def _variables(self) -> dict[str, str]:
-        """Without ``.git`` nothing else says a version to those that ask git for it."""
-        if not self._source.commit:
-            return {}
-        return {"SETUPTOOLS_SCM_PRETEND_VERSION": f"0+g{self._source.commit[:12]}"}
-
-    def _kept(self, wheel: Path, lock: str) -> Path:
-        wheels.check(wheel, self._source.name, self._source.version, self._interpreter)
-        return wheel_store.keep(wheel, self._source, lock, self._interpreter)
 
     def _failed(self, failed: DependencyError) -> ResolutionError:
         source, log = self._source, str(failed)

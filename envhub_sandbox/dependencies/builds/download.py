@@ -36,13 +36,7 @@ _INDEXES = ("UV_DEFAULT_INDEX", "UV_INDEX", "UV_INDEX_URL", "UV_EXTRA_INDEX_URL"
 
 
 def download(url: str, sha256: str, target: Path) -> None:
-    """Write the file of a URL.
-
-    Raises:
-        IndexUnavailableError: It cannot be had.
-        PackagesTooLargeError: It is too large.
-        PackageIntegrityError: It has another hash.
-    """
+    """Write the file of a URL, if it is there, not too large, and of this hash."""
     shown = without_login(url)
     try:
         with _opened(url) as source, target.open("wb") as file:

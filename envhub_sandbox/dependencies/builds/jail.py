@@ -31,16 +31,9 @@ class BuildFailedError(DependencyError):
 def build(order: Mapping[str, Any], folder: Path) -> Path | tuple[str, ...]:
     """A wheel below an empty folder, or what the build backend needs besides.
 
-    Nothing of either has been looked at: they are a stranger's.
-
-    Args:
-        order: What is built, and with what, as ``making/builder.py`` reads it; limits, profile and
-            what the jail may read are added here.
-        folder: Of this build alone.
-
-    Raises:
-        BuildFailedError: It failed.
-        DependencyError: There is no jail on this host.
+    Nothing of either has been looked at: they are a stranger's. The order is read by
+    ``making/builder.py``; limits, profile and what the jail may read are added here. Raises
+    ``BuildFailedError``, or ``DependencyError`` where there is no jail on this host.
     """
     said = _run(order, folder)
     further, name = said.get("requires"), said.get("wheel")

@@ -17,12 +17,8 @@ _MOST = 200
 
 @dataclass(frozen=True)
 class Project:
-    """What is needed to build it.
-
-    Attributes:
-        requires: The packages that it is built with.
-        backend: What builds it, as ``module:object``.
-        backend_path: Folders of the sources that the backend is looked for in first.
+    """What it is built with: packages, the backend (``module:object``), and folders of the sources
+    that the backend is looked for in first.
     """
 
     requires: tuple[Wanted, ...]
@@ -36,11 +32,7 @@ class Project:
 
 
 def read(tree: Path, title: str) -> Project:
-    """What the sources say; where they say nothing, setuptools builds them.
-
-    Raises:
-        RequirementError: It cannot be read, or is asked for what is not taken.
-    """
+    """What the sources say; where they say nothing, setuptools builds them."""
     where = f"[build-system] of {title}"
     table = _table(tree / "pyproject.toml", where)
     requires = _texts(table.get("requires", list(_LEGACY)), where)

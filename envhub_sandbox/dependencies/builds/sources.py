@@ -51,12 +51,8 @@ class Source:
 
 @dataclass(frozen=True)
 class WheelOrigin:
-    """What a wheel was built of.
-
-    Attributes:
-        source: The source distribution, or the commit.
-        environment: Of the lock of the packages that it was built with.
-        wheel: SHA-256 of the wheel.
+    """What a wheel was built of: its source, the digest of the lock of the packages that it was
+    built with, and its own SHA-256.
     """
 
     source: Source

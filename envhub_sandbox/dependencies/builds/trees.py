@@ -43,14 +43,7 @@ _TARS: dict[str, Callable[..., Any]] = {".gz": gzip.open, ".tgz": gzip.open, ".b
 
 @dataclass(frozen=True)
 class Member:
-    """A regular file that is to be written.
-
-    Attributes:
-        path: Relative, with ``/``.
-        size: In bytes.
-        executable: Whether it may be executed.
-        open: Gives a stream of its bytes.
-    """
+    """A regular file that is to be written; ``open`` gives a stream of its bytes."""
 
     path: str
     size: int
@@ -59,11 +52,8 @@ class Member:
 
 
 def lay_out(members: Iterable[Member], folder: Path, title: str) -> None:
-    """Write files below a folder that is there and empty.
-
-    Raises:
-        PackagesTooLargeError: They are too large, or too many.
-        PackageIntegrityError: A name could leave the folder, or a file is longer than it says.
+    """Write files below a folder that is there and empty; within bounds, under names that stay in
+    it.
     """
     kept = list(_bounded(members, title))
     try:
@@ -102,12 +92,7 @@ def _copy(source: IO[bytes], target: IO[bytes], member: Member, title: str) -> N
 
 
 def unpack(archive: Path, folder: Path, title: str) -> Path:
-    """Unpack a source distribution below a folder, and return its one top folder.
-
-    Raises:
-        PackagesTooLargeError: As ``lay_out``.
-        PackageIntegrityError: It is no such archive, or holds something else than files.
-    """
+    """Unpack a source distribution below a folder, as ``lay_out``; gives its one top folder."""
     try:
         with _members(archive, title) as members:
             lay_out(members, folder, title)

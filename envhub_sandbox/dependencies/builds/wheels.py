@@ -37,16 +37,9 @@ _UNREADABLE = (
 
 
 def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> None:
-    """Refuse a wheel that is not what was asked for.
+    """Refuse a wheel, under the name that its builder gave it, that is not what was asked for.
 
-    Args:
-        wheel: The file, under the name that its builder gave it.
-        name: The package that was asked for.
-        version: Likewise; empty for any.
-        interpreter: What it has to run in.
-
-    Raises:
-        PackageIntegrityError: The text says what is wrong.
+    An empty version stands for any. Raises ``PackageIntegrityError``.
     """
     try:
         found = named(wheel.name, name, version)
@@ -66,11 +59,7 @@ def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> Non
 
 
 def named(file: str, name: str, version: str) -> Version:
-    """The version of a wheel, by the name of its file.
-
-    Raises:
-        PackageIntegrityError: It is of another package, or of another version.
-    """
+    """The version of a wheel, by the name of its file. Raises ``PackageIntegrityError``."""
     try:
         found, number, _, _ = parse_wheel_filename(file)
         wanted = Version(version) if version else number
