@@ -89,7 +89,7 @@ class Watch:
                 raise DependencyError(
                     f"the disk of {place} is full: {free // 2**20} MiB are left, and nothing is "
                     f"installed below {LEFT_FREE // 2**20}. 'envhub cache remove --unused-for 30' "
-                    "frees what nobody used for long, and 'uv cache prune' what uv keeps"
+                    "frees what was not used for long, and 'uv cache prune' what uv keeps"
                 )
 
 
@@ -106,7 +106,7 @@ def measured(folder: Path) -> tuple[int, int]:
 
 
 def checked(folder: Path) -> tuple[int, int]:
-    """The same for a folder that nobody changes. Raises ``PackageIntegrityError``."""
+    """The same for a folder that does not change. Raises ``PackageIntegrityError``."""
     for path in walk(folder):
         mode = path.lstat().st_mode
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):

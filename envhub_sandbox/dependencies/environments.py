@@ -8,7 +8,7 @@
         packages/           what uv installed, 0444 in folders 0555, with its bytecode
     <cache>/environments/<key>.lock
 
-A folder is made under another name, by whoever holds the lock, and renamed into place: what bears
+A folder is made under another name, by the holder of the lock, and renamed into place: what bears
 a key is complete. Nothing in it is ever run here. It is no environment of any interpreter, so that
 none reads a ``.pth`` or ``sitecustomize`` of it at its start; a jail puts the folder onto its path
 once it is confined.
@@ -151,7 +151,7 @@ def every() -> list[Environment]:
 def remove(environment: Environment) -> str:
     """Remove one. Not while somebody makes or uses it: then the answer says who, else it is empty.
 
-    Whoever starts jails with it, or could, shares the lock of its record.
+    A process that starts jails with it, or could, shares the lock of its record.
     """
     lock, record = root() / f"{environment.key}.lock", environment.home / RECORD
     gone = root() / f"{BUILDING}{environment.key}-gone"
@@ -162,18 +162,16 @@ def remove(environment: Environment) -> str:
             remove_tree(gone)
             lock.unlink()
     except TimeoutError:
-        return _users(environment, {**sharers(record), **sharers(lock)})
+        users = {**sharers(record), **sharers(lock)}
+        who = ", ".join(f"process {pid} ({command})" for pid, command in users.items())
+        return (
+            f"the environment {environment.key[:12]} is in use by "
+            f"{who or 'a process that is not seen from here'}. Close its environments there, or "
+            "end it"
+        )
     except OSError:
         return ""  # another has removed it
     return ""
-
-
-def _users(environment: Environment, users: dict[int, str]) -> str:
-    who = ", ".join(f"process {pid} ({command})" for pid, command in users.items())
-    return (
-        f"the environment {environment.key[:12]} is in use by "
-        f"{who or 'a process that is not seen from here'}. Close its environments there, or end it"
-    )
 
 
 def half_made() -> list[Path]:
@@ -235,7 +233,7 @@ def _made(
 
 def _publish(building: Path, key: str, facts: dict[str, object]) -> None:
     (building / RECORD).write_text(json.dumps(facts, indent=1))
-    (building / RECORD).chmod(0o600)  # it is locked by those who use this: nobody else may
+    (building / RECORD).chmod(0o600)  # only its users may lock it
     building.chmod(folders.SHARED_MODE)
     try:
         os.rename(building, root() / key)
@@ -266,7 +264,7 @@ def _install(
         watch.hear(line)
         tell(line)
 
-    # uv keeps our lock for as long as it lives: if we are killed, nobody removes what it still
+    # uv keeps our lock for as long as it lives: if we are killed, no process removes what it still
     # writes to. Copies, since a file that is shared with uv's cache is another's to change.
     uv.run(
         [
@@ -294,7 +292,7 @@ def _size(packages: Path, bounds: Bounds) -> int:
 def _compile(interpreter: Interpreter, packages: Path, held: int) -> None:
     """Bytecode for all of it, by a process that is confined to the folder (``bytecode.py``).
 
-    What fails is only slower, so it is nobody's error.
+    What fails is only slower, so it is no error.
     """
     with contextlib.suppress(subprocess.SubprocessError):
         subprocess.run(
@@ -310,7 +308,7 @@ def _compile(interpreter: Interpreter, packages: Path, held: int) -> None:
 
 
 def _close(packages: Path) -> None:
-    """Let everybody read, and nobody write."""
+    """Make it readable for all users, and writable for none."""
     for path in [*walk(packages), packages]:
         mode = path.lstat().st_mode
         runs = stat.S_ISDIR(mode) or mode & stat.S_IXUSR

@@ -5,11 +5,11 @@ JSON, stdout a file that holds what there is to say at any time, as one object o
 line of progress; and at the end ``own``, ``made``, or ``error`` and ``said``. With the word
 ``check`` it only says whether it could work.
 
-Whoever orders is a client on another host, so nothing of an order is believed: requirements are
+An order comes from a client on another host, and nothing of it is believed: requirements are
 read as a stranger's file is. What is made lies in a folder of that client's key, uv's cache
 included, and all of it has one bound. So two processes are at it: one works, and this one measures,
 ends it, and leaves nothing of what was not finished. Each has a pidfd of the one that started it,
-and ends with it, also where that was killed: nobody would measure, and nobody waits.
+and ends with it, also where that was killed: the work would be neither measured nor waited for.
 """
 
 from __future__ import annotations
@@ -153,14 +153,14 @@ def _wanted(rows: Iterable[Sequence[str]]) -> tuple[Wanted, ...]:
 
 
 def _watched(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
-    """Have it made, within bounds; empty where whoever made it has said what there is to say."""
+    """Have it made, within bounds; empty where the process that made it has written the answer."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     if ended is not None:
         parent.end_with(ended, _CLEANING_S)
     with _alone(Path(order["folder"])) as held:
         unfinished = Path(order["folder"], "unfinished")
         if unfinished.exists():
-            _clean(order)  # whoever was at it was killed
+            _clean(order)  # the process that made it was killed
         _make_room(order)
         unfinished.touch()
         try:

@@ -82,7 +82,10 @@ class _Installed:
             try:
                 if not self._applies(wanted, extras):
                     continue
-            except (ValueError, LookupError):  # its marker compares what nobody can: let uv say so
+            except (
+                ValueError,
+                LookupError,
+            ):  # its marker cannot be evaluated, as uv will say
                 yield wanted, None
                 continue
             found = self._distribution(wanted.name)

@@ -22,7 +22,7 @@ _shown_by: list[Callable[[str], None]] = []
 
 @contextlib.contextmanager
 def shown_by(show: Callable[[str], None]) -> Iterator[None]:
-    """While it lasts, whoever shows something already shows this too: two share no line."""
+    """While it lasts, progress goes to ``show``, which has the terminal already."""
     _shown_by.append(show)
     try:
         yield

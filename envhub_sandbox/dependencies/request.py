@@ -38,7 +38,7 @@ class Choice:
         exclude_newer: A date: packages of later are not seen.
         infer: Whether what it imports and does not declare is installed, too.
         only: Requirements instead of those that it declares; None for those.
-        without: Names of packages that are left out, whoever needs them.
+        without: Names of packages that are left out, also where others need them.
         override: Requirements that hold instead of all others of the same package.
         fetch_python: Whether uv may download an interpreter that this machine lacks.
     """
@@ -174,7 +174,7 @@ class PackageRequest:
         always: Whether it gets an environment of its own even where the place meets all of it.
         guesses: What it imports; what no other package brings is installed, too.
         constraints: What holds for packages if something needs them.
-        without: Names of packages that are left out, whoever needs them.
+        without: Names of packages that are left out, also where others need them.
         override: Requirements that hold instead of all others of the same package.
         fetch_python: Whether uv may download an interpreter that this machine lacks.
         gpu: Whether its jails are given one.

@@ -245,8 +245,8 @@ def _with_their_hashes(pins: Iterable[tuple[str, str, list[str]]], wanted: Seque
 def _what_is_required(said: str, every: Sequence[Wanted]) -> str:
     """The requirements that an explanation speaks of, with where each stands."""
     words = {canonicalize_name(word) for word in re.findall(r"[A-Za-z0-9][A-Za-z0-9._-]*", said)}
-    told = [one for one in every if canonicalize_name(one.requirement.name) in words]
-    lines = [f"  {one.requirement}  ({one.where})" for one in (told or every)[:20]]
+    named = [one for one in every if canonicalize_name(one.requirement.name) in words]
+    lines = [f"  {one.requirement}  ({one.where})" for one in (named or every)[:20]]
     return "\n".join(["What is required of these packages:", *lines])
 
 

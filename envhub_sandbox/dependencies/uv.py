@@ -57,7 +57,7 @@ _MEANINGS: tuple[tuple[str, type[DependencyError], str], ...] = (
     (
         r"No space left|os error 28|Disk quota|os error 122",
         DependencyError,
-        "The disk is full; 'envhub cache remove --unused-for 30' frees what nobody used for long, "
+        "The disk is full; 'envhub cache remove --unused-for 30' frees what was not used for long, "
         "and 'uv cache prune' what uv keeps",
     ),
     (
@@ -240,7 +240,7 @@ def _offline() -> str:
 
 
 def _in_the_users_words(said: str) -> str:
-    """uv speaks to whoever wrote the requirements, and that is not who reads it here."""
+    """uv speaks to the author of the requirements; the reader here is another person."""
     plain = re.sub(r"\byour requirements are unsatisfiable", "nothing satisfies all of them", said)
     plain = re.sub(r"\b[Yy]ou require\b", "it is required that there be", plain)
     return re.sub(r"^hint: ", "  ", plain, flags=re.MULTILINE).strip()

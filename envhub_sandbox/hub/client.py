@@ -24,7 +24,7 @@ from urllib.parse import parse_qsl, quote, urlsplit
 
 from envhub_sandbox.errors import HubReferenceError, SnapshotError, SnapshotIntegrityError
 from envhub_sandbox.hub.answers import HostileAnswerError, bounded_body, guarded, streamed
-from envhub_sandbox.hub.failures import Subject, chain, conceal, explain
+from envhub_sandbox.hub.failures import chain, conceal, explain
 from envhub_sandbox.hub.grammar import is_commit
 from envhub_sandbox.hub.hashing import GIT_SHA1, SHA256
 from envhub_sandbox.hub.listing import FileRecord
@@ -222,8 +222,8 @@ class HubClient:
                     "Nothing of it was used. Check that the endpoint is a Hugging Face Hub, or use "
                     "another"
                 ) from error
-            subject = Subject(*repo, revision, self.public_endpoint)
-            raise explain(error, subject, secrets) from error
+            subject = {**repo._asdict(), "revision": revision, "endpoint": self.public_endpoint}
+            raise explain(error, secrets, **subject) from error
 
     def _secrets(self) -> tuple[str, ...]:
         from huggingface_hub import get_token

@@ -10,7 +10,7 @@ from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Any, TypeVar
 
 from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
 from envhub_sandbox.hub.grammar import has_control_characters
@@ -103,15 +103,7 @@ class SnapshotLimits:
 DEFAULT_LIMITS = SnapshotLimits()
 
 
-class _Sized(Protocol):
-    @property
-    def path(self) -> str: ...
-
-    @property
-    def size(self) -> int: ...
-
-
-_File = TypeVar("_File", bound=_Sized)
+_File = TypeVar("_File", bound=Any)  # with a path and a size
 
 
 def within_limits(files: Iterable[_File], limits: SnapshotLimits, title: str) -> tuple[_File, ...]:

@@ -261,7 +261,7 @@ def publish(
 
 @contextlib.contextmanager
 def _one_at_a_time(folder: Path) -> Iterator[None]:
-    """So that nobody moves away what another has just put there."""
+    """So that no process moves away what another has just put there."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         with contextlib.suppress(OSError):  # not every file system has locks
@@ -299,7 +299,7 @@ def remove(home: Path) -> dict[int, str]:
 
 
 def remove_unused(folder: Path, days: float) -> None:
-    """Remove snapshots that nobody asked for in that many days (see ``mark_used``)."""
+    """Remove snapshots that were not asked for in that many days (see ``mark_used``)."""
     oldest = time.time() - days * 24 * 3600
     for record in folder.glob("*/record.json"):
         with contextlib.suppress(OSError):
@@ -314,7 +314,7 @@ def mark_used(slot: Slot) -> None:
 
 
 def _refuse_shared_store(place: Path) -> None:
-    """Whoever can write there can put both a tree and a record that vouches for it."""
+    """A user who can write there can put both a tree and a record that vouches for it."""
     root = cache_root()
     try:
         why = folders.why_distrusted(place, root)

@@ -29,7 +29,7 @@ MAX_FILES = 20_000
 MAX_TASKS = 4096
 MAX_TEXT = 4096
 LOCAL = "local"
-"""The repository of a folder of this machine: its path is nobody else's."""
+"""The repository of a folder of this machine, whose path means nothing elsewhere."""
 _REQUIREMENTS = ("extra", "only", "override", "without")
 _COMMIT = re.compile(r"[0-9a-f]{40}|local-[0-9a-f]+")
 _PYTHON = re.compile(r"3\.\d{1,3}")
@@ -276,7 +276,7 @@ def _task_line(task: Task) -> str:
 
 
 def write(lock: LockFile, path: Path) -> None:
-    """Write a lock file; whoever reads it meanwhile reads the old one. Raises ``LockError``."""
+    """Write a lock file; meanwhile others read the old one. Raises ``LockError``."""
     try:
         write_whole(path, written(lock).encode(), mode=0o666)
     except (OSError, UnicodeEncodeError) as error:

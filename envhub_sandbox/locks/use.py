@@ -33,7 +33,7 @@ def opened(
     if sandbox != "process":
         raise PolicyError(
             f"{option_name('lock')} is for {option_name('sandbox', 'process')}; an image is locked "
-            "by its digest, and on another host whoever runs the server chooses its packages"
+            "by its digest, and on another host the operator of the server chooses its packages"
         )
     from envhub_sandbox.locks import lockfile
 

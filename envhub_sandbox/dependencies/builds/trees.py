@@ -31,7 +31,7 @@ AT_ONCE = 2**20
 MAX_TABLE = 16 * 2**20
 """Of a zip's table of contents."""
 _HEADERS = 1000
-PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """How members of a zip may be packed: Python unpacks other ways whole, whatever it is asked for."""
 _FAR = 2 * MAX_BYTES
 _BLOCK = 1 << 20
@@ -179,15 +179,23 @@ def _of_tar(archive: tarfile.TarFile, title: str) -> Iterator[Member]:
         yield Member(path, member.size, bool(member.mode & stat.S_IXUSR), opened)
 
 
+def check_packing(member: zipfile.ZipInfo, title: str) -> None:
+    """Refuse what is neither file nor folder, and what Python unpacks whole."""
+    kinds = (0, stat.S_IFREG, *([stat.S_IFDIR] if member.is_dir() else []))
+    if stat.S_IFMT(member.external_attr >> 16) not in kinds:
+        raise _no_file(title, member.filename)
+    if member.compress_type not in _PACKINGS:
+        raise PackageIntegrityError(
+            f"{title} holds {member.filename[:200]!r}, packed in another way, which is not read"
+        )
+
+
 def _of_zip(archive: zipfile.ZipFile, title: str) -> Iterator[Member]:
     for member in archive.infolist():
         mode = member.external_attr >> 16
         if member.is_dir():
             continue
-        if stat.S_IFMT(mode) not in (0, stat.S_IFREG):
-            raise _no_file(title, member.filename)
-        if member.compress_type not in PACKINGS:
-            raise PackageIntegrityError(f"{title} is packed in a way that is not read")
+        check_packing(member, title)
 
         def opened(member: zipfile.ZipInfo = member) -> IO[bytes]:
             return archive.open(member)

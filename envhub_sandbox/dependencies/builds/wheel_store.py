@@ -63,8 +63,8 @@ def describe(wheel: Path) -> WheelOrigin | None:
 def keep(wheel: Path, source: Source, environment: str, interpreter: Interpreter) -> Path:
     """Keep a wheel that was checked, and return where it lies. Raises ``DependencyError``."""
     place = root() / _key(source, interpreter)
-    told = replace(source, url=without_login(source.url), where="")
-    built = WheelOrigin(told, environment, _hash(wheel).removeprefix("sha256:"))
+    public = replace(source, url=without_login(source.url), where="")
+    built = WheelOrigin(public, environment, _hash(wheel).removeprefix("sha256:"))
     try:
         folders.make_private(root())
         folders.make(place)

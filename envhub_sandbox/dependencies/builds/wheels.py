@@ -11,7 +11,6 @@ import base64
 import csv
 import hashlib
 import io
-import stat
 import zipfile
 import zlib
 from pathlib import Path
@@ -20,7 +19,7 @@ from packaging import tags
 from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel_filename
 from packaging.version import InvalidVersion, Version
 
-from envhub_sandbox.dependencies.builds.trees import MAX_TABLE, PACKINGS, Bounded
+from envhub_sandbox.dependencies.builds.trees import MAX_TABLE, Bounded, check_packing
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.errors import DependencyError, PackageIntegrityError, SnapshotError
 from envhub_sandbox.hub.listing import FileRecord, check_names
@@ -90,10 +89,7 @@ def _files(archive: zipfile.ZipFile) -> None:
             f"it holds more than {MAX_FILES} files or {size_text(MAX_UNPACKED)}"
         )
     for member in members:
-        if stat.S_IFMT(member.external_attr >> 16) not in (0, stat.S_IFREG, stat.S_IFDIR):
-            raise PackageIntegrityError(f"{member.filename[:200]!r} in it is a link or a device")
-        if member.compress_type not in PACKINGS:
-            raise PackageIntegrityError(f"{member.filename[:200]!r} in it is packed in another way")
+        check_packing(member, "it")
     names = (one.filename + "_" * one.is_dir() for one in members)  # a folder as a file in it
     check_names([FileRecord(name, 0, "") for name in names], "it")
 
