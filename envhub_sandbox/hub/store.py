@@ -22,7 +22,7 @@ import re
 import stat
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -83,23 +83,9 @@ class HalfDeletedError(SnapshotIntegrityError):
     """Parts of a snapshot are gone, and what is left is what was verified: ``publish`` heals it."""
 
 
-class _Entry(NamedTuple):
-    path: str
-    size: int
-    digest: str
-    mtime_ns: int
-    ctime_ns: int
-    inode: int
-
-    def matches(self, found: os.stat_result) -> bool:
-        if found.st_mode & _OTHERS_WRITE:
-            return False
-        return (self.size, self.mtime_ns, self.ctime_ns, self.inode) == (
-            found.st_size,
-            found.st_mtime_ns,
-            found.st_ctime_ns,
-            found.st_ino,
-        )
+def _fingerprint(status: os.stat_result) -> list[int]:
+    """What changes with a file's content."""
+    return [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino]
 
 
 def repository_folder(endpoint: str, repo_type: str, repo_id: str) -> Path:
@@ -139,15 +125,19 @@ def load(slot: Slot) -> tuple[FileRecord, ...] | None:
     recorded = {entry.path for entry in entries}
     if extra := sorted(found.keys() - recorded):
         raise _damaged(slot, f"the file {extra[0]!r} is extra")
-    there = [entry for entry in entries if entry.path in found]
-    changed = [entry for entry in there if not entry.matches(found[entry.path])]
+    changed = [
+        entry
+        for entry, known in entries.items()
+        if (status := found.get(entry.path)) is not None
+        and (status.st_mode & _OTHERS_WRITE or _fingerprint(status) != known)
+    ]
     _verify_again(slot, changed)
     if missing := sorted(recorded - found.keys()):
         raise HalfDeletedError(_damage(slot, f"the file {missing[0]!r} is missing"))
     if changed:
         with contextlib.suppress(OSError):  # A read-only store only stays slower.
-            _write_record(slot.home, slot.tree, document, [_plain(entry) for entry in entries])
-    return tuple(_plain(entry) for entry in entries)
+            _write_record(slot.home, slot.tree, document, entries)
+    return tuple(entries)
 
 
 def load_whole(slot: Slot) -> tuple[FileRecord, ...] | None:
@@ -166,16 +156,13 @@ def _record_of(slot: Slot) -> bytes | None:
         return None
 
 
-def _plain(entry: _Entry) -> FileRecord:
-    return FileRecord(entry.path, entry.size, entry.digest)
-
-
-def _read_record(slot: Slot, text: bytes) -> tuple[dict[str, object], list[_Entry]]:
+def _read_record(slot: Slot, text: bytes) -> tuple[dict[str, object], dict[FileRecord, list[int]]]:
     try:
         document = json.loads(text)
         if document["format"] != _FORMAT:
             raise ValueError(f"unknown format {document['format']!r}")
-        return document, [_Entry(*row) for row in document["files"]]
+        rows = document["files"]
+        return document, {FileRecord(*row[:3]): [row[1], *row[3:]] for row in rows}
     except (ValueError, KeyError, TypeError) as error:
         raise _damaged(slot, f"its record.json cannot be read ({error})") from error
 
@@ -200,7 +187,7 @@ def _walk(slot: Slot, folder: Path | str, prefix: str) -> Iterator[tuple[str, os
                 raise _damaged(slot, f"{prefix + item.name!r} is not a regular file")
 
 
-def _verify_again(slot: Slot, changed: list[_Entry]) -> None:
+def _verify_again(slot: Slot, changed: list[FileRecord]) -> None:
     for entry in changed:
         path = slot.tree / entry.path
         try:
@@ -241,15 +228,19 @@ def publish(
     try:
         folders.make(slot.folder)
         _refuse_shared_store(slot.folder)
-        _remove_abandoned(slot.folder)
+        for abandoned in _older(slot.folder.glob(f"{BUILDING}*"), _ABANDONED_AFTER_S):
+            remove_tree(abandoned)
         with draft(slot.folder) as building:
             tree = building / "tree"
             _fill(tree, files, copy)
             fetched = time.strftime("%FT%TZ", time.gmtime())
             document = {"format": _FORMAT, **note, "fetched": fetched}
-            _write_record(building, tree, document, list(files))
+            _write_record(building, tree, document, files)
             building.chmod(folders.SHARED_MODE)
-            with _one_at_a_time(slot.folder):
+            with _opened(slot.folder) as handle:
+                # one at a time: no process moves away what another has just put there
+                with contextlib.suppress(OSError):  # not every file system has locks
+                    fcntl.flock(handle, fcntl.LOCK_EX)
                 _move_remains(slot)
                 _rename(building, slot.home)
     except OSError as error:
@@ -260,13 +251,10 @@ def publish(
 
 
 @contextlib.contextmanager
-def _one_at_a_time(folder: Path) -> Iterator[None]:
-    """So that no process moves away what another has just put there."""
+def _opened(folder: Path) -> Iterator[int]:
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        with contextlib.suppress(OSError):  # not every file system has locks
-            fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
+        yield handle
     finally:
         os.close(handle)
 
@@ -286,25 +274,27 @@ def _move_remains(slot: Slot) -> None:
 
 def remove(home: Path) -> dict[int, str]:
     """Remove a snapshot, unless others use it (share a lock of its folder); these are returned."""
-    with contextlib.suppress(FileNotFoundError):
-        descriptor = os.open(home, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    with contextlib.suppress(FileNotFoundError), _opened(home) as handle:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             remove_tree(home)
         except BlockingIOError:
             return sharers(home) or {0: "that is not seen from here"}
-        finally:
-            os.close(descriptor)
     return {}
 
 
 def remove_unused(folder: Path, days: float) -> None:
     """Remove snapshots that were not asked for in that many days (see ``mark_used``)."""
-    oldest = time.time() - days * 24 * 3600
-    for record in folder.glob("*/record.json"):
+    for record in _older(folder.glob("*/record.json"), days * 24 * 3600):
         with contextlib.suppress(OSError):
-            if record.stat().st_mtime < oldest:
-                remove(record.parent)
+            remove(record.parent)
+
+
+def _older(paths: Iterable[Path], seconds: float) -> Iterator[Path]:
+    for path in paths:
+        with contextlib.suppress(OSError):
+            if path.stat().st_mtime < time.time() - seconds:
+                yield path
 
 
 def mark_used(slot: Slot) -> None:
@@ -327,14 +317,6 @@ def _refuse_shared_store(place: Path) -> None:
         )
 
 
-def _remove_abandoned(folder: Path) -> None:
-    oldest = time.time() - _ABANDONED_AFTER_S
-    for path in folder.glob(f"{BUILDING}*"):
-        with contextlib.suppress(OSError):
-            if path.stat().st_mtime < oldest:
-                remove_tree(path)
-
-
 def _fill(
     tree: Path, files: tuple[FileRecord, ...], copy: Callable[[FileRecord, Path], None]
 ) -> None:
@@ -352,13 +334,12 @@ def _fill(
 
 
 def _write_record(
-    home: Path, tree: Path, document: Mapping[str, object], files: list[FileRecord]
+    home: Path, tree: Path, document: Mapping[str, object], files: Iterable[FileRecord]
 ) -> None:
-    rows = []
-    for file in files:
-        status = (tree / file.path).lstat()
-        times = (status.st_mtime_ns, status.st_ctime_ns, status.st_ino)
-        rows.append(_Entry(file.path, file.size, file.digest, *times))
+    rows = [
+        [file.path, file.size, file.digest, *_fingerprint((tree / file.path).lstat())[1:]]
+        for file in files
+    ]
     write_whole(home / "record.json", json.dumps({**document, "files": rows}).encode())
 
 
