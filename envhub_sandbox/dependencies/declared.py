@@ -231,7 +231,8 @@ def _joined(lines: Sequence[str]) -> Iterator[tuple[int, str]]:
     """Lines without comments, each with the number of its first; a backslash continues one."""
     parts: list[str] = []
     first = 0
-    for number, line in enumerate(map(_without_comment, lines), start=1):
+    for number, raw in enumerate(lines, start=1):
+        line = "" if raw.lstrip().startswith("#") else raw.split(" #", 1)[0].strip()
         first = first if parts else number
         goes_on = line.endswith("\\") and number < len(lines)
         parts.append(line[:-1].strip() if goes_on else line)
@@ -241,10 +242,6 @@ def _joined(lines: Sequence[str]) -> Iterator[tuple[int, str]]:
         parts = []
         if whole:
             yield first, whole
-
-
-def _without_comment(line: str) -> str:
-    return "" if line.lstrip().startswith("#") else line.split(" #", 1)[0].strip()
 
 
 def _script(path: Path, name: str) -> Declared | None:

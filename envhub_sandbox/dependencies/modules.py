@@ -147,18 +147,14 @@ def _recalled(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
     with contextlib.suppress(ValueError, TypeError):
         rows = json.loads(recall(folder, key) or "")
         return tuple((str(name), str(file), int(line)) for name, file, line in rows)
-    rows = _parsed(snapshot)
-    keep(folder, key, json.dumps(rows))
-    return tuple(rows)
-
-
-def _parsed(snapshot: Snapshot) -> list[tuple[str, str, int]]:
     from envhub_sandbox.sources import imports, parsing
 
     files = parsing.read(snapshot)
     found = [(one.module, one.file, one.line) for one in imports.imports(snapshot, files)]
     found = [row for row in found if row[0] not in _WORKERS]
-    return [*found, *(row for row in imports.ids(snapshot, files) if _of_id(row[0]))]
+    rows = [*found, *(row for row in imports.ids(snapshot, files) if _of_id(row[0]))]
+    keep(folder, key, json.dumps(rows))
+    return tuple(rows)
 
 
 @dataclass(frozen=True)

@@ -221,7 +221,9 @@ def recall(key: str) -> Resolution | None:
         lock = Lock(str(facts["lock"]), tuple(map(str, facts["options"])))
         interpreter = Interpreter(**facts["interpreter"])
         # what the worker needs is in each: an empty one was lost
-        known = _stamp(interpreter) == facts["stamp"] and all(map(_is_there, lock.options))
+        known = _stamp(interpreter) == facts["stamp"] and all(
+            os.sep not in option or os.path.isdir(option) for option in lock.options
+        )
         if lock.packages and known:
             return Resolution(lock, interpreter, tuple(map(str, facts["taken"])))
     except (OSError, ValueError, LookupError, TypeError):
@@ -239,11 +241,6 @@ def remember(key: str, found: Resolution) -> None:
         "taken": found.taken,
     }
     cache.keep(root(), key, json.dumps(facts))
-
-
-def _is_there(option: str) -> bool:
-    """Whether a folder of wheels that were built is where it was."""
-    return os.sep not in option or os.path.isdir(option)
 
 
 def _stamp(interpreter: Interpreter) -> list[int]:

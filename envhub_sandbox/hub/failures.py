@@ -122,7 +122,8 @@ def explain(
     endpoint: str,
 ) -> HubFailure:
     """The failure that an exception of the Hub client stands for."""
-    kind, source = _classify(error)
+    found = ((kind, link) for link in chain(error) if (kind := _kind_of(link)) is not None)
+    kind, source = next(found, (Kind.OTHER, error))
     response = getattr(source, "response", None)
     fields = {
         "repo_type": repo_type,
@@ -153,14 +154,6 @@ def conceal(error: BaseException, secrets: tuple[str, ...]) -> None:
         link.args = tuple(
             redact(value, secrets) if isinstance(value, str) else value for value in link.args
         )
-
-
-def _classify(error: BaseException) -> tuple[Kind, BaseException]:
-    for link in chain(error):
-        kind = _kind_of(link)
-        if kind is not None:
-            return kind, link
-    return Kind.OTHER, error
 
 
 def chain(error: BaseException | None) -> Iterator[BaseException]:

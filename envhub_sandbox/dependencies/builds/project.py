@@ -38,13 +38,11 @@ def read(tree: Path, title: str) -> Project:
     requires = _texts(table.get("requires", list(_LEGACY)), where)
     backend = table.get("build-backend", _LEGACY_BACKEND)
     paths = _texts(table.get("backend-path", []), where)
-    if not isinstance(backend, str) or not all(map(str.isidentifier, _words(backend))):
+    if not isinstance(backend, str) or not all(
+        map(str.isidentifier, backend.replace(":", ".", 1).split("."))
+    ):
         raise RequirementError(f"{where}: {str(backend)[:200]!r} is no build backend")
     return Project(tuple(parse_requirement(text, where) for text in requires), backend, paths)
-
-
-def _words(backend: str) -> list[str]:
-    return backend.replace(":", ".", 1).split(".")
 
 
 def _table(path: Path, where: str) -> dict[str, Any]:
