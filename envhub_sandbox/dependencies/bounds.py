@@ -37,11 +37,11 @@ class Bounds:
 
     @classmethod
     def set(cls) -> Bounds:
-        """Those of this machine's user. Raises ``DependencyError``: a variable holds no number."""
+        """Those of this machine's user; ``DependencyError`` if a variable holds no number."""
         return cls(_number(BYTES_VARIABLE, MAX_BYTES), _number(FILES_VARIABLE, MAX_FILES))
 
     def check(self, size: int, files: int, what: str) -> None:
-        """Refuse what is more. Raises ``PackagesTooLargeError``: it is."""
+        """Refuse more with ``PackagesTooLargeError``."""
         if size > self.bytes:
             raise PackagesTooLargeError(
                 f"{what} {size_text(size)}; at most {size_text(self.bytes)} are installed. No "

@@ -137,7 +137,7 @@ def check_versions(asked: str) -> None:
 
 
 def versions(asked: str) -> SpecifierSet:
-    """What a caller asks for: one version, or several. Raises ``ValueError``: it is neither."""
+    """What a caller asks for: one version, or several; otherwise ``ValueError``."""
     try:
         return SpecifierSet(f"=={Version(asked)}.*" if asked.count(".") < 2 else f"=={asked}")
     except (InvalidVersion, InvalidSpecifier):

@@ -190,7 +190,7 @@ def _listen(stream: IO[str], lines: list[str], tell: Callable[[str], None]) -> N
 
 
 def command() -> str:
-    """uv's path. Raises ``DependencyError``: it is not installed, or too old."""
+    """uv's path; ``DependencyError`` if it is not installed, or too old."""
     found: str | None
     try:
         from uv import find_uv_bin  # it knows where pip has put it, which need not be on PATH

@@ -29,7 +29,7 @@ def differences(then: LockFile, now: LockFile) -> list[str]:
 
 
 def refuse(found: Sequence[str], label: str) -> None:
-    """Raise what has drifted, if anything has. Raises ``LockDriftError``: something has."""
+    """Raise ``LockDriftError`` if anything has drifted."""
     if not found:
         return
     more = [f"and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else []

@@ -123,7 +123,7 @@ def arguments_text(env_kwargs: Mapping[str, Any] | None) -> str | None:
 
 
 def read(path: str | os.PathLike[str]) -> LockFile:
-    """A lock file. Raises ``LockError``: it cannot be read, or is none of ours."""
+    """A lock file; ``LockError`` if it cannot be read, or is none of ours."""
     where = f"the lock {os.fspath(path)}"
     try:
         with open(path, "rb") as file:

@@ -107,7 +107,7 @@ def described(lock: Lock, python: str) -> tuple[Package, ...]:
 def listed(
     versions: Sequence[str], python: str, options: Sequence[str] = (), *, refresh: bool = False
 ) -> tuple[Package, ...]:
-    """What the index has of each ``name==version``. Raises ``DependencyError``: as with uv."""
+    """What the index has of each ``name==version``. Raises as ``uv.run``."""
     text = uv.run(
         [
             *("pip", "compile", "-", *uv.NO_BUILDS, "--no-deps", "--format", "pylock.toml"),
@@ -124,7 +124,7 @@ def listed(
 
 
 def document(text: str, where: str) -> dict[str, Any]:
-    """The TOML of a lock file. Raises ``LockError``: it is none, or too long."""
+    """The TOML of a lock file; ``LockError`` if it is none, or too long."""
     try:
         return toml.loads(text, MAX_CHARACTERS, generated=True)
     except ValueError as error:

@@ -84,17 +84,20 @@ def test_what_nobody_could_have_meant_is_refused(wrong: Any) -> None:
         chosen(wrong, None)
 
 
-def test_a_further_requirement_is_a_plain_one() -> None:
-    """It comes from the caller, and still a link in it would build something outside of a jail."""
-    with pytest.raises(RequirementError, match="in dependencies"):
-        chosen({"extra": ["here @ file:///tmp/here"]}, None)
-
-
-@pytest.mark.parametrize("dependencies", ["/opt/python", {"extra": ["scipy"]}])
-def test_two_interpreters_are_one_too_many(dependencies: Any) -> None:
-    """``python`` names the packages as well."""
-    with pytest.raises(PolicyError, match="both"):
-        chosen(dependencies, "/usr/bin/python3")
+@pytest.mark.parametrize(
+    ("dependencies", "python", "error", "said"),
+    [
+        ({"extra": ["a @ file:///tmp/a"]}, None, RequirementError, "in dependencies"),
+        ("/opt/python", "/usr/bin/python3", PolicyError, "both"),
+        ({"extra": ["scipy"]}, "/usr/bin/python3", PolicyError, "both"),
+    ],
+)
+def test_no_link_and_no_second_interpreter(
+    dependencies: Any, python: str | None, error: type[Exception], said: str
+) -> None:
+    """A link would build something outside of a jail; ``python`` names the packages as well."""
+    with pytest.raises(error, match=said):
+        chosen(dependencies, python)
 
 
 @pytest.mark.parametrize(
