@@ -8,7 +8,7 @@ from dataclasses import replace
 from envhub_sandbox.errors import LockDriftError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.locks.fingerprint import Task
-from envhub_sandbox.locks.lockfile import LOCAL, LockFile, Runner, repository_of
+from envhub_sandbox.locks.lockfile import LOCAL, LockFile, repository_of
 from envhub_sandbox.locks.pylock import Package
 from envhub_worker.protocol.text import printable
 
@@ -17,12 +17,13 @@ _SHOWN = 30
 
 def differences(then: LockFile, now: LockFile) -> list[str]:
     """Whatever differs, a line each."""
+    runner = f"Python: {then.runner} was locked, this is {now.runner}"
     spaces: Iterator[str] = iter(())
     if then.spaces and now.spaces and then.spaces.arguments == now.spaces.arguments:
         spaces = of_tasks(then.spaces.tasks, now.spaces.tasks)
     return [
         *_of_files(then, now),
-        *_of_runner(then.runner, now.runner),
+        *([runner] if then.runner != now.runner else []),
         *_of_packages(then.packages, now.packages),
         *spaces,
     ]
@@ -39,11 +40,6 @@ def refuse(found: Sequence[str], label: str) -> None:
         "now: envhub lock --upgrade",
         tuple(found),
     )
-
-
-def files_and_commit(lock: LockFile, snapshot: Snapshot) -> list[str]:
-    """What differs in a repository's files."""
-    return list(_of_files(lock, with_files(lock, snapshot)))
 
 
 def with_files(lock: LockFile, snapshot: Snapshot) -> LockFile:
@@ -74,16 +70,6 @@ def _of_files(then: LockFile, now: LockFile) -> Iterator[str]:
             yield f"file {shown}: new"
         elif then.files[name] != now.files[name]:
             yield f"file {shown}: other content"
-
-
-def _of_runner(then: Runner, now: Runner) -> Iterator[str]:
-    if then != now:
-        yield f"Python: {then} was locked, this is {now}"
-
-
-def runner(lock: LockFile, now: Runner) -> list[str]:
-    """What differs in the interpreter."""
-    return list(_of_runner(lock.runner, now))
 
 
 def _of_packages(then: Sequence[Package], now: Sequence[Package]) -> Iterator[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox.errors import DependencyError, LockError, PolicyError, name_source
@@ -49,10 +50,12 @@ def provided(snapshot: Snapshot, lock: LockFile) -> PackageSet:
     from envhub_sandbox.dependencies.pipeline import PackageSet
     from envhub_sandbox.locks import drift, lockfile, pylock
 
-    drift.refuse(drift.files_and_commit(lock, snapshot), snapshot.label)
+    here = drift.with_files(lock, snapshot)
+    drift.refuse(drift.differences(lock, here), snapshot.label)
     try:
         interpreter = interpreters.find(lock.runner.python)
-        drift.refuse(drift.runner(lock, lockfile.Runner.of(interpreter)), snapshot.label)
+        here = replace(here, runner=lockfile.Runner.of(interpreter))
+        drift.refuse(drift.differences(lock, here), snapshot.label)
         with progress.shown("packages") as tell:
             locked = [one.origin for one in lock.packages if one.origin is not None]
             pins = _with_wheels(pylock.pins(lock.packages), locked, interpreter, tell)

@@ -64,14 +64,10 @@ def _run(order: Mapping[str, Any], folder: Path) -> dict[str, Any]:
             timeout=WALL_S + _AROUND_S,
         )
     try:
-        said = json.loads(done.stdout)
+        said: dict[str, Any] = json.loads(done.stdout)
     except ValueError as error:
         shown = printable(done.stderr.decode("utf-8", "replace")[-_SHOWN:])
         raise DependencyError(f"the program that builds failed:\n{shown}") from error
-    return _heard(said)
-
-
-def _heard(said: dict[str, Any]) -> dict[str, Any]:
     if "error" in said:
         kind = getattr(errors, str(said["error"]), DependencyError)
         text = str(said["said"])
