@@ -45,7 +45,7 @@ _NOT_READ = ("environment.yml", "environment.yaml", "setup.py", "setup.cfg", "Pi
 
 
 @dataclass(frozen=True)
-class Wanted:
+class WantedPackage:
     """One plain requirement.
 
     Attributes:
@@ -63,7 +63,7 @@ class Wanted:
 
 
 @dataclass(frozen=True)
-class Declared:
+class DeclaredPackages:
     """What a repository needs.
 
     Attributes:
@@ -74,12 +74,12 @@ class Declared:
     """
 
     source: str
-    wanted: tuple[Wanted, ...]
+    wanted: tuple[WantedPackage, ...]
     python: str = ""
-    constraints: tuple[Wanted, ...] = ()
+    constraints: tuple[WantedPackage, ...] = ()
 
 
-def declared(root: Path, entry: str) -> Declared | None:
+def declared(root: Path, entry: str) -> DeclaredPackages | None:
     """What the files say; None where they say nothing. Raises ``RequirementError``."""
     script = _script(root / entry, entry)
     if script is not None:
@@ -91,11 +91,11 @@ def declared(root: Path, entry: str) -> Declared | None:
     if listed is not None:
         python = "" if project is None else project.python
         wanted, constraints = read(root, listed)
-        return Declared(listed, tuple(wanted), python, tuple(constraints))
+        return DeclaredPackages(listed, tuple(wanted), python, tuple(constraints))
     return project if project is not None and (project.wanted or project.python) else None
 
 
-def optional(root: Path, entry: str) -> dict[str, Wanted]:
+def optional(root: Path, entry: str) -> dict[str, WantedPackage]:
     """What optional extras of a project bring, by canonical name; empty where none can be read."""
     try:
         project = _toml(_text(root / PROJECT, PROJECT), PROJECT).get("project", {})
@@ -125,7 +125,7 @@ def not_read(root: Path, entry: str) -> list[str]:
     return found
 
 
-def parse_requirement(text: str, where: str) -> Wanted:
+def parse_requirement(text: str, where: str) -> WantedPackage:
     """A requirement that somebody wrote, with the hashes behind it. Raises ``RequirementError``."""
     plain, *hashes = map(str.strip, re.split(r"(?<=\s)(?=--hash[= ])", text))
     if len(plain) > MAX_LINE:
@@ -148,7 +148,7 @@ def parse_requirement(text: str, where: str) -> Wanted:
             f"{where} takes {requirement.name} from {requirement.url[:200]!r}; only packages of "
             f"the index are installed. {_advice()}"
         )
-    return Wanted(requirement, where, tuple(one[1] for one in found if one))
+    return WantedPackage(requirement, where, tuple(one[1] for one in found if one))
 
 
 def _is_literal(text: str) -> bool:
@@ -165,13 +165,13 @@ def _is_literal(text: str) -> bool:
     )
 
 
-def read(root: Path, name: str) -> tuple[list[Wanted], list[Wanted]]:
+def read(root: Path, name: str) -> tuple[list[WantedPackage], list[WantedPackage]]:
     """The plain requirements in a ``requirements.txt``, and the constraints.
 
     Further files of the repository that it names (``-r``, ``-c``) are read, too.
     """
-    wanted: list[Wanted] = []
-    constraints: list[Wanted] = []
+    wanted: list[WantedPackage] = []
+    constraints: list[WantedPackage] = []
     waiting, seen = [(name, False)], {(name, False)}
     while waiting:
         file, constrains = waiting.pop(0)
@@ -193,7 +193,7 @@ def read(root: Path, name: str) -> tuple[list[Wanted], list[Wanted]]:
     return wanted, constraints
 
 
-def _of_itself(root: Path, extras: str, where: str) -> Iterator[Wanted]:
+def _of_itself(root: Path, extras: str, where: str) -> Iterator[WantedPackage]:
     """What ``-e .`` brings besides the repository, whose modules are there already."""
     data = _toml(_text(root / PROJECT, PROJECT), PROJECT) if _is_file(root / PROJECT) else {}
     project = data.get("project")
@@ -244,7 +244,7 @@ def _joined(lines: Sequence[str]) -> Iterator[tuple[int, str]]:
             yield first, whole
 
 
-def _script(path: Path, name: str) -> Declared | None:
+def _script(path: Path, name: str) -> DeclaredPackages | None:
     """The metadata in an entry file, after https://peps.python.org/pep-0723/."""
     try:
         with path.open("rb") as file:
@@ -260,7 +260,7 @@ def _script(path: Path, name: str) -> Declared | None:
     where = f"the script metadata of {name}"
     data = _toml(blocks[0], where)
     python = _specifier(data.get("requires-python", ""), where)
-    return Declared(name, _list(data.get("dependencies", []), where), python)
+    return DeclaredPackages(name, _list(data.get("dependencies", []), where), python)
 
 
 def _block(lines: Sequence[str], start: int) -> str | None:
@@ -276,7 +276,7 @@ def _block(lines: Sequence[str], start: int) -> str | None:
     return None if closed is None else "\n".join(inside[:closed])
 
 
-def _project(path: Path) -> Declared | None:
+def _project(path: Path) -> DeclaredPackages | None:
     if not path.is_file():
         return None
     project = _toml(_text(path, PROJECT), PROJECT).get("project")
@@ -284,7 +284,7 @@ def _project(path: Path) -> Declared | None:
         return None
     where = f"[project] of {PROJECT}"
     python = _specifier(project.get("requires-python", ""), where)
-    return Declared(PROJECT, _list(project.get("dependencies", []), where), python)
+    return DeclaredPackages(PROJECT, _list(project.get("dependencies", []), where), python)
 
 
 def _toml(text: str, where: str) -> dict[str, Any]:
@@ -294,7 +294,7 @@ def _toml(text: str, where: str) -> dict[str, Any]:
         raise RequirementError(f"{where} is no TOML: {error}. {_advice()}") from error
 
 
-def _list(found: object, where: str) -> tuple[Wanted, ...]:
+def _list(found: object, where: str) -> tuple[WantedPackage, ...]:
     if not isinstance(found, list) or not all(isinstance(item, str) for item in found):
         raise RequirementError(f"dependencies in {where} is no list of texts. {_advice()}")
     _bounded(len(found), where)

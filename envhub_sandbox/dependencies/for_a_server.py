@@ -37,7 +37,7 @@ from envhub_sandbox.dependencies import (
     resolutions,
     uv,
 )
-from envhub_sandbox.dependencies.declared import Wanted, parse_requirement
+from envhub_sandbox.dependencies.declared import WantedPackage, parse_requirement
 from envhub_sandbox.dependencies.modules import Guess
 from envhub_sandbox.dependencies.request import DATE, PackageRequest
 from envhub_sandbox.errors import DependencyError, PackagesTooLargeError, RequirementError
@@ -145,7 +145,7 @@ def _request(order: Mapping[str, Any]) -> PackageRequest:
     )
 
 
-def _wanted(rows: Iterable[Sequence[str]]) -> tuple[Wanted, ...]:
+def _wanted(rows: Iterable[Sequence[str]]) -> tuple[WantedPackage, ...]:
     return tuple(parse_requirement(text, printable(where, _WHERE_CHARS)) for text, where in rows)
 
 

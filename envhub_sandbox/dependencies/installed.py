@@ -20,7 +20,7 @@ from envhub_sandbox.dependencies.interpreters import release
 from envhub_sandbox.dependencies.request import PackageRequest
 
 
-class Described(NamedTuple):
+class InstalledPackage(NamedTuple):
     """A distribution of an interpreter elsewhere: its version, and what it needs."""
 
     version: str
@@ -29,7 +29,7 @@ class Described(NamedTuple):
 
 def first_unmet(
     request: PackageRequest,
-    there: Mapping[str, Described] | None = None,
+    there: Mapping[str, InstalledPackage] | None = None,
     version: str | None = None,
 ) -> str | None:
     """The first requirement that an interpreter does not meet, of those asked for or of theirs.
@@ -61,10 +61,12 @@ def brought(requirements: Iterable[Requirement]) -> list[metadata.Distribution]:
 class _Installed:
     """What an interpreter has: this one, or one elsewhere of that version."""
 
-    def __init__(self, elsewhere: Mapping[str, Described] | None = None, version: str = "") -> None:
+    def __init__(
+        self, elsewhere: Mapping[str, InstalledPackage] | None = None, version: str = ""
+    ) -> None:
         self._met: set[tuple[str, frozenset[str]]] = set()
         self._is_here = elsewhere is None
-        self._found: dict[str, metadata.Distribution | Described | None] = {
+        self._found: dict[str, metadata.Distribution | InstalledPackage | None] = {
             canonicalize_name(name): one for name, one in (elsewhere or {}).items()
         }
         self._environment = {str(k): str(v) for k, v in default_environment().items()}
@@ -74,7 +76,7 @@ class _Installed:
 
     def reached(
         self, requirements: Iterable[Requirement]
-    ) -> Iterator[tuple[Requirement, metadata.Distribution | Described | None]]:
+    ) -> Iterator[tuple[Requirement, metadata.Distribution | InstalledPackage | None]]:
         """Each that applies here, of all that they lead to, and what is here of that name."""
         waiting = [(one, frozenset[str]()) for one in requirements]
         while waiting:
@@ -101,7 +103,7 @@ class _Installed:
         each = ({**self._environment, "extra": extra} for extra in extras or ("",))
         return any(wanted.marker.evaluate(environment) for environment in each)
 
-    def _distribution(self, name: str) -> metadata.Distribution | Described | None:
+    def _distribution(self, name: str) -> metadata.Distribution | InstalledPackage | None:
         key = canonicalize_name(name)
         if self._is_here and key not in self._found:
             try:
@@ -111,14 +113,14 @@ class _Installed:
         return self._found.get(key)
 
 
-def _is_among(found: metadata.Distribution | Described, versions: SpecifierSet) -> bool:
+def _is_among(found: metadata.Distribution | InstalledPackage, versions: SpecifierSet) -> bool:
     try:
         return versions.contains(found.version, prereleases=True)
     except (InvalidVersion, TypeError):
         return False
 
 
-def _needs(found: metadata.Distribution | Described) -> list[Requirement]:
+def _needs(found: metadata.Distribution | InstalledPackage) -> list[Requirement]:
     try:
         return [Requirement(text) for text in found.requires or ()]
     except InvalidRequirement:

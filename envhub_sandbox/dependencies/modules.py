@@ -26,7 +26,7 @@ from envhub_sandbox.option_names import option_name
 from envhub_worker.protocol.text import printable
 
 if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.declared import Declared, Wanted
+    from envhub_sandbox.dependencies.declared import DeclaredPackages, WantedPackage
 
 _FORMAT = 1
 _READ: dict[tuple[Path, str], tuple[tuple[str, str, int], ...]] = {}
@@ -57,7 +57,7 @@ class Guess:
     """
 
     module: str
-    wanted: Wanted
+    wanted: WantedPackage
     brought_by: tuple[str, ...]
 
     @property
@@ -108,7 +108,7 @@ def _of_id(text: str) -> tuple[str, str, list[str]] | None:
     return None
 
 
-def _of_module(name: str, extras: Mapping[str, Wanted]) -> tuple[str, str, list[str]] | None:
+def _of_module(name: str, extras: Mapping[str, WantedPackage]) -> tuple[str, str, list[str]] | None:
     from packaging.utils import canonicalize_name
 
     from envhub_sandbox.sources.imports import of_module
@@ -194,7 +194,7 @@ class MissingModule:
                 return f" {printable(file, 200)}, line {line} imports {name}."
         return ""
 
-    def _cure(self, module: str, says: Declared | None) -> str:
+    def _cure(self, module: str, says: DeclaredPackages | None) -> str:
         from envhub_sandbox.sources.imports import of_module
 
         name = next(iter(of_module(module)), "NAME-OF-THE-PACKAGE")
@@ -228,7 +228,7 @@ class MissingModule:
         )
 
 
-def _what(found: Declared | None, snapshot: Snapshot) -> str:
+def _what(found: DeclaredPackages | None, snapshot: Snapshot) -> str:
     if found is not None and found.wanted:
         names = [str(wanted.requirement) for wanted in found.wanted]
         more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""

@@ -17,7 +17,7 @@ from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.option_names import option_name
 
 if TYPE_CHECKING:  # they cost time, and most repositories need none of them
-    from envhub_sandbox.dependencies.declared import Wanted
+    from envhub_sandbox.dependencies.declared import WantedPackage
     from envhub_sandbox.dependencies.modules import Guess
 
 DATE = re.compile(r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}:\d{2}(Z|[+-]\d{2}:\d{2}))?")
@@ -44,13 +44,13 @@ class Choice:
     """
 
     where: Literal["auto", "host", "own"]
-    extra: tuple[Wanted, ...] = ()
+    extra: tuple[WantedPackage, ...] = ()
     python: str = ""
     exclude_newer: str | None = None
     infer: bool = True
-    only: tuple[Wanted, ...] | None = None
+    only: tuple[WantedPackage, ...] | None = None
     without: tuple[str, ...] = ()
-    override: tuple[Wanted, ...] = ()
+    override: tuple[WantedPackage, ...] = ()
     fetch_python: bool = False
 
 
@@ -113,7 +113,7 @@ def _adjusted(given: Mapping[str, Any]) -> Choice:
     )
 
 
-def _requirements(given: Mapping[str, Any], name: str) -> tuple[Wanted, ...]:
+def _requirements(given: Mapping[str, Any], name: str) -> tuple[WantedPackage, ...]:
     found = given.get(name, ())
     if not isinstance(found, (list, tuple)) or not all(isinstance(text, str) for text in found):
         raise PolicyError(f"{name} in dependencies is {found!r}; it takes a list of requirements")
@@ -182,15 +182,15 @@ class PackageRequest:
     """
 
     source: str
-    wanted: tuple[Wanted, ...]
+    wanted: tuple[WantedPackage, ...]
     supports: str = ""
     python: str = ""
     exclude_newer: str | None = None
     always: bool = False
     guesses: tuple[Guess, ...] = ()
-    constraints: tuple[Wanted, ...] = ()
+    constraints: tuple[WantedPackage, ...] = ()
     without: tuple[str, ...] = ()
-    override: tuple[Wanted, ...] = ()
+    override: tuple[WantedPackage, ...] = ()
     fetch_python: bool = False
     gpu: bool = False
     runs_worker: bool = True

@@ -13,7 +13,7 @@ from packaging.version import Version
 
 from envhub_sandbox.dependencies import index, interpreters, uv
 from envhub_sandbox.dependencies.builds.sources import Source
-from envhub_sandbox.dependencies.declared import Wanted, parse_requirement
+from envhub_sandbox.dependencies.declared import WantedPackage, parse_requirement
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import (
     DependencyError,
@@ -185,7 +185,7 @@ def sources_of(
     ]
 
 
-def _lines(wanted: Iterable[Wanted]) -> str:
+def _lines(wanted: Iterable[WantedPackage]) -> str:
     wanted = list(wanted)
     for one in wanted:
         if one.requirement.url is not None:
@@ -222,7 +222,9 @@ def _pins(text: str) -> list[tuple[str, str, list[str]]]:
     return found
 
 
-def _with_their_hashes(pins: Iterable[tuple[str, str, list[str]]], wanted: Sequence[Wanted]) -> str:
+def _with_their_hashes(
+    pins: Iterable[tuple[str, str, list[str]]], wanted: Sequence[WantedPackage]
+) -> str:
     """The lock's text, with only those hashes of a package that its requirement permits."""
     permitted: dict[str, tuple[set[str], str]] = {}
     for asked in wanted:
@@ -242,7 +244,7 @@ def _with_their_hashes(pins: Iterable[tuple[str, str, list[str]]], wanted: Seque
     return "".join(f"{line}\n" for line in lines)
 
 
-def _what_is_required(said: str, every: Sequence[Wanted]) -> str:
+def _what_is_required(said: str, every: Sequence[WantedPackage]) -> str:
     """The requirements that an explanation speaks of, with where each stands."""
     words = {canonicalize_name(word) for word in re.findall(r"[A-Za-z0-9][A-Za-z0-9._-]*", said)}
     named = [one for one in every if canonicalize_name(one.requirement.name) in words]

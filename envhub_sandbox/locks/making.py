@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from envhub_sandbox.dependencies import interpreters
-from envhub_sandbox.dependencies.declared import Wanted, parse_requirement
+from envhub_sandbox.dependencies.declared import WantedPackage, parse_requirement
 from envhub_sandbox.dependencies.request import Choice, request_of
 from envhub_sandbox.dependencies.resolutions import resolution_for
 from envhub_sandbox.errors import LockError
@@ -60,7 +60,7 @@ def again(lock: LockFile) -> Choice:
     )
 
 
-def _parsed(texts: Sequence[str]) -> tuple[Wanted, ...]:
+def _parsed(texts: Sequence[str]) -> tuple[WantedPackage, ...]:
     return tuple(parse_requirement(text, f"{text[:80]!r} in the lock") for text in texts)
 
 

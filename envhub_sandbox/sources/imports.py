@@ -13,9 +13,9 @@ from functools import cache
 from pathlib import Path
 
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.sources.parsing import Named, Parsed
+from envhub_sandbox.sources.parsing import ImportStatement, ParsedFile
 
-Files = Mapping[str, Parsed | None]
+Files = Mapping[str, ParsedFile | None]
 
 
 _MOST_ROUNDS = 100
@@ -66,7 +66,7 @@ class _Reached:
                 return
 
     def _follow(self, file: str) -> None:
-        parsed = self._parsed[file] or Parsed()
+        parsed = self._parsed[file] or ParsedFile()
         for name, used in parsed.definitions:
             if not name or name in self._used:
                 self._used.update(used)
@@ -80,7 +80,7 @@ class _Reached:
                         self.imports.add(Import(name, file, one.line, module))
 
 
-def _targets(one: Named, file: str, files: set[str]) -> Iterator[tuple[str, str]]:
+def _targets(one: ImportStatement, file: str, files: set[str]) -> Iterator[tuple[str, str]]:
     """Each module that is named, and the repository's own file if it is one."""
     folder = file.rpartition("/")[0]
     for _ in range(one.level - 1):

@@ -10,7 +10,7 @@ from packaging.utils import canonicalize_name
 
 from envhub_sandbox.check.findings import Finding
 from envhub_sandbox.check.static.survey import File, survey
-from envhub_sandbox.dependencies.declared import Declared, declared
+from envhub_sandbox.dependencies.declared import DeclaredPackages, declared
 from envhub_sandbox.dependencies.resolve import WORKERS
 from envhub_sandbox.errors import RequirementError
 from envhub_sandbox.hub.snapshot import Snapshot
@@ -39,7 +39,7 @@ class Static:
     files: list[File]
     entries: tuple[tuple[str, int], ...]
     imports: list[Import]
-    declared: Declared | None
+    declared: DeclaredPackages | None
     findings: list[Finding]
 
     @property

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.dependencies.declared import MAX_BYTES, Wanted, parse_requirement
+from envhub_sandbox.dependencies.declared import MAX_BYTES, WantedPackage, parse_requirement
 from envhub_sandbox.errors import RequirementError
 from envhub_sandbox.sources import toml
 
@@ -21,7 +21,7 @@ class Project:
     that the backend is looked for in first.
     """
 
-    requires: tuple[Wanted, ...]
+    requires: tuple[WantedPackage, ...]
     backend: str
     backend_path: tuple[str, ...] = ()
 

@@ -111,10 +111,10 @@ def unpack(archive: Path, folder: Path, title: str) -> Path:
 def _members(archive: Path, title: str) -> Iterator[Iterator[Member]]:
     with ExitStack() as stack:
         if archive.suffix == ".zip":
-            stream: Any = Bounded(stack.enter_context(archive.open("rb")), title, MAX_TABLE)
+            stream: Any = BoundedStream(stack.enter_context(archive.open("rb")), title, MAX_TABLE)
             yield _of_zip(stack.enter_context(zipfile.ZipFile(stream)), title)
         elif opener := _TARS.get(archive.suffix):
-            stream = Bounded(stack.enter_context(opener(archive, "rb")), title)
+            stream = BoundedStream(stack.enter_context(opener(archive, "rb")), title)
             yield _of_tar(stack.enter_context(tarfile.open(fileobj=stream, mode="r:")), title)
         else:
             raise PackageIntegrityError(
@@ -122,7 +122,7 @@ def _members(archive: Path, title: str) -> Iterator[Iterator[Member]]:
             )
 
 
-class Bounded(io.RawIOBase):
+class BoundedStream(io.RawIOBase):
     """A stream that refuses to be read far, or much at once: an archive says its own lengths."""
 
     def __init__(self, stream: IO[bytes], title: str, at_once: int = AT_ONCE) -> None:

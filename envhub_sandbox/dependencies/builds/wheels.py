@@ -19,7 +19,7 @@ from packaging import tags
 from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel_filename
 from packaging.version import InvalidVersion, Version
 
-from envhub_sandbox.dependencies.builds.trees import MAX_TABLE, Bounded, check_packing
+from envhub_sandbox.dependencies.builds.trees import MAX_TABLE, BoundedStream, check_packing
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.errors import DependencyError, PackageIntegrityError, SnapshotError
 from envhub_sandbox.hub.listing import FileRecord, check_names
@@ -45,7 +45,10 @@ def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> Non
         _fits(wheel.name, interpreter)
         if wheel.stat().st_size > MAX_BYTES:
             raise PackageIntegrityError(f"it has more than {size_text(MAX_BYTES)}")
-        with wheel.open("rb") as file, zipfile.ZipFile(Bounded(file, "it", MAX_TABLE)) as archive:
+        with (
+            wheel.open("rb") as file,
+            zipfile.ZipFile(BoundedStream(file, "it", MAX_TABLE)) as archive,
+        ):
             _files(archive)
             info = _info(archive, name, found)
             _record(archive, f"{info}/RECORD")

@@ -25,7 +25,7 @@ from envhub_sandbox.sandboxes.docker.engines import (
 from envhub_sandbox.sandboxes.docker.image import INTERPRETER
 
 if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.installed import Described
+    from envhub_sandbox.dependencies.installed import InstalledPackage
     from envhub_sandbox.dependencies.interpreters import Interpreter
 
 # without site, so that nothing of what is installed there runs: its metadata is read
@@ -52,7 +52,7 @@ class ImageTarget:
         self._engine = engine
         self._image = image
 
-    def _inside(self) -> tuple[Interpreter, dict[str, Described]]:
+    def _inside(self) -> tuple[Interpreter, dict[str, InstalledPackage]]:
         engine = self._engine()
         return inside(engine, find_image(engine, self._image))
 
@@ -80,13 +80,13 @@ class ImageTarget:
 
 
 @lru_cache(maxsize=16)
-def inside(engine: Engine, image: str) -> tuple[Interpreter, dict[str, Described]]:
+def inside(engine: Engine, image: str) -> tuple[Interpreter, dict[str, InstalledPackage]]:
     """The interpreter of an image, and what is installed for its jails; by the image's id.
 
     Raises:
         SandboxUnavailableError: It is none of ours.
     """
-    from envhub_sandbox.dependencies.installed import Described
+    from envhub_sandbox.dependencies.installed import InstalledPackage
     from envhub_sandbox.dependencies.interpreters import Interpreter, release
 
     try:
@@ -98,7 +98,7 @@ def inside(engine: Engine, image: str) -> tuple[Interpreter, dict[str, Described
         )
         implementation, version, machine, libc, there = json.loads(said)
         installed = {
-            str(name): Described(str(version), tuple(map(str, requires)))
+            str(name): InstalledPackage(str(version), tuple(map(str, requires)))
             for name, (version, requires) in there.items()
         }
     except (EngineError, ValueError, TypeError, AttributeError) as error:

@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.dependencies import declared as module
-from envhub_sandbox.dependencies.declared import Declared, declared, read
+from envhub_sandbox.dependencies.declared import DeclaredPackages, declared, read
 from envhub_sandbox.errors import RequirementError
 
 HASH = "sha256:" + "0a" * 32
 
 
-def repository(folder: Path, **files: str) -> Declared | None:
+def repository(folder: Path, **files: str) -> DeclaredPackages | None:
     """What a repository of these files declares; ``__`` in a name is a dot."""
     (folder / "env.py").write_text("")
     for name, text in files.items():
@@ -22,7 +22,7 @@ def repository(folder: Path, **files: str) -> Declared | None:
     return declared(folder, "env.py")
 
 
-def plain(found: Declared | None) -> list[str]:
+def plain(found: DeclaredPackages | None) -> list[str]:
     """Its requirements as text."""
     assert found is not None
     return [str(one) for one in found.wanted]

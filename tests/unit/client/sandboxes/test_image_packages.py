@@ -8,7 +8,7 @@ import pytest
 
 from envhub_sandbox.dependencies import installed, interpreters
 from envhub_sandbox.dependencies.declared import parse_requirement
-from envhub_sandbox.dependencies.installed import Described
+from envhub_sandbox.dependencies.installed import InstalledPackage
 from envhub_sandbox.dependencies.modules import Guess
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import InterpreterUnavailableError
@@ -18,8 +18,10 @@ from envhub_sandbox.sandboxes.docker.packages import fitting
 OURS = interpreters.own()
 NEWER = replace(OURS, path="/opt/envhub-worker/bin/python", libc="99.0")
 THERE = {
-    "Wanted_One": Described("1.5", ("deeper>=2; python_version >= '3.11'", "more; extra == 'x'")),
-    "deeper": Described("1.0", ()),
+    "Wanted_One": InstalledPackage(
+        "1.5", ("deeper>=2; python_version >= '3.11'", "more; extra == 'x'")
+    ),
+    "deeper": InstalledPackage("1.0", ()),
 }
 
 
