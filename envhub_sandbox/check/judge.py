@@ -25,9 +25,9 @@ from envhub_sandbox.check.play.task import TaskJudge
 from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.check.static.static import undeclared
 from envhub_sandbox.check.static.survey import survey
-from envhub_sandbox.dependencies.choice import chosen
 from envhub_sandbox.dependencies.declared import declared
 from envhub_sandbox.dependencies.pipeline import packages_for
+from envhub_sandbox.dependencies.request import chosen
 from envhub_sandbox.errors import (
     DependencyError,
     EnvHubError,

@@ -85,9 +85,8 @@ def _build(
     exclude_newer: str | None,
     network: str | None,
 ) -> dict[str, Any]:
-    from envhub_sandbox.dependencies.choice import Choice
-    from envhub_sandbox.dependencies.pipeline import versions_for
-    from envhub_sandbox.dependencies.request import request_of
+    from envhub_sandbox.dependencies.request import Choice, request_of
+    from envhub_sandbox.dependencies.resolutions import versions_for
     from envhub_sandbox.dependencies.resolve import resolve
     from envhub_sandbox.errors import DependencyError
     from envhub_sandbox.sandboxes.docker import image

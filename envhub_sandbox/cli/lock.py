@@ -18,7 +18,7 @@ from envhub_sandbox.cli.shared.progress import Bar
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.choice import Choice
+    from envhub_sandbox.dependencies.request import Choice
     from envhub_sandbox.hub.snapshot import Snapshot
     from envhub_sandbox.locks.lockfile import LockFile
 
@@ -154,7 +154,7 @@ def _old(path: Path, upgrade: bool) -> LockFile | None:
 
 
 def _choice(given: Any, old: LockFile | None) -> Choice:
-    from envhub_sandbox.dependencies.choice import chosen
+    from envhub_sandbox.dependencies.request import chosen
     from envhub_sandbox.locks import making
 
     if given == "auto":
@@ -198,10 +198,11 @@ def _reference(ref: str | None, locked: LockFile, file: Path) -> str:
 
 
 def _now(locked: LockFile, snapshot: Snapshot, *, no_index: bool) -> LockFile:
+    from envhub_sandbox.dependencies import interpreters
     from envhub_sandbox.locks import lockfile, making
     from envhub_sandbox.locks.drift import with_files
 
-    here = lockfile.Runner.of(lockfile.runner_here(locked))
+    here = lockfile.Runner.of(interpreters.find(locked.runner.python))
     now = replace(with_files(locked, snapshot), runner=here)
     return now if no_index else replace(now, packages=making.relisted(locked).packages)
 

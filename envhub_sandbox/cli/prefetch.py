@@ -53,8 +53,8 @@ def prefetch(
 
 
 def _environment(snapshot: Snapshot, given: Any, upgrade: bool) -> Environment | None:
-    from envhub_sandbox.dependencies.choice import chosen
     from envhub_sandbox.dependencies.pipeline import ThisMachine, packages_for
+    from envhub_sandbox.dependencies.request import chosen
 
     choice, _ = chosen(given, None)
     made = packages_for(snapshot, choice, ThisMachine(upgrade=upgrade))

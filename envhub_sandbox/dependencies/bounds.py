@@ -30,36 +30,22 @@ _UNITS = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40}
 
 @dataclass(frozen=True)
 class Bounds:
-    """What one environment may have.
-
-    Attributes:
-        bytes: All files together, before their bytecode is made.
-        files: Their number, folders included.
-    """
+    """What one environment may have: bytes (before bytecode is made), and files with folders."""
 
     bytes: int
     files: int
 
     @classmethod
     def set(cls) -> Bounds:
-        """Those of this machine's user.
-
-        Raises:
-            DependencyError: A variable holds no number.
-        """
+        """Those of this machine's user; ``DependencyError`` if a variable holds no number."""
         return cls(_number(BYTES_VARIABLE, MAX_BYTES), _number(FILES_VARIABLE, MAX_FILES))
 
     def check(self, size: int, files: int, what: str) -> None:
-        """Refuse what is more.
-
-        Raises:
-            PackagesTooLargeError: It is.
-        """
+        """Refuse more with ``PackagesTooLargeError``."""
         if size > self.bytes:
-            told = f"{size_text(size)}; at most {size_text(self.bytes)}"
             raise PackagesTooLargeError(
-                f"{what} {told} are installed. No environment was made. If you want it, set "
-                f"{BYTES_VARIABLE} to more bytes"
+                f"{what} {size_text(size)}; at most {size_text(self.bytes)} are installed. No "
+                f"environment was made. If you want it, set {BYTES_VARIABLE} to more bytes"
             )
         if files > self.files:
             raise PackagesTooLargeError(
@@ -76,18 +62,15 @@ def _number(variable: str, usual: int) -> int:
 
 
 class Watch:
-    """Looks at an installation while it goes on.
-
-    Args:
-        bounds: What is permitted.
-        folder: What is being filled.
-        places: Further folders that are written to; they need not be there yet.
-    """
+    """Looks at an installation in progress: at its folder, and at the disks that uv writes to."""
 
     def __init__(self, bounds: Bounds, folder: Path, places: Sequence[Path]) -> None:
         self.bounds = bounds
         self._folder = folder
-        self._places = [_existing(place) for place in (folder, *places)]
+        self._places = [
+            next(path for path in (place, *place.parents) if path.exists())
+            for place in (folder, *places)
+        ]
         self._announced = 0
 
     def hear(self, line: str) -> None:
@@ -96,21 +79,17 @@ class Watch:
             self._announced += int(float(found[2]) * _UNITS[found[3]])
 
     def look(self) -> None:
-        """Refuse to go on.
-
-        Raises:
-            PackagesTooLargeError: It is over a bound, or will be.
-            DependencyError: A disk is as good as full.
-        """
+        """Refuse to go on over a bound, or where a disk is as good as full."""
         self.bounds.check(self._announced, 0, "its packages are downloads of")
         self.bounds.check(*measured(self._folder), "its packages have")
         for place in self._places:
-            free = _free(place)
+            found = os.statvfs(place)
+            free = found.f_bavail * found.f_frsize
             if free < LEFT_FREE:
                 raise DependencyError(
                     f"the disk of {place} is full: {free // 2**20} MiB are left, and nothing is "
                     f"installed below {LEFT_FREE // 2**20}. 'envhub cache remove --unused-for 30' "
-                    "frees what nobody used for long, and 'uv cache prune' what uv keeps"
+                    "frees what was not used for long, and 'uv cache prune' what uv keeps"
                 )
 
 
@@ -127,11 +106,7 @@ def measured(folder: Path) -> tuple[int, int]:
 
 
 def checked(folder: Path) -> tuple[int, int]:
-    """The same for a folder that nobody changes.
-
-    Raises:
-        PackageIntegrityError: A wheel brought anything but files and folders.
-    """
+    """The same for a folder that does not change. Raises ``PackageIntegrityError``."""
     for path in walk(folder):
         mode = path.lstat().st_mode
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
@@ -153,12 +128,3 @@ def walk(folder: Path) -> Iterator[Path]:
                 if item.is_dir(follow_symlinks=False):
                     waiting.append(item.path)
                 yield Path(item.path)
-
-
-def _existing(place: Path) -> Path:
-    return next(path for path in (place, *place.parents) if path.exists())
-
-
-def _free(place: Path) -> int:
-    found = os.statvfs(place)
-    return found.f_bavail * found.f_frsize

@@ -12,7 +12,6 @@ from __future__ import annotations
 import codecs
 import os
 import re
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,27 +21,23 @@ from packaging.requirements import InvalidRequirement, Requirement
 from packaging.specifiers import InvalidSpecifier, SpecifierSet
 from packaging.utils import canonicalize_name
 
-from envhub_sandbox.dependencies.files import LOOKED_AT, PROJECT, SCRIPT, requirements_file
-from envhub_sandbox.dependencies.sources import of_git
+from envhub_sandbox.dependencies.builds.sources import of_git
 from envhub_sandbox.errors import RequirementError
 from envhub_sandbox.option_names import option_name
+from envhub_sandbox.sources import toml
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
+PROJECT = "pyproject.toml"
 MAX_BYTES = 256 * 1024
 MAX_REQUIREMENTS = 1000
 MAX_FILES = 16
 """That a ``requirements.txt`` leads to."""
 MAX_LINE = 2000
-MAX_DOTS = 2000
-"""In TOML: the time that its parser takes grows with the square of the parts of a key."""
 
 _HASH = re.compile(r"--hash[= ](sha256:[0-9a-f]{64}|sha384:[0-9a-f]{96}|sha512:[0-9a-f]{128})")
 _QUOTED = re.compile(r"'[^']*'|\"[^\"]*\"")
-_CLOSES = "# ///"
+_SCRIPT, _CLOSES = "# /// script", "# ///"
+_LOOKED_AT = 1024 * 1024
+"""Bytes at the beginning of an entry file in which metadata is looked for."""
 _INCLUDES = re.compile(r"(-r|--requirement|-c|--constraint)[ =]\s*(\S+)")
 _ITSELF = re.compile(r"(?:(?:-e|--editable)[ =]\s*)?\./?(?:\[([\w.,\s-]{0,200})\])?")
 _BYTE_ORDER_MARKS = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
@@ -50,7 +45,7 @@ _NOT_READ = ("environment.yml", "environment.yaml", "setup.py", "setup.cfg", "Pi
 
 
 @dataclass(frozen=True)
-class Wanted:
+class WantedPackage:
     """One plain requirement.
 
     Attributes:
@@ -68,7 +63,7 @@ class Wanted:
 
 
 @dataclass(frozen=True)
-class Declared:
+class DeclaredPackages:
     """What a repository needs.
 
     Attributes:
@@ -79,34 +74,28 @@ class Declared:
     """
 
     source: str
-    wanted: tuple[Wanted, ...]
+    wanted: tuple[WantedPackage, ...]
     python: str = ""
-    constraints: tuple[Wanted, ...] = ()
+    constraints: tuple[WantedPackage, ...] = ()
 
 
-def declared(root: Path, entry: str) -> Declared | None:
-    """What the files say; None where they say nothing.
-
-    Args:
-        root: The verified files.
-        entry: The entry file, as the snapshot names it.
-
-    Raises:
-        RequirementError: They say something that cannot be taken.
-    """
+def declared(root: Path, entry: str) -> DeclaredPackages | None:
+    """What the files say; None where they say nothing. Raises ``RequirementError``."""
     script = _script(root / entry, entry)
     if script is not None:
         return script
     project = _project(root / PROJECT)
-    listed = requirements_file(root, entry)
+    beside = os.path.join(os.path.dirname(entry), "requirements.txt")
+    names = (beside, "requirements.txt")
+    listed = next((name for name in names if (root / name).is_file()), None)
     if listed is not None:
         python = "" if project is None else project.python
         wanted, constraints = read(root, listed)
-        return Declared(listed, tuple(wanted), python, tuple(constraints))
+        return DeclaredPackages(listed, tuple(wanted), python, tuple(constraints))
     return project if project is not None and (project.wanted or project.python) else None
 
 
-def optional(root: Path, entry: str) -> dict[str, Wanted]:
+def optional(root: Path, entry: str) -> dict[str, WantedPackage]:
     """What optional extras of a project bring, by canonical name; empty where none can be read."""
     try:
         project = _toml(_text(root / PROJECT, PROJECT), PROJECT).get("project", {})
@@ -136,12 +125,8 @@ def not_read(root: Path, entry: str) -> list[str]:
     return found
 
 
-def parse_requirement(text: str, where: str) -> Wanted:
-    """A requirement that somebody wrote, with the hashes behind it.
-
-    Raises:
-        RequirementError: It is none that can be taken.
-    """
+def parse_requirement(text: str, where: str) -> WantedPackage:
+    """A requirement that somebody wrote, with the hashes behind it. Raises ``RequirementError``."""
     plain, *hashes = map(str.strip, re.split(r"(?<=\s)(?=--hash[= ])", text))
     if len(plain) > MAX_LINE:
         raise RequirementError(f"{where} has {len(plain)} characters; at most {MAX_LINE} are read")
@@ -163,7 +148,7 @@ def parse_requirement(text: str, where: str) -> Wanted:
             f"{where} takes {requirement.name} from {requirement.url[:200]!r}; only packages of "
             f"the index are installed. {_advice()}"
         )
-    return Wanted(requirement, where, tuple(one[1] for one in found if one))
+    return WantedPackage(requirement, where, tuple(one[1] for one in found if one))
 
 
 def _is_literal(text: str) -> bool:
@@ -180,16 +165,13 @@ def _is_literal(text: str) -> bool:
     )
 
 
-def read(root: Path, name: str) -> tuple[list[Wanted], list[Wanted]]:
+def read(root: Path, name: str) -> tuple[list[WantedPackage], list[WantedPackage]]:
     """The plain requirements in a ``requirements.txt``, and the constraints.
 
     Further files of the repository that it names (``-r``, ``-c``) are read, too.
-
-    Raises:
-        RequirementError: It holds something else, or is no text.
     """
-    wanted: list[Wanted] = []
-    constraints: list[Wanted] = []
+    wanted: list[WantedPackage] = []
+    constraints: list[WantedPackage] = []
     waiting, seen = [(name, False)], {(name, False)}
     while waiting:
         file, constrains = waiting.pop(0)
@@ -211,7 +193,7 @@ def read(root: Path, name: str) -> tuple[list[Wanted], list[Wanted]]:
     return wanted, constraints
 
 
-def _of_itself(root: Path, extras: str, where: str) -> Iterator[Wanted]:
+def _of_itself(root: Path, extras: str, where: str) -> Iterator[WantedPackage]:
     """What ``-e .`` brings besides the repository, whose modules are there already."""
     data = _toml(_text(root / PROJECT, PROJECT), PROJECT) if _is_file(root / PROJECT) else {}
     project = data.get("project")
@@ -249,7 +231,8 @@ def _joined(lines: Sequence[str]) -> Iterator[tuple[int, str]]:
     """Lines without comments, each with the number of its first; a backslash continues one."""
     parts: list[str] = []
     first = 0
-    for number, line in enumerate(map(_without_comment, lines), start=1):
+    for number, raw in enumerate(lines, start=1):
+        line = "" if raw.lstrip().startswith("#") else raw.split(" #", 1)[0].strip()
         first = first if parts else number
         goes_on = line.endswith("\\") and number < len(lines)
         parts.append(line[:-1].strip() if goes_on else line)
@@ -261,27 +244,23 @@ def _joined(lines: Sequence[str]) -> Iterator[tuple[int, str]]:
             yield first, whole
 
 
-def _without_comment(line: str) -> str:
-    return "" if line.lstrip().startswith("#") else line.split(" #", 1)[0].strip()
-
-
-def _script(path: Path, name: str) -> Declared | None:
+def _script(path: Path, name: str) -> DeclaredPackages | None:
     """The metadata in an entry file, after https://peps.python.org/pep-0723/."""
     try:
         with path.open("rb") as file:
-            lines = file.read(LOOKED_AT).decode("utf-8", "replace").splitlines()
+            lines = file.read(_LOOKED_AT).decode("utf-8", "replace").splitlines()
     except OSError as error:
         raise RequirementError(f"{name} cannot be read: {error}") from error
-    starts = [number for number, line in enumerate(lines) if line.rstrip() == SCRIPT]
+    starts = [number for number, line in enumerate(lines) if line.rstrip() == _SCRIPT]
     blocks = [block for block in (_block(lines, start) for start in starts) if block is not None]
     if not blocks:
         return None
     if len(blocks) > 1:
-        raise RequirementError(f"{name} has {len(blocks)} blocks {SCRIPT!r}; one is permitted")
+        raise RequirementError(f"{name} has {len(blocks)} blocks {_SCRIPT!r}; one is permitted")
     where = f"the script metadata of {name}"
     data = _toml(blocks[0], where)
     python = _specifier(data.get("requires-python", ""), where)
-    return Declared(name, _list(data.get("dependencies", []), where), python)
+    return DeclaredPackages(name, _list(data.get("dependencies", []), where), python)
 
 
 def _block(lines: Sequence[str], start: int) -> str | None:
@@ -289,7 +268,7 @@ def _block(lines: Sequence[str], start: int) -> str | None:
     inside: list[str] = []
     closed = None
     for line in lines[start + 1 :]:
-        if line.rstrip() == SCRIPT or not (line == "#" or line.startswith("# ")):
+        if line.rstrip() == _SCRIPT or not (line == "#" or line.startswith("# ")):
             break
         if line.rstrip() == _CLOSES:
             closed = len(inside)
@@ -297,7 +276,7 @@ def _block(lines: Sequence[str], start: int) -> str | None:
     return None if closed is None else "\n".join(inside[:closed])
 
 
-def _project(path: Path) -> Declared | None:
+def _project(path: Path) -> DeclaredPackages | None:
     if not path.is_file():
         return None
     project = _toml(_text(path, PROJECT), PROJECT).get("project")
@@ -305,20 +284,17 @@ def _project(path: Path) -> Declared | None:
         return None
     where = f"[project] of {PROJECT}"
     python = _specifier(project.get("requires-python", ""), where)
-    return Declared(PROJECT, _list(project.get("dependencies", []), where), python)
+    return DeclaredPackages(PROJECT, _list(project.get("dependencies", []), where), python)
 
 
 def _toml(text: str, where: str) -> dict[str, Any]:
-    if len(text) > MAX_BYTES or text.count(".") > MAX_DOTS:
-        raise RequirementError(f"{where} is too long: {len(text)} characters. {_advice()}")
     try:
-        data: dict[str, Any] = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise RequirementError(f"{where} is no TOML: {str(error)[:200]}. {_advice()}") from error
-    return data
+        return toml.loads(text, MAX_BYTES)
+    except ValueError as error:
+        raise RequirementError(f"{where} is no TOML: {error}. {_advice()}") from error
 
 
-def _list(found: object, where: str) -> tuple[Wanted, ...]:
+def _list(found: object, where: str) -> tuple[WantedPackage, ...]:
     if not isinstance(found, list) or not all(isinstance(item, str) for item in found):
         raise RequirementError(f"dependencies in {where} is no list of texts. {_advice()}")
     _bounded(len(found), where)

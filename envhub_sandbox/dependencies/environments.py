@@ -8,7 +8,7 @@
         packages/           what uv installed, 0444 in folders 0555, with its bytecode
     <cache>/environments/<key>.lock
 
-A folder is made under another name, by whoever holds the lock, and renamed into place: what bears
+A folder is made under another name, by the holder of the lock, and renamed into place: what bears
 a key is complete. Nothing in it is ever run here. It is no environment of any interpreter, so that
 none reads a ``.pth`` or ``sitecustomize`` of it at its start; a jail puts the folder onto its path
 once it is confined.
@@ -18,37 +18,32 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import hashlib
 import json
 import os
 import stat
 import subprocess
-import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import envhub_worker.protocol
-from envhub_sandbox.dependencies import index, uv, uv_cache
+from envhub_sandbox.dependencies import index, uv
 from envhub_sandbox.dependencies.bounds import Bounds, Watch, checked, walk
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.resolve import Lock
 from envhub_sandbox.errors import DependencyError
-from envhub_sandbox.hub.store import CACHE_VARIABLE, cache_root, remove_tree
+from envhub_sandbox.hub.cache import BUILDING, CACHE_VARIABLE, cache_root, draft, remove_tree
 from envhub_sandbox.system import folders, locks
 from envhub_sandbox.system.locks import sharers
 from envhub_worker.protocol.runtime import RECORD
 
 _FORMAT = 1
-_BUILDING = ".building-"
 _INSTALL_S = 3600.0
 _WAIT_S = 2 * 3600.0
-_POLL_S = 0.1
 _COMPILE_S = 1800.0
-_NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+_FULL = "'envhub cache remove --unused-for 30' frees what was not used for long"
 _THERE = (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR)
 
 _BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
@@ -105,11 +100,7 @@ def key_of(lock: Lock, interpreter: Interpreter) -> str:
 
 
 def ready(key: str) -> Environment | None:
-    """The environment of this name, if it has been made.
-
-    Raises:
-        DependencyError: Others can write where it lies.
-    """
+    """The environment of this name, if it has been made. Raises ``DependencyError``."""
     found = _read(root() / key)
     if found is not None:
         _refuse_shared(found.home)
@@ -121,23 +112,30 @@ def provide(
 ) -> Environment:
     """The environment for a lock and an interpreter; made if there is none, and marked as used.
 
-    Whoever asks for the same at once waits for the one that makes it.
-
-    Raises:
-        IndexUnavailableError, PackageIntegrityError: As with uv.
-        PackagesTooLargeError: It is over the bounds of this machine.
-        DependencyError: It cannot be made, or others can write where it lies.
+    A second process that asks for the same at once waits for the first. Raises ``DependencyError``.
     """
     key = key_of(lock, interpreter)
     made = ready(key)
     if made is None:
+        held = root() / f"{key}.lock"
+        waiting = "waiting for another process, which makes the same environment"
         try:
             folders.make(root())
             _refuse_shared(root())
-            with _held(key, tell) as descriptor:
+            with locks.held(held, wait_s=_WAIT_S, on_wait=lambda: tell(waiting)) as descriptor:
                 made = ready(key) or _made(key, lock, interpreter, descriptor, tell)
+        except TimeoutError as error:
+            raise DependencyError(
+                f"another process makes the same environment for {_WAIT_S / 3600:.0f} hours "
+                f"already, and holds {held}. End it, and try again"
+            ) from error
         except OSError as error:
-            raise _not_writable(error) from error
+            full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+            advice = _FULL if full else "Fix its permissions"
+            raise DependencyError(
+                f"the environments in {root()} cannot be written: {error}. {advice}, or set "
+                f"{CACHE_VARIABLE} to another folder"
+            ) from error
     with contextlib.suppress(OSError):
         os.utime(made.home / RECORD)
     return made
@@ -152,10 +150,10 @@ def every() -> list[Environment]:
 def remove(environment: Environment) -> str:
     """Remove one. Not while somebody makes or uses it: then the answer says who, else it is empty.
 
-    Whoever starts jails with it, or could, shares the lock of its record.
+    A process that starts jails with it, or could, shares the lock of its record.
     """
     lock, record = root() / f"{environment.key}.lock", environment.home / RECORD
-    gone = root() / f"{_BUILDING}{environment.key}-gone"
+    gone = root() / f"{BUILDING}{environment.key}-gone"
     try:
         with locks.held(lock), locks.held(record):
             # another name first: what bears the key is complete, or not there
@@ -163,33 +161,31 @@ def remove(environment: Environment) -> str:
             remove_tree(gone)
             lock.unlink()
     except TimeoutError:
-        return _users(environment, {**sharers(record), **sharers(lock)})
+        users = {**sharers(record), **sharers(lock)}
+        who = ", ".join(f"process {pid} ({command})" for pid, command in users.items())
+        return (
+            f"the environment {environment.key[:12]} is in use by "
+            f"{who or 'a process that is not seen from here'}. Close its environments there, or "
+            "end it"
+        )
     except OSError:
         return ""  # another has removed it
     return ""
 
 
-def _users(environment: Environment, users: dict[int, str]) -> str:
-    who = ", ".join(f"process {pid} ({command})" for pid, command in users.items())
-    return (
-        f"the environment {environment.key[:12]} is in use by "
-        f"{who or 'a process that is not seen from here'}. Close its environments there, or end it"
-    )
-
-
 def half_made() -> list[Path]:
     """What somebody makes now, or was killed over."""
-    return sorted(root().glob(f"{_BUILDING}*"))
+    return sorted(root().glob(f"{BUILDING}*"))
 
 
 def remove_abandoned() -> None:
     """Remove what was left half-made by somebody who was killed."""
     for path in half_made():
-        key = path.name.removeprefix(_BUILDING).partition("-")[0]
-        with contextlib.suppress(OSError), _taken(root() / f"{key}.lock") as descriptor:
-            if descriptor is not None:
-                remove_tree(path)
-                (root() / f"{key}.lock").unlink()
+        key = path.name.removeprefix(BUILDING).partition("-")[0]
+        lock = root() / f"{key}.lock"
+        with contextlib.suppress(OSError), locks.held(lock):
+            remove_tree(path)
+            lock.unlink()
 
 
 def _read(home: Path) -> Environment | None:
@@ -205,57 +201,15 @@ def _read(home: Path) -> Environment | None:
         return None
 
 
-@contextlib.contextmanager
-def _held(key: str, tell: Callable[[str], None]) -> Iterator[int]:
-    """Hold the lock of a key; gives its descriptor."""
-    until = time.monotonic() + _WAIT_S
-    told = False
-    while True:
-        with _taken(root() / f"{key}.lock") as descriptor:
-            if descriptor is not None:
-                yield descriptor
-                return
-        if time.monotonic() > until:
-            raise DependencyError(
-                f"another process makes the same environment for {_WAIT_S / 3600:.0f} hours "
-                f"already, and holds {root() / key}.lock. End it, and try again"
-            )
-        if not told:
-            tell("waiting for another process, which makes the same environment")
-            told = True
-        time.sleep(_POLL_S)
-
-
-@contextlib.contextmanager
-def _taken(path: Path) -> Iterator[int | None]:
-    """Take a lock file; None if somebody has it. It holds until every copy of it is closed."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # whoever removes an environment removes its lock file, too
-            taken = os.path.samestat(os.fstat(descriptor), os.stat(path))
-        except (BlockingIOError, FileNotFoundError):
-            taken = False
-        try:
-            yield descriptor if taken else None
-        finally:
-            # a fork of this process may have a copy, which would hold it on
-            fcntl.flock(descriptor, fcntl.LOCK_UN)
-    finally:
-        os.close(descriptor)
-
-
 def _made(
     key: str, lock: Lock, interpreter: Interpreter, held: int, tell: Callable[[str], None]
 ) -> Environment:
-    for path in root().glob(f"{_BUILDING}{key}-*"):
+    for path in root().glob(f"{BUILDING}{key}-*"):
         remove_tree(path)  # its maker was killed: we hold what it held
-    building = Path(tempfile.mkdtemp(prefix=f"{_BUILDING}{key}-", dir=root()))
-    try:
+    with draft(root(), f"{BUILDING}{key}-") as building:
         packages = building / "packages"
         watch = Watch(Bounds.set(), building, [index.uv_cache()])
-        with uv_cache.cleared_after_refusal(lock.packages):
+        with uv.cleared_after_refusal(lock.packages):
             _install(lock, interpreter, building, held, watch, tell)
             size = _size(packages, watch.bounds)
         tell(f"compiling {size / 2**20:.0f} MiB")
@@ -271,8 +225,6 @@ def _made(
             "size": size,
         }
         _publish(building, key, facts)
-    finally:
-        remove_tree(building)
     made = _read(root() / key)
     assert made is not None
     return made
@@ -280,7 +232,7 @@ def _made(
 
 def _publish(building: Path, key: str, facts: dict[str, object]) -> None:
     (building / RECORD).write_text(json.dumps(facts, indent=1))
-    (building / RECORD).chmod(0o600)  # it is locked by those who use this: nobody else may
+    (building / RECORD).chmod(0o600)  # only its users may lock it
     building.chmod(folders.SHARED_MODE)
     try:
         os.rename(building, root() / key)
@@ -288,10 +240,9 @@ def _publish(building: Path, key: str, facts: dict[str, object]) -> None:
         if error.errno not in _THERE:
             raise
         # what bears the name is none, or we would not be here: a disk that lost power, a hand
-        damaged = Path(tempfile.mkdtemp(prefix=f"{_BUILDING}{key}-", dir=root()))
-        os.rename(root() / key, damaged / "damaged")
-        os.rename(building, root() / key)
-        remove_tree(damaged)
+        with draft(root(), f"{BUILDING}{key}-") as damaged:
+            os.rename(root() / key, damaged / "damaged")
+            os.rename(building, root() / key)
 
 
 def _install(
@@ -312,7 +263,7 @@ def _install(
         watch.hear(line)
         tell(line)
 
-    # uv keeps our lock for as long as it lives: if we are killed, nobody removes what it still
+    # uv keeps our lock for as long as it lives: if we are killed, no process removes what it still
     # writes to. Copies, since a file that is shared with uv's cache is another's to change.
     uv.run(
         [
@@ -340,7 +291,7 @@ def _size(packages: Path, bounds: Bounds) -> int:
 def _compile(interpreter: Interpreter, packages: Path, held: int) -> None:
     """Bytecode for all of it, by a process that is confined to the folder (``bytecode.py``).
 
-    What fails is only slower, so it is nobody's error.
+    What fails is only slower, so it is no error.
     """
     with contextlib.suppress(subprocess.SubprocessError):
         subprocess.run(
@@ -356,7 +307,7 @@ def _compile(interpreter: Interpreter, packages: Path, held: int) -> None:
 
 
 def _close(packages: Path) -> None:
-    """Let everybody read, and nobody write."""
+    """Make it readable for all users, and writable for none."""
     for path in [*walk(packages), packages]:
         mode = path.lstat().st_mode
         runs = stat.S_ISDIR(mode) or mode & stat.S_IXUSR
@@ -369,16 +320,3 @@ def _refuse_shared(place: Path) -> None:
             f"the environments in {root()} are not trusted, since other users can change what is "
             f"in them: {why}; or set {CACHE_VARIABLE} to a folder of your own"
         )
-
-
-def _not_writable(error: OSError) -> DependencyError:
-    full = error.errno in _NO_SPACE
-    advice = (
-        "'envhub cache remove --unused-for 30' frees what nobody used for long"
-        if full
-        else "Fix its permissions"
-    )
-    return DependencyError(
-        f"the environments in {root()} cannot be written: {error}. {advice}, or set "
-        f"{CACHE_VARIABLE} to another folder"
-    )

@@ -5,17 +5,16 @@ JSON, stdout a file that holds what there is to say at any time, as one object o
 line of progress; and at the end ``own``, ``made``, or ``error`` and ``said``. With the word
 ``check`` it only says whether it could work.
 
-Whoever orders is a client on another host, so nothing of an order is believed: requirements are
+An order comes from a client on another host, and nothing of it is believed: requirements are
 read as a stranger's file is. What is made lies in a folder of that client's key, uv's cache
 included, and all of it has one bound. So two processes are at it: one works, and this one measures,
 ends it, and leaves nothing of what was not finished. Each has a pidfd of the one that started it,
-and ends with it, also where that was killed: nobody would measure, and nobody waits.
+and ends with it, also where that was killed: the work would be neither measured nor waited for.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import os
 import resource
@@ -23,20 +22,26 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from packaging.utils import canonicalize_name
 
-from envhub_sandbox.dependencies import bounds, environments, interpreters, pipeline, uv
-from envhub_sandbox.dependencies.choice import DATE
-from envhub_sandbox.dependencies.declared import Wanted, parse_requirement
-from envhub_sandbox.dependencies.guesses import Guess
-from envhub_sandbox.dependencies.request import PackageRequest
+from envhub_sandbox.dependencies import (
+    bounds,
+    environments,
+    interpreters,
+    pipeline,
+    resolutions,
+    uv,
+)
+from envhub_sandbox.dependencies.declared import WantedPackage, parse_requirement
+from envhub_sandbox.dependencies.modules import Guess
+from envhub_sandbox.dependencies.request import DATE, PackageRequest
 from envhub_sandbox.errors import DependencyError, PackagesTooLargeError, RequirementError
-from envhub_sandbox.hub.store import CACHE_VARIABLE, remove_tree
-from envhub_sandbox.system import processes
+from envhub_sandbox.hub.cache import CACHE_VARIABLE, remove_tree
+from envhub_sandbox.system import locks, processes
 from envhub_worker.protocol.text import printable
 
 BLOCK_BYTES = 4096
@@ -57,7 +62,8 @@ def main(words: Sequence[str] | None = None) -> int:
         if "check" in words:
             uv.command()
             return 0
-        ended = _pidfd(words)
+        given = [word.partition("=")[2] for word in words if word.startswith(_PIDFD)]
+        ended = int(given[0]) if given else None  # of the process which started this one
         order = json.load(sys.stdin)
         os.environ[CACHE_VARIABLE] = order["folder"]
         os.environ["UV_CACHE_DIR"] = str(_uv_cache(order))
@@ -71,12 +77,6 @@ def main(words: Sequence[str] | None = None) -> int:
     if said:
         _say(said)
     return 0
-
-
-def _pidfd(words: Sequence[str]) -> int | None:
-    """That of the process which started this one."""
-    given = [word.partition("=")[2] for word in words if word.startswith(_PIDFD)]
-    return int(given[0]) if given else None
 
 
 def _say(what: Mapping[str, Any]) -> None:
@@ -96,7 +96,7 @@ def _made(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
     resource.setrlimit(resource.RLIMIT_FSIZE, (bound, bound))
     request = _request(order)
     # a client could have it ask any host that it reaches, and what a build takes is in no account
-    pipeline.BUILDER = None
+    resolutions.BUILDER = None
     if not request.always and pipeline.HERE.meets(request):
         return {"own": True}
     made = pipeline.HERE.make(request, lambda line: _say({"told": line[:_WHERE_CHARS]}))
@@ -125,6 +125,7 @@ def _request(order: Mapping[str, Any]) -> PackageRequest:
             "the client asks for versions of Python that are none, for an interpreter by its path, "
             "or for a date that is none"
         ) from error
+    left_out = ((name, "without, of the client") for [name] in order["without"])
     return PackageRequest(
         "what the client asks for",
         _wanted(order["requirements"]),
@@ -138,31 +139,27 @@ def _request(order: Mapping[str, Any]) -> PackageRequest:
         ),
         constraints=_wanted(order["constraints"]),
         override=_wanted(order["override"]),
-        without=tuple(one.requirement.name for one in _wanted(_named(order["without"]))),
+        without=tuple(one.requirement.name for one in _wanted(left_out)),
         gpu=order["gpu"],
     )
 
 
-def _wanted(rows: Iterable[Sequence[str]]) -> tuple[Wanted, ...]:
+def _wanted(rows: Iterable[Sequence[str]]) -> tuple[WantedPackage, ...]:
     return tuple(parse_requirement(text, printable(where, _WHERE_CHARS)) for text, where in rows)
-
-
-def _named(rows: Iterable[Sequence[str]]) -> Iterator[Sequence[str]]:
-    return ((name, "without, of the client") for [name] in rows)
 
 
 # --- who watches --------------------------------------------------------------------------------
 
 
 def _watched(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
-    """Have it made, within bounds; empty where whoever made it has said what there is to say."""
+    """Have it made, within bounds; empty where the process that made it has written the answer."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     if ended is not None:
         processes.end_with(ended, _CLEANING_S)
     with _alone(Path(order["folder"])) as held:
         unfinished = Path(order["folder"], "unfinished")
         if unfinished.exists():
-            _clean(order)  # whoever was at it was killed
+            _clean(order)  # the process that made it was killed
         _make_room(order)
         unfinished.touch()
         try:
@@ -225,24 +222,14 @@ def _charged(folder: Path) -> int:
 
 @contextlib.contextmanager
 def _alone(folder: Path) -> Iterator[int]:
-    """Nobody else makes packages in this folder: a server that was killed may have left one."""
+    """Hold the lock of a client's folder: a killed server may have left a process there."""
     folder.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    try:
-        until = time.monotonic() + _WAIT_S
-        while True:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                if time.monotonic() > until:
-                    raise DependencyError("another process makes packages there; ask again") from (
-                        None
-                    )
-                time.sleep(_LOOK_S)
+    with contextlib.ExitStack() as stack:
+        try:
+            descriptor = stack.enter_context(locks.held(folder / "lock", wait_s=_WAIT_S))
+        except TimeoutError:
+            raise DependencyError("another process makes packages there; ask again") from None
         yield descriptor
-    finally:
-        os.close(descriptor)
 
 
 def _uv_cache(order: Mapping[str, Any]) -> Path:
@@ -270,14 +257,11 @@ def _make_room(order: Mapping[str, Any]) -> None:
     if _charged(folder) > order["bytes"] // 2:
         remove_tree(_uv_cache(order))
         remove_tree(folder / "resolutions")
-    for environment in _removable(keep):
+    removable = [one for one in reversed(environments.every()) if one.key not in keep]
+    for environment in removable:
         if _charged(folder) <= order["bytes"] // 2:
             return
         environments.remove(environment)
-
-
-def _removable(keep: Collection[str]) -> list[environments.Environment]:
-    return [one for one in reversed(environments.every()) if one.key not in keep]
 
 
 if __name__ == "__main__":

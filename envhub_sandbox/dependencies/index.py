@@ -2,7 +2,7 @@
 
 uv gets an environment that is made here, name by name: what chooses an index, a proxy, a
 certificate or a cache is the user's to say, and nothing that would turn builds on gets through.
-Who is behind a mirror has mostly told pip of it; what uv was not told is taken from there.
+Users behind a mirror have mostly configured pip; what is not configured for uv is taken from there.
 """
 
 from __future__ import annotations
@@ -38,11 +38,7 @@ _YES = ("1", "true", "yes", "on")
 
 
 def environment(variables: Mapping[str, str] | None = None) -> dict[str, str]:
-    """The environment that uv runs in.
-
-    Args:
-        variables: The user's; those of this process by default.
-    """
+    """The environment that uv runs in, of the user's variables (those of this process)."""
     given = os.environ if variables is None else variables
     kept = {name: value for name, value in given.items() if value and _KEPT.fullmatch(name)}
     if not any(name in kept for name in _CHOOSE_AN_INDEX):
@@ -75,7 +71,7 @@ def is_chosen() -> bool:
 
 
 def options() -> tuple[str, ...]:
-    """What uv is told on its command line: it has no variable for that there is no index."""
+    """Options on the command line of uv: it has no variable for that there is no index."""
     return ("--no-index",) if environment().get("UV_NO_INDEX", "").lower() in _YES else ()
 
 

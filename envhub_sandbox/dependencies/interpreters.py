@@ -15,6 +15,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from packaging.specifiers import InvalidSpecifier, SpecifierSet
@@ -91,9 +92,6 @@ def find(asked: str, declared: str = "", *, fetch: bool = False) -> Interpreter:
             empty for none.
         declared: The versions that the repository runs in.
         fetch: Whether uv may download one where none is at hand.
-
-    Raises:
-        InterpreterUnavailableError: There is none.
     """
     if os.sep in asked:
         return _at(os.path.abspath(os.path.expanduser(asked)))
@@ -133,21 +131,13 @@ def _fetch(wanted: SpecifierSet) -> None:
 
 
 def check_versions(asked: str) -> None:
-    """Refuse what is neither a version, nor versions, nor a path.
-
-    Raises:
-        ValueError: It is none of these.
-    """
+    """Refuse what is neither a version, nor versions, nor a path. Raises ``ValueError``."""
     if os.sep not in asked:
         versions(asked)
 
 
 def versions(asked: str) -> SpecifierSet:
-    """What a caller asks for: one version, or several.
-
-    Raises:
-        ValueError: It is neither.
-    """
+    """What a caller asks for: one version, or several; otherwise ``ValueError``."""
     try:
         return SpecifierSet(f"=={Version(asked)}.*" if asked.count(".") < 2 else f"=={asked}")
     except (InvalidVersion, InvalidSpecifier):
@@ -181,16 +171,16 @@ def _others(wanted: SpecifierSet) -> list[Interpreter]:
     except (DependencyError, ValueError, LookupError, TypeError):
         pass  # there is none that uv finds
     newest: dict[str, Interpreter] = {}
-    for path in dict.fromkeys(os.path.realpath(path) for path in paths):
+    for one in sorted(_answering(paths), key=lambda one: Version(one.version), reverse=True):
+        if one.fits(wanted):
+            newest.setdefault(one.series, one)
+    return list(newest.values())
+
+
+def _answering(paths: Iterable[str]) -> Iterator[Interpreter]:
+    for path in dict.fromkeys(map(os.path.realpath, paths)):
         with contextlib.suppress(InterpreterUnavailableError):
-            one = _at(path)
-            known = newest.get(one.series)
-            if one.fits(wanted) and (
-                known is None or Version(known.version) < Version(one.version)
-            ):
-                newest[one.series] = one
-    fitting = [one for one in newest.values() if one.fits(wanted)]
-    return sorted(fitting, key=lambda one: Version(one.version), reverse=True)
+            yield _at(path)
 
 
 def _may_be(row: dict[str, object]) -> bool:

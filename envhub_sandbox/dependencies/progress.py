@@ -15,7 +15,6 @@ from envhub_sandbox.system.log import DEPENDENCIES
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.text import Text
 
 _WIDTH = 100
 _shown_by: list[Callable[[str], None]] = []
@@ -23,7 +22,7 @@ _shown_by: list[Callable[[str], None]] = []
 
 @contextlib.contextmanager
 def shown_by(show: Callable[[str], None]) -> Iterator[None]:
-    """While it lasts, whoever shows something already shows this too: two share no line."""
+    """While it lasts, progress goes to ``show``, which has the terminal already."""
     _shown_by.append(show)
     try:
         yield
@@ -38,8 +37,10 @@ def shown(title: str) -> Iterator[Callable[[str], None]]:
         shows = list(_shown_by[-1:])
         console = None if shows else _console()
         if console is not None:
+            from rich.text import Text
+
             status = stack.enter_context(console.status(""))
-            shows = [lambda text: status.update(_plain(text))]
+            shows = [lambda text: status.update(Text(text))]
 
         def tell(line: str) -> None:
             DEPENDENCIES.info("%s: %s", title, line)
@@ -51,20 +52,11 @@ def shown(title: str) -> Iterator[Callable[[str], None]]:
 
 def _console() -> Console | None:
     """A console that somebody looks at."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    is_notebook = type(shell).__name__ == "ZMQInteractiveShell"
     looked_at = sys.stderr is not None and sys.stderr.isatty()
-    if os.environ.get("CI") or not (looked_at or _is_notebook()):
+    if os.environ.get("CI") or not (looked_at or is_notebook):
         return None
     from rich.console import Console
 
     return Console(stderr=True, markup=False, highlight=False, emoji=False)
-
-
-def _is_notebook() -> bool:
-    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
-    return type(shell).__name__ == "ZMQInteractiveShell"
-
-
-def _plain(text: str) -> Text:
-    from rich.text import Text
-
-    return Text(text)

@@ -1,7 +1,7 @@
-"""Remembers which versions were chosen, by everything that the choice depends on.
+"""Which versions a repository gets, and of which interpreter: chosen once, and remembered.
 
-So the same repository gets the same packages on this machine until somebody asks for newer ones,
-and needs no index a second time.
+What is remembered goes by everything that the choice depends on: the same repository gets the same
+packages on this machine until newer ones are asked for, and needs no index a second time.
 """
 
 from __future__ import annotations
@@ -9,26 +9,36 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from dataclasses import asdict, dataclass
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from envhub_sandbox.dependencies import index, remembered
+from packaging.utils import parse_wheel_filename
+
+from envhub_sandbox.dependencies import index, interpreters, resolve
+from envhub_sandbox.dependencies.builds.sources import Builder, Source, of_git
+from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.request import PackageRequest
-from envhub_sandbox.dependencies.resolve import WORKERS, Lock
-from envhub_sandbox.hub.store import cache_root
+from envhub_sandbox.dependencies.resolve import WORKERS, Lock, Target
+from envhub_sandbox.errors import ResolutionError
+from envhub_sandbox.hub import cache
+from envhub_sandbox.option_names import option_name
+
+if TYPE_CHECKING:
+    from envhub_sandbox.dependencies.modules import Guess
 
 _FORMAT = 2
+Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Resolution:
-    """What was chosen for a request.
-
-    Attributes:
-        lock: The versions.
-        interpreter: What they are for.
-        taken: Modules that are imported and not declared, and were installed for it.
+    """Versions and the interpreter that they are for; and the modules that are imported and not
+    declared, and were installed for it.
     """
 
     lock: Lock
@@ -36,9 +46,161 @@ class Resolution:
     taken: tuple[str, ...] = ()
 
 
+def lock_for(request: PackageRequest, interpreter: Interpreter, tell: Tell) -> Lock:
+    """Versions for one interpreter; what has no wheel is built."""
+    return _lock_for(request, interpreter, tell, builder=BUILDER)
+
+
+def build(sources: Sequence[Source], interpreter: Interpreter, tell: Tell) -> list[Path]:
+    """A wheel of each source, in the same order: kept from before, or built in a jail."""
+    from envhub_sandbox.dependencies.builds.build import build_wheels
+
+    return build_wheels(sources, interpreter, tell, lock_for)
+
+
+BUILDER: Builder | None = build
+"""Makes wheels of packages that have none."""
+
+
+def resolution_for(
+    request: PackageRequest, tell: Tell = lambda line: None, *, upgrade: bool = False
+) -> Resolution:
+    """Versions for an interpreter of this machine: remembered, or chosen.
+
+    Raises ``ResolutionError``, with what to change, or ``DependencyError`` where there is no
+    interpreter, no index or no uv.
+    """
+    first = interpreters.find(request.python, request.supports, fetch=request.fetch_python)
+    key = key_of(request, first)
+    known = None if upgrade else recall(key)
+    if known is not None:
+        return known
+    tell(f"choosing versions for {request.source}")
+    found = _chosen(request, first, upgrade, tell)
+    strict = option_name("dependencies", "declared")
+    for one in request.guesses:
+        if one.module in found.taken:
+            text = (
+                f"{one.wanted.requirement} is installed, which nothing declares "
+                f"({one.wanted.where}); {strict} takes what is declared alone"
+            )
+            warnings.warn(text, stacklevel=2)
+    remember(key, found)
+    return found
+
+
+def _chosen(request: PackageRequest, first: Interpreter, refresh: bool, tell: Tell) -> Resolution:
+    """By the first interpreter that has versions, of wheels alone if that can be."""
+    tried: list[str] = []
+    failed: list[ResolutionError] = []
+    for asked, builder in _attempts(request):
+        failed.clear()
+        for one in _candidates(first, request):
+            tried.append(one.version)
+            lock = partial(_lock_for, interpreter=one, tell=tell, builder=builder, refresh=refresh)
+            try:
+                found, taken = versions_for(asked, lock)
+                return Resolution(found, one, tuple(guess.module for guess in taken))
+            except ResolutionError as error:
+                failed.append(error)
+                if not resolve.is_about_python(error):
+                    break
+    what = resolve.advice(request.python, list(dict.fromkeys(tried)), failed[0])
+    raise ResolutionError(f"{failed[0]}\n{what}") from failed[0]
+
+
+def _attempts(request: PackageRequest) -> Iterator[tuple[PackageRequest, Builder | None]]:
+    """What to ask for, and how: last of all without what is only guessed."""
+    every = (*request.wanted, *(guess.wanted for guess in request.guesses))
+    wheels_alone = BUILDER is None or not any(one.requirement.url for one in every)
+    ways = [*([None] if wheels_alone else []), *([BUILDER] if BUILDER else [])]
+    less = [replace(request, guesses=())] if request.guesses and request.wanted else []
+    return ((asked, builder) for asked in (request, *less) for builder in ways)
+
+
+def _candidates(first: Interpreter, request: PackageRequest) -> Iterator[Interpreter]:
+    yield first
+    if not request.python:
+        yield from interpreters.others(request.supports, first)
+
+
+def _lock_for(
+    request: PackageRequest,
+    interpreter: Interpreter,
+    tell: Tell,
+    *,
+    builder: Builder | None,
+    refresh: bool = False,
+) -> Lock:
+    """Versions; each round builds what has no wheel and then looks at what that needs."""
+    target = Target(python=interpreter.path)
+    links: list[str] = []
+    if builder is not None:
+        request, links = _built_from_git(request, builder, interpreter, tell)
+    built: set[str] = set()
+    while True:
+        try:
+            lock = resolve.resolve(request, target, options=links, refresh=refresh, tell=tell)
+            break
+        except ResolutionError as error:
+            names = sorted(set(resolve.without_wheels(error)) - built)
+            if builder is None or not names:
+                raise
+            # what one needs is known once it is built: then others may be chosen
+            sources = resolve.sources_of(request, target, names, links)
+            if built.issuperset(one.name for one in sources):
+                raise
+        built.update(one.name for one in sources)
+        links += _links(builder(sources, interpreter, tell))
+    return resolve.without_cuda(
+        request,
+        lock,
+        lambda asked, more: resolve.resolve(asked, target, options=[*links, *more], tell=tell),
+    )
+
+
+def _links(wheels: Sequence[Path]) -> list[str]:
+    folders = dict.fromkeys(str(wheel.parent) for wheel in wheels)
+    return [word for folder in folders for word in ("--find-links", folder)]
+
+
+def _built_from_git(
+    request: PackageRequest, builder: Builder, interpreter: Interpreter, tell: Tell
+) -> tuple[PackageRequest, list[str]]:
+    """The request with versions of wheels instead of repositories, and where these wheels are."""
+    wanted, wheels = [], []
+    for one in request.wanted:
+        source = of_git(one.requirement, one.where) if one.requirement.url else None
+        if source is None:
+            wanted.append(one)
+            continue
+        [wheel] = builder([source], interpreter, tell)
+        wheels.append(wheel)
+        extras = ",".join(sorted(one.requirement.extras))
+        text = f"{source.name}[{extras}]=={parse_wheel_filename(wheel.name)[1]}"
+        wanted.append(parse_requirement(text, one.where))
+    return replace(request, wanted=tuple(wanted)), _links(wheels)
+
+
+def versions_for(
+    request: PackageRequest, resolved: Callable[[PackageRequest], Lock]
+) -> tuple[Lock, tuple[Guess, ...]]:
+    """Versions, and what was taken that nothing else brings; ``resolved`` gives them without
+    guesses.
+    """
+    taken = request.guesses
+    if request.wanted or not taken:
+        lock = resolved(request)
+        names = {pin.partition("==")[0] for pin in lock.packages}
+        taken = tuple(one for one in request.guesses if not one.is_among(names))
+        if not taken:
+            return lock, ()
+    return resolved(request.plus(taken)), taken
+
+
 def root() -> Path:
     """Where they lie; ours alone, since what lies there is installed."""
-    return cache_root() / "resolutions"
+    return cache.cache_root() / "resolutions"
 
 
 def key_of(request: PackageRequest, interpreter: Interpreter) -> str:
@@ -55,11 +217,13 @@ def key_of(request: PackageRequest, interpreter: Interpreter) -> str:
 def recall(key: str) -> Resolution | None:
     """What was chosen, if that is known, and its interpreter is still the same."""
     try:
-        facts = json.loads(remembered.recall(root(), key) or "{}")
+        facts = json.loads(cache.recall(root(), key) or "{}")
         lock = Lock(str(facts["lock"]), tuple(map(str, facts["options"])))
         interpreter = Interpreter(**facts["interpreter"])
         # what the worker needs is in each: an empty one was lost
-        known = _stamp(interpreter) == facts["stamp"] and all(map(_is_there, lock.options))
+        known = _stamp(interpreter) == facts["stamp"] and all(
+            os.sep not in option or os.path.isdir(option) for option in lock.options
+        )
         if lock.packages and known:
             return Resolution(lock, interpreter, tuple(map(str, facts["taken"])))
     except (OSError, ValueError, LookupError, TypeError):
@@ -76,12 +240,7 @@ def remember(key: str, found: Resolution) -> None:
         "stamp": _stamp(found.interpreter),
         "taken": found.taken,
     }
-    remembered.keep(root(), key, json.dumps(facts))
-
-
-def _is_there(option: str) -> bool:
-    """Whether a folder of wheels that were built is where it was."""
-    return os.sep not in option or os.path.isdir(option)
+    cache.keep(root(), key, json.dumps(facts))
 
 
 def _stamp(interpreter: Interpreter) -> list[int]:

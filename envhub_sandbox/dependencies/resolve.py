@@ -3,30 +3,33 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
-import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
 from envhub_sandbox.dependencies import index, interpreters, uv
-from envhub_sandbox.dependencies.declared import Wanted, parse_requirement
+from envhub_sandbox.dependencies.builds.sources import Source
+from envhub_sandbox.dependencies.declared import WantedPackage, parse_requirement
 from envhub_sandbox.dependencies.request import PackageRequest
-from envhub_sandbox.dependencies.sources import Source
-from envhub_sandbox.errors import PackageIntegrityError, RequirementError, ResolutionError
+from envhub_sandbox.errors import (
+    DependencyError,
+    PackageIntegrityError,
+    RequirementError,
+    ResolutionError,
+)
 from envhub_sandbox.option_names import option_name
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from envhub_sandbox.sources import toml
 
 WORKERS = ("cloudpickle>=3", "gymnasium>=0.26", "msgpack>=1.0.5", "numpy>=1.26")
 """What the worker's jails import besides: the repository's versions must be among these.
 Gymnasium may be older in a jail than outside."""
 _RESOLVE_S = 600.0
+_TORCH = ("torch", "torchvision", "torchaudio")
+_CPU_INDEX = ("--torch-backend", "cpu")
 _PIN = re.compile(r"([a-z0-9][a-z0-9.-]*)==([A-Za-z0-9.!+_-]+) \\")
 _IS_PYTHON = re.compile(
     r"does not satisfy Python|with a matching Python|no usable wheels|requires? Python"
@@ -38,15 +41,20 @@ _HASH = re.compile(r"    --hash=(sha(?:256|384|512):[0-9a-f]+)( \\)?")
 
 @dataclass(frozen=True)
 class Lock:
-    """Every package, pinned, with the hashes of its wheels.
-
-    Attributes:
-        text: As pip's ``--require-hashes`` reads it.
-        options: For uv: where the index does not have all of them.
+    """Every package, pinned, with the hashes of its wheels, as pip's ``--require-hashes`` reads it;
+    and options for uv where the index does not have all of them.
     """
 
     text: str
     options: tuple[str, ...] = ()
+
+    @property
+    def has_cuda(self) -> bool:
+        """Whether PyTorch is among them, with packages of NVIDIA's."""
+        pins = self.packages
+        return any(pin.startswith("torch==") for pin in pins) and any(
+            pin.startswith(("nvidia-", "cuda-")) for pin in pins
+        )
 
     @property
     def digest(self) -> str:
@@ -106,10 +114,8 @@ def resolve(
         refresh: Ask the index anew for what uv has seen a moment ago.
         tell: Gets each line of uv's progress.
 
-    Raises:
-        ResolutionError: There is no solution.
-        PackageIntegrityError: A version is there, but not with a hash that was asked for.
-        DependencyError: There is no uv, or it failed.
+    Raises ``ResolutionError``; and ``PackageIntegrityError`` for a version that is there, but not
+    with a hash that was asked for.
     """
     words = [*uv.NO_BUILDS, "--generate-hashes", *options, *(["--refresh"] if refresh else [])]
     text = _compiled(request, target, words, tell)
@@ -158,9 +164,6 @@ def sources_of(
     """The source distributions that are chosen for packages without wheels. Nothing is built.
 
     What each needs is not known yet: it counts once there is a wheel of it.
-
-    Raises:
-        ResolutionError: There is no solution either.
     """
     tables = "".join(
         f'[[dependency-metadata]]\nname = "{name}"\nrequires-dist = []\n' for name in names
@@ -174,7 +177,7 @@ def sources_of(
         lambda line: None,
         {"uv.toml": settings},
     )
-    rows = tomllib.loads(text).get("packages", [])
+    rows = toml.loads(text, len(text), generated=True).get("packages", [])
     return [
         Source(row["name"], row["version"], sdist["url"], sdist["hashes"]["sha256"])
         for row in rows
@@ -182,7 +185,7 @@ def sources_of(
     ]
 
 
-def _lines(wanted: Iterable[Wanted]) -> str:
+def _lines(wanted: Iterable[WantedPackage]) -> str:
     wanted = list(wanted)
     for one in wanted:
         if one.requirement.url is not None:
@@ -198,14 +201,9 @@ def is_about_python(error: ResolutionError) -> bool:
     return _IS_PYTHON.search(str(error)) is not None
 
 
-def needs_other_python(error: ResolutionError) -> bool:
-    """Whether a version of Python is asked for that this is not."""
-    return _NEEDS_PYTHON.search(str(error)) is not None
-
-
 def without_wheels(error: ResolutionError) -> list[str]:
-    """Packages that have no wheel, as far as uv's text says."""
-    return _NO_WHEELS.findall(str(error))
+    """Packages without a wheel, as far as uv's text says; none if it asks for another Python."""
+    return [] if _NEEDS_PYTHON.search(str(error)) else _NO_WHEELS.findall(str(error))
 
 
 def _pins(text: str) -> list[tuple[str, str, list[str]]]:
@@ -224,7 +222,9 @@ def _pins(text: str) -> list[tuple[str, str, list[str]]]:
     return found
 
 
-def _with_their_hashes(pins: Iterable[tuple[str, str, list[str]]], wanted: Sequence[Wanted]) -> str:
+def _with_their_hashes(
+    pins: Iterable[tuple[str, str, list[str]]], wanted: Sequence[WantedPackage]
+) -> str:
     """The lock's text, with only those hashes of a package that its requirement permits."""
     permitted: dict[str, tuple[set[str], str]] = {}
     for asked in wanted:
@@ -244,21 +244,17 @@ def _with_their_hashes(pins: Iterable[tuple[str, str, list[str]]], wanted: Seque
     return "".join(f"{line}\n" for line in lines)
 
 
-def _what_is_required(said: str, every: Sequence[Wanted]) -> str:
+def _what_is_required(said: str, every: Sequence[WantedPackage]) -> str:
     """The requirements that an explanation speaks of, with where each stands."""
     words = {canonicalize_name(word) for word in re.findall(r"[A-Za-z0-9][A-Za-z0-9._-]*", said)}
-    told = [one for one in every if canonicalize_name(one.requirement.name) in words]
-    lines = [f"  {one.requirement}  ({one.where})" for one in (told or every)[:20]]
+    named = [one for one in every if canonicalize_name(one.requirement.name) in words]
+    lines = [f"  {one.requirement}  ({one.where})" for one in (named or every)[:20]]
     return "\n".join(["What is required of these packages:", *lines])
 
 
 def advice(asked: str, tried: Sequence[str], error: ResolutionError) -> str:
-    """What to do where nothing satisfies all requirements.
-
-    Args:
-        asked: The Python that the caller asks for; empty for none.
-        tried: Versions of the interpreters that were tried.
-        error: Of the first of them.
+    """What to do where nothing satisfies all requirements, by the Python that was asked for, the
+    versions that were tried, and the error of the first of them.
     """
     others = ""
     needed = _NEEDS_PYTHON.findall(str(error))
@@ -274,3 +270,48 @@ def advice(asked: str, tried: Sequence[str], error: ResolutionError) -> str:
         "install what fits into an interpreter of your own and give that with "
         f"{option_name('python', 'PATH')}"
     )
+
+
+def without_cuda(
+    request: PackageRequest,
+    lock: Lock,
+    resolved: Callable[[PackageRequest, Sequence[str]], Lock],
+) -> Lock:
+    """The same without CUDA, where jails have no GPU and the index has such builds of PyTorch.
+
+    Which builds there are, only the index knows, and many mirrors have none of these: that is no
+    error, and the versions that were chosen first stay. ``resolved`` takes further options for uv.
+    """
+    if request.gpu or not lock.has_cuda or os.environ.get("UV_TORCH_BACKEND"):
+        return lock
+    for asked, options in _ways_without_cuda(request, lock):
+        try:
+            found = resolved(asked, options)
+        except DependencyError:
+            continue
+        if not found.has_cuda:
+            return found
+    return lock
+
+
+def _ways_without_cuda(
+    request: PackageRequest, lock: Lock
+) -> Iterator[tuple[PackageRequest, Sequence[str]]]:
+    """The same versions of the user's own index; and of PyTorch's, where he has chosen none."""
+    rows = (pin.partition("==") for pin in lock.packages)
+    held = tuple(
+        parse_requirement(f"{name}=={version.partition('+')[0]}+cpu", "the choice of no CUDA")
+        for name, _, version in rows
+        if name in _TORCH
+    )
+    yield replace(request, constraints=(*request.constraints, *held)), ()
+    if not index.is_chosen():
+        yield request, _CPU_INDEX
+
+
+def torch_options(lock: Lock) -> tuple[str, ...]:
+    """What uv needs to find these versions again, where only they are known."""
+    without = any(
+        pin.partition("==")[0] in _TORCH and pin.endswith("+cpu") for pin in lock.packages
+    )
+    return _CPU_INDEX if without and not index.is_chosen() else ()

@@ -1,11 +1,12 @@
-"""uv: found, started in a folder of nobody's, and its refusals as errors of ours.
+"""uv: found, started in an empty folder, and its refusals as errors of ours.
 
-It is told to build nothing, to read no settings but ours (``index.py``), and to download no
-interpreter. What it prints is the user's to read, but quotes a stranger's names: it is escaped.
+It builds nothing, reads no settings but ours (``index.py``), and downloads no interpreter. What it
+prints is the user's to read, but quotes a stranger's names: it is escaped.
 """
 
 from __future__ import annotations
 
+import contextlib
 import re
 import resource
 import shutil
@@ -14,9 +15,10 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
+from typing import IO
 
 from envhub_sandbox.dependencies import index
 from envhub_sandbox.errors import (
@@ -26,7 +28,9 @@ from envhub_sandbox.errors import (
     PackagesTooLargeError,
     ResolutionError,
 )
+from envhub_sandbox.hub.cache import remove_tree
 from envhub_sandbox.option_names import option_name
+from envhub_sandbox.system import locks
 from envhub_worker.protocol.text import printable
 
 NO_BUILDS = ("--no-config", "--no-build")
@@ -37,6 +41,9 @@ _VERSION_S = 60.0
 _SECRET = re.compile(r"(?<=://)[^/?#\s]*(?=@)|(?<=\?)[^\s?=]+=[^\s'\"`)]+")
 """What may be one in a URL; uv hides passwords, but for those in a query or in what is no URL."""
 _WATCH_S = 1.0
+_CLEAN_S = 60.0
+CACHE_WAIT_S = 10.0
+"""For how long to wait for others who use uv's cache."""
 _SHOWN = 4000
 _KEPT_LINES = 400
 
@@ -50,7 +57,7 @@ _MEANINGS: tuple[tuple[str, type[DependencyError], str], ...] = (
     (
         r"No space left|os error 28|Disk quota|os error 122",
         DependencyError,
-        "The disk is full; 'envhub cache remove --unused-for 30' frees what nobody used for long, "
+        "The disk is full; 'envhub cache remove --unused-for 30' frees what was not used for long, "
         "and 'uv cache prune' what uv keeps",
     ),
     (
@@ -107,14 +114,21 @@ def run(
     Raises:
         DependencyError: It failed, or there is none.
     """
-    with tempfile.TemporaryDirectory(prefix="envhub-uv-") as nowhere:
+    lines: list[str] = []
+    with (
+        tempfile.TemporaryDirectory(prefix="envhub-uv-") as nowhere,
+        tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as asked,
+        tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as printed,
+    ):
         # uv reads projects and settings of the folder that it runs in
         for name, text in files.items():
             Path(nowhere, name).write_text(text, "utf-8")
+        asked.write(given)
+        asked.seek(0)
         process = subprocess.Popen(
             [command(), *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
+            stdin=asked,
+            stdout=printed,
             stderr=subprocess.PIPE,
             cwd=nowhere,
             env={**index.environment(), **variables},
@@ -122,24 +136,27 @@ def run(
             text=True,
             errors="replace",
         )
+        listener = threading.Thread(target=_listen, args=(process.stderr, lines, tell))
         with process:
-            if file_bytes is not None:
-                _limit_files(process, file_bytes)
-            said = _Listener(process, tell)
             try:
-                printed = said.exchange(given, timeout_s, watch)
+                listener.start()
+                if file_bytes is not None:
+                    _limit_files(process, file_bytes)
+                _wait(process, timeout_s, watch)
             except subprocess.TimeoutExpired:
                 text = f"{what}: uv was not done after {timeout_s:.0f} s"
                 raise IndexUnavailableError(text) from None
             finally:
                 process.kill()
-    if process.returncode == -signal.SIGXFSZ:
-        raise PackagesTooLargeError(
-            f"{what}: a file was about to have more than {file_bytes} bytes"
-        )
-    if process.returncode != 0:
-        raise _error(what, said.text)
-    return printed
+                listener.join()
+        if process.returncode == -signal.SIGXFSZ:
+            raise PackagesTooLargeError(
+                f"{what}: a file was about to have more than {file_bytes} bytes"
+            )
+        if process.returncode != 0:
+            raise _error(what, "\n".join(lines))
+        printed.seek(0)
+        return printed.read()
 
 
 def _limit_files(process: subprocess.Popen[str], largest: int) -> None:
@@ -152,70 +169,28 @@ def _limit_files(process: subprocess.Popen[str], largest: int) -> None:
     resource.prlimit(process.pid, resource.RLIMIT_CORE, (0, 0))
 
 
-class _Listener:
-    """Reads both outputs of a process at once; the first as a whole, the other by lines."""
-
-    def __init__(self, process: subprocess.Popen[str], tell: Callable[[str], None]) -> None:
-        self._process = process
-        self._tell = tell
-        self._lines: list[str] = []
-        self._printed = ""
-
-    @property
-    def text(self) -> str:
-        """The last lines that it wrote on stderr."""
-        return "\n".join(self._lines)
-
-    def exchange(self, given: str, timeout_s: float, watch: Callable[[], None]) -> str:
-        """Write to it, read until it ends, and return what it printed."""
-        threads = [threading.Thread(target=work) for work in (self._read, self._listen)]
-        for thread in threads:
-            thread.start()
+def _wait(process: subprocess.Popen[str], timeout_s: float, watch: Callable[[], None]) -> None:
+    until = time.monotonic() + timeout_s
+    while True:
         try:
-            assert self._process.stdin is not None
-            try:
-                self._process.stdin.write(given)
-                self._process.stdin.close()
-            except BrokenPipeError:
-                pass  # it says on stderr why it has gone
-            self._wait(timeout_s, watch)
-        except BaseException:
-            self._process.kill()
-            raise
-        finally:
-            for thread in threads:
-                thread.join()
-        return self._printed
+            process.wait(min(_WATCH_S, max(until - time.monotonic(), 0)))
+            return
+        except subprocess.TimeoutExpired:
+            if time.monotonic() >= until:
+                raise
+            watch()
 
-    def _wait(self, timeout_s: float, watch: Callable[[], None]) -> None:
-        until = time.monotonic() + timeout_s
-        while True:
-            try:
-                self._process.wait(min(_WATCH_S, max(until - time.monotonic(), 0)))
-                return
-            except subprocess.TimeoutExpired:
-                if time.monotonic() >= until:
-                    raise
-                watch()
 
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        self._printed = self._process.stdout.read()
-
-    def _listen(self) -> None:
-        assert self._process.stderr is not None
-        for line in self._process.stderr:
-            del self._lines[:-_KEPT_LINES]
-            self._lines.append(printable(_SECRET.sub("****", line.rstrip()), 500))
-            self._tell(self._lines[-1].strip())
+def _listen(stream: IO[str], lines: list[str], tell: Callable[[str], None]) -> None:
+    """Pass on what it writes on stderr, and keep the last lines of it."""
+    for line in stream:
+        del lines[:-_KEPT_LINES]
+        lines.append(printable(_SECRET.sub("****", line.rstrip()), 500))
+        tell(lines[-1].strip())
 
 
 def command() -> str:
-    """uv's path.
-
-    Raises:
-        DependencyError: It is not installed, or too old.
-    """
+    """uv's path; ``DependencyError`` if it is not installed, or too old."""
     found: str | None
     try:
         from uv import find_uv_bin  # it knows where pip has put it, which need not be on PATH
@@ -265,7 +240,49 @@ def _offline() -> str:
 
 
 def _in_the_users_words(said: str) -> str:
-    """uv speaks to whoever wrote the requirements, and that is not who reads it here."""
+    """uv speaks to the author of the requirements; the reader here is another person."""
     plain = re.sub(r"\byour requirements are unsatisfiable", "nothing satisfies all of them", said)
     plain = re.sub(r"\b[Yy]ou require\b", "it is required that there be", plain)
     return re.sub(r"^hint: ", "  ", plain, flags=re.MULTILINE).strip()
+
+
+@contextlib.contextmanager
+def cleared_after_refusal(pins: Sequence[str]) -> Iterator[None]:
+    """Remove what uv has of these packages if they are refused; they can be downloaded again.
+
+    uv unpacks a download in its cache before it installs it, and keeps what it had unpacked when
+    it was ended: a wheel that is too large would stay, and be found there the next time.
+    """
+    begun = time.time()
+    try:
+        yield
+    except IndexUnavailableError:
+        raise  # what has come is worth keeping
+    except DependencyError:
+        # from the file system's clock, which may be some milliseconds behind
+        if _remove_unfinished(index.uv_cache(), begun - 1):
+            names = sorted({pin.partition("==")[0] for pin in pins})
+            with contextlib.suppress(DependencyError):
+                run(
+                    ["cache", "clean", "--no-config", *names],
+                    what="uv's cache could not be cleaned",
+                    timeout_s=_CLEAN_S,
+                )
+        raise
+
+
+def _remove_unfinished(cache: Path, since: float) -> bool:
+    """Remove uv's temporary folders of this time, once no uv is at work that could own one.
+
+    Each holds this lock, shared, for as long as it works; where one works on, nothing is removed,
+    and False returned.
+    """
+    with (
+        contextlib.suppress(OSError),
+        locks.held(cache / ".lock", wait_s=CACHE_WAIT_S),
+    ):
+        for path in cache.glob(".tmp*"):
+            if path.lstat().st_mtime >= since:
+                remove_tree(path)
+        return True
+    return False

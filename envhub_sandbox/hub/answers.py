@@ -39,11 +39,7 @@ def streamed(session: Any, url: str, options: Mapping[str, Any]) -> Iterator[Any
 
 
 def bounded_body(response: Any) -> bytes:
-    """The body of a streamed answer, unpacked.
-
-    Raises:
-        HostileAnswerError: It has no end, or takes for ever.
-    """
+    """The body of a streamed answer, unpacked. Raises ``HostileAnswerError``."""
     of_requests = hasattr(response, "iter_content")
     chunks = response.iter_content(1 << 16) if of_requests else response.iter_bytes()
     body, end = bytearray(), time.monotonic() + _MAX_BODY_S

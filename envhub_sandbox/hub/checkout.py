@@ -103,7 +103,10 @@ def read_checkout(folder: Path) -> Checkout | None:
     repository = _repository_of(folder)
     if repository is None:
         return None
-    output = _git(repository, folder, *_LIST, *_excluding(repository))
+    # what the checkout's user has git ignore, beside what the commit says
+    exclude = repository.common / "info/exclude"
+    excluding = [f"--exclude-from={exclude}"] if exclude.is_file() else []
+    output = _git(repository, folder, *_LIST, *excluding)
     rows = [os.fsdecode(row) for row in (output or b"").split(b"\0")[:-1] if row[2:] != b"./"]
     if output is None or not (rows or folder == repository.top):
         return None
@@ -141,12 +144,6 @@ def _repository_of(folder: Path) -> _Repository | None:
     except (OSError, ValueError):  # also a path with a null byte
         return None
     return _Repository(top, own, common) if is_one and is_trusted else None
-
-
-def _excluding(repository: _Repository) -> list[str]:
-    """What the checkout's user has git ignore, beside what the commit says."""
-    file = repository.common / "info/exclude"
-    return [f"--exclude-from={file}"] if file.is_file() else []
 
 
 def _text_of(file: Path) -> str:

@@ -24,7 +24,7 @@ from urllib.parse import parse_qsl, quote, urlsplit
 
 from envhub_sandbox.errors import HubReferenceError, SnapshotError, SnapshotIntegrityError
 from envhub_sandbox.hub.answers import HostileAnswerError, bounded_body, guarded, streamed
-from envhub_sandbox.hub.failures import HubFailure, Subject, conceal, explain
+from envhub_sandbox.hub.failures import chain, conceal, explain
 from envhub_sandbox.hub.grammar import is_commit
 from envhub_sandbox.hub.hashing import GIT_SHA1, SHA256
 from envhub_sandbox.hub.listing import FileRecord
@@ -53,11 +53,7 @@ def default_endpoint() -> str:
 
 
 def checked_endpoint(endpoint: str | None) -> str:
-    """The endpoint without a trailing slash.
-
-    Raises:
-        HubReferenceError: It is not an http(s) URL.
-    """
+    """The endpoint without a trailing slash. Raises ``HubReferenceError``."""
     chosen = default_endpoint() if endpoint is None else endpoint.rstrip("/")
     shown = without_login(chosen)
     if "@" in shown:
@@ -73,11 +69,7 @@ def checked_endpoint(endpoint: str | None) -> str:
 
 
 def checked_token(token: str | bool | None) -> str | bool | None:
-    """The token, stripped; the text of an error never shows it.
-
-    Raises:
-        HubReferenceError: It cannot be sent in an HTTP header, whose error would print it.
-    """
+    """The token, stripped; the text of an error never shows it. Raises ``HubReferenceError``."""
     if not isinstance(token, str):
         return token
     stripped = token.strip()
@@ -223,14 +215,15 @@ class HubClient:
         except Exception as error:
             secrets = self._secrets()
             conceal(error, secrets)
-            hostile = _in_chain(error, HostileAnswerError)
-            if hostile is not None:
+            hostile = [one for one in chain(error) if isinstance(one, HostileAnswerError)]
+            if hostile:
                 raise SnapshotIntegrityError(
-                    f"{'/'.join(repo)}@{revision} on {self.public_endpoint}: {hostile}. Nothing of "
-                    "it was used. Check that the endpoint is a Hugging Face Hub, or use another"
+                    f"{'/'.join(repo)}@{revision} on {self.public_endpoint}: {hostile[0]}. "
+                    "Nothing of it was used. Check that the endpoint is a Hugging Face Hub, or use "
+                    "another"
                 ) from error
-            subject = Subject(*repo, revision, self.public_endpoint)
-            raise explain(error, subject, secrets) from error
+            subject = {**repo._asdict(), "revision": revision, "endpoint": self.public_endpoint}
+            raise explain(error, secrets, **subject) from error
 
     def _secrets(self) -> tuple[str, ...]:
         from huggingface_hub import get_token
@@ -239,14 +232,6 @@ class HubClient:
         login = login_of(self.endpoint)
         secrets = (token, *self._login().values(), login and login[1])
         return tuple(secret for secret in secrets if secret)
-
-
-def _in_chain(error: BaseException | None, kind: type[Exception]) -> BaseException | None:
-    seen: list[BaseException] = []
-    while error is not None and error not in seen and not isinstance(error, kind):
-        seen.append(error)
-        error = error.__cause__ or error.__context__
-    return error if isinstance(error, kind) else None
 
 
 def _next_page(url: str | None, query: dict[str, str]) -> dict[str, str] | None:
@@ -265,7 +250,12 @@ def _record_of(item: Any, repo: Repository) -> FileRecord | None:
         size, digest = (lfs["size"], lfs["oid"]) if lfs else (item["size"], item["oid"])
         kind, length = (SHA256, 64) if lfs else (GIT_SHA1, 40)
         digest = digest.removeprefix("sha256:")
-        if type(path) is str and type(size) is int and size >= 0 and _is_hex(digest, length):
+        if (
+            type(path) is str
+            and type(size) is int
+            and size >= 0
+            and re.fullmatch(rf"[0-9a-f]{{{length}}}", digest)
+        ):
             path.encode()  # A lone surrogate cannot be a file's name.
             return FileRecord(path, size, f"{kind}:{digest}")
         raise ValueError("a field is not what it should be")
@@ -274,10 +264,6 @@ def _record_of(item: Any, repo: Repository) -> FileRecord | None:
             f"{repo.repo_id}: the Hub's listing has an entry that cannot be read ({error!r}); "
             "check that the endpoint is a Hugging Face Hub"
         ) from error
-
-
-def _is_hex(text: str, length: int) -> bool:
-    return re.fullmatch(rf"[0-9a-f]{{{length}}}", text) is not None
 
 
 def _with_xet_or_without(download: Any, **arguments: Any) -> str:
@@ -313,6 +299,3 @@ def _xet_disabled() -> Iterator[None]:
             yield
         finally:
             constants.HF_HUB_DISABLE_XET = before
-
-
-__all__ = ["HubClient", "HubFailure", "Repository", "checked_endpoint", "checked_token"]

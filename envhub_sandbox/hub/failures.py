@@ -9,33 +9,81 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Iterator
-from enum import Enum, auto
-from typing import NamedTuple
+from enum import Enum
 
 from envhub_sandbox.option_names import option_name
 
 _LONGEST_QUOTE = 200
+_LOG_IN = "log in with `hf auth login` (`huggingface-cli login` before 1.0) or pass a token"
 
 
 class Kind(Enum):
-    """Why the Hub did not give something."""
+    """Why the Hub did not give something: what happened, and what to do.
 
-    NO_REPOSITORY = auto()
-    NO_REVISION = auto()
-    NO_ENTRY = auto()
-    GATED = auto()
-    DISABLED = auto()
-    UNAUTHORIZED = auto()
-    FORBIDDEN = auto()
-    NO_TOKEN = auto()
-    RATE_LIMITED = auto()
-    SERVER_ERROR = auto()
-    OFFLINE = auto()
-    TIMEOUT = auto()
-    UNREACHABLE = auto()
-    BROKEN_DOWNLOAD = auto()
-    DISK_FULL = auto()
-    OTHER = auto()
+    The fields in the texts are those of ``explain``.
+    """
+
+    NO_REPOSITORY = (
+        "there is no {repo_type} repository {repo_id} that you may see ({status})",
+        f"Check the spelling and the owner; if it is private, {_LOG_IN}",
+    )
+    NO_REVISION = (
+        "the {repo_type} repository {repo_id} has no revision {revision}",
+        "Check the branch, tag or commit at {url}/commits/main",
+    )
+    NO_ENTRY = (
+        "the {repo_type} repository {repo_id} lacks a file that its own listing names",
+        "Try again; if it stays, tell the repository's owner",
+    )
+    GATED = (
+        "the {repo_type} repository {repo_id} is gated and you have no access yet{said}",
+        f"Accept its terms at {{url}}, then {_LOG_IN}",
+    )
+    DISABLED = (
+        "the {repo_type} repository {repo_id} was disabled on the Hub{said}",
+        "Ask its owner, or use another repository",
+    )
+    UNAUTHORIZED = (
+        "the Hub refused your token (401){said}",
+        f"It may be expired or of another endpoint: {_LOG_IN}; {{no_token}} sends none",
+    )
+    FORBIDDEN = (
+        "your token may not read the {repo_type} repository {repo_id} (403){said}",
+        "Give the token read access to it at {endpoint}/settings/tokens, or ask its owner",
+    )
+    NO_TOKEN = (
+        "a stored token was asked for, but no token is stored on this machine",
+        f"To store one, {_LOG_IN}",
+    )
+    RATE_LIMITED = (
+        "the Hub's rate limit is reached (429){said}",
+        f"Wait {{wait}} and try again; you get a higher limit if you {_LOG_IN}",
+    )
+    SERVER_ERROR = (
+        "the Hub has a problem ({status}){said}",
+        "Try again later; see https://status.huggingface.co",
+    )
+    OFFLINE = (
+        "HF_HUB_OFFLINE is set, so the Hub was not asked",
+        "Unset HF_HUB_OFFLINE to go online",
+    )
+    TIMEOUT = (
+        "the Hub did not answer in time",
+        "Check the network and try again; HF_HUB_ETAG_TIMEOUT=30 waits longer",
+    )
+    UNREACHABLE = (
+        "the Hub cannot be reached ({reason})",
+        "Check the network, the proxy settings and the endpoint",
+    )
+    BROKEN_DOWNLOAD = (
+        "the download broke off or had the wrong length",
+        "Try again; if it stays, something between you and the Hub changes files",
+    )
+    DISK_FULL = ("the disk is full", "Free space, or put the Hub cache elsewhere (HF_HOME)")
+    OTHER = (
+        "the Hub client failed ({reason}){said}",
+        "Check the endpoint; if it is right, try again with HF_DEBUG=1",
+    )
 
 
 ABSENT = frozenset({Kind.NO_REPOSITORY, Kind.NO_REVISION, Kind.NO_ENTRY})
@@ -57,88 +105,6 @@ class HubFailure(Exception):
         self.advice = advice
 
 
-class Subject(NamedTuple):
-    """What was asked for, as it stands in messages."""
-
-    repo_type: str
-    repo_id: str
-    revision: str | None
-    endpoint: str
-
-    @property
-    def url(self) -> str:
-        """The repository's page."""
-        prefix = "" if self.repo_type == "model" else f"{self.repo_type}s/"
-        return f"{self.endpoint}/{prefix}{self.repo_id}"
-
-
-_LOG_IN = "log in with `hf auth login` (`huggingface-cli login` before 1.0) or pass a token"
-
-# kind -> what happened, what to do. The fields are those of Subject, and those of ``explain``.
-_WORDS: dict[Kind, tuple[str, str]] = {
-    Kind.NO_REPOSITORY: (
-        "there is no {repo_type} repository {repo_id} that you may see ({status})",
-        f"Check the spelling and the owner; if it is private, {_LOG_IN}",
-    ),
-    Kind.NO_REVISION: (
-        "the {repo_type} repository {repo_id} has no revision {revision}",
-        "Check the branch, tag or commit at {url}/commits/main",
-    ),
-    Kind.NO_ENTRY: (
-        "the {repo_type} repository {repo_id} lacks a file that its own listing names",
-        "Try again; if it stays, tell the repository's owner",
-    ),
-    Kind.GATED: (
-        "the {repo_type} repository {repo_id} is gated and you have no access yet{said}",
-        f"Accept its terms at {{url}}, then {_LOG_IN}",
-    ),
-    Kind.DISABLED: (
-        "the {repo_type} repository {repo_id} was disabled on the Hub{said}",
-        "Ask its owner, or use another repository",
-    ),
-    Kind.UNAUTHORIZED: (
-        "the Hub refused your token (401){said}",
-        f"It may be expired or of another endpoint: {_LOG_IN}; {{no_token}} sends none",
-    ),
-    Kind.FORBIDDEN: (
-        "your token may not read the {repo_type} repository {repo_id} (403){said}",
-        "Give the token read access to it at {endpoint}/settings/tokens, or ask its owner",
-    ),
-    Kind.NO_TOKEN: (
-        "a stored token was asked for, but no token is stored on this machine",
-        f"To store one, {_LOG_IN}",
-    ),
-    Kind.RATE_LIMITED: (
-        "the Hub's rate limit is reached (429){said}",
-        f"Wait {{wait}} and try again; you get a higher limit if you {_LOG_IN}",
-    ),
-    Kind.SERVER_ERROR: (
-        "the Hub has a problem ({status}){said}",
-        "Try again later; see https://status.huggingface.co",
-    ),
-    Kind.OFFLINE: (
-        "HF_HUB_OFFLINE is set, so the Hub was not asked",
-        "Unset HF_HUB_OFFLINE to go online",
-    ),
-    Kind.TIMEOUT: (
-        "the Hub did not answer in time",
-        "Check the network and try again; HF_HUB_ETAG_TIMEOUT=30 waits longer",
-    ),
-    Kind.UNREACHABLE: (
-        "the Hub cannot be reached ({reason})",
-        "Check the network, the proxy settings and the endpoint",
-    ),
-    Kind.BROKEN_DOWNLOAD: (
-        "the download broke off or had the wrong length",
-        "Try again; if it stays, something between you and the Hub changes files",
-    ),
-    Kind.DISK_FULL: ("the disk is full", "Free space, or put the Hub cache elsewhere (HF_HOME)"),
-    Kind.OTHER: (
-        "the Hub client failed ({reason}){said}",
-        "Check the endpoint; if it is right, try again with HF_DEBUG=1",
-    ),
-}
-
 _BAD_TOKEN = "Invalid credentials in Authorization header"
 _TIMEOUT_CLASSES = frozenset({"Timeout", "TimeoutException", "TimeoutError"})
 _TRANSPORT_CLASSES = frozenset(
@@ -146,21 +112,32 @@ _TRANSPORT_CLASSES = frozenset(
 )
 
 
-def explain(error: BaseException, subject: Subject, secrets: tuple[str, ...] = ()) -> HubFailure:
+def explain(
+    error: BaseException,
+    secrets: tuple[str, ...] = (),
+    *,
+    repo_type: str,
+    repo_id: str,
+    revision: str | None,
+    endpoint: str,
+) -> HubFailure:
     """The failure that an exception of the Hub client stands for."""
-    kind, source = _classify(error)
+    found = ((kind, link) for link in chain(error) if (kind := _kind_of(link)) is not None)
+    kind, source = next(found, (Kind.OTHER, error))
     response = getattr(source, "response", None)
     fields = {
-        **subject._asdict(),
-        "url": subject.url,
-        "revision": repr(subject.revision) if subject.revision else "'main' (is it empty?)",
+        "repo_type": repo_type,
+        "repo_id": repo_id,
+        "endpoint": endpoint,
+        "url": f"{endpoint}/{'' if repo_type == 'model' else f'{repo_type}s/'}{repo_id}",
+        "revision": repr(revision) if revision else "'main' (is it empty?)",
         "status": getattr(response, "status_code", "not found"),
         "said": _said(response),
         "wait": _wait(response),
         "reason": type(source).__name__,
         "no_token": option_name("token", False),
     }
-    what, advice = (text.format(**fields) for text in _WORDS[kind])
+    what, advice = (text.format(**fields) for text in kind.value)
     return HubFailure(kind, redact(what, secrets), redact(advice, secrets))
 
 
@@ -173,21 +150,14 @@ def redact(text: str, secrets: tuple[str, ...]) -> str:
 
 def conceal(error: BaseException, secrets: tuple[str, ...]) -> None:
     """Take the secrets out of the texts of an exception and its causes: tracebacks show them."""
-    for link in _chain(error):
+    for link in chain(error):
         link.args = tuple(
             redact(value, secrets) if isinstance(value, str) else value for value in link.args
         )
 
 
-def _classify(error: BaseException) -> tuple[Kind, BaseException]:
-    for link in _chain(error):
-        kind = _kind_of(link)
-        if kind is not None:
-            return kind, link
-    return Kind.OTHER, error
-
-
-def _chain(error: BaseException | None) -> Iterator[BaseException]:
+def chain(error: BaseException | None) -> Iterator[BaseException]:
+    """An exception, and what it came of."""
     seen: set[int] = set()
     while error is not None and id(error) not in seen:
         seen.add(id(error))

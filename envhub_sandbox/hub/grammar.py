@@ -1,5 +1,7 @@
-"""What a hub reference may be made of. Raises ``Wrong``, which says what to write instead.
+"""What a hub reference may be made of, and the forms in which people write one.
 
+``read`` reads a plain one, ``hf://``, and pages of the Hub's site; ``check`` then judges the parts.
+Both raise ``Wrong``, which says what to write instead.
 Repository names follow ``huggingface_hub.utils.validate_repo_id``, revisions follow
 ``git check-ref-format``, and paths are relative, forward and to a ``.py`` file.
 """
@@ -7,7 +9,11 @@ Repository names follow ``huggingface_hub.utils.validate_repo_id``, revisions fo
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from typing import NamedTuple
+from urllib.parse import unquote, urlsplit
+
+from envhub_sandbox.option_names import option_name
 
 DEFAULT_PATH = "env.py"
 REPO_TYPES = ("model", "space", "dataset")
@@ -16,6 +22,11 @@ GRAMMAR = "owner/name, owner/name@revision, owner/name:path.py or owner/name@rev
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _NAME = re.compile(r"\b[\w\-.]{1,96}\b", re.ASCII)
 _NOT_IN_A_REVISION = re.compile(r"\.\.|@\{|//|/\.|[~^?*\[\\:\s]|\.lock(?:/|$)|^[/.-]|[/.]$")
+_TYPE_OF_PREFIX = {prefix: kind for kind in REPO_TYPES for prefix in (kind, f"{kind}s")}
+_HUB_HOSTS = frozenset({"huggingface.co", "www.huggingface.co", "hf.co", "www.hf.co"})
+_FILE_PAGES = frozenset({"tree", "blob", "resolve", "raw"})
+_SLASHED_REVISION = re.compile(r"refs/(?:pr|convert|heads|tags)/[^/]+")
+_DRIVE = re.compile(r"[A-Za-z]:(?:[\\/]|$)")
 _INSIDE = "a path inside the repository, such as 'owner/name:envs/env.py'"
 
 
@@ -107,22 +118,18 @@ def _check_path(parts: Parts) -> None:
         raise Wrong("the path after ':' is empty", f"{join(example)!r} (it means ':env.py')")
     if has_control_characters(path):
         raise Wrong("the path has control characters", _INSIDE)
-    if re.match(r"[A-Za-z]:(?:[\\/]|$)", path):
+    if _DRIVE.match(path):
         raise Wrong("the path has a drive letter", _INSIDE)
-    _check_steps(parts, pieces)
-    _check_suffix(parts, pieces[-1])
-
-
-def _check_steps(parts: Parts, pieces: list[str]) -> None:
     for bad, what in (
-        ("\\" in parts.path, "the path has backslashes"),
-        (parts.path.startswith("/"), "the path is absolute"),
+        ("\\" in path, "the path has backslashes"),
+        (path.startswith("/"), "the path is absolute"),
         (".." in pieces, "the path has '..'"),
         ("." in pieces or "" in pieces[:-1], "the path has empty steps"),
         (any(p != p.strip() for p in pieces), "the path has spaces around a name"),
     ):
         if bad:
             raise Wrong(what, _suggest(parts, _inside(pieces)))
+    _check_suffix(parts, pieces[-1])
 
 
 def _check_suffix(parts: Parts, name: str) -> None:
@@ -153,3 +160,169 @@ def _inside(pieces: list[str]) -> str | None:
         elif piece not in ("", "."):
             kept.append(piece)
     return "/".join(kept) if kept and kept[-1].endswith(".py") else None
+
+
+def read(text: str) -> Parts:
+    """The parts of a reference in any known form."""
+    _refuse_other_texts(text)
+    scheme, separator, rest = text.partition("://")
+    if separator and re.fullmatch(r"[A-Za-z][A-Za-z0-9+.-]*", scheme):
+        reader = _SCHEMES.get(scheme.lower())
+        if reader is None:
+            raise Wrong(f"'{text.partition(':')[0]}://' does not lead to the Hub", GRAMMAR)
+        return reader(text, rest)
+    if text.partition("/")[0].lower() in _HUB_HOSTS:
+        return _read_url("https://" + text, text)
+    if text.startswith("git@"):
+        raise _git_remote(text.partition(":")[2])
+    return _read_plain(text)
+
+
+def _refuse_other_texts(text: str) -> None:
+    if not text:
+        raise Wrong("it is empty", GRAMMAR)
+    if has_control_characters(text):
+        raise Wrong("it has control characters", GRAMMAR)
+    if is_local(text):
+        raise Wrong(
+            "this is a folder of this machine, not a repository",
+            f"{GRAMMAR}, or give the folder itself to make_env or envhub run",
+        )
+    if _DRIVE.match(text):
+        raise Wrong("this is a path with a drive letter", GRAMMAR)
+
+
+def _read_plain(text: str) -> Parts:
+    """``[type/]owner/name[@revision][:path]``; an ``@`` behind the colon belongs to the path."""
+    head, colon, path = text.partition(":")
+    repo, at, revision = head.partition("@")
+    kind, repo_id = _split_repo(repo, text[len(repo) :])
+    return _parts(kind, repo_id, revision if at else None, _normal(path) if colon else DEFAULT_PATH)
+
+
+def _parts(kind: str | None, repo_id: str, revision: str | None, path: str) -> Parts:
+    if revision is not None and is_commit(revision.lower()):
+        revision = revision.lower()
+    return Parts(repo_id, revision, path, kind)
+
+
+def _normal(path: str) -> str:
+    """``./a//b.py`` is ``a/b.py``; what is absolute or climbs stays, to be refused."""
+    if path.startswith("/") or "\\" in path:
+        return path
+    kept = "/".join(step for step in path.split("/") if step not in ("", "."))
+    return f"{kept}/" if kept and path.endswith("/") else kept or path
+
+
+def _split_repo(repo: str, rest: str) -> tuple[str | None, str]:
+    """Split ``[type/]owner/name``; ``rest`` is what stood behind it, for the suggestions."""
+    steps = repo.split("/")
+    kind, prefix = None, ""
+    if len(steps) > 1 and steps[0] in _TYPE_OF_PREFIX:
+        kind, prefix = _TYPE_OF_PREFIX[steps[0]], f"{steps[0]}/"
+        steps = steps[1:]
+    if len(steps) == 1 and steps[0]:
+        local = "" if prefix or rest else f" (or './{repo}' for a local folder)"
+        example = f"{prefix}OWNER/{steps[0]}{rest}"
+        raise Wrong("the owner is missing", f"{example!r} with the owner's name{local}")
+    if len(steps) > 2:
+        raise _too_many_slashes(prefix, steps, rest)
+    return kind, "/".join(steps)
+
+
+def _too_many_slashes(prefix: str, steps: list[str], rest: str) -> Wrong:
+    if "" in steps or rest:
+        return Wrong("a repository is owner/name, with one slash", GRAMMAR)
+    path = "/".join(steps[2:])
+    path = path if path.endswith(".py") else f"{path}/{DEFAULT_PATH}"
+    return Wrong("a path stands behind a colon", repr(f"{prefix}{'/'.join(steps[:2])}:{path}"))
+
+
+def _read_hf(text: str, rest: str) -> Parts:
+    """``hf://[type/]owner/name[@revision][/path]``, or with ``:path`` as in a plain one."""
+    if ":" in rest:
+        return _read_plain(rest)
+    steps = rest.strip("/").split("/")
+    lead = 3 if steps[0] in _TYPE_OF_PREFIX else 2
+    repo, at, revision = "/".join(steps[:lead]).partition("@")
+    kind, repo_id = _split_repo(repo, rest[len(repo) :])
+    if not at:
+        return _with_path(kind, repo_id, None, steps[lead:])
+    return _with_path(kind, repo_id, *_split_revision([revision, *steps[lead:]]))
+
+
+def _split_revision(steps: list[str]) -> tuple[str, list[str]]:
+    """A revision is one step (its slashes percent-encoded), or ``refs/pr/3`` and its like."""
+    slashed = _SLASHED_REVISION.match("/".join(steps))
+    if slashed is not None:
+        return unquote(slashed.group()), steps[3:]
+    return unquote(steps[0]), steps[1:]
+
+
+def _with_path(kind: str | None, repo_id: str, revision: str | None, steps: list[str]) -> Parts:
+    path = unquote("/".join(step for step in steps if step))
+    return _parts(kind, repo_id, revision, _normal(path) or DEFAULT_PATH)
+
+
+def _read_url(url: str, _: str) -> Parts:
+    try:
+        split = urlsplit(url)
+    except ValueError:
+        raise Wrong("this URL cannot be read", GRAMMAR) from None
+    if "@" in split.netloc:
+        plain = f"{split.scheme}://{split.netloc.rpartition('@')[2]}{split.path}"
+        raise Wrong(
+            "the URL has a user or token in it", f"{plain!r}, and pass {option_name('token')}"
+        )
+    steps = [step for step in split.path.split("/") if step]
+    if split.netloc.lower() not in _HUB_HOSTS:
+        repo = "/".join(steps[:2]) or "owner/name"
+        endpoint = f"{split.scheme}://{split.netloc}"
+        mirror = f"{repo!r}, with {option_name('endpoint', endpoint)} if that mirrors the Hub"
+        raise Wrong("this host is not the Hugging Face Hub", mirror)
+    return _read_page(steps)
+
+
+def _read_page(steps: list[str]) -> Parts:
+    """``[type/]owner/name``, then nothing, a commit, or a file page with revision and path."""
+    lead = 3 if steps and steps[0] in _TYPE_OF_PREFIX else 2
+    repo = "/".join(steps[:lead]).removesuffix(".git")
+    if len(steps) < lead:
+        raise Wrong("the URL names no repository", GRAMMAR)
+    kind, repo_id = _split_repo(repo, "")
+    page, rest = "".join(steps[lead : lead + 1]), steps[lead + 1 :]
+    if not page or (page in _FILE_PAGES and not rest):
+        return _parts(kind, repo_id, None, DEFAULT_PATH)
+    if page in _FILE_PAGES:
+        return _with_path(kind, repo_id, *_split_revision(rest))
+    if page in ("commit", "commits") and rest:
+        return _parts(kind, repo_id, _split_revision(rest)[0], DEFAULT_PATH)
+    raise _wrong_page(Parts(repo_id, repo_type=kind), page, rest)
+
+
+def _wrong_page(parts: Parts, page: str, rest: list[str]) -> Wrong:
+    write = repr(join(parts))
+    if page == "discussions" and rest and rest[0].isdigit():
+        pull_request = join(parts._replace(revision=f"refs/pr/{rest[0]}"))
+        write += f", or {pull_request!r} for the pull request"
+    return Wrong(f"the page {page!r} of a repository is not a file", write)
+
+
+def _read_git(_: str, rest: str) -> Parts:
+    raise _git_remote(rest.partition("/")[2])
+
+
+def _git_remote(path: str) -> Wrong:
+    repo = path.removesuffix(".git").strip("/")
+    return Wrong("this is a git remote", repr(repo) if repo else GRAMMAR)
+
+
+_SCHEMES: dict[str, Callable[[str, str], Parts]] = {
+    "hf": _read_hf,
+    "http": _read_url,
+    "https": _read_url,
+    "ssh": _read_git,
+    "git": _read_git,
+    "git+ssh": _read_git,
+    "git+https": _read_git,
+}

@@ -8,7 +8,7 @@ import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import Any, BinaryIO
 
 from envhub_sandbox.hub.listing import FileRecord
 
@@ -25,13 +25,7 @@ class Mismatch(Exception):
         self.found = found
 
 
-class _Hash(Protocol):
-    def update(self, data: bytes, /) -> None: ...
-
-    def hexdigest(self) -> str: ...
-
-
-def _start(kind: str, size: int) -> _Hash:
+def _start(kind: str, size: int) -> Any:
     if kind == SHA256:
         return hashlib.sha256()
     # A git blob id covers the length too; git chose SHA-1, we only follow.
@@ -41,11 +35,7 @@ def _start(kind: str, size: int) -> _Hash:
 
 
 def digest_of(source: Path, kind: str, size: int) -> str:
-    """The digest of a file that should have ``size`` bytes, for example ``"sha256:..."``.
-
-    Raises:
-        Mismatch: It is not a regular file, or cannot be read.
-    """
+    """The digest of a file that should have ``size`` bytes, for example ``"sha256:..."``."""
     running = _start(kind, size)
     with _open_regular(source) as stream:
         for chunk in _chunks(stream):
@@ -56,7 +46,7 @@ def digest_of(source: Path, kind: str, size: int) -> str:
 def copy_verified(source: Path, target: Path, record: FileRecord) -> None:
     """Copy a file into a new one; what was written is exactly what the record says.
 
-    The hash is taken of the bytes on their way, so nobody can change them in between.
+    The hash is taken of the bytes on their way, so they cannot change in between.
 
     Raises:
         Mismatch: Other bytes or another size. The new file may be there in part.

@@ -10,7 +10,7 @@ from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Any, TypeVar
 
 from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
 from envhub_sandbox.hub.grammar import has_control_characters
@@ -103,23 +103,11 @@ class SnapshotLimits:
 DEFAULT_LIMITS = SnapshotLimits()
 
 
-class _Sized(Protocol):
-    @property
-    def path(self) -> str: ...
-
-    @property
-    def size(self) -> int: ...
-
-
-_File = TypeVar("_File", bound=_Sized)
+_File = TypeVar("_File", bound=Any)  # with a path and a size
 
 
 def within_limits(files: Iterable[_File], limits: SnapshotLimits, title: str) -> tuple[_File, ...]:
-    """Collect the files, sorted by path, and stop as soon as a limit is passed.
-
-    Raises:
-        SnapshotTooLargeError: The text names the limit and how to raise it.
-    """
+    """The files, sorted by path; ``SnapshotTooLargeError`` as soon as a limit is passed."""
     taken: list[_File] = []
     total = 0
     for file in files:

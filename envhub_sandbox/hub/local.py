@@ -17,22 +17,31 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from envhub_sandbox.errors import RepositoryUnavailableError, SnapshotError
+from envhub_sandbox.errors import (
+    RepositoryUnavailableError,
+    SnapshotError,
+    SnapshotTooLargeError,
+)
 from envhub_sandbox.hub.checkout import Checkout, read_checkout
 from envhub_sandbox.hub.hashing import SHA256, Mismatch, copy_verified, digest_of
-from envhub_sandbox.hub.listing import MAX_DEPTH, FileRecord
+from envhub_sandbox.hub.listing import (
+    MAX_DEPTH,
+    FileRecord,
+    SnapshotLimits,
+    check_names,
+    within_limits,
+)
 
 _GIT = ".git"
+_ALL_COUNTS = (
+    "It is in no git checkout, so every file in it counts. Move away what does not belong to the "
+    "repository, or run 'git init' there and name it in .gitignore"
+)
 
 
 class LocalFile(NamedTuple):
-    """A file of a folder.
-
-    Attributes:
-        path: Its name in the snapshot.
-        source: Where its bytes are.
-        size: In bytes.
-        link: The text of a link that git would commit, which is then its content.
+    """A file of a folder: its name in the snapshot, where its bytes are, and its size; or the text
+    of a link that git would commit, which is then its content.
     """
 
     path: str
@@ -42,12 +51,8 @@ class LocalFile(NamedTuple):
 
 
 class LeftOut(NamedTuple):
-    """What lies in a checkout and is in no commit of it.
-
-    Attributes:
-        path: Its name; of a folder with a slash at its end.
-        is_repository: It is a repository of its own, of which git commits a pointer. Otherwise
-            git ignores it.
+    """What lies in a checkout and is in no commit of it; a folder has a slash at its end. It is
+    ignored, or a repository of its own, of which git commits a pointer.
     """
 
     path: str
@@ -56,11 +61,8 @@ class LeftOut(NamedTuple):
 
 @dataclass(frozen=True)
 class LocalFolder:
-    """A folder of this machine.
-
-    Attributes:
-        root: Its path, without links.
-        checkout: What git says of it; None where every file counts.
+    """A folder of this machine, without links in its path; every file counts where git says nothing
+    of it.
     """
 
     root: Path
@@ -76,12 +78,36 @@ class LocalFolder:
         return cls(root, read_checkout(root))
 
     def files(self) -> Iterator[LocalFile]:
-        """Yield the files of the snapshot. Names are relative, with ``/``.
-
-        Raises:
-            SnapshotError: A link leaves the folder, is broken or leads to a loop.
+        """The files of the snapshot, with ``/`` in their names. A link that leaves the folder is
+        refused.
         """
         return (one for one in self._found() if isinstance(one, LocalFile))
+
+    def listed(
+        self, limits: SnapshotLimits
+    ) -> tuple[tuple[LocalFile, ...], tuple[FileRecord, ...]]:
+        """The files of the snapshot, within limits, and their records, by reading all of them."""
+        try:
+            found = within_limits(self.files(), limits, str(self))
+        except OSError as error:
+            raise SnapshotError(f"{self}: it cannot be read: {error}") from error
+        except SnapshotTooLargeError as error:
+            if self.checkout is None:
+                error.args = (f"{error}. {_ALL_COUNTS}",)
+            raise
+        records = hash_files(found, str(self))
+        check_names(records, str(self))
+        return found, records
+
+    def why_left_out(self, path: str) -> tuple[str, str] | None:
+        """What to say of a file that is there, and that git would not commit."""
+        for one in self.left_out():
+            if f"{path}/".startswith(f"{one.path.rstrip('/')}/"):
+                what = f"has the file {path!r}, but git would not commit it"
+                if one.is_repository:
+                    return what, f"{one.path} is a git repository of its own; name that one"
+                return what, f"Run 'git add --force {path}', or take it out of .gitignore"
+        return None
 
     def left_out(self) -> Iterator[LeftOut]:
         """Yield what lies here and is not in the snapshot; empty folders aside."""
@@ -167,11 +193,7 @@ def _is_empty_folder(path: Path) -> bool:
 
 
 def split_local(text: str, path: str) -> tuple[Path, str]:
-    """The folder and entry of ``./env``, ``./env:sub/env.py`` or ``./env/other.py``.
-
-    Raises:
-        RepositoryUnavailableError: There is no such folder, or the file is not Python's.
-    """
+    """The folder and entry of ``./env``, ``./env:sub/env.py`` or ``./env/other.py``."""
     folder = Path(os.path.abspath(os.path.expanduser(text)))
     if folder.is_dir():
         return folder, os.path.normpath(path)

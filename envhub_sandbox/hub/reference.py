@@ -21,8 +21,8 @@ from envhub_sandbox.hub.grammar import (
     is_commit,
     is_local,
     join,
+    read,
 )
-from envhub_sandbox.hub.urls import read
 
 __all__ = ["DEFAULT_PATH", "REPO_TYPES", "HubRef", "is_local"]
 

@@ -8,9 +8,10 @@ read-only in a store of our own. A full commit that is in the store costs no req
 
 from __future__ import annotations
 
+import difflib
 import os
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -18,12 +19,12 @@ from envhub_sandbox.errors import (
     HubReferenceError,
     RepositoryUnavailableError,
     SnapshotError,
-    SnapshotTooLargeError,
+    SnapshotIntegrityError,
 )
 from envhub_sandbox.hub import store as store
-from envhub_sandbox.hub.candidate import Candidate, missing_entry
 from envhub_sandbox.hub.client import HubClient, Repository, checked_endpoint, checked_token
 from envhub_sandbox.hub.failures import ABSENT, UNREACHABLE, HubFailure, Kind
+from envhub_sandbox.hub.hashing import Mismatch, copy_verified
 from envhub_sandbox.hub.listing import (
     DEFAULT_LIMITS,
     FileRecord,
@@ -32,24 +33,15 @@ from envhub_sandbox.hub.listing import (
     check_names,
     within_limits,
 )
-from envhub_sandbox.hub.local import (
-    LocalFile,
-    LocalFolder,
-    content_commit,
-    copier,
-    hash_files,
-    split_local,
-)
+from envhub_sandbox.hub.local import LocalFolder, content_commit, copier, split_local
 from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef, is_local
+from envhub_sandbox.system.log import SNAPSHOT
 
 __all__ = ["FileRecord", "Snapshot", "SnapshotLimits", "fetch", "local"]
 
 _SHOWN_COMMITS = 5
 _LOCAL_COPIES_DAYS = 14.0
-_ALL_COUNTS = (
-    "It is in no git checkout, so every file in it counts. Move away what does not belong to the "
-    "repository, or run 'git init' there and name it in .gitignore"
-)
+_SHOWN_FILES = 20
 T = TypeVar("T")
 
 
@@ -96,16 +88,12 @@ def commit_of(
     """
     if is_here(reference):
         root, _ = split_local(reference, DEFAULT_PATH)
-        return content_commit(_found_here(LocalFolder.at(root), DEFAULT_LIMITS)[1])
+        return content_commit(LocalFolder.at(root).listed(DEFAULT_LIMITS)[1])
     ref = HubRef.parse(reference)
     if ref.is_pinned and ref.revision is not None:
         return ref.revision
     hub = HubClient(checked_endpoint(endpoint), checked_token(token), hub_cache_dir)
-    candidates = _candidates(ref, hub, DEFAULT_LIMITS)
-    try:
-        return _first(candidates, Candidate.resolved)
-    except HubFailure as failure:
-        raise _unavailable(candidates, [failure]) from failure.__cause__
+    return _first(_candidates(ref, hub, DEFAULT_LIMITS), _Candidate.resolved)
 
 
 def fetch(
@@ -138,51 +126,40 @@ def fetch(
     hub = HubClient(checked_endpoint(endpoint), checked_token(token), hub_cache_dir)
     candidates = _candidates(ref, hub, limits)
     try:
-        return _first_stored(candidates) or _first(candidates, Candidate.fetched)
+        for candidate in candidates if ref.is_pinned else ():
+            if (stored := candidate.stored()) is not None:
+                return stored
     except HubFailure as failure:
         raise _unavailable(candidates, [failure]) from failure.__cause__
     except store.HalfDeletedError as half:
-        return _fetched_again(candidates, half)
+        try:  # what is left of it stays, until there is all of it
+            return _first(candidates, _Candidate.fetched)
+        except RepositoryUnavailableError as error:
+            error.args = (f"{half}\nThat was tried: {error}",)
+            raise
+    return _first(candidates, _Candidate.fetched)
 
 
-def _candidates(ref: HubRef, hub: HubClient, limits: SnapshotLimits) -> list[Candidate]:
+def _candidates(ref: HubRef, hub: HubClient, limits: SnapshotLimits) -> list[_Candidate]:
     kinds = (ref.repo_type,) if ref.repo_type else ("model", "space")
-    return [Candidate(ref, Repository(kind, ref.repo_id), hub, limits) for kind in kinds]
+    return [_Candidate(ref, Repository(kind, ref.repo_id), hub, limits) for kind in kinds]
 
 
-def _fetched_again(candidates: list[Candidate], half: store.HalfDeletedError) -> Snapshot:
-    """What is left of it stays, until there is all of it."""
-    try:
-        return _first(candidates, Candidate.fetched)
-    except HubFailure as failure:
-        error, cause = _unavailable(candidates, [failure]), failure.__cause__
-    except RepositoryUnavailableError as unavailable:
-        error, cause = unavailable, unavailable.__cause__
-    error.args = (f"{half}\nThat was tried: {error}",)
-    raise error from cause
-
-
-def _first_stored(candidates: list[Candidate]) -> Snapshot | None:
-    if not candidates[0].ref.is_pinned:
-        return None
-    stored = (candidate.stored() for candidate in candidates)
-    return next((snapshot for snapshot in stored if snapshot is not None), None)
-
-
-def _first(candidates: list[Candidate], ask: Callable[[Candidate], T]) -> T:
+def _first(candidates: list[_Candidate], ask: Callable[[_Candidate], T]) -> T:
+    """The answer of the first candidate that is there; raises as ``fetch``."""
     failures: list[HubFailure] = []
     for candidate in candidates:
         try:
             return ask(candidate)
         except HubFailure as failure:
             if failure.kind not in ABSENT:
-                raise
+                raise _unavailable(candidates, [failure]) from failure.__cause__
             failures.append(failure)
     raise _unavailable(candidates, failures) from failures[0].__cause__
 
 
 def _unavailable(
-    candidates: list[Candidate], failures: list[HubFailure]
+    candidates: list[_Candidate], failures: list[HubFailure]
 ) -> RepositoryUnavailableError:
     """One error for all that was tried; the furthest attempt gives the advice."""
     ref, hub = candidates[0].ref, candidates[0].hub
@@ -197,7 +174,7 @@ def _unavailable(
     )
 
 
-def _in_store(candidates: list[Candidate], even_if_none: bool) -> str:
+def _in_store(candidates: list[_Candidate], even_if_none: bool) -> str:
     """Which commits can be had without the Hub, and how to write them."""
     ref = candidates[0].ref
     found = [stored for candidate in candidates for stored in store.commits(candidate.folder)]
@@ -231,42 +208,123 @@ def local(
             cannot have.
     """
     root, path = split_local(str(folder), path)
-    here, title = LocalFolder.at(root), f"local folder {root}"
-    found, files = _found_here(here, limits)
+    here = LocalFolder.at(root)
+    found, files = here.listed(limits)
     if all(file.path != path for file in files):
-        what, advice = _left_out(here, path) or missing_entry(path, files)
-        raise RepositoryUnavailableError(f"{title} {what}. {advice}")
-    slot = store.Slot(store.local_folder(), content_commit(files), title)
+        what, advice = here.why_left_out(path) or _missing_entry(path, files)
+        raise RepositoryUnavailableError(f"{here} {what}. {advice}")
+    slot = store.Slot(store.local_folder(), content_commit(files), str(here))
     if store.load_whole(slot) is None:
-        store.publish(slot, files, copier(found, title), {"repo_type": "local"})
+        store.publish(slot, files, copier(found, str(here)), {"repo_type": "local"})
         # Every edit leaves a copy; a Hub commit, in contrast, is kept until somebody removes it.
         store.remove_unused(slot.folder, days=_LOCAL_COPIES_DAYS)
     store.mark_used(slot)
     return Snapshot(str(root), "local", slot.commit, path, slot.tree, files)
 
 
-def _left_out(here: LocalFolder, path: str) -> tuple[str, str] | None:
-    """What to say of an entry that is there, and that git would not commit."""
-    for one in here.left_out():
-        if f"{path}/".startswith(f"{one.path.rstrip('/')}/"):
-            what = f"has the file {path!r}, but git would not commit it"
-            if one.is_repository:
-                return what, f"{one.path} is a git repository of its own; name that one"
-            return what, f"Run 'git add --force {path}', or take it out of .gitignore"
-    return None
+@dataclass(frozen=True)
+class _Candidate:
+    """A reference read as a repository of one type. Raises ``HubFailure`` and ``SnapshotError``."""
+
+    ref: HubRef
+    repo: Repository
+    hub: HubClient
+    limits: SnapshotLimits
+
+    @property
+    def folder(self) -> Path:
+        """Where the repository's commits lie in the store."""
+        return store.repository_folder(self.hub.public_endpoint, *self.repo)
+
+    def stored(self) -> Snapshot | None:
+        """The pinned commit, if it is in the store. No request. Raises ``HalfDeletedError``."""
+        slot = self._slot(self.ref.revision or "")
+        files = store.load(slot)
+        return None if files is None else self._finished(slot, files)
+
+    def fetched(self) -> Snapshot:
+        """The revision as the Hub resolves it now, downloaded unless it is in the store."""
+        slot = self._slot(self.resolved())
+        files = store.load_whole(slot)
+        if files is None:
+            self._bring(slot)
+            files = store.load(slot)
+        if files is None:
+            raise SnapshotError(f"{slot.title}: somebody removed it from the store; try again")
+        return self._finished(slot, files)
+
+    def resolved(self) -> str:
+        """The commit that the revision is at the Hub now."""
+        commit = self.hub.resolve(self.repo, self.ref.revision)
+        if self.ref.is_pinned and commit != self.ref.revision:
+            raise SnapshotIntegrityError(
+                f"{self.ref}: {self.hub.public_endpoint} answered with another commit, {commit}, "
+                "than the pinned one. Do not trust this endpoint; use another"
+            )
+        return commit
+
+    def _slot(self, commit: str) -> store.Slot:
+        title = f"{'/'.join(self.repo)}@{commit} on {self.hub.public_endpoint}"
+        return store.Slot(self.folder, commit, title)
+
+    def _bring(self, slot: store.Slot) -> None:
+        listing = self.hub.listing(self.repo, slot.commit)
+        files = within_limits(listing, self.limits, slot.title)
+        check_names(files, slot.title)
+        self._require_entry(files)
+        size = sum(file.size for file in files)
+        SNAPSHOT.info("%s: downloading %d files, %d bytes", slot.title, len(files), size)
+        folder = self.hub.download(self.repo, slot.commit, [file.path for file in files])
+        note = {"endpoint": self.hub.public_endpoint, **self.repo._asdict()}
+        note["revision"] = None if self.ref.is_pinned else self.ref.revision or "main"
+        store.publish(slot, files, self._copier(slot, folder), note)
+        SNAPSHOT.info("%s: verified, and in the store", slot.title)
+
+    def _copier(self, slot: store.Slot, folder: Path) -> Callable[[FileRecord, Path], None]:
+        def copy(record: FileRecord, target: Path) -> None:
+            try:
+                copy_verified(folder / record.path, target, record)
+            except Mismatch:
+                # The Hub cache may hold an edited or half-written file: once more, from the Hub.
+                target.unlink(missing_ok=True)
+                again = self.hub.download_again(self.repo, slot.commit, record.path)
+                self._copy_or_refuse(slot, again, target, record)
+
+        return copy
+
+    def _copy_or_refuse(
+        self, slot: store.Slot, source: Path, target: Path, record: FileRecord
+    ) -> None:
+        try:
+            copy_verified(source, target, record)
+        except Mismatch as mismatch:
+            raise SnapshotIntegrityError(
+                f"{slot.title}: the file {record.path!r} came with other content than the "
+                f"commit's listing says: {mismatch.found}, not {record.size} bytes with "
+                f"{record.digest}. Nothing of it was used. A proxy, a mirror or the Hub cache "
+                f"changes files: try another network or endpoint, and remove the bad copy: "
+                f"rm '{source}'"
+            ) from mismatch
+
+    def _finished(self, slot: store.Slot, files: tuple[FileRecord, ...]) -> Snapshot:
+        within_limits(files, self.limits, slot.title)
+        self._require_entry(files)
+        repo_type, repo_id = self.repo
+        return Snapshot(repo_id, repo_type, slot.commit, self.ref.path, slot.tree, files)
+
+    def _require_entry(self, files: tuple[FileRecord, ...]) -> None:
+        if all(file.path != self.ref.path for file in files):
+            what, advice = _missing_entry(self.ref.path, files)
+            raise HubFailure(Kind.NO_ENTRY, f"the {self.repo.repo_type} repository {what}", advice)
 
 
-def _found_here(
-    here: LocalFolder, limits: SnapshotLimits
-) -> tuple[tuple[LocalFile, ...], tuple[FileRecord, ...]]:
-    try:
-        found = within_limits(here.files(), limits, str(here))
-    except OSError as error:
-        raise SnapshotError(f"{here}: it cannot be read: {error}") from error
-    except SnapshotTooLargeError as error:
-        if here.checkout is None:
-            error.args = (f"{error}. {_ALL_COUNTS}",)
-        raise
-    files = hash_files(found, str(here))
-    check_names(files, str(here))
-    return found, files
+def _missing_entry(path: str, files: tuple[FileRecord, ...]) -> tuple[str, str]:
+    """What to say when a repository lacks the entry file: which ``.py`` files there are."""
+    names = [file.path for file in files if file.path.endswith(".py")]
+    what = f"has no file {path!r}"
+    if not names:
+        return what, "It has no .py file at all, so it is no environment"
+    close = difflib.get_close_matches(path, names, n=1) or names
+    shown = ", ".join(repr(name) for name in names[:_SHOWN_FILES])
+    more = f" and {len(names) - _SHOWN_FILES} more" if len(names) > _SHOWN_FILES else ""
+    return what, f"Name the entry behind a colon, as in ':{close[0]}'; it has {shown}{more}"

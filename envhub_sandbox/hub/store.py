@@ -22,13 +22,17 @@ import re
 import stat
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
+from envhub_sandbox.hub.cache import BUILDING, draft
+from envhub_sandbox.hub.cache import CACHE_VARIABLE as CACHE_VARIABLE
+from envhub_sandbox.hub.cache import cache_root as cache_root
+from envhub_sandbox.hub.cache import remove_tree as remove_tree
 from envhub_sandbox.hub.hashing import Mismatch, digest_of
 from envhub_sandbox.hub.listing import FileRecord
 from envhub_sandbox.system import folders
@@ -36,9 +40,7 @@ from envhub_sandbox.system.files import write_whole
 from envhub_sandbox.system.locks import sharers
 from envhub_sandbox.system.log import SNAPSHOT
 
-CACHE_VARIABLE = "ENVHUB_CACHE"
 _FORMAT = 1
-_BUILDING = ".building-"
 _ABANDONED_AFTER_S = 24 * 3600.0
 _FILE_MODE = 0o444
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
@@ -81,42 +83,9 @@ class HalfDeletedError(SnapshotIntegrityError):
     """Parts of a snapshot are gone, and what is left is what was verified: ``publish`` heals it."""
 
 
-class _Entry(NamedTuple):
-    path: str
-    size: int
-    digest: str
-    mtime_ns: int
-    ctime_ns: int
-    inode: int
-
-    def matches(self, found: os.stat_result) -> bool:
-        if found.st_mode & _OTHERS_WRITE:
-            return False
-        return (self.size, self.mtime_ns, self.ctime_ns, self.inode) == (
-            found.st_size,
-            found.st_mtime_ns,
-            found.st_ctime_ns,
-            found.st_ino,
-        )
-
-
-def cache_root() -> Path:
-    """``$ENVHUB_CACHE``, or the user's cache folder for ``envhub-sandbox``.
-
-    Raises:
-        SnapshotError: The user has none.
-    """
-    chosen = os.environ.get(CACHE_VARIABLE)
-    if chosen:
-        return Path(os.path.abspath(os.path.expanduser(chosen)))
-    import platformdirs
-
-    try:
-        return Path(platformdirs.user_cache_dir("envhub-sandbox", appauthor=False))
-    except RuntimeError:
-        raise SnapshotError(
-            f"this user has no home, and so no folder for a cache; set {CACHE_VARIABLE} to a folder"
-        ) from None
+def _fingerprint(status: os.stat_result) -> list[int]:
+    """What changes with a file's content."""
+    return [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino]
 
 
 def repository_folder(endpoint: str, repo_type: str, repo_id: str) -> Path:
@@ -156,15 +125,19 @@ def load(slot: Slot) -> tuple[FileRecord, ...] | None:
     recorded = {entry.path for entry in entries}
     if extra := sorted(found.keys() - recorded):
         raise _damaged(slot, f"the file {extra[0]!r} is extra")
-    there = [entry for entry in entries if entry.path in found]
-    changed = [entry for entry in there if not entry.matches(found[entry.path])]
+    changed = [
+        entry
+        for entry, known in entries.items()
+        if (status := found.get(entry.path)) is not None
+        and (status.st_mode & _OTHERS_WRITE or _fingerprint(status) != known)
+    ]
     _verify_again(slot, changed)
     if missing := sorted(recorded - found.keys()):
         raise HalfDeletedError(_damage(slot, f"the file {missing[0]!r} is missing"))
     if changed:
         with contextlib.suppress(OSError):  # A read-only store only stays slower.
-            _write_record(slot.home, slot.tree, document, [_plain(entry) for entry in entries])
-    return tuple(_plain(entry) for entry in entries)
+            _write_record(slot.home, slot.tree, document, entries)
+    return tuple(entries)
 
 
 def load_whole(slot: Slot) -> tuple[FileRecord, ...] | None:
@@ -183,16 +156,13 @@ def _record_of(slot: Slot) -> bytes | None:
         return None
 
 
-def _plain(entry: _Entry) -> FileRecord:
-    return FileRecord(entry.path, entry.size, entry.digest)
-
-
-def _read_record(slot: Slot, text: bytes) -> tuple[dict[str, object], list[_Entry]]:
+def _read_record(slot: Slot, text: bytes) -> tuple[dict[str, object], dict[FileRecord, list[int]]]:
     try:
         document = json.loads(text)
         if document["format"] != _FORMAT:
             raise ValueError(f"unknown format {document['format']!r}")
-        return document, [_Entry(*row) for row in document["files"]]
+        rows = document["files"]
+        return document, {FileRecord(*row[:3]): [row[1], *row[3:]] for row in rows}
     except (ValueError, KeyError, TypeError) as error:
         raise _damaged(slot, f"its record.json cannot be read ({error})") from error
 
@@ -217,7 +187,7 @@ def _walk(slot: Slot, folder: Path | str, prefix: str) -> Iterator[tuple[str, os
                 raise _damaged(slot, f"{prefix + item.name!r} is not a regular file")
 
 
-def _verify_again(slot: Slot, changed: list[_Entry]) -> None:
+def _verify_again(slot: Slot, changed: list[FileRecord]) -> None:
     for entry in changed:
         path = slot.tree / entry.path
         try:
@@ -255,31 +225,36 @@ def publish(
     ``copy(record, target)`` writes the target and must raise unless it wrote what the record
     says. ``note`` is kept in the record (where the snapshot is from). Nothing stays if it fails.
     """
-    building = _begin(slot)
     try:
-        tree = building / "tree"
-        _fill(tree, files, copy)
-        document = {"format": _FORMAT, **note, "fetched": time.strftime("%FT%TZ", time.gmtime())}
-        _write_record(building, tree, document, list(files))
-        building.chmod(folders.SHARED_MODE)
-        with _one_at_a_time(slot.folder):
-            _move_remains(slot)
-            with _another_may_have_won():
-                os.rename(building, slot.home)
+        folders.make(slot.folder)
+        _refuse_shared_store(slot.folder)
+        for abandoned in _older(slot.folder.glob(f"{BUILDING}*"), _ABANDONED_AFTER_S):
+            remove_tree(abandoned)
+        with draft(slot.folder) as building:
+            tree = building / "tree"
+            _fill(tree, files, copy)
+            fetched = time.strftime("%FT%TZ", time.gmtime())
+            document = {"format": _FORMAT, **note, "fetched": fetched}
+            _write_record(building, tree, document, files)
+            building.chmod(folders.SHARED_MODE)
+            with _opened(slot.folder) as handle:
+                # one at a time: no process moves away what another has just put there
+                with contextlib.suppress(OSError):  # not every file system has locks
+                    fcntl.flock(handle, fcntl.LOCK_EX)
+                _move_remains(slot)
+                _rename(building, slot.home)
     except OSError as error:
-        raise _not_writable(slot.folder, error) from error
-    finally:
-        remove_tree(building)
+        raise SnapshotError(
+            f"the snapshot store {slot.folder} cannot be written: {error}. Free space or fix its "
+            "permissions, or set ENVHUB_CACHE to another folder"
+        ) from error
 
 
 @contextlib.contextmanager
-def _one_at_a_time(folder: Path) -> Iterator[None]:
-    """So that nobody moves away what another has just put there."""
+def _opened(folder: Path) -> Iterator[int]:
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        with contextlib.suppress(OSError):  # not every file system has locks
-            fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
+        yield handle
     finally:
         os.close(handle)
 
@@ -292,49 +267,34 @@ def _move_remains(slot: Slot) -> None:
         load(slot)
     except HalfDeletedError as error:
         SNAPSHOT.warning("%s. It has been made again", str(error).partition(". Nothing of it")[0])
-        aside = tempfile.mkdtemp(prefix=_BUILDING, dir=slot.folder)
+        aside = tempfile.mkdtemp(prefix=BUILDING, dir=slot.folder)
         os.rename(slot.home, aside)
         os.utime(aside)
 
 
-def _begin(slot: Slot) -> Path:
-    try:
-        folders.make(slot.folder)
-        _refuse_shared_store(slot.folder)
-        _remove_abandoned(slot.folder)
-        # 0700 until it is complete: its files have the umask's modes while they are written
-        building = Path(tempfile.mkdtemp(prefix=_BUILDING, dir=slot.folder))
-        building.chmod(folders.PRIVATE_MODE)
-    except OSError as error:
-        raise _not_writable(slot.folder, error) from error
-    return building
-
-
 def remove(home: Path) -> dict[int, str]:
-    """Remove a snapshot. Not while others use it, who share a lock of its folder.
-
-    Returns:
-        These, as ``sharers`` does; none where it was removed.
-    """
-    with contextlib.suppress(FileNotFoundError):
-        descriptor = os.open(home, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    """Remove a snapshot, unless others use it (share a lock of its folder); these are returned."""
+    with contextlib.suppress(FileNotFoundError), _opened(home) as handle:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             remove_tree(home)
         except BlockingIOError:
             return sharers(home) or {0: "that is not seen from here"}
-        finally:
-            os.close(descriptor)
     return {}
 
 
 def remove_unused(folder: Path, days: float) -> None:
-    """Remove snapshots that nobody asked for in that many days (see ``mark_used``)."""
-    oldest = time.time() - days * 24 * 3600
-    for record in folder.glob("*/record.json"):
+    """Remove snapshots that were not asked for in that many days (see ``mark_used``)."""
+    for record in _older(folder.glob("*/record.json"), days * 24 * 3600):
         with contextlib.suppress(OSError):
-            if record.stat().st_mtime < oldest:
-                remove(record.parent)
+            remove(record.parent)
+
+
+def _older(paths: Iterable[Path], seconds: float) -> Iterator[Path]:
+    for path in paths:
+        with contextlib.suppress(OSError):
+            if path.stat().st_mtime < time.time() - seconds:
+                yield path
 
 
 def mark_used(slot: Slot) -> None:
@@ -344,7 +304,7 @@ def mark_used(slot: Slot) -> None:
 
 
 def _refuse_shared_store(place: Path) -> None:
-    """Whoever can write there can put both a tree and a record that vouches for it."""
+    """A user who can write there can put both a tree and a record that vouches for it."""
     root = cache_root()
     try:
         why = folders.why_distrusted(place, root)
@@ -353,16 +313,8 @@ def _refuse_shared_store(place: Path) -> None:
     if why:
         raise SnapshotError(
             f"the snapshot store {root} is not trusted, since other users can change what is in "
-            f"it: {why}; or set {CACHE_VARIABLE} to a folder of your own"
+            f"it: {why}; or set ENVHUB_CACHE to a folder of your own"
         )
-
-
-def _remove_abandoned(folder: Path) -> None:
-    oldest = time.time() - _ABANDONED_AFTER_S
-    for path in folder.glob(f"{_BUILDING}*"):
-        with contextlib.suppress(OSError):
-            if path.stat().st_mtime < oldest:
-                remove_tree(path)
 
 
 def _fill(
@@ -382,49 +334,21 @@ def _fill(
 
 
 def _write_record(
-    home: Path, tree: Path, document: Mapping[str, object], files: list[FileRecord]
+    home: Path, tree: Path, document: Mapping[str, object], files: Iterable[FileRecord]
 ) -> None:
-    rows = []
-    for file in files:
-        status = (tree / file.path).lstat()
-        times = (status.st_mtime_ns, status.st_ctime_ns, status.st_ino)
-        rows.append(_Entry(file.path, file.size, file.digest, *times))
+    rows = [
+        [file.path, file.size, file.digest, *_fingerprint((tree / file.path).lstat())[1:]]
+        for file in files
+    ]
     write_whole(home / "record.json", json.dumps({**document, "files": rows}).encode())
 
 
-@contextlib.contextmanager
-def _another_may_have_won() -> Iterator[None]:
+def _rename(building: Path, home: Path) -> None:
     try:
-        yield
+        os.rename(building, home)
     except OSError as error:
-        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
+        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):  # another has put it there first
             raise
-
-
-def _not_writable(folder: Path, error: OSError) -> SnapshotError:
-    return SnapshotError(
-        f"the snapshot store {folder} cannot be written: {error}. Free space or fix its "
-        f"permissions, or set {CACHE_VARIABLE} to another folder"
-    )
-
-
-def remove_tree(path: Path) -> None:
-    """Remove a folder of the store, whose own folders are read-only; nothing if it is gone.
-
-    Without recursion, as ``shutil.rmtree`` has it: of a package, a stranger chose how deep it is.
-    """
-    found = [] if path.is_symlink() else [str(path)]
-    for folder in found:  # which grows
-        with contextlib.suppress(OSError):
-            os.chmod(folder, 0o700)
-            with os.scandir(folder) as items:
-                found += [item.path for item in items if item.is_dir(follow_symlinks=False)]
-    for folder in reversed(found):
-        with contextlib.suppress(OSError):
-            for name in os.listdir(folder):
-                with contextlib.suppress(OSError):
-                    os.unlink(os.path.join(folder, name))
-            os.rmdir(folder)
 
 
 def commits(folder: Path) -> list[StoredCommit]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from envhub_sandbox.errors import LockDriftError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.locks.fingerprint import Task
-from envhub_sandbox.locks.lockfile import LOCAL, LockFile, Runner, repository_of
+from envhub_sandbox.locks.lockfile import LOCAL, LockFile, repository_of
 from envhub_sandbox.locks.pylock import Package
 from envhub_worker.protocol.text import printable
 
@@ -17,20 +17,20 @@ _SHOWN = 30
 
 def differences(then: LockFile, now: LockFile) -> list[str]:
     """Whatever differs, a line each."""
+    runner = f"Python: {then.runner} was locked, this is {now.runner}"
+    spaces: Iterator[str] = iter(())
+    if then.spaces and now.spaces and then.spaces.arguments == now.spaces.arguments:
+        spaces = of_tasks(then.spaces.tasks, now.spaces.tasks)
     return [
         *_of_files(then, now),
-        *_of_runner(then.runner, now.runner),
+        *([runner] if then.runner != now.runner else []),
         *_of_packages(then.packages, now.packages),
-        *_of_spaces(then, now),
+        *spaces,
     ]
 
 
 def refuse(found: Sequence[str], label: str) -> None:
-    """Raise what has drifted, if anything has.
-
-    Raises:
-        LockDriftError: Something has.
-    """
+    """Raise ``LockDriftError`` if anything has drifted."""
     if not found:
         return
     more = [f"and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else []
@@ -40,11 +40,6 @@ def refuse(found: Sequence[str], label: str) -> None:
         "now: envhub lock --upgrade",
         tuple(found),
     )
-
-
-def files_and_commit(lock: LockFile, snapshot: Snapshot) -> list[str]:
-    """What differs in a repository's files."""
-    return list(_of_files(lock, with_files(lock, snapshot)))
 
 
 def with_files(lock: LockFile, snapshot: Snapshot) -> LockFile:
@@ -60,38 +55,21 @@ def with_files(lock: LockFile, snapshot: Snapshot) -> LockFile:
 
 def _of_files(then: LockFile, now: LockFile) -> Iterator[str]:
     if then.repository != now.repository:
-        names = ["a local folder" if one == LOCAL else one for one in _two(then, now)]
+        both = (then.repository, now.repository)
+        names = ["a local folder" if one == LOCAL else one for one in both]
         yield f"repository: {names[0]} was locked, this is {names[1]}"
     if then.commit != now.commit:
         yield f"commit: {then.commit[:18]} was locked, this is {now.commit[:18]}"
     if then.entry != now.entry:
         yield f"entry file: {then.entry} was locked, this is {now.entry}"
-    yield from _of_digests(then.files, now.files)
-
-
-def _two(then: LockFile, now: LockFile) -> tuple[str, str]:
-    return then.repository, now.repository
-
-
-def _of_digests(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[str]:
-    for name in sorted({*then, *now}):
+    for name in sorted({*then.files, *now.files}):
         shown = printable(name, 200)
-        if name not in now:
+        if name not in now.files:
             yield f"file {shown}: gone"
-        elif name not in then:
+        elif name not in then.files:
             yield f"file {shown}: new"
-        elif then[name] != now[name]:
+        elif then.files[name] != now.files[name]:
             yield f"file {shown}: other content"
-
-
-def _of_runner(then: Runner, now: Runner) -> Iterator[str]:
-    if then != now:
-        yield f"Python: {then} was locked, this is {now}"
-
-
-def runner(lock: LockFile, now: Runner) -> list[str]:
-    """What differs in the interpreter."""
-    return list(_of_runner(lock.runner, now))
 
 
 def _of_packages(then: Sequence[Package], now: Sequence[Package]) -> Iterator[str]:
@@ -110,7 +88,7 @@ def _of_package(then: Package, now: Package) -> Iterator[str]:
     if then.version != now.version:
         yield f"package {then.name}: {then.version} was locked, this is {now.version}"
         return
-    before, after = (one.origin.identity if one.origin else "" for one in (then, now))
+    before, after = (one.origin.source.identity if one.origin else "" for one in (then, now))
     if before != after:
         yield f"package {then.name}: built of {before or 'no source'}, this of {after or 'none'}"
     there = {wheel.sha256 for wheel in now.wheels}
@@ -121,13 +99,6 @@ def _of_package(then: Package, now: Package) -> Iterator[str]:
                 f"package {then.name}=={then.version}: the file with SHA-256 "
                 f"{wheel.sha256[:12]}... was locked, there is {others}"
             )
-
-
-def _of_spaces(then: LockFile, now: LockFile) -> Iterator[str]:
-    if then.spaces is None or now.spaces is None:
-        return
-    if then.spaces.arguments == now.spaces.arguments:
-        yield from of_tasks(then.spaces.tasks, now.spaces.tasks)
 
 
 def of_tasks(then: Sequence[Task], now: Sequence[Task]) -> Iterator[str]:
@@ -141,16 +112,13 @@ def of_tasks(then: Sequence[Task], now: Sequence[Task]) -> Iterator[str]:
         if old.mode != new.mode:
             yield f"environment {shown}: autoreset mode {old.mode or 'none'}, now {new.mode}"
         if old.spaces != new.spaces:
-            yield f"environment {shown}: {_of_texts(old, new)}"
-
-
-def _of_texts(old: Task, new: Task) -> str:
-    told = [
-        f"{what} were {before}, now {after}"
-        for what, before, after in (
-            ("observations", old.observations, new.observations),
-            ("actions", old.actions, new.actions),
-        )
-        if before != after
-    ]
-    return "; ".join(told) or "other bounds or types in its spaces, which read the same"
+            said = [
+                f"{what} were {before}, now {after}"
+                for what, before, after in (
+                    ("observations", old.observations, new.observations),
+                    ("actions", old.actions, new.actions),
+                )
+                if before != after
+            ]
+            text = "; ".join(said) or "other bounds or types in its spaces, which read the same"
+            yield f"environment {shown}: {text}"

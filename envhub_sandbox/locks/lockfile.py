@@ -14,15 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.dependencies import interpreters
-from envhub_sandbox.dependencies.choice import DATE
 from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
+from envhub_sandbox.dependencies.request import DATE
 from envhub_sandbox.errors import LockError, RequirementError
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.locks import pylock, toml
+from envhub_sandbox.locks import pylock
 from envhub_sandbox.locks.fingerprint import Task
-from envhub_sandbox.locks.pylock import Package, quoted
+from envhub_sandbox.locks.pylock import Package, quoted, table
 from envhub_sandbox.system.files import write_whole
 
 FORMAT = 1
@@ -30,7 +29,8 @@ MAX_FILES = 20_000
 MAX_TASKS = 4096
 MAX_TEXT = 4096
 LOCAL = "local"
-"""The repository of a folder of this machine: its path is nobody else's."""
+"""The repository of a folder of this machine, whose path means nothing elsewhere."""
+_REQUIREMENTS = ("extra", "only", "override", "without")
 _COMMIT = re.compile(r"[0-9a-f]{40}|local-[0-9a-f]+")
 _PYTHON = re.compile(r"3\.\d{1,3}")
 _WORD = re.compile(r"[a-z0-9_]{1,40}")
@@ -57,12 +57,7 @@ class Runner:
 
 @dataclass(frozen=True)
 class Spaces:
-    """What a repository's ``make_env`` returned.
-
-    Attributes:
-        arguments: The ``env_kwargs`` that it was given, as ``arguments_text`` writes them.
-        tasks: Its environments.
-    """
+    """What a repository's ``make_env`` returned for arguments (as ``arguments_text`` writes)."""
 
     arguments: str
     tasks: tuple[Task, ...]
@@ -128,25 +123,20 @@ def arguments_text(env_kwargs: Mapping[str, Any] | None) -> str | None:
 
 
 def read(path: str | os.PathLike[str]) -> LockFile:
-    """A lock file.
-
-    Raises:
-        LockError: It cannot be read, or is none of ours.
-    """
+    """A lock file; ``LockError`` if it cannot be read, or is none of ours."""
     where = f"the lock {os.fspath(path)}"
     try:
         with open(path, "rb") as file:
-            data = file.read(toml.MAX_CHARACTERS + 1)
+            data = file.read(pylock.MAX_CHARACTERS + 1)
         text = data.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise LockError(f"{where} cannot be read: {error}. 'envhub lock REF' writes one") from error
-    document = toml.loads(text, where)
+    document = pylock.document(text, where)
     packages = pylock.read(document, where)
     if not packages:
         raise LockError(f"{where} has no packages")
-    tool = document.get("tool")
-    ours = tool.get("envhub") if isinstance(tool, dict) else None
-    if not isinstance(ours, dict) or ours.get("format") != FORMAT:
+    ours = table(table(document, "tool"), "envhub")
+    if ours.get("format") != FORMAT:
         raise LockError(
             f"{where} has no [tool.envhub] of format {FORMAT}: it was written by another program, "
             "or by another release of this one. 'envhub lock REF' writes one"
@@ -175,13 +165,10 @@ class _Reader:
                 text(self._ours, "machine", _WORD),
             ),
             packages=packages,
-            extra=self._requirements("extra"),
-            only=self._requirements("only") if "only" in self._ours else None,
-            override=self._requirements("override"),
-            without=self._requirements("without"),
             inferred=self._texts("inferred"),
             exclude_newer=newer,
             spaces=self._spaces(),
+            **{name: self._requirements(name) for name in _REQUIREMENTS if name in self._ours},
         )
 
     def _text(
@@ -264,17 +251,11 @@ def written(lock: LockFile) -> str:
         facts["exclude-newer"] = lock.exclude_newer
     ours = ["", "[tool.envhub]", f"format = {FORMAT}"]
     ours += [f"{name} = {quoted(value)}" for name, value in facts.items()]
-    lists = {
-        "extra": lock.extra,
-        "only": lock.only,
-        "override": lock.override or None,
-        "without": lock.without or None,
-        "inferred": lock.inferred or None,
-    }
+    lists = {name: getattr(lock, name) for name in (*_REQUIREMENTS, "inferred")}
     ours += [
         f"{name} = [{', '.join(map(quoted, texts))}]"
         for name, texts in lists.items()
-        if texts is not None
+        if texts or name == "extra" or (name == "only" and texts is not None)
     ]
     ours += ["", "[tool.envhub.files]"]
     ours += [f"{quoted(name)} = {quoted(digest)}" for name, digest in sorted(lock.files.items())]
@@ -295,21 +276,8 @@ def _task_line(task: Task) -> str:
 
 
 def write(lock: LockFile, path: Path) -> None:
-    """Write a lock file; whoever reads it meanwhile reads the old one.
-
-    Raises:
-        LockError: It cannot be written.
-    """
+    """Write a lock file; meanwhile others read the old one. Raises ``LockError``."""
     try:
         write_whole(path, written(lock).encode(), mode=0o666)
     except (OSError, UnicodeEncodeError) as error:
         raise LockError(f"the lock {path} cannot be written: {error}") from error
-
-
-def runner_here(lock: LockFile) -> Interpreter:
-    """An interpreter of this machine of the kind that is locked.
-
-    Raises:
-        InterpreterUnavailableError: There is none.
-    """
-    return interpreters.find(lock.runner.python)

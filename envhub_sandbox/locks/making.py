@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from envhub_sandbox.dependencies.choice import Choice
-from envhub_sandbox.dependencies.declared import Wanted, parse_requirement
-from envhub_sandbox.dependencies.pipeline import resolution_for
-from envhub_sandbox.dependencies.request import request_of
+from envhub_sandbox.dependencies import interpreters
+from envhub_sandbox.dependencies.declared import WantedPackage, parse_requirement
+from envhub_sandbox.dependencies.request import Choice, request_of
+from envhub_sandbox.dependencies.resolutions import resolution_for
 from envhub_sandbox.errors import LockError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.locks import lockfile, pylock
@@ -25,11 +25,7 @@ def locked(
     *,
     upgrade: bool = False,
 ) -> LockFile:
-    """A lock of a repository with the packages of a choice; nothing of either runs.
-
-    Raises:
-        DependencyError: Versions cannot be chosen.
-    """
+    """A lock of a repository with the packages of a choice; nothing of either runs."""
     request = request_of(snapshot, replace(choice, where="own"))
     assert request is not None  # which only another choice gives
     found = resolution_for(request, tell, upgrade=upgrade)
@@ -64,19 +60,15 @@ def again(lock: LockFile) -> Choice:
     )
 
 
-def _parsed(texts: Sequence[str]) -> tuple[Wanted, ...]:
+def _parsed(texts: Sequence[str]) -> tuple[WantedPackage, ...]:
     return tuple(parse_requirement(text, f"{text[:80]!r} in the lock") for text in texts)
 
 
 def relisted(lock: LockFile) -> LockFile:
-    """The same with the files that the index has of its packages now.
-
-    Raises:
-        DependencyError: The index does not answer, or lacks one.
-    """
+    """The same with the files that the index has of its packages now."""
     built = [one for one in lock.packages if one.origin is not None]
     pins = [f"{one.name}=={one.version}" for one in lock.packages if one.origin is None]
-    interpreter = lockfile.runner_here(lock)
+    interpreter = interpreters.find(lock.runner.python)
     options = pylock.pins(lock.packages).options
     found = pylock.listed(pins, interpreter.path, options, refresh=True)
     packages = tuple(sorted((*built, *found), key=lambda one: one.name))
@@ -86,11 +78,7 @@ def relisted(lock: LockFile) -> LockFile:
 def with_spaces(
     lock: LockFile, env_kwargs: Mapping[str, Any], suites: Mapping[str, Mapping[Any, Any]]
 ) -> LockFile:
-    """The same with what a repository's ``make_env`` returned for these arguments.
-
-    Raises:
-        LockError: The arguments have no form that can be compared.
-    """
+    """The same with what a repository's ``make_env`` returned for these arguments."""
     arguments = lockfile.arguments_text(env_kwargs)
     if arguments is None:
         raise LockError("env_kwargs have no plain form that a lock could hold")
@@ -99,17 +87,10 @@ def with_spaces(
 
 def tasks_of(suites: Mapping[str, Mapping[Any, Any]]) -> tuple[Task, ...]:
     """What a repository's ``make_env`` returned, in a form that can be compared."""
-    return tuple(
-        task_of(
-            *(suite, task, _mode(env)),
-            *(env.single_observation_space, env.single_action_space),
-        )
-        for suite, tasks in suites.items()
-        for task, env in tasks.items()
-    )
-
-
-def _mode(env: Any) -> str | None:
-    mode = env.metadata.get("autoreset_mode")
-    found: str | None = getattr(mode, "value", mode)
-    return found
+    found = []
+    for suite, tasks in suites.items():
+        for task, env in tasks.items():
+            mode = env.metadata.get("autoreset_mode")
+            spaces = env.single_observation_space, env.single_action_space
+            found.append(task_of(suite, task, getattr(mode, "value", mode), *spaces))
+    return tuple(found)

@@ -2,6 +2,10 @@
 
 uv writes it for the pins, and what it wrote is read, checked and printed anew. Nothing of a lock
 file is ever handed to uv as it stands: only names, versions and hashes of these forms get through.
+
+A package without a wheel on the index is held to its source, which is fetched and hashed again. The
+hash of the wheel that was built says whether the next build gives the same bytes; compilers of two
+machines do not.
 """
 
 from __future__ import annotations
@@ -10,24 +14,29 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeGuard
 
+from packaging.requirements import InvalidRequirement, Requirement
 from packaging.version import InvalidVersion, Version
 
-from envhub_sandbox.dependencies import index, torch_cpu, uv
-from envhub_sandbox.dependencies.resolve import Lock, Target
+from envhub_sandbox.dependencies import index, uv
+from envhub_sandbox.dependencies.builds import wheel_store
+from envhub_sandbox.dependencies.builds.sources import Source, WheelOrigin, of_git
+from envhub_sandbox.dependencies.resolve import Lock, Target, torch_options
 from envhub_sandbox.errors import LockError, PackageIntegrityError
 from envhub_sandbox.hub.logins import without_login
-from envhub_sandbox.locks import toml
-from envhub_sandbox.locks.built import Origin, origins
-from envhub_sandbox.locks.built import read as read_origin
+from envhub_sandbox.sources import toml
 
+MAX_CHARACTERS = 16 * 1024 * 1024
 MAX_PACKAGES = 2000
 MAX_WHEELS = 200
 """Of one package: one for each platform and interpreter that it is built for."""
 _NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _VERSION = re.compile(r"[A-Za-z0-9.!+_-]{1,200}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
+_COMMIT = re.compile(r"[0-9a-f]{40}")
+_URL = re.compile(r"(?:https?|file)://[^\s\"\\]{1,2000}")
 _DESCRIBE_S = 600.0
 
 
@@ -53,7 +62,7 @@ class Package:
     name: str
     version: str
     wheels: tuple[Wheel, ...]
-    origin: Origin | None = None
+    origin: WheelOrigin | None = None
     """What it is built of, where it has no wheels."""
 
     @property
@@ -67,20 +76,18 @@ class Package:
 def pins(packages: Sequence[Package]) -> Lock:
     """What is installed for them."""
     lock = Lock("".join(package.pin for package in packages))
-    return replace(lock, options=torch_cpu.options_for(lock))
+    return replace(lock, options=torch_options(lock))
 
 
 def described(lock: Lock, python: str) -> tuple[Package, ...]:
     """The pins with their files, as the index has them now, for the interpreter at this path.
 
-    Raises:
-        PackageIntegrityError: No file of a package is one that the pins permit.
-        DependencyError: As with uv.
+    Raises ``PackageIntegrityError`` where no file of a package is one that the pins permit.
     """
     versions = [line.partition(" ")[0] for line in lock.text.splitlines()]
     found = listed(versions, python, lock.options)
     permitted = set(re.findall(r"--hash=sha256:([0-9a-f]{64})", lock.text))
-    built = origins(lock)
+    built = _origins(lock)
     kept = []
     for package in found:
         origin = next((built[one.sha256] for one in package.wheels if one.sha256 in built), None)
@@ -100,36 +107,32 @@ def described(lock: Lock, python: str) -> tuple[Package, ...]:
 def listed(
     versions: Sequence[str], python: str, options: Sequence[str] = (), *, refresh: bool = False
 ) -> tuple[Package, ...]:
-    """What the index has of each ``name==version``.
-
-    Raises:
-        DependencyError: As with uv.
-    """
+    """What the index has of each ``name==version``. Raises as ``uv.run``."""
     text = uv.run(
         [
             *("pip", "compile", "-", *uv.NO_BUILDS, "--no-deps", "--format", "pylock.toml"),
-            *(
-                "--no-header",
-                "--no-annotate",
-                *Target(python=python).options,
-                *index.options(),
-                *options,
-            ),
+            *("--no-header", "--no-annotate", *Target(python=python).options),
+            *(*index.options(), *options),
             *(("--refresh",) if refresh else ()),
         ],
         what="the files of the packages could not be listed",
         given="".join(f"{one}\n" for one in versions if "==" in one),
         timeout_s=_DESCRIBE_S,
     )
-    return read(toml.loads(text, "what uv says"), "what uv says")
+    where = "the answer of uv"
+    return read(document(text, where), where)
+
+
+def document(text: str, where: str) -> dict[str, Any]:
+    """The TOML of a lock file; ``LockError`` if it is none, or too long."""
+    try:
+        return toml.loads(text, MAX_CHARACTERS, generated=True)
+    except ValueError as error:
+        raise LockError(f"{where} is no TOML of a lock file: {error}") from error
 
 
 def read(document: Mapping[str, Any], where: str) -> tuple[Package, ...]:
-    """The packages in a lock file, sorted by name.
-
-    Raises:
-        LockError: It is none, or holds something else than wheels of an index.
-    """
+    """The packages in a lock file, sorted by name. Raises ``LockError``."""
     if document.get("lock-version") != "1.0":
         raise LockError(f"{where} is no lock file of version 1.0")
     given = document.get("packages")
@@ -146,15 +149,15 @@ def _package(given: object, where: str) -> Package:
     if not isinstance(given, dict):
         raise LockError(f"a package in {where} is no table")
     name, version = given.get("name"), given.get("version")
-    if not isinstance(name, str) or not _NAME.fullmatch(name):
+    if not _is(name, _NAME):
         raise LockError(f"{str(name)[:80]!r} in {where} is no normalized name of a package")
     try:
-        if not isinstance(version, str) or not _VERSION.fullmatch(version):
+        if not _is(version, _VERSION):
             raise InvalidVersion("no text")
         Version(version)
     except InvalidVersion as error:
         raise LockError(f"{name} in {where} has no version: {str(version)[:80]!r}") from error
-    if origin := read_origin(given, name, version, where):
+    if origin := _origin(given, name, version, where):
         return Package(name, version, (), origin)
     if others := sorted({"vcs", "directory", "archive", "marker"} & given.keys()):
         raise LockError(
@@ -167,14 +170,60 @@ def _package(given: object, where: str) -> Package:
 
 
 def _wheel(given: object, where: str) -> Wheel:
-    hashes = given.get("hashes") if isinstance(given, dict) else None
-    found = hashes.get("sha256") if isinstance(hashes, dict) else None
-    if not isinstance(given, dict) or not isinstance(found, str) or not _SHA256.fullmatch(found):
+    found = table(given, "hashes").get("sha256")
+    if not isinstance(given, dict) or not _is(found, _SHA256):
         raise LockError(f"a wheel of {where} has no SHA-256")
     url, size = given.get("url", ""), given.get("size")
     if type(size) is not int or size < 0:
         size = None
     return Wheel(found, without_login(url) if isinstance(url, str) else "", size)
+
+
+def table(given: object, name: str) -> Mapping[str, Any]:
+    """A table in a table; an empty one where there is none."""
+    found = given.get(name) if isinstance(given, dict) else None
+    return found if isinstance(found, dict) else {}
+
+
+def _is(value: object, form: re.Pattern[str]) -> TypeGuard[str]:
+    return isinstance(value, str) and form.fullmatch(value) is not None
+
+
+def _origin(given: Mapping[str, Any], name: str, version: str, where: str) -> WheelOrigin | None:
+    """What a package is built of; None for one that has wheels on an index."""
+    ours = table(table(given, "tool"), "envhub")
+    if not ours:
+        return None
+    wheel, environment = ours.get("wheel"), ours.get("environment")
+    if not _is(wheel, _SHA256) or not _is(environment, _SHA256):
+        raise LockError(f"{name} in {where} has no hashes of what was built")
+    if vcs := table(given, "vcs"):
+        return WheelOrigin(_of_git(vcs, name, version, where), environment, wheel)
+    sdist = table(given, "sdist")
+    url, digest = sdist.get("url"), table(sdist, "hashes").get("sha256")
+    if not _is(url, _URL) or not _is(digest, _SHA256):
+        raise LockError(f"{name} in {where} has no source with a URL and a SHA-256")
+    return WheelOrigin(Source(name, version, url, digest), environment, wheel)
+
+
+def _of_git(vcs: Mapping[str, Any], name: str, version: str, where: str) -> Source:
+    below = f"#subdirectory={vcs['subdirectory']}" if vcs.get("subdirectory") else ""
+    try:
+        asked = Requirement(f"{name} @ git+{vcs.get('url')}@{vcs.get('commit-id')}{below}")
+        found = of_git(asked, where)
+    except InvalidRequirement:
+        found = None
+    if found is None or not _COMMIT.fullmatch(found.commit):
+        raise LockError(f"{name} in {where} has no full commit of a repository of git")
+    return replace(found, name=name, version=version, where="")
+
+
+def _origins(lock: Lock) -> dict[str, WheelOrigin]:
+    """What was built here of the packages of a lock, by the hash of the wheel."""
+    folders = [Path(option) for option in lock.options if option.startswith("/")]
+    wheels = [wheel for folder in folders for wheel in folder.glob("*.whl")]
+    found = [built for built in map(wheel_store.describe, wheels) if built is not None]
+    return {one.wheel: one for one in found}
 
 
 def written(packages: Sequence[Package]) -> str:
@@ -184,7 +233,7 @@ def written(packages: Sequence[Package]) -> str:
         lines += ["", "[[packages]]", f"name = {quoted(package.name)}"]
         lines += [f"version = {quoted(package.version)}"]
         if package.origin is not None:
-            lines += package.origin.table
+            lines += _written_origin(package.origin)
             continue
         lines += ["wheels = ["]
         for wheel in package.wheels:
@@ -193,6 +242,19 @@ def written(packages: Sequence[Package]) -> str:
             lines.append(f"    {{ url = {quoted(wheel.url)}, {size}{hashes} }},")
         lines.append("]")
     return "\n".join([*lines, ""])
+
+
+def _written_origin(origin: WheelOrigin) -> list[str]:
+    source = origin.source
+    if source.commit:
+        below = f", subdirectory = {quoted(source.subdirectory)}" * bool(source.subdirectory)
+        where = f"url = {quoted(source.url)}, commit-id = {quoted(source.commit)}{below}"
+        first = f'vcs = {{ type = "git", {where} }}'
+    else:
+        hashes = f"hashes = {{ sha256 = {quoted(source.sha256)} }}"
+        first = f"sdist = {{ url = {quoted(source.url)}, {hashes} }}"
+    ours = f"wheel = {quoted(origin.wheel)}, environment = {quoted(origin.environment)}"
+    return [first, f"tool = {{ envhub = {{ {ours} }} }}"]
 
 
 def quoted(text: str) -> str:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox.errors import DependencyError, LockError, PolicyError, name_source
@@ -11,7 +12,10 @@ from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.option_names import option_name
 
 if TYPE_CHECKING:  # they cost time, and mostly there is no lock
+    from envhub_sandbox.dependencies.builds.sources import WheelOrigin
+    from envhub_sandbox.dependencies.interpreters import Interpreter
     from envhub_sandbox.dependencies.pipeline import PackageSet
+    from envhub_sandbox.dependencies.resolve import Lock
     from envhub_sandbox.locks.lockfile import LockFile
     from envhub_worker.protocol.manifest.manifest import Manifest
 
@@ -19,11 +23,8 @@ if TYPE_CHECKING:  # they cost time, and mostly there is no lock
 def opened(
     path: str | os.PathLike[str], sandbox: object, python: object, dependencies: object
 ) -> LockFile:
-    """The lock of these arguments of ``make_env``.
-
-    Raises:
-        LockError: It cannot be read.
-        PolicyError: The other arguments say something else.
+    """The lock of these arguments of ``make_env``; ``PolicyError`` if the others say something
+    else.
     """
     if python is not None or dependencies != "auto":
         raise PolicyError(
@@ -33,7 +34,7 @@ def opened(
     if sandbox != "process":
         raise PolicyError(
             f"{option_name('lock')} is for {option_name('sandbox', 'process')}; an image is locked "
-            "by its digest, and on another host whoever runs the server chooses its packages"
+            "by its digest, and on another host the operator of the server chooses its packages"
         )
     from envhub_sandbox.locks import lockfile
 
@@ -43,27 +44,54 @@ def opened(
 def provided(snapshot: Snapshot, lock: LockFile) -> PackageSet:
     """The environment of its packages; made if there is none.
 
-    Raises:
-        LockDriftError: The files or the interpreter are others.
-        DependencyError: It cannot be made; a package that was replaced is one of these.
+    Raises ``LockDriftError`` where the files or the interpreter are others.
     """
-    from envhub_sandbox.dependencies import environments, progress
+    from envhub_sandbox.dependencies import environments, interpreters, progress
     from envhub_sandbox.dependencies.pipeline import PackageSet
     from envhub_sandbox.locks import drift, lockfile, pylock
-    from envhub_sandbox.locks.built import with_wheels
 
-    drift.refuse(drift.files_and_commit(lock, snapshot), snapshot.label)
+    here = drift.with_files(lock, snapshot)
+    drift.refuse(drift.differences(lock, here), snapshot.label)
     try:
-        interpreter = lockfile.runner_here(lock)
-        drift.refuse(drift.runner(lock, lockfile.Runner.of(interpreter)), snapshot.label)
+        interpreter = interpreters.find(lock.runner.python)
+        here = replace(here, runner=lockfile.Runner.of(interpreter))
+        drift.refuse(drift.differences(lock, here), snapshot.label)
         with progress.shown("packages") as tell:
             locked = [one.origin for one in lock.packages if one.origin is not None]
-            pins = with_wheels(pylock.pins(lock.packages), locked, interpreter, tell)
+            pins = _with_wheels(pylock.pins(lock.packages), locked, interpreter, tell)
             made = environments.provide(pins, interpreter, tell)
             return PackageSet.of(made)
     except (DependencyError, LockError) as error:
         name_source(error, snapshot.label)
         raise
+
+
+def _with_wheels(
+    lock: Lock,
+    locked: Sequence[WheelOrigin],
+    interpreter: Interpreter,
+    tell: Callable[[str], None],
+) -> Lock:
+    """The lock with wheels of what has none: kept, or built again of the locked sources.
+    Raises ``DependencyError`` where one cannot be built, or its source is another.
+    """
+    from envhub_sandbox.dependencies import environments
+    from envhub_sandbox.dependencies.builds import wheel_store
+    from envhub_sandbox.dependencies.resolutions import build
+    from envhub_sandbox.dependencies.resolve import Lock
+
+    if not locked or environments.ready(environments.key_of(lock, interpreter)) is not None:
+        return lock
+    wheels = build([one.source for one in locked], interpreter, tell)
+    text, options = lock.text, list(lock.options)
+    for origin, wheel in zip(locked, wheels, strict=True):
+        built = wheel_store.describe(wheel)
+        assert built is not None
+        if built.wheel != origin.wheel:
+            tell(f"{origin.source.name} was built again, and not to the same bytes")
+        text = text.replace(f"sha256:{origin.wheel}", f"sha256:{built.wheel}")
+        options += ["--find-links", str(wheel.parent)]
+    return Lock(text, tuple(options))
 
 
 def checker(

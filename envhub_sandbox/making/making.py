@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from envhub_sandbox.dependencies.choice import Choice, chosen
-from envhub_sandbox.dependencies.missing_module import MissingModule
+from envhub_sandbox.dependencies.modules import MissingModule
 from envhub_sandbox.dependencies.pipeline import PackageSet, packages_for
+from envhub_sandbox.dependencies.request import Choice, chosen
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.hub import store
 from envhub_sandbox.hub.snapshot import Snapshot, named
@@ -161,7 +161,9 @@ def _repository(
         options.copy,
         recipe=recipe,
         installed=packages.facts if packages else None,
-        advice=MissingModule(snapshot, wanted.place.name, wanted.choice, wanted.python, own).advice,
+        advice=MissingModule(
+            snapshot, wanted.place.name, wanted.choice.where, wanted.python, own
+        ).advice,
     )
 
 

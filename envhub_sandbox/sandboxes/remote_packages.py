@@ -21,7 +21,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.text import printable
 
 if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.declared import Wanted
+    from envhub_sandbox.dependencies.declared import WantedPackage
 
 _POLL_S = 0.5
 _NAME_CHARS = 64
@@ -63,7 +63,7 @@ def order_of(request: PackageRequest) -> m.NeedPackages:
     )
 
 
-def _rows(wanted: Sequence[Wanted]) -> tuple[tuple[str, str], ...]:
+def _rows(wanted: Sequence[WantedPackage]) -> tuple[tuple[str, str], ...]:
     return tuple((str(one), one.where) for one in wanted)
 
 

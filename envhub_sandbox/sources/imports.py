@@ -9,11 +9,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.sources.parsing import Named, Parsed
+from envhub_sandbox.sources.parsing import ImportStatement, ParsedFile
 
-Files = Mapping[str, Parsed | None]
+Files = Mapping[str, ParsedFile | None]
 
 
 _MOST_ROUNDS = 100
@@ -64,24 +66,21 @@ class _Reached:
                 return
 
     def _follow(self, file: str) -> None:
-        parsed = self._parsed[file] or Parsed()
+        parsed = self._parsed[file] or ParsedFile()
         for name, used in parsed.definitions:
             if not name or name in self._used:
                 self._used.update(used)
         for one in parsed.imports:
             if one.required and (not one.within or one.within in self._used):
                 for module, own in _targets(one, file, self._names):
-                    self._add(module, own, file, one.line)
-
-    def _add(self, module: str, own: str, file: str, line: int) -> None:
-        name = module.partition(".")[0]
-        if own in self._parsed:
-            self.files.add(own)
-        elif not own and name and name not in sys.stdlib_module_names:
-            self.imports.add(Import(name, file, line, module))
+                    name = module.partition(".")[0]
+                    if own in self._parsed:
+                        self.files.add(own)
+                    elif not own and name and name not in sys.stdlib_module_names:
+                        self.imports.add(Import(name, file, one.line, module))
 
 
-def _targets(one: Named, file: str, files: set[str]) -> Iterator[tuple[str, str]]:
+def _targets(one: ImportStatement, file: str, files: set[str]) -> Iterator[tuple[str, str]]:
     """Each module that is named, and the repository's own file if it is one."""
     folder = file.rpartition("/")[0]
     for _ in range(one.level - 1):
@@ -106,3 +105,18 @@ def _own(name: str, folder: str, files: set[str]) -> str:
             if candidate in files:
                 return candidate
     return ""
+
+
+def of_module(name: str) -> list[str]:
+    """The distributions that bring a module, the usual one first; empty where none is known."""
+    table = _table()
+    while name and name not in table:
+        name = name.rpartition(".")[0]
+    return table.get(name, [])
+
+
+@cache
+def _table() -> dict[str, list[str]]:
+    text = Path(__file__).with_name("modules.txt").read_text("utf-8")
+    rows = [line.split() for line in text.splitlines() if not line.startswith("#")]
+    return {module: names or [module] for module, *names in rows}

@@ -29,7 +29,7 @@ CPU_S = 20.0
 """For one file; 256 KiB that a person wrote take less than one."""
 OUTPUT = 64 << 20
 MOST = 10_000
-"""Of each kind that are told of one file."""
+"""Of each kind, for one file."""
 LONGEST = 1024
 """Of a module, as a path of a file can be."""
 _LONGEST_TEXT = 200
@@ -216,7 +216,7 @@ def _may_be(node: ast.expr) -> bool:
 
 
 def _text(node: ast.Constant) -> list[list[Any]]:
-    """Of texts that name places beyond the repository, or that nobody can read."""
+    """Of texts that name places beyond the repository, or that no person can read."""
     text = str(node.value)
     if len(text) <= _LONGEST_TEXT and _OUTSIDE.fullmatch(text):
         return [["outside", text, len(text), node.lineno]]

@@ -30,7 +30,7 @@ _PATIENCE_S = 600.0
 
 
 @dataclass(frozen=True)
-class Named:
+class ImportStatement:
     """One statement of import.
 
     Attributes:
@@ -52,7 +52,7 @@ class Named:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Parsed:
+class ParsedFile:
     """What a file says; each with its line at the end. Names are followed to their imports.
 
     Attributes:
@@ -70,7 +70,7 @@ class Parsed:
         is_python: Of this version.
     """
 
-    imports: tuple[Named, ...] = ()
+    imports: tuple[ImportStatement, ...] = ()
     calls: tuple[tuple[str, int], ...] = ()
     uses: tuple[tuple[str, int], ...] = ()
     fetches: tuple[tuple[str, str | None, int], ...] = ()
@@ -82,14 +82,14 @@ class Parsed:
     is_python: bool = True
 
 
-def read(snapshot: Snapshot) -> dict[str, Parsed | None]:
+def read(snapshot: Snapshot) -> dict[str, ParsedFile | None]:
     """Every Python file of a snapshot; None for those that have not been read.
 
     That is: larger than a person writes, beyond what all may take, or what the parser has not
     survived.
     """
     names = sorted(one.path for one in snapshot.files if one.path.endswith(".py"))
-    found: dict[str, Parsed | None] = dict.fromkeys(names)
+    found: dict[str, ParsedFile | None] = dict.fromkeys(names)
     left, texts = MOST_BYTES_IN_ALL, {}
     for name in names:
         data = content(snapshot.root / name, MOST_BYTES)
@@ -120,9 +120,9 @@ def content(path: Path, most: int) -> bytes | None:
     return data if len(data) <= most else None
 
 
-def parsed(texts: Mapping[str, bytes]) -> dict[str, Parsed | None]:
+def parsed(texts: Mapping[str, bytes]) -> dict[str, ParsedFile | None]:
     """What each text is; None where it was too much for a child."""
-    found: dict[str, Parsed | None] = dict.fromkeys(texts)
+    found: dict[str, ParsedFile | None] = dict.fromkeys(texts)
     waiting = list(texts)
     for _ in range(MOST_LOST):
         if not waiting:
@@ -134,7 +134,7 @@ def parsed(texts: Mapping[str, bytes]) -> dict[str, Parsed | None]:
     return found
 
 
-def _answers(texts: list[bytes]) -> Iterator[Parsed | None]:
+def _answers(texts: list[bytes]) -> Iterator[ParsedFile | None]:
     with tempfile.TemporaryFile() as given, tempfile.TemporaryFile() as taken:
         for text in texts:
             given.write(len(text).to_bytes(4, "big"))
@@ -163,13 +163,13 @@ def _run(given: IO[bytes], taken: IO[bytes]) -> None:
         return  # it has been killed; what it has answered counts
 
 
-def _answer(row: Any) -> Parsed | None:
+def _answer(row: Any) -> ParsedFile | None:
     if row is None:
         return None
     if not row or "encoding" in row:
-        return Parsed(is_python=bool(row), **row)
+        return ParsedFile(is_python=bool(row), **row)
     imports = (
-        Named(level, module, tuple(names), required, line, within)
+        ImportStatement(level, module, tuple(names), required, line, within)
         for level, module, names, required, line, within in row["imports"]
     )
     definitions = ((name, tuple(names)) for name, names in row["definitions"])
@@ -178,4 +178,4 @@ def _answer(row: Any) -> Parsed | None:
         for kind, rows in row.items()
         if kind not in ("imports", "definitions")
     }
-    return Parsed(imports=tuple(imports), definitions=tuple(definitions), **rest)
+    return ParsedFile(imports=tuple(imports), definitions=tuple(definitions), **rest)

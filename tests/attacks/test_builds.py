@@ -16,7 +16,7 @@ import pytest
 from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.builds import jail
 from envhub_sandbox.dependencies.builds.build import build_wheels
-from envhub_sandbox.dependencies.pipeline import lock_for
+from envhub_sandbox.dependencies.resolutions import lock_for
 from envhub_sandbox.errors import DependencyError
 from tests.attacks.harness import Arena, kill_named, new_alias, pids_named, token
 from tests.attacks.listeners import listening

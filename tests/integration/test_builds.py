@@ -12,9 +12,9 @@ from envhub_sandbox import make_env
 from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.builds import git, wheel_store
 from envhub_sandbox.dependencies.builds.build import build_wheels
-from envhub_sandbox.dependencies.choice import Choice
-from envhub_sandbox.dependencies.pipeline import lock_for
-from envhub_sandbox.dependencies.sources import Source
+from envhub_sandbox.dependencies.builds.sources import Source
+from envhub_sandbox.dependencies.request import Choice
+from envhub_sandbox.dependencies.resolutions import lock_for
 from envhub_sandbox.errors import DependencyError, PackageIntegrityError, ResolutionError
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.hub.store import cache_root, remove_tree
@@ -73,7 +73,7 @@ def test_it_is_built_with_what_it_asks_for_and_once(packages: Index, tmp_path: P
     assert "building x 1.0 in a jail" in said
     known = wheel_store.describe(wheel)
     assert known is not None
-    assert known.source == f"sha256:{source.sha256}"
+    assert known.source.identity == f"sha256:{source.sha256}"
     (tmp_path / "x-1.0.tar.gz").unlink()
     said.clear()
     packages.broken = 503
@@ -123,7 +123,7 @@ def test_a_commit_of_git(packages: Index, tmp_path: Path, monkeypatch: pytest.Mo
     assert wheel.name == "x-3.0-py3-none-any.whl"
     known = wheel_store.describe(wheel)
     assert known is not None
-    assert known.source == f"git+{address}/repo@{commit}#subdirectory=python"
+    assert known.source.identity == f"git+{address}/repo@{commit}#subdirectory=python"
 
 
 ENV = """

@@ -20,7 +20,7 @@ import zmq
 
 from envhub_sandbox.check.play import confinement
 from envhub_sandbox.crash import bundle_writer
-from envhub_sandbox.dependencies import environments, guesses, interpreters, resolutions
+from envhub_sandbox.dependencies import environments, interpreters, modules, resolutions
 from envhub_sandbox.making import making
 from envhub_sandbox.sandboxes import remote
 from envhub_sandbox.sandboxes.docker import sandbox
@@ -387,7 +387,7 @@ def making_an_environment(step: str) -> Spot:
 
 def imports_in_memory() -> Spot:
     """What was read of repositories in this process."""
-    return guesses, "_READ"
+    return modules, "_READ"
 
 
 def finding_interpreters() -> Spot:

@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator
 
 from envhub_sandbox.check.findings import Finding
-from envhub_sandbox.sources.parsing import Parsed
+from envhub_sandbox.sources.parsing import ParsedFile
 
 _NETWORK, _PROCESS, _DYNAMIC, _PICKLE, _NATIVE, _OUTSIDE, _OBSCURE = (
     f"source-{kind}"
@@ -60,7 +60,7 @@ _REFLECTED = ("os", "sys", "builtins", "importlib", "subprocess", "socket", "cty
 _LONG_LINE = re.compile(r"^[^\n]{2000,}", re.MULTILINE)
 
 
-def constructs(file: str, parsed: Parsed) -> Iterator[Finding]:
+def constructs(file: str, parsed: ParsedFile) -> Iterator[Finding]:
     """What a file has of them, each once in a line."""
     found = (*_imported(parsed), *_named(parsed), *_fetched(parsed), *_said(parsed))
     for line, check, message in sorted(set(found)):
@@ -75,7 +75,7 @@ def long_lines(file: str, text: str) -> Iterator[Finding]:
         yield Finding(_OBSCURE, message, file=file, line=line)
 
 
-def _imported(parsed: Parsed) -> Iterator[tuple[int, str, str]]:
+def _imported(parsed: ParsedFile) -> Iterator[tuple[int, str, str]]:
     for one in parsed.imports:
         # below 0: names of modules; 0: names out of one; above: relative
         modules = one.names if one.level < 0 else () if one.level else (one.module,)
@@ -84,7 +84,7 @@ def _imported(parsed: Parsed) -> Iterator[tuple[int, str, str]]:
                 yield one.line, check, f"imports {name}"
 
 
-def _named(parsed: Parsed) -> Iterator[tuple[int, str, str]]:
+def _named(parsed: ParsedFile) -> Iterator[tuple[int, str, str]]:
     for name, line in parsed.calls:
         if check := _CALLS.get(name):
             yield line, check, f"calls {name}"
@@ -93,7 +93,7 @@ def _named(parsed: Parsed) -> Iterator[tuple[int, str, str]]:
             yield line, check, f"uses {name}"
 
 
-def _fetched(parsed: Parsed) -> Iterator[tuple[int, str, str]]:
+def _fetched(parsed: ParsedFile) -> Iterator[tuple[int, str, str]]:
     for module, name, line in parsed.fetches:
         if (module, name) == ("numpy.load", "allow_pickle"):
             yield line, _PICKLE, "calls numpy.load with allow_pickle"
@@ -103,7 +103,7 @@ def _fetched(parsed: Parsed) -> Iterator[tuple[int, str, str]]:
             yield line, check, f"gets {module}.{name} by its name"
 
 
-def _said(parsed: Parsed) -> Iterator[tuple[int, str, str]]:
+def _said(parsed: ParsedFile) -> Iterator[tuple[int, str, str]]:
     for kind, text, length, line in parsed.texts:
         if kind == "outside":
             yield line, _OUTSIDE, f"names {text!r}"

@@ -17,8 +17,8 @@ from packaging.utils import canonicalize_name
 
 from envhub_sandbox.check.findings import Finding
 from envhub_sandbox.check.static.survey import File, survey
-from envhub_sandbox.dependencies import host
-from envhub_sandbox.dependencies.declared import Declared, declared
+from envhub_sandbox.dependencies import installed
+from envhub_sandbox.dependencies.declared import DeclaredPackages, declared
 from envhub_sandbox.dependencies.resolve import WORKERS
 from envhub_sandbox.errors import RequirementError
 from envhub_sandbox.hub.snapshot import Snapshot
@@ -47,7 +47,7 @@ class Static:
     files: list[File]
     entries: tuple[tuple[str, int], ...]
     imports: list[Import]
-    declared: Declared | None
+    declared: DeclaredPackages | None
     findings: list[Finding]
 
     @property
@@ -157,7 +157,7 @@ def undeclared(
 
 def _of_this_interpreter(declared: Mapping[str, Requirement]) -> set[str]:
     wanted = [*map(Requirement, WORKERS), *declared.values()]
-    return {module for one in host.brought(wanted) for module in _modules(one)}
+    return {module for one in installed.brought(wanted) for module in _modules(one)}
 
 
 def _modules(found: metadata.Distribution) -> set[str]:

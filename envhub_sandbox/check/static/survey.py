@@ -19,7 +19,7 @@ from envhub_sandbox.errors import SnapshotError
 from envhub_sandbox.hub.checkout import Checkout
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
 from envhub_sandbox.hub.local import LocalFolder
-from envhub_sandbox.sources.parsing import MOST_BYTES, Parsed
+from envhub_sandbox.sources.parsing import MOST_BYTES, ParsedFile
 
 _MOST_BYTES_OF_TEXT = 1 << 20
 _MOST_BYTES_IN_ALL = 32 << 20
@@ -66,7 +66,7 @@ class Survey:
                 self.findings.append(one)
 
 
-def survey(snapshot: Snapshot, parsed: Mapping[str, Parsed | None]) -> Survey:
+def survey(snapshot: Snapshot, parsed: Mapping[str, ParsedFile | None]) -> Survey:
     """Look at every file of a repository, and at what ``parsing.read`` read of it."""
     found = Survey()
     found.add(_papers(snapshot))
@@ -109,7 +109,7 @@ def _in_text(record: FileRecord, path: Path, *, is_code: bool) -> Iterator[Findi
         yield from long_lines(record.path, text)
 
 
-def _in_code(record: FileRecord, parsed: Parsed | None) -> Iterator[Finding]:
+def _in_code(record: FileRecord, parsed: ParsedFile | None) -> Iterator[Finding]:
     if parsed is None:
         larger = f"it is larger than {MOST_BYTES >> 10} KiB"
         other = "it is more than can be read of a file, or of a repository"

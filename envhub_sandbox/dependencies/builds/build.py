@@ -22,11 +22,11 @@ from envhub_sandbox.dependencies.builds import (
     wheel_store,
     wheels,
 )
+from envhub_sandbox.dependencies.builds.sources import Source
 from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.dependencies.resolve import Lock
-from envhub_sandbox.dependencies.sources import Source
 from envhub_sandbox.errors import DependencyError, RequirementError, ResolutionError
 from envhub_sandbox.hub.logins import without_login
 from envhub_worker.protocol.runtime import OWN
@@ -46,30 +46,19 @@ def build_wheels(
 ) -> list[Path]:
     """A wheel of each: kept from before, or built in a jail without network.
 
-    Args:
-        sources: What there is no wheel of.
-        interpreter: What they are for.
-        tell: Gets a line for each thing that happens.
-        choose: Gives versions of what they are built with.
-
-    Raises:
-        ResolutionError: One cannot be built; the text says why, and what is missing here.
-        DependencyError: As with downloads; and where sources or a wheel are refused, or this host
-            has no jail to build in.
+    ``choose`` gives versions of what they are built with. Raises ``ResolutionError`` where one
+    cannot be built, with what is missing here; ``DependencyError`` where sources or a wheel are
+    refused, or this host has no jail.
     """
-    if _UNDER_WAY.get():
-        return [_wheel(source, interpreter, tell, choose) for source in sources]
-    token = _BUILDS.set(itertools.count(1))
-    try:
-        return [_wheel(source, interpreter, tell, choose) for source in sources]
-    finally:
-        _BUILDS.reset(token)
+    if not _UNDER_WAY.get():
+        _BUILDS.set(itertools.count(1))
+    return [_wheel(source, interpreter, tell, choose) for source in sources]
 
 
 def _wheel(source: Source, interpreter: Interpreter, tell: Tell, choose: Choose) -> Path:
     if source.commit:
         source = replace(source, commit=git.resolve(source.url, source.commit))
-    known = wheel_store.recall(identity(source), interpreter)
+    known = wheel_store.recall(source, interpreter)
     if known is not None:
         wheels.named(known.name, source.name, source.version)  # one commit, asked for as another
         return known
@@ -77,14 +66,6 @@ def _wheel(source: Source, interpreter: Interpreter, tell: Tell, choose: Choose)
         Path(place).chmod(0o755)  # a jail's user is another one
         tree = _fetched(source, Path(place), tell)
         return _Build(source, tree, Path(place), interpreter, tell, choose).wheel()
-
-
-def identity(source: Source) -> str:
-    """What names its content: the hash of a file, or a full commit."""
-    if not source.commit:
-        return f"sha256:{source.sha256}"
-    below = f"#subdirectory={source.subdirectory}" if source.subdirectory else ""
-    return f"git+{source.url}@{source.commit}{below}"
 
 
 @contextmanager
@@ -159,11 +140,7 @@ class _Build:
         self._project = project.read(tree, _title(source))
 
     def wheel(self) -> Path:
-        """Built, checked and kept.
-
-        Raises:
-            ResolutionError: It cannot be built; the text is of the last try.
-        """
+        """Built, checked and kept. Raises ``ResolutionError``."""
         further: tuple[str, ...] = ()
         while True:
             try:
@@ -197,7 +174,8 @@ class _Build:
             folder.chmod(0o755)
             found = jail.build(self._order(packages, known), folder)
             if isinstance(found, Path):
-                return self._kept(found, lock)
+                wheels.check(found, self._source.name, self._source.version, self._interpreter)
+                return wheel_store.keep(found, self._source, lock, self._interpreter)
             known = (*known, *found)
         raise jail.BuildFailedError("its backend never has all that it needs")
 
@@ -212,13 +190,19 @@ class _Build:
         lock = self._choose(request, self._interpreter, self._tell)
         return environments.provide(lock, self._interpreter, self._tell).packages, lock.digest
 
-    def _order(self, packages: Path, known: tuple[str, ...]) -> jail.Order:
-        return jail.Order(
-            *(self._tree, self._project, packages, self._interpreter),
-            runtime=self._runtime(),
-            known=(*(str(one.requirement) for one in self._project.requires), *known),
-            environment=self._variables(),
-        )
+    def _order(self, packages: Path, known: tuple[str, ...]) -> dict[str, object]:
+        # without ``.git`` nothing else says a version to those that ask git for it
+        version = {"SETUPTOOLS_SCM_PRETEND_VERSION": f"0+g{self._source.commit[:12]}"}
+        return {
+            "source": str(self._tree),
+            "packages": str(packages),
+            "python": self._interpreter.path,
+            "runtime": self._runtime(),
+            "backend": self._project.backend,
+            "backend_path": self._project.backend_path,
+            "known": (*(str(one.requirement) for one in self._project.requires), *known),
+            "environment": version if self._source.commit else {},
+        }
 
     def _runtime(self) -> tuple[str, str]:
         """What runs the jail's own code: here our own packages, else ones that are made."""
@@ -229,19 +213,6 @@ class _Build:
         )
         environment = environments.provide(lock, self._interpreter, self._tell)
         return environment.python, str(environment.packages)
-
-    def _variables(self) -> dict[str, str]:
-        """Without ``.git`` nothing else says a version to those that ask git for it."""
-        if not self._source.commit:
-            return {}
-        return {"SETUPTOOLS_SCM_PRETEND_VERSION": f"0+g{self._source.commit[:12]}"}
-
-    def _kept(self, wheel: Path, lock: str) -> Path:
-        source = self._source
-        wheels.check(wheel, source.name, source.version, self._interpreter)
-        url = without_login(source.url)
-        facts = identity(source), url, lock
-        return wheel_store.keep(wheel, *facts, self._interpreter)
 
     def _failed(self, failed: DependencyError) -> ResolutionError:
         source, log = self._source, str(failed)

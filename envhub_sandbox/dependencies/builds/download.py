@@ -14,7 +14,6 @@ import re
 import ssl
 import urllib.error
 import urllib.request
-from collections.abc import Mapping
 from pathlib import Path
 from typing import IO
 from urllib.parse import unquote, urlsplit
@@ -36,13 +35,7 @@ _INDEXES = ("UV_DEFAULT_INDEX", "UV_INDEX", "UV_INDEX_URL", "UV_EXTRA_INDEX_URL"
 
 
 def download(url: str, sha256: str, target: Path) -> None:
-    """Write the file of a URL.
-
-    Raises:
-        IndexUnavailableError: It cannot be had.
-        PackagesTooLargeError: It is too large.
-        PackageIntegrityError: It has another hash.
-    """
+    """Write the file of a URL, if it is there, not too large, and of this hash."""
     shown = without_login(url)
     try:
         with _opened(url) as source, target.open("wb") as file:
@@ -83,9 +76,14 @@ def _opened(url: str) -> IO[bytes]:
         # not to where it is redirected
         request.add_unredirected_header("Authorization", authorization(login))
     context = ssl.create_default_context(cafile=settings.get("SSL_CERT_FILE"))
+    lower = {name.lower(): value for name, value in settings.items()}
+    named = {
+        name: lower.get(f"{name}_proxy") or lower.get("all_proxy") for name in ("http", "https")
+    }
+    proxies = {name: proxy for name, proxy in named.items() if proxy}
     opener = urllib.request.OpenerDirector()
     for handler in (
-        urllib.request.ProxyHandler(_proxies(settings)),
+        urllib.request.ProxyHandler(proxies),
         urllib.request.HTTPHandler(),
         urllib.request.HTTPSHandler(context=context),
         urllib.request.HTTPRedirectHandler(),
@@ -95,15 +93,6 @@ def _opened(url: str) -> IO[bytes]:
         opener.add_handler(handler)
     opened: IO[bytes] = opener.open(request, timeout=_TIMEOUT_S)
     return opened
-
-
-def _proxies(settings: Mapping[str, str]) -> dict[str, str]:
-    lower = {name.lower(): value for name, value in settings.items()}
-    return {
-        scheme: proxy
-        for scheme in ("http", "https")
-        if (proxy := lower.get(f"{scheme}_proxy") or lower.get("all_proxy"))
-    }
 
 
 def login_for(url: str) -> tuple[str, str] | None:

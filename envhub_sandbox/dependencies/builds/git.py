@@ -74,11 +74,7 @@ def resolve(url: str, revision: str) -> str:
 def check_out(url: str, commit: str, folder: Path, tell: Callable[[str], None]) -> None:
     """Write the files of a commit below a folder that is there and empty.
 
-    Links and submodules are left out, and said.
-
-    Raises:
-        IndexUnavailableError: It cannot be fetched.
-        PackagesTooLargeError, PackageIntegrityError: As ``lay_out``.
+    Links and submodules are left out, and named to ``tell``.
     """
     address = _checked(url)
     with tempfile.TemporaryDirectory(prefix="envhub-git-") as place:

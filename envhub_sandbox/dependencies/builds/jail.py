@@ -7,14 +7,11 @@ import os
 import subprocess
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from envhub_sandbox import errors
-from envhub_sandbox.dependencies.builds.project import Project
 from envhub_sandbox.dependencies.builds.wheels import MAX_BYTES
-from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.system import processes
 from envhub_worker.protocol.text import printable
@@ -32,37 +29,12 @@ class BuildFailedError(DependencyError):
     """The build backend failed, or was ended; the text is what it printed last."""
 
 
-@dataclass(frozen=True)
-class Order:
-    """What is built, and with what.
-
-    Attributes:
-        source: The folder of the sources.
-        project: How they say that they are built.
-        packages: The folder of the packages for that.
-        interpreter: What the wheel is for.
-        runtime: What runs the jail's own code: an interpreter and a folder of packages.
-        known: What the backend is known to need besides what the sources say.
-        environment: Further variables for the build.
-    """
-
-    source: Path
-    project: Project
-    packages: Path
-    interpreter: Interpreter
-    runtime: tuple[str, str]
-    known: tuple[str, ...]
-    environment: Mapping[str, str]
-
-
-def build(order: Order, folder: Path) -> Path | tuple[str, ...]:
+def build(order: Mapping[str, Any], folder: Path) -> Path | tuple[str, ...]:
     """A wheel below an empty folder, or what the build backend needs besides.
 
-    Nothing of either has been looked at: they are a stranger's.
-
-    Raises:
-        BuildFailedError: It failed.
-        DependencyError: There is no jail on this host.
+    Nothing of either has been looked at: they are a stranger's. The order is read by
+    ``making/builder.py``; limits, profile and what the jail may read are added here. Raises
+    ``BuildFailedError``, or ``DependencyError`` where there is no jail on this host.
     """
     said = _run(order, folder)
     further, name = said.get("requires"), said.get("wheel")
@@ -73,23 +45,16 @@ def build(order: Order, folder: Path) -> Path | tuple[str, ...]:
     return folder / "wheel" / os.path.basename(name)
 
 
-def _run(order: Order, folder: Path) -> dict[str, Any]:
-    told = {
-        "source": str(order.source),
-        "packages": str(order.packages),
-        "readable": [str(order.source), str(order.packages), str(folder / "tools")],
-        "python": order.interpreter.path,
-        "runtime": order.runtime,
-        "backend": order.project.backend,
-        "backend_path": order.project.backend_path,
-        "known": order.known,
-        "environment": dict(order.environment),
+def _run(order: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    whole = {
+        **order,
+        "readable": [order["source"], order["packages"], str(folder / "tools")],
         "limits": LIMITS,
         "wall_s": WALL_S,
         "max_bytes": MAX_BYTES,
         "profile": os.environ.get(PROFILE_VARIABLE) or "strict",
     }
-    (folder / "order.json").write_text(json.dumps(told))
+    (folder / "order.json").write_text(json.dumps(whole))
     with processes.pidfd() as ourselves:
         done = subprocess.run(
             [sys.executable, "-I", "-m", _PROGRAM, str(folder), str(ourselves)],
@@ -100,14 +65,10 @@ def _run(order: Order, folder: Path) -> dict[str, Any]:
             timeout=WALL_S + _AROUND_S,
         )
     try:
-        said = json.loads(done.stdout)
+        said: dict[str, Any] = json.loads(done.stdout)
     except ValueError as error:
         shown = printable(done.stderr.decode("utf-8", "replace")[-_SHOWN:])
         raise DependencyError(f"the program that builds failed:\n{shown}") from error
-    return _heard(said)
-
-
-def _heard(said: dict[str, Any]) -> dict[str, Any]:
     if "error" in said:
         kind = getattr(errors, str(said["error"]), DependencyError)
         text = str(said["said"])

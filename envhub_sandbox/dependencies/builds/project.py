@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.dependencies.declared import MAX_BYTES, MAX_DOTS, Wanted, parse_requirement
+from envhub_sandbox.dependencies.declared import MAX_BYTES, WantedPackage, parse_requirement
 from envhub_sandbox.errors import RequirementError
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from envhub_sandbox.sources import toml
 
 _LEGACY = ("setuptools", "wheel")
 _LEGACY_BACKEND = "setuptools.build_meta:__legacy__"
@@ -22,15 +17,11 @@ _MOST = 200
 
 @dataclass(frozen=True)
 class Project:
-    """What is needed to build it.
-
-    Attributes:
-        requires: The packages that it is built with.
-        backend: What builds it, as ``module:object``.
-        backend_path: Folders of the sources that the backend is looked for in first.
+    """What it is built with: packages, the backend (``module:object``), and folders of the sources
+    that the backend is looked for in first.
     """
 
-    requires: tuple[Wanted, ...]
+    requires: tuple[WantedPackage, ...]
     backend: str
     backend_path: tuple[str, ...] = ()
 
@@ -41,23 +32,17 @@ class Project:
 
 
 def read(tree: Path, title: str) -> Project:
-    """What the sources say; where they say nothing, setuptools builds them.
-
-    Raises:
-        RequirementError: It cannot be read, or is asked for what is not taken.
-    """
+    """What the sources say; where they say nothing, setuptools builds them."""
     where = f"[build-system] of {title}"
     table = _table(tree / "pyproject.toml", where)
     requires = _texts(table.get("requires", list(_LEGACY)), where)
     backend = table.get("build-backend", _LEGACY_BACKEND)
     paths = _texts(table.get("backend-path", []), where)
-    if not isinstance(backend, str) or not all(map(str.isidentifier, _words(backend))):
+    if not isinstance(backend, str) or not all(
+        map(str.isidentifier, backend.replace(":", ".", 1).split("."))
+    ):
         raise RequirementError(f"{where}: {str(backend)[:200]!r} is no build backend")
     return Project(tuple(parse_requirement(text, where) for text in requires), backend, paths)
-
-
-def _words(backend: str) -> list[str]:
-    return backend.replace(":", ".", 1).split(".")
 
 
 def _table(path: Path, where: str) -> dict[str, Any]:
@@ -66,11 +51,10 @@ def _table(path: Path, where: str) -> dict[str, Any]:
     with path.open("rb") as file:
         data = file.read(MAX_BYTES + 1)
     try:
-        text = data.decode("utf-8-sig")
-        if len(data) > MAX_BYTES or text.count(".") > MAX_DOTS:
+        if len(data) > MAX_BYTES:
             raise ValueError("it is too long")
-        table = tomllib.loads(text).get("build-system", {})
-    except (ValueError, RecursionError) as error:
+        table = toml.loads(data.decode("utf-8-sig"), MAX_BYTES).get("build-system", {})
+    except ValueError as error:
         raise RequirementError(f"{where} cannot be read: {str(error)[:200]}") from error
     if not isinstance(table, dict):
         raise RequirementError(f"{where} is no table")

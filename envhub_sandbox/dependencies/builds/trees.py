@@ -31,7 +31,7 @@ AT_ONCE = 2**20
 MAX_TABLE = 16 * 2**20
 """Of a zip's table of contents."""
 _HEADERS = 1000
-PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """How members of a zip may be packed: Python unpacks other ways whole, whatever it is asked for."""
 _FAR = 2 * MAX_BYTES
 _BLOCK = 1 << 20
@@ -43,14 +43,7 @@ _TARS: dict[str, Callable[..., Any]] = {".gz": gzip.open, ".tgz": gzip.open, ".b
 
 @dataclass(frozen=True)
 class Member:
-    """A regular file that is to be written.
-
-    Attributes:
-        path: Relative, with ``/``.
-        size: In bytes.
-        executable: Whether it may be executed.
-        open: Gives a stream of its bytes.
-    """
+    """A regular file that is to be written; ``open`` gives a stream of its bytes."""
 
     path: str
     size: int
@@ -59,11 +52,8 @@ class Member:
 
 
 def lay_out(members: Iterable[Member], folder: Path, title: str) -> None:
-    """Write files below a folder that is there and empty.
-
-    Raises:
-        PackagesTooLargeError: They are too large, or too many.
-        PackageIntegrityError: A name could leave the folder, or a file is longer than it says.
+    """Write files below a folder that is there and empty; within bounds, under names that stay in
+    it.
     """
     kept = list(_bounded(members, title))
     try:
@@ -102,12 +92,7 @@ def _copy(source: IO[bytes], target: IO[bytes], member: Member, title: str) -> N
 
 
 def unpack(archive: Path, folder: Path, title: str) -> Path:
-    """Unpack a source distribution below a folder, and return its one top folder.
-
-    Raises:
-        PackagesTooLargeError: As ``lay_out``.
-        PackageIntegrityError: It is no such archive, or holds something else than files.
-    """
+    """Unpack a source distribution below a folder, as ``lay_out``; gives its one top folder."""
     try:
         with _members(archive, title) as members:
             lay_out(members, folder, title)
@@ -126,10 +111,10 @@ def unpack(archive: Path, folder: Path, title: str) -> Path:
 def _members(archive: Path, title: str) -> Iterator[Iterator[Member]]:
     with ExitStack() as stack:
         if archive.suffix == ".zip":
-            stream: Any = Bounded(stack.enter_context(archive.open("rb")), title, MAX_TABLE)
+            stream: Any = BoundedStream(stack.enter_context(archive.open("rb")), title, MAX_TABLE)
             yield _of_zip(stack.enter_context(zipfile.ZipFile(stream)), title)
         elif opener := _TARS.get(archive.suffix):
-            stream = Bounded(stack.enter_context(opener(archive, "rb")), title)
+            stream = BoundedStream(stack.enter_context(opener(archive, "rb")), title)
             yield _of_tar(stack.enter_context(tarfile.open(fileobj=stream, mode="r:")), title)
         else:
             raise PackageIntegrityError(
@@ -137,7 +122,7 @@ def _members(archive: Path, title: str) -> Iterator[Iterator[Member]]:
             )
 
 
-class Bounded(io.RawIOBase):
+class BoundedStream(io.RawIOBase):
     """A stream that refuses to be read far, or much at once: an archive says its own lengths."""
 
     def __init__(self, stream: IO[bytes], title: str, at_once: int = AT_ONCE) -> None:
@@ -194,15 +179,23 @@ def _of_tar(archive: tarfile.TarFile, title: str) -> Iterator[Member]:
         yield Member(path, member.size, bool(member.mode & stat.S_IXUSR), opened)
 
 
+def check_packing(member: zipfile.ZipInfo, title: str) -> None:
+    """Refuse what is neither file nor folder, and what Python unpacks whole."""
+    kinds = (0, stat.S_IFREG, *([stat.S_IFDIR] if member.is_dir() else []))
+    if stat.S_IFMT(member.external_attr >> 16) not in kinds:
+        raise _no_file(title, member.filename)
+    if member.compress_type not in _PACKINGS:
+        raise PackageIntegrityError(
+            f"{title} holds {member.filename[:200]!r}, packed in another way, which is not read"
+        )
+
+
 def _of_zip(archive: zipfile.ZipFile, title: str) -> Iterator[Member]:
     for member in archive.infolist():
         mode = member.external_attr >> 16
         if member.is_dir():
             continue
-        if stat.S_IFMT(mode) not in (0, stat.S_IFREG):
-            raise _no_file(title, member.filename)
-        if member.compress_type not in PACKINGS:
-            raise PackageIntegrityError(f"{title} is packed in a way that is not read")
+        check_packing(member, title)
 
         def opened(member: zipfile.ZipInfo = member) -> IO[bytes]:
             return archive.open(member)

@@ -11,7 +11,6 @@ import base64
 import csv
 import hashlib
 import io
-import stat
 import zipfile
 import zlib
 from pathlib import Path
@@ -20,7 +19,7 @@ from packaging import tags
 from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel_filename
 from packaging.version import InvalidVersion, Version
 
-from envhub_sandbox.dependencies.builds.trees import MAX_TABLE, PACKINGS, Bounded
+from envhub_sandbox.dependencies.builds.trees import MAX_TABLE, BoundedStream, check_packing
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.errors import DependencyError, PackageIntegrityError, SnapshotError
 from envhub_sandbox.hub.listing import FileRecord, check_names
@@ -37,23 +36,19 @@ _UNREADABLE = (
 
 
 def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> None:
-    """Refuse a wheel that is not what was asked for.
+    """Refuse a wheel, under the name that its builder gave it, that is not what was asked for.
 
-    Args:
-        wheel: The file, under the name that its builder gave it.
-        name: The package that was asked for.
-        version: Likewise; empty for any.
-        interpreter: What it has to run in.
-
-    Raises:
-        PackageIntegrityError: The text says what is wrong.
+    An empty version stands for any. Raises ``PackageIntegrityError``.
     """
     try:
         found = named(wheel.name, name, version)
         _fits(wheel.name, interpreter)
         if wheel.stat().st_size > MAX_BYTES:
             raise PackageIntegrityError(f"it has more than {size_text(MAX_BYTES)}")
-        with wheel.open("rb") as file, zipfile.ZipFile(Bounded(file, "it", MAX_TABLE)) as archive:
+        with (
+            wheel.open("rb") as file,
+            zipfile.ZipFile(BoundedStream(file, "it", MAX_TABLE)) as archive,
+        ):
             _files(archive)
             info = _info(archive, name, found)
             _record(archive, f"{info}/RECORD")
@@ -66,11 +61,7 @@ def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> Non
 
 
 def named(file: str, name: str, version: str) -> Version:
-    """The version of a wheel, by the name of its file.
-
-    Raises:
-        PackageIntegrityError: It is of another package, or of another version.
-    """
+    """The version of a wheel, by the name of its file. Raises ``PackageIntegrityError``."""
     try:
         found, number, _, _ = parse_wheel_filename(file)
         wanted = Version(version) if version else number
@@ -101,10 +92,7 @@ def _files(archive: zipfile.ZipFile) -> None:
             f"it holds more than {MAX_FILES} files or {size_text(MAX_UNPACKED)}"
         )
     for member in members:
-        if stat.S_IFMT(member.external_attr >> 16) not in (0, stat.S_IFREG, stat.S_IFDIR):
-            raise PackageIntegrityError(f"{member.filename[:200]!r} in it is a link or a device")
-        if member.compress_type not in PACKINGS:
-            raise PackageIntegrityError(f"{member.filename[:200]!r} in it is packed in another way")
+        check_packing(member, "it")
     names = (one.filename + "_" * one.is_dir() for one in members)  # a folder as a file in it
     check_names([FileRecord(name, 0, "") for name in names], "it")
 

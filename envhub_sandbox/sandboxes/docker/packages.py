@@ -24,7 +24,7 @@ from envhub_sandbox.sandboxes.docker.engines import (
 )
 
 if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.host import Described
+    from envhub_sandbox.dependencies.installed import InstalledPackage
     from envhub_sandbox.dependencies.interpreters import Interpreter
 
 _INTERPRETER = "/opt/envhub-worker/bin/python"
@@ -53,7 +53,7 @@ class ImageTarget:
         self._engine = engine
         self._image = image
 
-    def _inside(self) -> tuple[Interpreter, dict[str, Described]]:
+    def _inside(self) -> tuple[Interpreter, dict[str, InstalledPackage]]:
         engine = self._engine()
         return inside(engine, find_image(engine, self._image))
 
@@ -61,12 +61,12 @@ class ImageTarget:
         """Whether the image has all of it; raises as ``inside``."""
         from packaging.utils import canonicalize_name
 
-        from envhub_sandbox.dependencies import host
+        from envhub_sandbox.dependencies import installed
 
         interpreter, there = self._inside()
         names = set(map(canonicalize_name, there))
         known = all(one.is_among(names) for one in request.guesses)
-        return known and host.lacks(request, there, interpreter.version) is None
+        return known and installed.first_unmet(request, there, interpreter.version) is None
 
     def make(self, request: PackageRequest, tell: Callable[[str], None]) -> PackageSet:
         """An environment of this machine, to be mounted; its interpreter is the image's.
@@ -81,13 +81,13 @@ class ImageTarget:
 
 
 @lru_cache(maxsize=16)
-def inside(engine: Engine, image: str) -> tuple[Interpreter, dict[str, Described]]:
+def inside(engine: Engine, image: str) -> tuple[Interpreter, dict[str, InstalledPackage]]:
     """The interpreter of an image, and what is installed for its jails; by the image's id.
 
     Raises:
         SandboxUnavailableError: It is none of ours.
     """
-    from envhub_sandbox.dependencies.host import Described
+    from envhub_sandbox.dependencies.installed import InstalledPackage
     from envhub_sandbox.dependencies.interpreters import Interpreter, release
 
     try:
@@ -99,7 +99,7 @@ def inside(engine: Engine, image: str) -> tuple[Interpreter, dict[str, Described
         )
         implementation, version, machine, libc, there = json.loads(said)
         installed = {
-            str(name): Described(str(version), tuple(map(str, requires)))
+            str(name): InstalledPackage(str(version), tuple(map(str, requires)))
             for name, (version, requires) in there.items()
         }
     except (EngineError, ValueError, TypeError, AttributeError) as error:

@@ -82,7 +82,7 @@ MAY_IMPORT = {
     "envhub_sandbox.crash": {"hub", "policy", "transport"},
     "envhub_sandbox.sandboxes": {"dependencies", "hub", "policy", "transport"},
     "envhub_sandbox.transport": set(),
-    "envhub_sandbox.locks": {"dependencies", "hub"},
+    "envhub_sandbox.locks": {"dependencies", "hub", "sources"},
     "envhub_sandbox.dependencies": {"hub", "sources"},
     "envhub_sandbox.sources": {"hub"},
     "envhub_sandbox.hub": set(),

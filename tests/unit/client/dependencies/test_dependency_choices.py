@@ -12,12 +12,18 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.dependencies import host, interpreters
-from envhub_sandbox.dependencies.choice import AUTO, DECLARED, HOST, chosen
+from envhub_sandbox.dependencies import installed, interpreters
 from envhub_sandbox.dependencies.declared import parse_requirement
-from envhub_sandbox.dependencies.missing_module import MissingModule
+from envhub_sandbox.dependencies.modules import MissingModule
 from envhub_sandbox.dependencies.pipeline import HERE
-from envhub_sandbox.dependencies.request import PackageRequest, request_of
+from envhub_sandbox.dependencies.request import (
+    AUTO,
+    DECLARED,
+    HOST,
+    PackageRequest,
+    chosen,
+    request_of,
+)
 from envhub_sandbox.errors import InterpreterUnavailableError, PolicyError, RequirementError
 from envhub_sandbox.hub.snapshot import Snapshot, local
 from tests.support.wheels import make_wheel
@@ -78,17 +84,20 @@ def test_what_nobody_could_have_meant_is_refused(wrong: Any) -> None:
         chosen(wrong, None)
 
 
-def test_a_further_requirement_is_a_plain_one() -> None:
-    """It comes from the caller, and still a link in it would build something outside of a jail."""
-    with pytest.raises(RequirementError, match="in dependencies"):
-        chosen({"extra": ["here @ file:///tmp/here"]}, None)
-
-
-@pytest.mark.parametrize("dependencies", ["/opt/python", {"extra": ["scipy"]}])
-def test_two_interpreters_are_one_too_many(dependencies: Any) -> None:
-    """``python`` names the packages as well."""
-    with pytest.raises(PolicyError, match="both"):
-        chosen(dependencies, "/usr/bin/python3")
+@pytest.mark.parametrize(
+    ("dependencies", "python", "error", "said"),
+    [
+        ({"extra": ["a @ file:///tmp/a"]}, None, RequirementError, "in dependencies"),
+        ("/opt/python", "/usr/bin/python3", PolicyError, "both"),
+        ({"extra": ["scipy"]}, "/usr/bin/python3", PolicyError, "both"),
+    ],
+)
+def test_no_link_and_no_second_interpreter(
+    dependencies: Any, python: str | None, error: type[Exception], said: str
+) -> None:
+    """A link would build something outside of a jail; ``python`` names the packages as well."""
+    with pytest.raises(error, match=said):
+        chosen(dependencies, python)
 
 
 @pytest.mark.parametrize(
@@ -100,7 +109,7 @@ def test_two_interpreters_are_one_too_many(dependencies: Any) -> None:
 )
 def test_what_is_here_is_not_installed_again(lines: list[str]) -> None:
     """By name and version, without importing any of it."""
-    assert host.lacks(declares(*lines)) is None
+    assert installed.first_unmet(declares(*lines)) is None
 
 
 @pytest.mark.parametrize(
@@ -112,13 +121,15 @@ def test_what_is_here_is_not_installed_again(lines: list[str]) -> None:
 )
 def test_what_is_not_here_is_named(line: str) -> None:
     """Another version is not here; nor is one whose files nobody can compare."""
-    assert host.lacks(declares("gymnasium", line)) == str(parse_requirement(line, "").requirement)
+    assert installed.first_unmet(declares("gymnasium", line)) == str(
+        parse_requirement(line, "").requirement
+    )
 
 
 @pytest.mark.parametrize("marker", ["os_name ~= 'posix'", "python_version ~= '3'", "'a' ~= 'b'"])
 def test_a_marker_that_says_nothing_is_left_to_uv(marker: str) -> None:
     """It compares what cannot be compared; that is no error of ours."""
-    assert str(host.lacks(declares(f"numpy; {marker}"))).startswith("numpy; ")
+    assert str(installed.first_unmet(declares(f"numpy; {marker}"))).startswith("numpy; ")
 
 
 def test_a_python_that_was_built_from_a_checkout(
@@ -126,7 +137,7 @@ def test_a_python_that_was_built_from_a_checkout(
 ) -> None:
     """It says a plus behind its version."""
     monkeypatch.setattr(platform, "python_version", lambda: "3.12.1+")
-    assert host.lacks(declares(python=">=3.12,<3.13")) is None
+    assert installed.first_unmet(declares(python=">=3.12,<3.13")) is None
     assert interpreters.own().version == "3.12.1"
     other = tmp_path / "python3"
     facts = ["cpython", "3.12.2+", "x86_64", "2.36", str(other)]
@@ -137,8 +148,8 @@ def test_a_python_that_was_built_from_a_checkout(
 
 def test_another_python_is_not_here() -> None:
     """Whatever is installed."""
-    assert host.lacks(declares(python=f"=={platform.python_version()}")) is None
-    assert host.lacks(declares("numpy", python="<3")) == "python<3"
+    assert installed.first_unmet(declares(python=f"=={platform.python_version()}")) is None
+    assert installed.first_unmet(declares("numpy", python="<3")) == "python<3"
 
 
 def test_what_is_here_needs_what_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -148,10 +159,10 @@ def test_what_is_here_needs_what_it_needs(tmp_path: Path, monkeypatch: pytest.Mo
         with zipfile.ZipFile(make_wheel(tmp_path, name, requires=requires)) as wheel:
             wheel.extractall(tmp_path / "site")
     monkeypatch.syspath_prepend(tmp_path / "site")
-    assert host.lacks(declares("here5")) is None
-    assert host.lacks(declares("here23")) is None
-    assert str(host.lacks(declares("here23[more]"))).startswith("absent")
-    assert host.lacks(declares("here6")) == "absent"
+    assert installed.first_unmet(declares("here5")) is None
+    assert installed.first_unmet(declares("here23")) is None
+    assert str(installed.first_unmet(declares("here23[more]"))).startswith("absent")
+    assert installed.first_unmet(declares("here6")) == "absent"
 
 
 def test_only_what_is_missing_makes_an_environment(tmp_path: Path) -> None:
@@ -215,7 +226,7 @@ def test_an_interpreter_by_its_path(tmp_path: Path) -> None:
         ("process", HOST, "/opt/python", False, "/opt/python"),
         ("docker", AUTO, None, False, "envhub image build"),
         ("docker", AUTO, None, True, "{'extra': ['NAME-OF-THE-PACKAGE']}"),
-        ("remote", AUTO, None, False, "whoever runs that"),
+        ("remote", AUTO, None, False, "its operator installs"),
         ("remote", AUTO, None, False, "--dependencies"),
         ("remote", AUTO, None, True, "{'extra': ['NAME-OF-THE-PACKAGE']}"),
     ],
@@ -224,7 +235,9 @@ def test_a_missing_module_has_one_cure(
     tmp_path: Path, place: str, choice: Any, python: Any, own: bool, said: str
 ) -> None:
     """It depends on the place, and what the repository declares is told."""
-    text = MissingModule(snapshot(tmp_path, "numpy>=1\n"), place, choice, python, own).advice()
+    text = MissingModule(
+        snapshot(tmp_path, "numpy>=1\n"), place, choice.where, python, own
+    ).advice()
     assert said in text
     assert place == "process" or "python=" not in text  # which is refused elsewhere
     assert "Its requirements.txt declares numpy>=1" in text
@@ -232,8 +245,8 @@ def test_a_missing_module_has_one_cure(
 
 def test_a_repository_that_declares_nothing_is_said_to(tmp_path: Path) -> None:
     """And one whose file cannot be taken, why."""
-    nothing = MissingModule(snapshot(tmp_path), "process", AUTO, None, False).advice()
+    nothing = MissingModule(snapshot(tmp_path), "process", "auto", None, False).advice()
     assert "declares no packages" in nothing
     wrong = snapshot(tmp_path, "-e .\n")
-    said = MissingModule(wrong, "docker", AUTO, None, False).advice()
+    said = MissingModule(wrong, "docker", "auto", None, False).advice()
     assert "line 1 of requirements.txt" in said

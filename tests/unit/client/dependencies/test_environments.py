@@ -16,12 +16,11 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.dependencies import bounds, environments, uv_cache
+from envhub_sandbox.dependencies import bounds, environments, uv
 from envhub_sandbox.dependencies import index as index_settings
-from envhub_sandbox.dependencies.choice import chosen
 from envhub_sandbox.dependencies.environments import Environment
 from envhub_sandbox.dependencies.pipeline import ThisMachine
-from envhub_sandbox.dependencies.request import request_of
+from envhub_sandbox.dependencies.request import chosen, request_of
 from envhub_sandbox.errors import (
     DependencyError,
     IndexUnavailableError,
@@ -62,43 +61,38 @@ def left_behind() -> list[str]:
     return [path.name for path in environments.root().glob(".*")]
 
 
-def test_packages_lie_in_a_folder_of_their_own(index: Index, tmp_path: Path) -> None:
-    """With what they need and what the worker imports; the pins are told."""
+def known(folder: Path) -> Environment:
+    """One that is made and removed: versions are known, and packages have to be downloaded."""
+    env = made(folder)
+    assert environments.remove(env) == ""
+    shutil.rmtree(folder.parent / "uv")
+    return env
+
+
+def test_packages_lie_in_a_folder_that_nobody_can_write(index: Index, tmp_path: Path) -> None:
+    """With what they need, what the worker imports, and bytecode; the pins are told.
+
+    Jails of root are another user: all can read it, whatever the umask was.
+    """
     make_wheel(index.folder, "wanted")
-    env = made(repository(tmp_path / "repo", "wanted"))
+    before = os.umask(0o077)
+    try:
+        env = made(repository(tmp_path / "repo", "wanted"))
+    finally:
+        os.umask(before)
     assert (env.packages / "wanted/__init__.py").is_file()
     assert (env.packages / "numpy/__init__.py").is_file()
     assert "wanted==1.0" in env.pins
     assert os.path.isabs(env.python)
     assert left_behind() == []
-
-
-def test_it_can_be_read_by_all_and_written_by_nobody(index: Index, tmp_path: Path) -> None:
-    """Jails of root are another user; whatever the umask was."""
-    before = os.umask(0o077)
-    try:
-        env = made(repository(tmp_path / "repo"))
-    finally:
-        os.umask(before)
-    paths = [env.packages, *env.packages.rglob("*")]
-    assert len(paths) > 8
-    for path in paths:
+    for path in [env.packages, *env.packages.rglob("*")]:
         mode = stat.S_IMODE(path.lstat().st_mode)
         assert not mode & 0o222, path
         assert mode & 0o444 == 0o444, path
         assert mode & 0o111 == 0o111 or not path.is_dir(), path
-
-
-def test_its_bytecode_is_made_with_it(index: Index, tmp_path: Path) -> None:
-    """For the interpreter that it is for: nobody can write any later."""
-    make_wheel(index.folder, "wanted")
-    env = made(repository(tmp_path / "repo", "wanted"))
+    code = "import sys; print(sys.implementation.cache_tag)"
+    tag = subprocess.check_output([env.python, "-I", "-S", "-c", code], text=True).strip()
     source = str(env.packages / "wanted/__init__.py")
-    tag = subprocess.run(
-        [env.python, "-I", "-S", "-c", "import sys; print(sys.implementation.cache_tag)"],
-        capture_output=True,
-        text=True,
-    ).stdout.strip()
     compiled = Path(importlib.util.cache_from_source(source)).parent / f"__init__.{tag}.pyc"
     assert compiled.is_file()
 
@@ -263,8 +257,7 @@ def test_what_a_killed_maker_started_is_waited_for(index: Index, tmp_path: Path)
     """uv outlives it, and still writes: nobody removes that from under it, or uses it."""
     make_wheel(index.folder, "wanted")
     folder = repository(tmp_path / "repo", "wanted")
-    environments.remove(made(folder))  # so that versions are known, and packages are not
-    subprocess.run(["rm", "-r", str(tmp_path / "uv")], check=True)
+    known(folder)
     told: list[str] = []
     index.hold("/files/wanted")
     process = subprocess.Popen([sys.executable, "-c", MAKER, str(folder)], cwd=CHECKOUT)
@@ -296,16 +289,6 @@ def test_what_was_left_half_made_is_collected(index: Index, tmp_path: Path) -> N
     assert environments.every() == [env]
 
 
-def test_one_that_is_removed_is_made_again(index: Index, tmp_path: Path) -> None:
-    """Of the same packages, without asking for versions."""
-    folder = repository(tmp_path / "repo")
-    env = made(folder)
-    environments.remove(env)
-    assert environments.every() == []
-    assert left_behind() == []
-    assert made(folder).home == env.home
-
-
 def test_one_that_is_used_stays_and_the_answer_names_its_user(index: Index, tmp_path: Path) -> None:
     """By a server that could start a jail, or a client whose environment could."""
     env = made(repository(tmp_path / "repo"))
@@ -316,15 +299,15 @@ def test_one_that_is_used_stays_and_the_answer_names_its_user(index: Index, tmp_
     used.release()
     assert environments.remove(env) == ""
     assert environments.every() == []
+    assert left_behind() == []
+    assert made(tmp_path / "repo").home == env.home
 
 
 def test_a_file_that_is_not_the_one_of_its_hash(index: Index, tmp_path: Path) -> None:
     """What was replaced after versions were chosen is refused, and nothing stays."""
     wheel = make_wheel(index.folder, "wanted")
     folder = repository(tmp_path / "repo", "wanted")
-    env = made(folder)
-    environments.remove(env)
-    subprocess.run(["rm", "-r", str(tmp_path / "uv")], check=True)
+    known(folder)
     index.replaced[wheel.name] = make_wheel(tmp_path, "wanted", files={"evil.py": ""}).read_bytes()
     with pytest.raises(PackageIntegrityError, match="replaced"):
         made(folder)
@@ -335,9 +318,7 @@ def test_a_file_that_is_not_the_one_of_its_hash(index: Index, tmp_path: Path) ->
 def test_without_a_network_nothing_half_is_left(index: Index, tmp_path: Path) -> None:
     """The index goes away between choosing and installing."""
     folder = repository(tmp_path / "repo")
-    env = made(folder)
-    environments.remove(env)
-    subprocess.run(["rm", "-r", str(tmp_path / "uv")], check=True)
+    known(folder)
     index.broken = 503
     with pytest.raises(IndexUnavailableError):
         made(folder)
@@ -399,7 +380,7 @@ def test_what_another_uv_unpacks_is_left_to_it(
     """Its temporary folders look like those of one that was ended; then nobody is at work."""
     make_wheel(index.folder, "wanted")
     (tmp_path / "uv/.tmpours").mkdir(parents=True)
-    monkeypatch.setattr(uv_cache, "WAIT_S", 0.0)
+    monkeypatch.setattr(uv, "CACHE_WAIT_S", 0.0)
     index.hold("/files/wanted")
     with ThreadPoolExecutor(1) as pool:
         making = pool.submit(made, repository(tmp_path / "repo", "wanted"))
@@ -416,7 +397,7 @@ def test_what_another_uv_unpacks_is_left_to_it(
 
 def refused() -> None:
     """An installation of nothing, which is refused."""
-    with contextlib.suppress(PackageIntegrityError), uv_cache.cleared_after_refusal(["none==1"]):
+    with contextlib.suppress(PackageIntegrityError), uv.cleared_after_refusal(["none==1"]):
         (index_settings.uv_cache() / ".tmpours").touch()
         raise PackageIntegrityError("another hash")
 
@@ -438,8 +419,7 @@ def test_a_disk_that_fills_up_ends_it(
     """While packages come, and before they do: somebody else needs what is left."""
     make_wheel(index.folder, "wanted")
     folder = repository(tmp_path / "repo", "wanted")
-    environments.remove(made(folder))  # so that versions are known, and packages are not
-    subprocess.run(["rm", "-r", str(tmp_path / "uv")], check=True)
+    known(folder)
     index.hold("/files/wanted")
     with ThreadPoolExecutor(1) as pool:
         making = pool.submit(made, folder)

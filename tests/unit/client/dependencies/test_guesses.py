@@ -8,14 +8,19 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.dependencies import interpreters, pipeline
+from envhub_sandbox.dependencies import interpreters, resolutions
 from envhub_sandbox.dependencies import resolve as resolving
-from envhub_sandbox.dependencies.choice import AUTO, DECLARED, Choice, chosen
-from envhub_sandbox.dependencies.guesses import guessed
 from envhub_sandbox.dependencies.interpreters import Interpreter
-from envhub_sandbox.dependencies.missing_module import MissingModule
+from envhub_sandbox.dependencies.modules import MissingModule, guessed
 from envhub_sandbox.dependencies.pipeline import PackageSet, packages_for
-from envhub_sandbox.dependencies.request import PackageRequest, request_of
+from envhub_sandbox.dependencies.request import (
+    AUTO,
+    DECLARED,
+    Choice,
+    PackageRequest,
+    chosen,
+    request_of,
+)
 from envhub_sandbox.dependencies.resolve import Lock, Target
 from envhub_sandbox.errors import ResolutionError
 from envhub_sandbox.hub.snapshot import Snapshot, local
@@ -137,12 +142,14 @@ def test_no_index_is_asked_for_the_name_of_a_module(index: Index, tmp_path: Path
         assert made(found) is not None
     assert any("chess" in path for path in index.asked)
     assert not any("nobody" in path for path in index.asked)
-    said = MissingModule(found, "process", AUTO, None, True).advice(
+    said = MissingModule(found, "process", "auto", None, True).advice(
         "No module named 'nobody_knows_this'"
     )
     assert "env.py, line 1 imports nobody_knows_this" in said
     assert "{'extra': ['NAME-OF-THE-PACKAGE']}" in said
-    known = MissingModule(found, "process", AUTO, None, True).advice("No module named 'cv2.aruco'")
+    known = MissingModule(found, "process", "auto", None, True).advice(
+        "No module named 'cv2.aruco'"
+    )
     assert "{'extra': ['opencv-python-headless']}" in known
 
 
@@ -232,20 +239,20 @@ def test_another_release_is_tried_and_remembered(
         *inside.telling_releases_apart(),
         lambda one: stamps.get(one.path, [0, 0]),
     )
-    found = pipeline.resolution_for(request("a"))
+    found = resolutions.resolution_for(request("a"))
     assert found.interpreter.version == "3.98.0"
     assert tried == [OURS.path, "/opt/3.99.1", "/opt/3.98.0"]
-    assert pipeline.resolution_for(request("a")) == found
+    assert resolutions.resolution_for(request("a")) == found
     assert len(tried) == 3
     stamps["/opt/3.98.0"] = [1, 2]  # another release under its name
-    pipeline.resolution_for(request("a"))
+    resolutions.resolution_for(request("a"))
     assert len(tried) == 6
 
 
 def test_all_that_were_tried_are_named(tried: list[str]) -> None:
     """With the way to one that this machine lacks."""
     with pytest.raises(ResolutionError) as caught:
-        pipeline.resolution_for(request("never"))
+        resolutions.resolution_for(request("never"))
     said = str(caught.value)
     assert f"Python {OURS.version}, 3.99.1, 3.98.0 of this machine were tried" in said
     assert "{'python': '3.98', 'fetch_python': True}" in said
@@ -259,7 +266,7 @@ def test_no_other_release_is_tried_in_vain(
 ) -> None:
     """Where Python is not the matter, or the caller has chosen it."""
     with pytest.raises(ResolutionError) as caught:
-        pipeline.resolution_for(request(name, **fields))
+        resolutions.resolution_for(request(name, **fields))
     assert set(tried) == {OURS.path}
     assert ("fetch_python" in str(caught.value)) == bool(fields)
 

@@ -234,22 +234,20 @@ def test_no_setting_of_the_working_directory_counts(
     assert resolve("numpy").packages
 
 
-def test_no_uv_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """With how to get it."""
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [("{folder}", "pip install uv"), ("{folder}:{path}", r"uv before .* pip install")],
+)
+def test_without_a_uv_that_can_be_used_the_error_says_how_to_get_one(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, path: str, said: str
+) -> None:
+    """An old one would put a package's scripts wherever that says."""
     monkeypatch.setitem(sys.modules, "uv", None)
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(DependencyError, match="pip install uv"):
-        uv.command()
-
-
-def test_an_old_uv_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """It would put a package's scripts wherever that says; pyproject.toml asks for no older."""
-    monkeypatch.setitem(sys.modules, "uv", None)
-    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
-    found = tmp_path / "uv"
-    found.write_text("#!/bin/sh\necho 'uv 0.11.8 (x86_64-unknown-linux-gnu)'\n")
-    found.chmod(0o755)
-    with pytest.raises(DependencyError, match=r"uv before .* pip install"):
+    monkeypatch.setenv("PATH", path.format(folder=tmp_path, path=os.environ["PATH"]))
+    if ":" in path:
+        (tmp_path / "uv").write_text("#!/bin/sh\necho 'uv 0.11.8 (x86_64-unknown-linux-gnu)'\n")
+        (tmp_path / "uv").chmod(0o755)
+    with pytest.raises(DependencyError, match=said):
         uv.command()
 
 
@@ -262,19 +260,35 @@ def test_the_project_asks_for_the_oldest_uv_that_is_taken(project: dict[str, Any
 NO_FILES = {"PIP_CONFIG_FILE": os.devnull}
 
 
-def test_a_mirror_that_pip_knows_is_used() -> None:
-    """Who is behind one has mostly told pip, and not uv."""
-    pip = {
-        "PIP_INDEX_URL": "https://mirror.example/simple",
-        "PIP_EXTRA_INDEX_URL": "https://a.example https://b.example",
-        "PIP_FIND_LINKS": "/wheels /more",
-        "PIP_CERT": "/ca.pem",
-    }
-    found = places.environment({**NO_FILES, **pip})
-    assert found["UV_DEFAULT_INDEX"] == "https://mirror.example/simple"
-    assert found["UV_INDEX"] == "https://a.example https://b.example"
-    assert found["UV_FIND_LINKS"] == "/wheels,/more"
-    assert found["SSL_CERT_FILE"] == "/ca.pem"
+@pytest.mark.parametrize(
+    ("given", "uvs"),
+    [
+        (
+            {
+                "PIP_INDEX_URL": "https://mirror.example/simple",
+                "PIP_EXTRA_INDEX_URL": "https://a.example https://b.example",
+                "PIP_FIND_LINKS": "/wheels /more",
+                "PIP_CERT": "/ca.pem",
+            },
+            {
+                "UV_DEFAULT_INDEX": "https://mirror.example/simple",
+                "UV_INDEX": "https://a.example https://b.example",
+                "UV_FIND_LINKS": "/wheels,/more",
+                "SSL_CERT_FILE": "/ca.pem",
+            },
+        ),
+        (
+            {"UV_INDEX_URL": "https://u.example", "PIP_INDEX_URL": "https://p.example"},
+            {"UV_INDEX_URL": "https://u.example", "UV_DEFAULT_INDEX": None},
+        ),
+        ({"UV_PYTHON_DOWNLOADS": "automatic"}, {"UV_PYTHON_DOWNLOADS": "never"}),
+    ],
+    ids=["a mirror that pip knows", "uv's settings before pip's", "no interpreter is downloaded"],
+)
+def test_the_users_settings_are_uvs(given: dict[str, str], uvs: dict[str, str | None]) -> None:
+    """Users behind a mirror have mostly configured pip, and not uv."""
+    found = places.environment({**NO_FILES, **given})
+    assert {name: found.get(name) for name in uvs} == uvs
 
 
 def test_a_relative_path_is_relative_to_the_users_folder(
@@ -316,14 +330,6 @@ def test_pips_files_are_read_in_pips_order(tmp_path: Path) -> None:
     assert places.pip_settings(variables)["index-url"] == "https://variable.example/simple"
 
 
-def test_what_uv_was_told_wins_over_pip() -> None:
-    """Both name an index."""
-    variables = {"UV_INDEX_URL": "https://u.example", "PIP_INDEX_URL": "https://p.example"}
-    found = places.environment({**NO_FILES, **variables})
-    assert found["UV_INDEX_URL"] == "https://u.example"
-    assert "UV_DEFAULT_INDEX" not in found
-
-
 @pytest.mark.parametrize(
     "name",
     [
@@ -335,9 +341,3 @@ def test_what_uv_was_told_wins_over_pip() -> None:
 def test_no_other_variable_gets_through(name: str) -> None:
     """What could turn builds on, take settings from elsewhere, or load code."""
     assert name not in places.environment({**NO_FILES, name: "1"})
-
-
-def test_no_interpreter_is_downloaded() -> None:
-    """Whatever the user permits elsewhere."""
-    variables = {**NO_FILES, "UV_PYTHON_DOWNLOADS": "automatic"}
-    assert places.environment(variables)["UV_PYTHON_DOWNLOADS"] == "never"

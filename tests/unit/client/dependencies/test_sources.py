@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.dependencies import interpreters, pipeline
+from envhub_sandbox.dependencies import interpreters, pipeline, resolutions
+from envhub_sandbox.dependencies.builds.sources import Source, of_git
 from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.request import PackageRequest
-from envhub_sandbox.dependencies.sources import Source, of_git
 from envhub_sandbox.errors import RequirementError, ResolutionError
 from tests.support.wheels import Index, make_wheel
 
@@ -60,7 +60,7 @@ def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Source]:
             for folder, one in zip(folders, sources, strict=True)
         ]
 
-    monkeypatch.setattr(pipeline, "BUILDER", build)
+    monkeypatch.setattr(resolutions, "BUILDER", build)
     monkeypatch.setattr(interpreters, "others", lambda declared, first: [])
     return seen
 
@@ -92,7 +92,7 @@ def test_what_is_named_beside_another_is_built_in_its_turn(
     for name, version in (("half-source", "1.0"), ("half-source", "2.0"), ("deeper-source", "1.5")):
         source_distribution(index.folder, name, version, tmp_path / "ran")
     make_wheel(index.folder, "half-source", "2.0", requires=["deeper-source"])
-    found = pipeline.resolution_for(request("half-source")).lock.packages
+    found = resolutions.resolution_for(request("half-source")).lock.packages
     assert {"half-source==2.0", "deeper-source==1.5"} <= set(found)
     assert "deeper-source" in {one.name for one in built}
 
@@ -103,7 +103,7 @@ def test_wheels_are_taken_where_there_are_some(
     """An older one, rather than a newer source."""
     source_distribution(index.folder, "only-source", "2.0", tmp_path / "ran")
     make_wheel(index.folder, "only-source", "1.0")
-    assert "only-source==1.0" in pipeline.resolution_for(request("only-source")).lock.packages
+    assert "only-source==1.0" in resolutions.resolution_for(request("only-source")).lock.packages
     assert built == []
 
 
@@ -111,12 +111,12 @@ def test_without_a_builder_there_are_wheels_alone(index: Index, tmp_path: Path) 
     """Nothing runs, and the text names the package."""
     source_distribution(index.folder, "only-source", "1.5", tmp_path / "ran")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "BUILDER", None)
+        patch.setattr(resolutions, "BUILDER", None)
         patch.setattr(interpreters, "others", lambda declared, first: [])
         with pytest.raises(ResolutionError, match="only-source"):
-            pipeline.resolution_for(request("only-source"))
+            resolutions.resolution_for(request("only-source"))
         with pytest.raises(RequirementError, match="line 1 takes of-git from"):
-            pipeline.resolution_for(request(f"of-git @ git+https://git.example/a/b@{COMMIT}"))
+            resolutions.resolution_for(request(f"of-git @ git+https://git.example/a/b@{COMMIT}"))
     assert not (tmp_path / "ran").exists()
 
 
@@ -124,7 +124,7 @@ def test_a_repository_becomes_the_version_of_its_wheel(index: Index, built: list
     """uv never hears of it."""
     make_wheel(index.folder, "only-wheel")
     line = f"Of_Git @ git+https://git.example/a/b.git@{COMMIT}#subdirectory=python"
-    found = pipeline.resolution_for(request(line)).lock
+    found = resolutions.resolution_for(request(line)).lock
     assert {"of-git==3.0", "only-wheel==1.0"} <= set(found.packages)
     assert built == [
         Source(

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.dependencies import torch_cpu
+from envhub_sandbox.dependencies import resolve
 from envhub_sandbox.dependencies.declared import parse_requirement
-from envhub_sandbox.dependencies.pipeline import resolution_for
 from envhub_sandbox.dependencies.request import PackageRequest
+from envhub_sandbox.dependencies.resolutions import resolution_for
 from envhub_sandbox.dependencies.resolve import Lock
 from tests.support.wheels import Index, make_wheel
 
@@ -58,7 +58,7 @@ def test_who_has_a_gpu_gets_cuda(gpu: bool, monkeypatch: pytest.MonkeyPatch) -> 
     def resolved(*given: object) -> Lock:
         pytest.fail("the index was asked again")
 
-    assert torch_cpu.smaller(replace(TORCH, gpu=gpu), lock, resolved) is lock
+    assert resolve.without_cuda(replace(TORCH, gpu=gpu), lock, resolved) is lock
 
 
 def test_pytorchs_own_index_is_asked_only_by_who_has_chosen_none(
@@ -78,8 +78,8 @@ def test_pytorchs_own_index_is_asked_only_by_who_has_chosen_none(
             given.append(options)
             return without if options else lock
 
-        assert torch_cpu.smaller(TORCH, lock, resolved) is (lock if chosen else without)
+        assert resolve.without_cuda(TORCH, lock, resolved) is (lock if chosen else without)
         assert given == asked
         # a lock file has versions alone
-        assert torch_cpu.options_for(without) == (() if chosen else ("--torch-backend", "cpu"))
-        assert torch_cpu.options_for(lock) == ()
+        assert resolve.torch_options(without) == (() if chosen else ("--torch-backend", "cpu"))
+        assert resolve.torch_options(lock) == ()

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from envhub_sandbox.dependencies import host, interpreters
+from envhub_sandbox.dependencies import installed, interpreters
 from envhub_sandbox.dependencies.declared import parse_requirement
-from envhub_sandbox.dependencies.guesses import Guess
-from envhub_sandbox.dependencies.host import Described
+from envhub_sandbox.dependencies.installed import InstalledPackage
+from envhub_sandbox.dependencies.modules import Guess
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import InterpreterUnavailableError
 from envhub_sandbox.sandboxes.docker import packages
@@ -18,8 +18,10 @@ from envhub_sandbox.sandboxes.docker.packages import fitting
 OURS = interpreters.own()
 NEWER = replace(OURS, path="/opt/envhub-worker/bin/python", libc="99.0")
 THERE = {
-    "Wanted_One": Described("1.5", ("deeper>=2; python_version >= '3.11'", "more; extra == 'x'")),
-    "deeper": Described("1.0", ()),
+    "Wanted_One": InstalledPackage(
+        "1.5", ("deeper>=2; python_version >= '3.11'", "more; extra == 'x'")
+    ),
+    "deeper": InstalledPackage("1.0", ()),
 }
 
 
@@ -43,7 +45,7 @@ def test_what_an_image_has_is_read_off_its_metadata(
     line: str, python: str, lacking: str | None
 ) -> None:
     """With the markers of the image's Python, and nothing of this one."""
-    assert host.lacks(declares(line), THERE, python) == lacking
+    assert installed.first_unmet(declares(line), THERE, python) == lacking
 
 
 def test_what_it_imports_is_in_the_image_or_made(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ import gymnasium as gym
 import pytest
 
 from envhub_sandbox import errors
-from envhub_sandbox.session.author_lines import point_out
+from envhub_sandbox.session.author_lines import add_author_line
 from envhub_sandbox.transport.replies import check, death, expect, raised, refusal
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import REASONS
@@ -286,7 +286,7 @@ def test_a_strangers_lines_cannot_be_taken_for_ours(stage: str, builtin: str) ->
     if not isinstance(error, errors.RemoteEnvError) and error.__cause__ is None:
         shown = [str(error)]
     else:
-        point_out(error, Mock(root="/nowhere", known_as=lambda name: None))
+        add_author_line(error, Mock(root="/nowhere", known_as=lambda name: None))
         shown = [str(error), str(error.__cause__ or error), *vars(error)["__notes__"]]
     shown.append(str(errors.RemoteEnvWarning("repo", "Oops", _IMITATION)))
     for text in shown:

@@ -11,6 +11,7 @@ import tracemalloc
 import zipfile
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,10 +20,10 @@ from envhub_sandbox.errors import DependencyError, PackageIntegrityError, Packag
 from tests.support.sdists import add, make_sdist
 
 
-def packed(tmp_path: Path, *members: tuple[str, bytes, bytes]) -> Path:
+def packed(tmp_path: Path, *members: tuple[str, bytes, bytes], **options: Any) -> Path:
     """An archive of these: name, content and kind."""
     path = tmp_path / "x-1.0.tar.gz"
-    with tarfile.open(path, "w:gz") as archive:
+    with tarfile.open(path, "w:gz", format=tarfile.PAX_FORMAT, **options) as archive:
         for name, data, kind in members:
             add(archive, name, data, kind)
     return path
@@ -44,16 +45,22 @@ def test_the_files_of_a_source_distribution(tmp_path: Path) -> None:
     assert stat.S_IMODE((top / "setup.py").stat().st_mode) == 0o644
 
 
-def test_a_zip_and_what_may_be_executed(tmp_path: Path) -> None:
-    """The mode of a file is kept as far as it says that it may be executed."""
+def zipped(tmp_path: Path, name: str, mode: int, text: str) -> Path:
+    """A zip of one file."""
     path = tmp_path / "x-1.0.zip"
     with zipfile.ZipFile(path, "w") as archive:
-        member = zipfile.ZipInfo("x-1.0/configure")
-        member.external_attr = 0o104755 << 16
-        archive.writestr(member, "#!/bin/sh")
-    assert os.access(unpacked(path) / "configure", os.X_OK)
-    assert not (unpacked_mode := (tmp_path / "tree/x-1.0/configure").stat().st_mode) & 0o4000
-    assert stat.S_ISREG(unpacked_mode)
+        member = zipfile.ZipInfo(name)
+        member.external_attr = mode << 16
+        archive.writestr(member, text)
+    return path
+
+
+def test_a_zip_and_what_may_be_executed(tmp_path: Path) -> None:
+    """The mode of a file is kept as far as it says that it may be executed."""
+    found = unpacked(zipped(tmp_path, "x-1.0/configure", 0o104755, "#!/bin/sh")) / "configure"
+    assert os.access(found, os.X_OK)
+    assert not found.stat().st_mode & 0o4000
+    assert stat.S_ISREG(found.stat().st_mode)
 
 
 @pytest.mark.parametrize(
@@ -85,13 +92,8 @@ def test_the_same_name_twice(tmp_path: Path) -> None:
 
 def test_a_link_in_a_zip(tmp_path: Path) -> None:
     """As in a tar."""
-    path = tmp_path / "x-1.0.zip"
-    with zipfile.ZipFile(path, "w") as archive:
-        member = zipfile.ZipInfo("x-1.0/link")
-        member.external_attr = (stat.S_IFLNK | 0o777) << 16
-        archive.writestr(member, "/etc/passwd")
     with pytest.raises(PackageIntegrityError, match="link"):
-        unpacked(path)
+        unpacked(zipped(tmp_path, "x-1.0/link", stat.S_IFLNK | 0o777, "/etc/passwd"))
 
 
 def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,11 +138,9 @@ def test_a_zip_whose_packing_has_no_bounds(tmp_path: Path, packing: int) -> None
 
 def test_headers_for_all_files_are_kept_once(tmp_path: Path) -> None:
     """Each member of a tar copies them; the copies are not kept."""
-    path = tmp_path / "x-1.0.tar.gz"
     headers = {f"key{number}": "x" * 50 for number in range(900)}
-    with tarfile.open(path, "w:gz", format=tarfile.PAX_FORMAT, pax_headers=headers) as archive:
-        for number in range(1000):
-            add(archive, f"x-1.0/{number}", b"", tarfile.REGTYPE)
+    members = ((f"x-1.0/{number}", b"", tarfile.REGTYPE) for number in range(1000))
+    path = packed(tmp_path, *members, pax_headers=headers)
     tracemalloc.start()
     try:
         unpacked(path)
@@ -154,12 +154,9 @@ def test_headers_for_all_files_are_kept_once(tmp_path: Path) -> None:
 
 def test_more_headers_for_all_files_than_there_may_be(tmp_path: Path) -> None:
     """A clear error."""
-    path = tmp_path / "x-1.0.tar.gz"
     headers = {f"key{number}": "x" for number in range(2000)}
-    with tarfile.open(path, "w:gz", format=tarfile.PAX_FORMAT, pax_headers=headers) as archive:
-        add(archive, "x-1.0/a", b"", tarfile.REGTYPE)
     with pytest.raises(PackagesTooLargeError, match="headers"):
-        unpacked(path)
+        unpacked(packed(tmp_path, ("x-1.0/a", b"", b"0"), pax_headers=headers))
 
 
 def test_a_file_that_is_not_as_long_as_it_says(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Packages that come as sources: what was chosen and has no wheel, and who makes one of it."""
+"""Packages that come as sources: what was chosen and has no wheel, and what makes one of it."""
 
 from __future__ import annotations
 
@@ -39,6 +39,25 @@ class Source:
     commit: str = ""
     subdirectory: str = ""
     where: str = ""
+
+    @property
+    def identity(self) -> str:
+        """What names its content: the hash of a file, or a full commit."""
+        if not self.commit:
+            return f"sha256:{self.sha256}"
+        below = f"#subdirectory={self.subdirectory}" if self.subdirectory else ""
+        return f"git+{self.url}@{self.commit}{below}"
+
+
+@dataclass(frozen=True)
+class WheelOrigin:
+    """What a wheel was built of: its source, the digest of the lock of the packages that it was
+    built with, and its own SHA-256.
+    """
+
+    source: Source
+    environment: str
+    wheel: str
 
 
 Builder = Callable[[Sequence[Source], Interpreter, Callable[[str], None]], Sequence[Path]]

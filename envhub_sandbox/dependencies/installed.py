@@ -1,14 +1,14 @@
-"""Whether an interpreter has all that a repository declares, so that nothing is to be installed.
+"""What is installed in an interpreter, by its metadata, and whether that is all that is declared.
 
-The metadata of what is installed is read, and nothing is imported.
+Nothing is imported.
 """
 
 from __future__ import annotations
 
 import platform
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from importlib import metadata
+from typing import NamedTuple
 
 from packaging.markers import default_environment
 from packaging.requirements import InvalidRequirement, Requirement
@@ -16,47 +16,37 @@ from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 from packaging.version import InvalidVersion
 
+from envhub_sandbox.dependencies.interpreters import release
 from envhub_sandbox.dependencies.request import PackageRequest
 
 
-@dataclass(frozen=True)
-class Described:
-    """A distribution of an interpreter elsewhere.
-
-    Attributes:
-        version: Its version.
-        requires: What it needs.
-    """
+class InstalledPackage(NamedTuple):
+    """A distribution of an interpreter elsewhere: its version, and what it needs."""
 
     version: str
     requires: Sequence[str]
 
 
-def lacks(
+def first_unmet(
     request: PackageRequest,
-    there: Mapping[str, Described] | None = None,
+    there: Mapping[str, InstalledPackage] | None = None,
     version: str | None = None,
 ) -> str | None:
     """The first requirement that an interpreter does not meet, of those asked for or of theirs.
 
-    None if it meets them all. Where hashes or a repository are given it never does: nobody knows
-    any more what its packages were made of.
-
-    Args:
-        request: What is required.
-        there: What an interpreter elsewhere has; by default it is this one.
-        version: That one's version.
+    None if it meets them all. Where hashes or a repository are given it never does: the metadata
+    does not say what its packages were made of. The interpreter is this one, unless another's
+    packages (``there``) and version are given.
     """
     python = SpecifierSet(request.supports)
-    # a Python that was built from a checkout has a plus at the end, which is no version
-    found = version or platform.python_version().rstrip("+")
+    found = version or release(platform.python_version())
     if not python.contains(found, prereleases=True):
         return f"python{request.supports}"
     hashed = next((one for one in request.wanted if one.hashes or one.requirement.url), None)
     if hashed is not None:
         return str(hashed.requirement)
-    installed = _Installed() if there is None else _InstalledElsewhere(there, found)
-    for wanted, met_by in installed.reached(one.requirement for one in request.wanted):
+    there_or_here = _Installed() if there is None else _Installed(there, found)
+    for wanted, met_by in there_or_here.reached(one.requirement for one in request.wanted):
         if met_by is None or not _is_among(met_by, wanted.specifier):
             return str(wanted)
     return None
@@ -69,14 +59,24 @@ def brought(requirements: Iterable[Requirement]) -> list[metadata.Distribution]:
 
 
 class _Installed:
-    def __init__(self) -> None:
+    """What an interpreter has: this one, or one elsewhere of that version."""
+
+    def __init__(
+        self, elsewhere: Mapping[str, InstalledPackage] | None = None, version: str = ""
+    ) -> None:
         self._met: set[tuple[str, frozenset[str]]] = set()
-        self._found: dict[str, metadata.Distribution | Described | None] = {}
+        self._is_here = elsewhere is None
+        self._found: dict[str, metadata.Distribution | InstalledPackage | None] = {
+            canonicalize_name(name): one for name, one in (elsewhere or {}).items()
+        }
         self._environment = {str(k): str(v) for k, v in default_environment().items()}
+        if version:
+            minor = ".".join(version.split(".")[:2])
+            self._environment |= {"python_full_version": version, "python_version": minor}
 
     def reached(
         self, requirements: Iterable[Requirement]
-    ) -> Iterator[tuple[Requirement, metadata.Distribution | Described | None]]:
+    ) -> Iterator[tuple[Requirement, metadata.Distribution | InstalledPackage | None]]:
         """Each that applies here, of all that they lead to, and what is here of that name."""
         waiting = [(one, frozenset[str]()) for one in requirements]
         while waiting:
@@ -84,7 +84,10 @@ class _Installed:
             try:
                 if not self._applies(wanted, extras):
                     continue
-            except (ValueError, LookupError):  # its marker compares what nobody can: let uv say so
+            except (
+                ValueError,
+                LookupError,
+            ):  # its marker cannot be evaluated, as uv will say
                 yield wanted, None
                 continue
             found = self._distribution(wanted.name)
@@ -100,34 +103,24 @@ class _Installed:
         each = ({**self._environment, "extra": extra} for extra in extras or ("",))
         return any(wanted.marker.evaluate(environment) for environment in each)
 
-    def _distribution(self, name: str) -> metadata.Distribution | Described | None:
-        if name not in self._found:
+    def _distribution(self, name: str) -> metadata.Distribution | InstalledPackage | None:
+        key = canonicalize_name(name)
+        if self._is_here and key not in self._found:
             try:
-                self._found[name] = metadata.distribution(name)
+                self._found[key] = metadata.distribution(name)
             except (metadata.PackageNotFoundError, ValueError):
-                self._found[name] = None
-        return self._found[name]
+                self._found[key] = None
+        return self._found.get(key)
 
 
-class _InstalledElsewhere(_Installed):
-    def __init__(self, there: Mapping[str, Described], version: str) -> None:
-        super().__init__()
-        self._there = {canonicalize_name(name): one for name, one in there.items()}
-        minor = ".".join(version.split(".")[:2])
-        self._environment |= {"python_full_version": version, "python_version": minor}
-
-    def _distribution(self, name: str) -> Described | None:
-        return self._there.get(canonicalize_name(name))
-
-
-def _is_among(found: metadata.Distribution | Described, versions: SpecifierSet) -> bool:
+def _is_among(found: metadata.Distribution | InstalledPackage, versions: SpecifierSet) -> bool:
     try:
         return versions.contains(found.version, prereleases=True)
     except (InvalidVersion, TypeError):
         return False
 
 
-def _needs(found: metadata.Distribution | Described) -> list[Requirement]:
+def _needs(found: metadata.Distribution | InstalledPackage) -> list[Requirement]:
     try:
         return [Requirement(text) for text in found.requires or ()]
     except InvalidRequirement:

@@ -1,0 +1,244 @@
+"""The modules that a repository imports: what brings each, and what to do where one is missing.
+
+Which distribution brings one says its own pyproject.toml, or a table of ours,
+``sources/modules.txt``; never an index: anybody may publish a package under a module's name.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import re
+import sys
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.machinery import PathFinder
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from envhub_sandbox.errors import RequirementError
+from envhub_sandbox.hub.cache import cache_root, keep, recall
+from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.option_names import option_name
+from envhub_worker.protocol.text import printable
+
+if TYPE_CHECKING:
+    from envhub_sandbox.dependencies.declared import DeclaredPackages, WantedPackage
+
+_FORMAT = 1
+_READ: dict[tuple[Path, str], tuple[tuple[str, str, int], ...]] = {}
+_MOST = 64
+_SHOWN = 20
+_MISSING = re.compile(r"No module named '([\w.]+)'")
+_WORKERS = {"cloudpickle", "gymnasium", "msgpack", "numpy", "farama_notifications"}
+"""Modules that are in every jail."""
+_GYMNASIUM = (
+    (
+        r"(Ant|HalfCheetah|Hopper|Humanoid|HumanoidStandup|InvertedDoublePendulum"
+        r"|InvertedPendulum|Pusher|Reacher|Swimmer|Walker2d)-v[45]",
+        ("mujoco", "gymnasium[mujoco]", "mujoco"),
+    ),
+    (
+        r"(LunarLander|LunarLanderContinuous|BipedalWalker|BipedalWalkerHardcore|CarRacing)-v\d",
+        ("Box2D", "gymnasium[box2d]", "box2d box2d-py"),
+    ),
+    (r"ALE/.*", ("ale_py", "gymnasium[atari]", "ale-py")),
+)
+"""Environments of Gymnasium's that need an extra of it: by the texts of their ids."""
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A module that is imported, with the requirement that brings it (and the place of the import),
+    and the canonical names of distributions, any of which does.
+    """
+
+    module: str
+    wanted: WantedPackage
+    brought_by: tuple[str, ...]
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """For the provenance."""
+        return {
+            "module": self.module,
+            "requirement": str(self.wanted.requirement),
+            "where": self.wanted.where,
+        }
+
+    def is_among(self, names: Collection[str]) -> bool:
+        """Whether one of these distributions, by canonical name, brings it."""
+        return not set(self.brought_by).isdisjoint(names)
+
+
+def guessed(snapshot: Snapshot) -> tuple[Guess, ...]:
+    """What a repository imports, as far as it is known what brings it.
+
+    What its declared packages bring is among it: that is known once versions are chosen.
+    """
+    return _guessed(snapshot.root, snapshot.path, read(snapshot))
+
+
+@lru_cache(maxsize=64)
+def _guessed(root: Path, entry: str, rows: tuple[tuple[str, str, int], ...]) -> tuple[Guess, ...]:
+    if not rows:
+        return ()
+    from envhub_sandbox.dependencies.declared import optional, parse_requirement
+
+    extras = optional(root, entry)
+    found: dict[str, Guess] = {}
+    for name, file, line in rows:
+        known = _of_id(name) if "-" in name else _of_module(name, extras)
+        if known is not None and len(found) < _MOST:
+            module, requirement, brought_by = known
+            wanted = parse_requirement(
+                requirement, f"{printable(file, 200)}, line {line}, which needs {module}"
+            )
+            found.setdefault(requirement, Guess(module, wanted, tuple(brought_by)))
+    return tuple(found.values())
+
+
+def _of_id(text: str) -> tuple[str, str, list[str]] | None:
+    for pattern, (module, requirement, names) in _GYMNASIUM:
+        if re.fullmatch(pattern, text):
+            return module, requirement, names.split()
+    return None
+
+
+def _of_module(name: str, extras: Mapping[str, WantedPackage]) -> tuple[str, str, list[str]] | None:
+    from packaging.utils import canonicalize_name
+
+    from envhub_sandbox.sources.imports import of_module
+
+    distributions = of_module(name)
+    names = list(map(str, map(canonicalize_name, distributions or [name.partition(".")[0]])))
+    own = next((str(extras[one].requirement) for one in names if one in extras), None)
+    if own is None and not distributions:
+        return None
+    return name.partition(".")[0], own or distributions[0], names
+
+
+def is_here(guess: Guess) -> bool:
+    """Whether this interpreter can import its module. Nothing is imported."""
+    here = [path for path in sys.path if path not in ("", os.getcwd())]
+    return PathFinder.find_spec(guess.module, here) is not None
+
+
+def read(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
+    """Modules that a repository imports and does not have, and ids of environments; file and line.
+
+    A commit's are remembered: they are read in a process of their own.
+    """
+    place = snapshot.root, snapshot.path  # a root holds one commit
+    if place not in _READ:
+        if len(_READ) >= _MOST:
+            _READ.clear()
+        _READ[place] = _recalled(snapshot)
+    return _READ[place]
+
+
+def _recalled(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
+    folder = cache_root() / "imports"
+    facts = json.dumps([_FORMAT, sys.version_info[:2], snapshot.commit, snapshot.path])
+    key = hashlib.sha256(facts.encode()).hexdigest()
+    with contextlib.suppress(ValueError, TypeError):
+        rows = json.loads(recall(folder, key) or "")
+        return tuple((str(name), str(file), int(line)) for name, file, line in rows)
+    from envhub_sandbox.sources import imports, parsing
+
+    files = parsing.read(snapshot)
+    found = [(one.module, one.file, one.line) for one in imports.imports(snapshot, files)]
+    found = [row for row in found if row[0] not in _WORKERS]
+    rows = [*found, *(row for row in imports.ids(snapshot, files) if _of_id(row[0]))]
+    keep(folder, key, json.dumps(rows))
+    return tuple(rows)
+
+
+@dataclass(frozen=True)
+class MissingModule:
+    """Advice for a repository whose import fails.
+
+    Attributes:
+        snapshot: Its files.
+        place: The sandbox's name.
+        where: Where its packages were to come from, as ``Choice`` has it.
+        python: The interpreter that the caller named.
+        own: Whether it ran in an environment that was made for it.
+    """
+
+    snapshot: Snapshot
+    place: str
+    where: str
+    python: str | Path | None
+    own: bool
+
+    def advice(self, said: str = "") -> str:
+        """What the repository declares, where it imports the module that ``said`` names, and what
+        helps.
+        """
+        from envhub_sandbox.dependencies.declared import declared
+
+        module = found[1] if (found := _MISSING.search(said)) else ""
+        try:
+            says = declared(self.snapshot.root, self.snapshot.path)
+        except RequirementError as error:
+            return f"What it declares cannot be taken: {error}"
+        return f"{_what(says, self.snapshot)}.{self._where(module)} {self._cure(module, says)}"
+
+    def _where(self, module: str) -> str:
+        for name, file, line in read(self.snapshot) if module else ():
+            if name.partition(".")[0] == module.partition(".")[0]:
+                return f" {printable(file, 200)}, line {line} imports {name}."
+        return ""
+
+    def _cure(self, module: str, says: DeclaredPackages | None) -> str:
+        from envhub_sandbox.sources.imports import of_module
+
+        name = next(iter(of_module(module)), "NAME-OF-THE-PACKAGE")
+        extra = option_name("dependencies", {"extra": [name]})
+        if self.place in ("docker", "remote"):
+            return self._elsewhere(extra)
+        if self.python is not None:
+            return f"It ran in {self.python}: install the package there, or leave out that argument"
+        if self.own:
+            return f"It ran in an environment of its own; the package joins it with {extra}"
+        here = f"It ran in this interpreter ({sys.executable})"
+        if self.where == "host" and says is not None and says.wanted:
+            host = option_name("dependencies", "host")
+            return f"{here}, as {host} says; leave that out, and it gets an environment of its own"
+        return f"{here}; it gets an environment of its own, and the package in it, with {extra}"
+
+    def _elsewhere(self, extra: str) -> str:
+        where = "in a container" if self.place == "docker" else "on another host"
+        if self.own:
+            return f"It ran {where}, with packages of its own; this one joins them with {extra}"
+        if self.place == "docker":
+            image = option_name("sandbox", "docker:IMAGE")
+            return (
+                f"It ran {where}, with the image's packages: it gets others with {extra}, or "
+                f"with an image that has them (envhub image build REF, then {image})"
+            )
+        return (
+            f"It ran {where}, with the packages of its server: its operator installs the package "
+            "into the server's interpreter, or starts the server with --dependencies, and the "
+            f"package comes with {extra}"
+        )
+
+
+def _what(found: DeclaredPackages | None, snapshot: Snapshot) -> str:
+    if found is not None and found.wanted:
+        names = [str(wanted.requirement) for wanted in found.wanted]
+        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+        return f"Its {found.source} declares {', '.join(names[:_SHOWN])}{more}"
+    from envhub_sandbox.dependencies.declared import not_read
+
+    seen = not_read(snapshot.root, snapshot.path)
+    if seen:
+        return (
+            f"It has {', '.join(seen)}, which may say what it needs and was not read: "
+            "requirements.txt, [project] of pyproject.toml and the metadata of a script are"
+        )
+    return "It declares no packages"

@@ -1,0 +1,46 @@
+"""TOML that a stranger may have written, read within bounds."""
+
+from __future__ import annotations
+
+import re
+import sys
+from typing import Any
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+_MAX_DOTS = 2000
+"""Outside of texts: the time that a parser takes grows with the square of the parts of a key."""
+_TEXT = re.compile(r"\"(?:[^\"\\\n]|\\.)*\"|'[^'\n]*'")
+_TIME = re.compile(r":\d\d\.\d")
+
+
+def loads(text: str, most: int, *, generated: bool = False) -> dict[str, Any]:
+    """A document.
+
+    Args:
+        text: Its text.
+        most: The most characters.
+        generated: Whether it is of a form without texts of several lines. Then dots in texts,
+            of which one that people write may have 2000 at most, do not count.
+
+    Raises:
+        ValueError: It is none, or too long.
+    """
+    if len(text) > most:
+        raise ValueError(f"it has {len(text)} characters; at most {most} are read")
+    counted = text
+    if generated:
+        # texts of several lines could hide what is none from this count
+        if '"""' in text or "'''" in text:
+            raise ValueError("it has a text of several lines")
+        counted = _TIME.sub("", _TEXT.sub("", text))
+    if counted.count(".") > _MAX_DOTS:
+        raise ValueError(f"it is too long: it has more than {_MAX_DOTS} dots")
+    try:
+        document: dict[str, Any] = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(str(error)[:200]) from error
+    return document
