@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.making.making import make
-from envhub_sandbox.making.options import Options
+from envhub_sandbox.factory.make import make
+from envhub_sandbox.factory.options import Options
 from envhub_sandbox.policy import Limits, Policy, Timeouts
 from envhub_sandbox.sandboxes.base import Sandbox
 from envhub_sandbox.vector.suites import EnvSuites

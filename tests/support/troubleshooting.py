@@ -35,7 +35,7 @@ _PARTS = (
     ("Locks", ("envhub_sandbox/locks",), "dependencies.md#locks"),
     (
         "Arguments, policies, limits, timeouts",
-        ("envhub_sandbox/making", "envhub_sandbox/policy.py"),
+        ("envhub_sandbox/factory", "envhub_sandbox/policy.py"),
         "settings.md",
     ),
     ("What this host can enforce", ("envhub_worker/lockdown",), "threat-model.md"),

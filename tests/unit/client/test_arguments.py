@@ -12,9 +12,9 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import HubReferenceError, PolicyError, RepositoryUnavailableError
+from envhub_sandbox.factory import arguments
+from envhub_sandbox.factory.config import plain_config
 from envhub_sandbox.hub import snapshot
-from envhub_sandbox.making import arguments
-from envhub_sandbox.making.config import plain_config
 from tests.support import inside
 from tests.support.samples import sample
 

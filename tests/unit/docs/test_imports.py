@@ -63,8 +63,8 @@ MAY_IMPORT = {
         *("", "api", "check", "crash", "dependencies", "hub", "locks", "policy", "rollouts"),
         *("parent", "sandboxes", "session", "std_streams"),
     },
-    "envhub_sandbox.api": {"making", "policy", "sandboxes", "vector"},
-    "envhub_sandbox.making": {
+    "envhub_sandbox.api": {"factory", "policy", "sandboxes", "vector"},
+    "envhub_sandbox.factory": {
         *("dependencies", "hub", "locks", "parent", "policy", "sandboxes", "session"),
         *("std_streams", "transport", "vector"),
     },

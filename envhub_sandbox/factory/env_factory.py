@@ -22,7 +22,7 @@ from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest
 
 
-class Proxies:
+class EnvFactory:
     """Makes the proxies, from the remembered manifest or from a first jail.
 
     Args:

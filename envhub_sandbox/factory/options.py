@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.errors import PolicyError
-from envhub_sandbox.making import arguments
+from envhub_sandbox.factory import arguments
 from envhub_sandbox.policy import Limits, Policy, Timeouts
 from envhub_sandbox.sandboxes.base import Sandbox
 

@@ -11,14 +11,14 @@ from envhub_sandbox.dependencies.choice import Choice, chosen
 from envhub_sandbox.dependencies.missing_module import MissingModule
 from envhub_sandbox.dependencies.pipeline import HERE, PackageSet, packages_for
 from envhub_sandbox.errors import PolicyError
+from envhub_sandbox.factory import arguments
+from envhub_sandbox.factory.config import plain_config
+from envhub_sandbox.factory.env_factory import EnvFactory
+from envhub_sandbox.factory.options import Options
+from envhub_sandbox.factory.sandbox_spec import reference_of, sandbox_of
 from envhub_sandbox.hub import store
 from envhub_sandbox.hub.snapshot import Snapshot, named
 from envhub_sandbox.locks import use as locks
-from envhub_sandbox.making import arguments
-from envhub_sandbox.making.config import plain_config
-from envhub_sandbox.making.options import Options
-from envhub_sandbox.making.places import reference_of, sandbox_of
-from envhub_sandbox.making.proxies import Proxies
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy, Timeouts, policy_from, timeouts_from
 from envhub_sandbox.sandboxes import inprocess
@@ -70,7 +70,7 @@ def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSui
         ),
     )
     repository = _repository(snapshot, load, wanted, packages, options, recipe)
-    return Proxies(
+    return EnvFactory(
         Launcher(repository, wanted.place, store.cache_root() / "snapshots"),
         options.num_workers,
         _ahead(wanted, options),
