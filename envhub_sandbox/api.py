@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.factory.make import make
-from envhub_sandbox.factory.options import Options
+from envhub_sandbox.options import Options
 from envhub_sandbox.policy import Limits, Policy, Timeouts
 from envhub_sandbox.sandboxes.base import Sandbox
 from envhub_sandbox.vector.suites import EnvSuites
@@ -101,26 +101,5 @@ def make_env(
             (``ServerBusyError``).
         RuntimeError: ``sandbox=None`` without ``trust_remote_code=True``.
     """
-    options = Options(
-        n_envs=n_envs,
-        use_async_envs=use_async_envs,
-        hub_cache_dir=hub_cache_dir,
-        trust_remote_code=trust_remote_code,
-        sandbox=sandbox,
-        env_kwargs=env_kwargs,
-        policy=policy,
-        timeouts=timeouts,
-        limits=limits,
-        token=token,
-        endpoint=endpoint,
-        python=python,
-        dependencies=dependencies,
-        lock=lock,
-        num_workers=num_workers,
-        prewarm=prewarm,
-        lane=lane,
-        copy=copy,
-        validate=validate,
-        server_key=server_key,
-    )
-    return make(make_env, cfg, options)
+    given = locals().copy()  # the arguments, as long as nothing else has a name here
+    return make(make_env, given.pop("cfg"), Options(**given))

@@ -76,6 +76,6 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "version": version.version,
 }
 for name, command in _COMMANDS.items():
-    app.command(name, cls=Command, epilog=EXIT_CODES)(command)
+    app.command(name, cls=Command)(command)
 app.add_typer(cache.app, name="cache")
 app.add_typer(image.app, name="image")

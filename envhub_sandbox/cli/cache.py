@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import print_json, say, show_rows
-from envhub_sandbox.cli.shared.exits import UsageError, reported
+from envhub_sandbox.cli.shared.exits import UsageError
 from envhub_sandbox.cli.shared.program import Command
 from envhub_worker.protocol.text import counted, size_text
 
@@ -84,24 +85,24 @@ def _repository(name: str) -> str:
 
 
 @app.command("list", cls=Command)
+@opt.with_options()
 def list_(
-    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    json: opt.Json = False,
 ) -> None:
     """List snapshots, and the environments of their packages, the latest used first."""
     from envhub_sandbox.dependencies import environments
     from envhub_sandbox.hub import store
 
-    with reported(debug=False):
-        found, made = stored_snapshots(), environments.every()
-        if json:
-            document = {"folder": str(store.cache_root()), "snapshots": _data(found)}
-            print_json({**document, "environments": _environment_data(made)})
-            return
-        if found:
-            _print(found)
-        if made:
-            _print_environments(made)
-        say(f"{_told(found, made)}, in {store.cache_root()}")
+    found, made = stored_snapshots(), environments.every()
+    if json:
+        document = {"folder": str(store.cache_root()), "snapshots": _data(found)}
+        print_json({**document, "environments": _environment_data(made)})
+        return
+    if found:
+        _print(found)
+    if made:
+        _print_environments(made)
+    say(f"{_told(found, made)}, in {store.cache_root()}")
 
 
 def _told(found: list[Stored], made: list[Environment]) -> str:
@@ -158,6 +159,7 @@ def _day(seconds: float) -> str:
 
 
 @app.command("remove", cls=Command, no_args_is_help=True)
+@opt.with_options()
 def remove(
     names: Annotated[
         list[str] | None,
@@ -178,22 +180,21 @@ def remove(
     from envhub_sandbox.dependencies import environments
     from envhub_sandbox.hub import store
 
-    with reported(debug=False):
-        found, made = stored_snapshots(), environments.every()
-        if everything:
-            for folder in ("manifests", "resolutions"):
-                shutil.rmtree(store.cache_root() / folder, ignore_errors=True)
-        else:
-            found, made = _chosen(found, made, names or [], unused_for)
-        kept = {one.commit: why for one in found if (why := _users_of(one))}
-        kept |= {one.key: why for one in made if (why := environments.remove(one))}
-        environments.remove_abandoned()
-        gone = [one for one in found if one.commit not in kept]
-        say(f"Removed {_told(gone, [one for one in made if one.key not in kept])}.")
-        if kept and names:
-            raise UsageError("; ".join(kept.values()))
-        for why in kept.values():
-            say(f"Kept: {why}.")
+    found, made = stored_snapshots(), environments.every()
+    if everything:
+        for folder in ("manifests", "resolutions"):
+            shutil.rmtree(store.cache_root() / folder, ignore_errors=True)
+    else:
+        found, made = _chosen(found, made, names or [], unused_for)
+    kept = {one.commit: why for one in found if (why := _users_of(one))}
+    kept |= {one.key: why for one in made if (why := environments.remove(one))}
+    environments.remove_abandoned()
+    gone = [one for one in found if one.commit not in kept]
+    say(f"Removed {_told(gone, [one for one in made if one.key not in kept])}.")
+    if kept and names:
+        raise UsageError("; ".join(kept.values()))
+    for why in kept.values():
+        say(f"Kept: {why}.")
 
 
 def _users_of(one: Stored) -> str:

@@ -9,7 +9,7 @@ import typer
 
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, say
-from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
+from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_sandbox.cli.shared.progress import Bar
 
 if TYPE_CHECKING:
@@ -34,17 +34,13 @@ Grant = Annotated[
 ]
 
 
+@opt.with_options("sandbox", "profile", "python", *opt.HUB)
 def replay(
+    *,
     bundle: BundleFolder,
     grant: Grant = False,
-    sandbox: opt.SandboxName = "process",
-    profile: opt.Profile = None,
-    python: opt.Python = None,
-    token: opt.Token = None,
-    endpoint: opt.Endpoint = None,
-    hub_cache_dir: opt.HubCacheDir = None,
     json: opt.Json = False,
-    debug: opt.Debug = False,
+    make: opt.MakeOptions,
 ) -> None:
     """Make the environment of a crash bundle again, ask the same of it, and say how that ends.
 
@@ -54,24 +50,15 @@ def replay(
 
     [bold]envhub replay ~/.cache/envhub-sandbox/crashes/20261121T081500-5f3a9c01[/bold]
     """
-    given = {
-        "profile": profile,
-        "python": python,
-        "token": token,
-        "endpoint": endpoint,
-        "hub_cache_dir": hub_cache_dir,
-    }
-    with reported(debug=debug):
-        _Replay(bundle, grant, sandbox, given, as_json=json).execute()
+    _Replay(bundle, grant, make, as_json=json).execute()
 
 
 class _Replay:
     """One ``envhub replay``."""
 
-    def __init__(
-        self, folder: Path, grant: bool, sandbox: str, given: dict[str, Any], *, as_json: bool
-    ) -> None:
-        self._folder, self._grant, self._sandbox = folder, grant, sandbox
+    def __init__(self, folder: Path, grant: bool, make: opt.MakeOptions, *, as_json: bool) -> None:
+        self._folder, self._grant, self._sandbox = folder, grant, make.given["sandbox"]
+        given = {name: value for name, value in make.given.items() if name != "sandbox"}
         self._given = {name: value for name, value in given.items() if value is not None}
         self._as_json = as_json
         self._changed: list[str] = []

@@ -11,15 +11,14 @@ from envhub_sandbox.dependencies.choice import Choice, chosen
 from envhub_sandbox.dependencies.missing_module import MissingModule
 from envhub_sandbox.dependencies.pipeline import HERE, PackageSet, packages_for
 from envhub_sandbox.errors import PolicyError
-from envhub_sandbox.factory import arguments
-from envhub_sandbox.factory.config import plain_config
+from envhub_sandbox.factory import sandbox_spec
+from envhub_sandbox.factory.config import plain_config, reference_of
 from envhub_sandbox.factory.env_factory import EnvFactory
-from envhub_sandbox.factory.options import Options
-from envhub_sandbox.factory.sandbox_spec import reference_of, sandbox_of
 from envhub_sandbox.hub import store
 from envhub_sandbox.hub.snapshot import Snapshot, named
 from envhub_sandbox.locks import use as locks
 from envhub_sandbox.option_names import option_name
+from envhub_sandbox.options import Options
 from envhub_sandbox.policy import Policy, Timeouts, policy_from, timeouts_from
 from envhub_sandbox.sandboxes import inprocess
 from envhub_sandbox.sandboxes.base import PackageSource, Sandbox
@@ -80,7 +79,7 @@ def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSui
 
 
 @dataclass(frozen=True)
-class _Wanted:
+class _Plan:
     """What was asked for, looked at before anything is fetched or started."""
 
     place: Sandbox
@@ -92,24 +91,24 @@ class _Wanted:
     lock: LockFile | None
 
 
-def _wanted(sandbox: str | Sandbox, options: Options) -> _Wanted:
+def _wanted(sandbox: str | Sandbox, options: Options) -> _Plan:
     lock = None
     if options.lock is not None:
         lock = locks.opened(options.lock, sandbox, options.python, options.dependencies)
     choice, python = chosen(options.dependencies, options.python)
     policy = policy_from(options.policy, options.limits)
     timeouts = timeouts_from(options.timeouts)
-    place = sandbox_of(sandbox, options.server_key)
+    place = sandbox_spec.sandbox_of(sandbox, options.server_key)
     if choice.where == "own" and sandbox != "process" and not isinstance(place, PackageSource):
         raise PolicyError(
             f"packages by {option_name('dependencies')} are for this machine, for containers and "
             "for servers on other hosts; this place has packages of its own"
         )
-    runtime = Runtime(arguments.interpreter(python))
+    runtime = Runtime(sandbox_spec.interpreter(python))
     if sandbox == "process":
-        arguments.check_executable(runtime.python)
-        arguments.check_readable(policy.readable)
-    return _Wanted(place, policy, timeouts, choice, python, runtime, lock)
+        sandbox_spec.check_executable(runtime.python)
+        sandbox_spec.check_readable(policy.readable)
+    return _Plan(place, policy, timeouts, choice, python, runtime, lock)
 
 
 def _snapshot(reference: str, options: Options) -> Snapshot:
@@ -125,14 +124,14 @@ def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
     """In this process, without a sandbox, as LeRobot does."""
     if not options.trust_remote_code:
         raise inprocess.refusal(reference)
-    options.refuse_what_does_nothing()
+    options.refuse_sandboxed()
     snapshot = _snapshot(reference, options)
     further = dict(options.env_kwargs or {})
     envs = inprocess.make(snapshot, options.n_envs, options.use_async_envs, config, further)
     return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))
 
 
-def _packages(snapshot: Snapshot, wanted: _Wanted, options: Options) -> PackageSet | None:
+def _packages(snapshot: Snapshot, wanted: _Plan, options: Options) -> PackageSet | None:
     """The packages that are made for it; None for those of the place."""
     if wanted.lock is not None:
         return locks.provided(snapshot, wanted.lock)
@@ -146,7 +145,7 @@ def _packages(snapshot: Snapshot, wanted: _Wanted, options: Options) -> PackageS
 def _repository(
     snapshot: Snapshot,
     load: LoadArguments,
-    wanted: _Wanted,
+    wanted: _Plan,
     packages: PackageSet | None,
     options: Options,
     recipe: Recipe,
@@ -166,7 +165,7 @@ def _repository(
     )
 
 
-def _ahead(wanted: _Wanted, options: Options) -> int | None:
+def _ahead(wanted: _Plan, options: Options) -> int | None:
     """How many tasks are started ahead, unasked none where it is not ours alone to say.
 
     A container's memory is all its jails', a quota is all a key's, and a GPU everybody's.

@@ -39,7 +39,13 @@ def _with_settings(ctx: typer.Context, path: Path | None) -> Path | None:
     return path
 
 
+_HERE = ("lock", "num_workers", "validate", "trust_remote_code", "network", "gpu", "readable")
+_OPTIONS = [key for key in opt.ALL if key not in (*_HERE, "environment", "output")]
+
+
+@opt.with_options(*_OPTIONS, n_envs=2)
 def check(
+    *,
     ctx: typer.Context,
     ref: Annotated[
         str | None,
@@ -117,13 +123,6 @@ def check(
     again: own.Again = False,
     suite: opt.Suite = None,
     task: opt.Task = None,
-    n_envs: opt.NEnvs = 2,
-    use_async: opt.UseAsync = False,
-    env_kwargs: opt.EnvKwargs = None,
-    python: opt.Python = None,
-    dependencies: opt.Dependencies = "auto",
-    sandbox: opt.SandboxName = "process",
-    server_key: opt.ServerKey = None,
     policy: Annotated[
         Path | None,
         typer.Option(
@@ -132,15 +131,7 @@ def check(
             rich_help_panel=_MAY,
         ),
     ] = None,
-    profile: opt.Profile = None,
-    memory: opt.Memory = None,
-    disk: opt.Disk = None,
-    processes: opt.Processes = None,
-    cpu_time: opt.CpuTime = None,
-    timeout: opt.Timeout = None,
-    token: opt.Token = None,
-    endpoint: opt.Endpoint = None,
-    hub_cache_dir: opt.HubCacheDir = None,
+    make: opt.MakeOptions,
     debug: opt.Debug = False,
 ) -> None:
     """Run a repository in a sandbox and say what is wrong with it.
@@ -154,7 +145,6 @@ def check(
     [bold]envhub check --all references.txt --output judged[/bold]
     """
     with reported(debug=debug):
-        make = opt.MakeOptions.of(ctx)
         if not math.isfinite(deadline):
             raise UsageError(f"--deadline is {deadline}; it takes seconds, such as 900")
         least, allowed = level(fail_on), _known(allow or ())

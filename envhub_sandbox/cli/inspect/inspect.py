@@ -10,7 +10,6 @@ import typer
 from envhub_sandbox.cli.inspect.static import check_options, inspect_static
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, show
-from envhub_sandbox.cli.shared.exits import reported
 from envhub_sandbox.cli.shared.findings import FailOn
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_sandbox.cli.shared.report import print_provenance
@@ -20,7 +19,12 @@ _SPACES = ("single_observation_space", "single_action_space", "observation_space
 _SPACE_TEXT = 2000
 
 
+_OPTIONS = [key for key in opt.ALL if key not in ("num_workers", "validate", "output")]
+
+
+@opt.with_options(*_OPTIONS)
 def inspect(
+    *,
     context: typer.Context,
     ref: opt.Ref,
     static: Annotated[
@@ -34,50 +38,18 @@ def inspect(
     json: opt.Json = False,
     suite: opt.Suite = None,
     task: opt.Task = None,
-    n_envs: opt.NEnvs = 1,
-    use_async: opt.UseAsync = False,
-    env_kwargs: opt.EnvKwargs = None,
-    python: opt.Python = None,
-    dependencies: opt.Dependencies = "auto",
-    lock: opt.Lock = None,
-    sandbox: opt.SandboxOrNone = "process",
-    server_key: opt.ServerKey = None,
-    trust: opt.Trust = False,
-    profile: opt.Profile = None,
-    network: opt.Network = None,
-    gpu: opt.Gpu = None,
-    readable: opt.Readable = None,
-    variables: opt.Variables = None,
-    memory: opt.Memory = None,
-    disk: opt.Disk = None,
-    processes: opt.Processes = None,
-    cpu_time: opt.CpuTime = None,
-    timeout: opt.Timeout = None,
-    token: opt.Token = None,
-    endpoint: opt.Endpoint = None,
-    hub_cache_dir: opt.HubCacheDir = None,
-    debug: opt.Debug = False,
+    make: opt.MakeOptions,
 ) -> None:
     """Print suites, tasks, spaces, metadata and provenance, without stepping anything.
 
     The repository's make_env runs (in the sandbox) unless its answer is remembered. With --static
     nothing runs: files, entry, packages, imports, and what is worth a look are read.
     """
-    with reported(debug=debug):
-        check_options(context, static=static)
-        if static:
-            inspect_static(
-                ref,
-                as_json=json,
-                sarif=sarif,
-                fail_on=fail_on,
-                token=token,
-                endpoint=endpoint,
-                hub_cache_dir=hub_cache_dir,
-            )
-            return
-        make = opt.MakeOptions.of(context)
-        _inspect(make, suite, task, as_json=json)
+    check_options(context, static=static)
+    if static:
+        inspect_static(ref, as_json=json, sarif=sarif, fail_on=fail_on, hub=make.hub)
+        return
+    _inspect(make, suite, task, as_json=json)
 
 
 def _inspect(

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -48,9 +48,7 @@ def inspect_static(
     as_json: bool,
     sarif: Path | None,
     fail_on: str | None,
-    token: str | None,
-    endpoint: str | None,
-    hub_cache_dir: str | None,
+    hub: Mapping[str, Any],
 ) -> None:
     """Read a repository, and say what is in it."""
     least = None if fail_on is None else level(fail_on)
@@ -59,7 +57,7 @@ def inspect_static(
         from envhub_sandbox.check.static.static import document, static
         from envhub_sandbox.hub.snapshot import named
 
-        snapshot = named(ref, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
+        snapshot = named(ref, **hub)
         read = static(snapshot)
     failures = [one for one in read.findings if least and one.check.severity.reaches(least)]
     if sarif is not None:

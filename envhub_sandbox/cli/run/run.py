@@ -13,7 +13,7 @@ import typer
 from envhub_sandbox.cli.shared import logs
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
-from envhub_sandbox.cli.shared.exits import code_for, describe, reported
+from envhub_sandbox.cli.shared.exits import code_for, describe
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_sandbox.cli.shared.report import (
     TaskResult,
@@ -36,8 +36,9 @@ class PolicyName(str, Enum):
     ZERO = "zero"
 
 
+@opt.with_options(*opt.ALL)
 def run(
-    context: typer.Context,
+    *,
     ref: opt.Ref,
     episodes: Annotated[
         int, typer.Option("--episodes", "-e", min=1, help="Episodes of each task, exactly.")
@@ -61,35 +62,10 @@ def run(
         ),
     ] = None,
     json: opt.Json = False,
-    worker_output: logs.WorkerOutput = None,
     verbose: logs.Verbose = False,
     suite: opt.Suite = None,
     task: opt.Task = None,
-    n_envs: opt.NEnvs = 1,
-    use_async: opt.UseAsync = False,
-    env_kwargs: opt.EnvKwargs = None,
-    python: opt.Python = None,
-    dependencies: opt.Dependencies = "auto",
-    lock: opt.Lock = None,
-    num_workers: opt.NumWorkers = None,
-    validate: opt.Validate = False,
-    sandbox: opt.SandboxOrNone = "process",
-    server_key: opt.ServerKey = None,
-    trust: opt.Trust = False,
-    profile: opt.Profile = None,
-    network: opt.Network = None,
-    gpu: opt.Gpu = None,
-    readable: opt.Readable = None,
-    variables: opt.Variables = None,
-    memory: opt.Memory = None,
-    disk: opt.Disk = None,
-    processes: opt.Processes = None,
-    cpu_time: opt.CpuTime = None,
-    timeout: opt.Timeout = None,
-    token: opt.Token = None,
-    endpoint: opt.Endpoint = None,
-    hub_cache_dir: opt.HubCacheDir = None,
-    debug: opt.Debug = False,
+    make: opt.MakeOptions,
 ) -> None:
     """Play episodes of an environment and print returns, lengths, speed and provenance.
 
@@ -97,8 +73,7 @@ def run(
 
     [bold]envhub run ./examples/cartpole --episodes 20 --n-envs 4 --video cartpole.mp4[/bold]
     """
-    with reported(debug=debug), logs.logged(verbose=verbose, worker_output=worker_output):
-        make = opt.MakeOptions.of(context)
+    with logs.logged(verbose=verbose, worker_output=make.given["output"]):
         play = Play(episodes=episodes, policy=policy.value, seed=seed, steps=steps, video=video)
         _Run(make, play, suite, task, as_json=json).execute()
 

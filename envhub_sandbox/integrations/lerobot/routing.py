@@ -7,7 +7,6 @@ whoever wants it has imported it already.
 
 from __future__ import annotations
 
-import inspect
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -17,11 +16,12 @@ import lerobot.envs.factory
 
 from envhub_sandbox.api import make_env
 from envhub_sandbox.integrations.lerobot.config import ASKS_CONFIGS, SandboxedEnvConfig
+from envhub_sandbox.options import OPTIONS
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 
 _HELPERS = ("_download_hub_file", "_import_hub_module", "_call_make_env")
-_GIVEN = ("cfg", "n_envs", "use_async_envs", "hub_cache_dir", "trust_remote_code")
+_GIVEN = ("n_envs", "use_async_envs", "hub_cache_dir", "trust_remote_code")
 
 
 def install(**options: Any) -> None:
@@ -37,7 +37,7 @@ def install(**options: Any) -> None:
         TypeError: An option that it does not have.
         RuntimeError: This LeRobot loads repositories in another way than is known here.
     """
-    known = [name for name in inspect.signature(make_env).parameters if name not in _GIVEN]
+    known = [key for key, one in OPTIONS.items() if not one.field and key not in _GIVEN]
     unknown = [name for name in options if name not in known]
     if unknown:
         raise TypeError(f"there is no option {', '.join(unknown)}; there are {', '.join(known)}")

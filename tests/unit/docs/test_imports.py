@@ -54,6 +54,7 @@ DESERIALISERS = {"_pickle", "copyreg", "dill", "joblib", "marshal", "pickle", "s
 # Every package may import the lowest ones, LOWEST, as far as these stand below it.
 LOWEST = {
     *("envhub_sandbox.errors", "envhub_sandbox.log", "envhub_sandbox.option_names"),
+    "envhub_sandbox.options",
     *("envhub_sandbox.system", "envhub_worker.protocol"),
 }
 MAY_IMPORT = {
@@ -93,6 +94,7 @@ MAY_IMPORT = {
     "envhub_sandbox.parent": set(),
     "envhub_sandbox.errors": set(),
     "envhub_sandbox.option_names": set(),
+    "envhub_sandbox.options": set(),
     "envhub_sandbox.system": set(),
     "envhub_worker.__main__": {"cli", "std_streams"},
     "envhub_worker.cli": {"", "access", "lockdown", "server", "spawn"},
