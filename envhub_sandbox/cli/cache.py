@@ -1,4 +1,4 @@
-"""``envhub cache``: what lies in the stores of snapshots and of environments, and how it goes."""
+"""``envhub cache``: the stores of snapshots and environments; ``envhub gc``: what was left."""
 
 from __future__ import annotations
 
@@ -12,19 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import print_json, say, show_rows
-from envhub_sandbox.cli.shared.exits import UsageError
-from envhub_sandbox.cli.shared.program import Command
+from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say, show_rows
+from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_worker.protocol.text import counted, size_text
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.environments import Environment
-
-app = typer.Typer(
-    help="List and remove what was downloaded, and made of it.",
-    no_args_is_help=True,
-    rich_markup_mode="rich",
-)
 
 _DAY_S = 24 * 3600.0
 
@@ -84,7 +77,6 @@ def _repository(name: str) -> str:
     return prefix + "/".join(parts) if parts else name
 
 
-@app.command("list", cls=Command)
 @opt.with_options()
 def list_(
     json: opt.Json = False,
@@ -158,7 +150,6 @@ def _day(seconds: float) -> str:
     return time.strftime("%F", time.localtime(seconds))
 
 
-@app.command("remove", cls=Command, no_args_is_help=True)
 @opt.with_options()
 def remove(
     names: Annotated[
@@ -226,3 +217,36 @@ def _chosen(
         return meant and (oldest is None or one.used < oldest)
 
     return [one for one in found if is_chosen(one)], [one for one in made if is_chosen(one)]
+
+
+@opt.with_options()
+def gc(
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", "-n", help="Say what would be removed.")
+    ] = False,
+    json: opt.Json = False,
+) -> None:
+    """Remove containers, runtime folders and control groups whose client is gone.
+
+    Usually there are none: they end with the client. Never touched are those of a client that
+    still runs, of another machine's clients while they run, or of anything but envhub; nor those
+    of another user, but root removes every user's containers and control groups. Exit code 9 says
+    that an engine is installed and could not be asked.
+    """
+    from envhub_sandbox.sandboxes.docker import prune
+
+    found, unasked = prune.find()
+    removed = [] if dry_run else [one for one in found if one.remove()]
+    if json:
+        items = [{"kind": one.kind, "name": one.name, "removed": one in removed} for one in found]
+        print_json({"found": items, "unasked": unasked})
+    for one in () if json else found:
+        done = "removed" if one in removed else "found" if dry_run else "could not remove"
+        out(f"{done}: {one.kind} {safe_line(one.name, 300)}")
+    for engine, why in unasked.items():
+        reason = safe_line(why, 500)
+        say(f"{engine} could not be asked, so its containers are not known: {reason}")
+    if not json:
+        say(f"{len(found)} left behind, {len(removed)} removed.")
+    if unasked:
+        raise typer.Exit(Exit.UNASKED)

@@ -9,7 +9,6 @@ import typer
 
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
-from envhub_sandbox.cli.shared.program import Command
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_worker.protocol.text import counted
 
@@ -18,17 +17,7 @@ if TYPE_CHECKING:
     from envhub_sandbox.dependencies.resolve import Target
     from envhub_sandbox.hub.snapshot import Snapshot
 
-app = typer.Typer(
-    help="Container images for repositories.", no_args_is_help=True, rich_markup_mode="rich"
-)
 
-
-@app.callback()
-def images() -> None:
-    """Container images for repositories."""
-
-
-@app.command("build", cls=Command)
 @opt.with_options(*opt.HUB)
 def build(
     *,

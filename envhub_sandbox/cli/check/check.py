@@ -17,7 +17,6 @@ from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
 from envhub_sandbox.cli.shared.findings import STYLES, annotate, level, show_finding
 from envhub_sandbox.cli.shared.progress import Bar
-from envhub_sandbox.cli.shared.select import select
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
@@ -181,7 +180,7 @@ def check(
             steps=steps,
             resets=resets,
             slow_step_s=slow_step,
-            tasks=lambda envs: [one[:2] for one in select(envs, suite, task)],
+            tasks=lambda envs: [one[:2] for one in opt.select(envs, suite, task)],
             pictures=html is not None,
         )
         failures = report.failures(least, allowed)

@@ -13,7 +13,6 @@ from envhub_sandbox.cli.shared.console import out, print_json, safe_line, show
 from envhub_sandbox.cli.shared.findings import FailOn
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_sandbox.cli.shared.report import print_provenance
-from envhub_sandbox.cli.shared.select import select
 
 _SPACES = ("single_observation_space", "single_action_space", "observation_space", "action_space")
 _SPACE_TEXT = 2000
@@ -61,7 +60,7 @@ def _inspect(
     with Bar(quiet=as_json) as bar, make.explained():
         bar.begin(f"loading {make.ref} in a sandbox")
         with make_env(**arguments) as envs:
-            found = [describe_env(*item) for item in select(envs, suites, tasks)]
+            found = [describe_env(*item) for item in opt.select(envs, suites, tasks)]
             provenance = envs.provenance
     if as_json:
         print_json({"reference": make.ref, "envs": found, "provenance": provenance})

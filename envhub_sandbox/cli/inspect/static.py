@@ -33,13 +33,11 @@ def check_options(context: typer.Context, *, static: bool) -> None:
     Raises:
         UsageError: There is one.
     """
-    given = [name for name in context.params if is_typed(context, name)]
     means = _OF_BOTH | _OF_STATIC if static else set(context.params) - _OF_STATIC
-    wrong = [name for name in given if name not in means]
-    if wrong:
-        shown = "--" + wrong[0].replace("_", "-")
-        why = "with --static nothing runs" if static else "it needs --static"
-        raise UsageError(f"{shown} means nothing here: {why}")
+    for one in context.command.params:
+        if one.name not in means and is_typed(context, one.name or ""):
+            why = "with --static nothing runs" if static else "it needs --static"
+            raise UsageError(f"{one.opts[0]} means nothing here: {why}")
 
 
 def inspect_static(

@@ -10,19 +10,10 @@ from typing import Annotated
 import typer
 
 from envhub_sandbox.cli.shared.console import safe_text
+from envhub_sandbox.options import OPTIONS
 
-_PANEL = "What it tells"
+_PANEL = OPTIONS["output"].panel
 
-WorkerOutput = Annotated[
-    str | None,
-    typer.Option(
-        "--worker-output",
-        metavar="FILE|-",
-        help="Write what the worker prints to this file, a further file for each further jail; "
-        "- is stderr.",
-        rich_help_panel=_PANEL,
-    ),
-]
 Verbose = Annotated[
     bool,
     typer.Option(
@@ -34,11 +25,6 @@ Verbose = Annotated[
 class _Safe(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         return safe_text(super().format(record))
-
-
-def output_policy(worker_output: str | None) -> str | None:
-    """The policy's ``output`` for this option; None for the default."""
-    return None if worker_output == "-" else worker_output
 
 
 @contextlib.contextmanager

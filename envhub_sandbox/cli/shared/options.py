@@ -15,8 +15,8 @@ from typing import Annotated, Any
 
 import typer
 
+from envhub_sandbox.cli.shared.console import safe_line
 from envhub_sandbox.cli.shared.exits import ForeignError, UsageError, reported
-from envhub_sandbox.cli.shared.logs import output_policy
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.options import OPTIONS
 from envhub_worker.protocol.text import parse_size
@@ -25,6 +25,7 @@ ALL = tuple(key for key, one in OPTIONS.items() if one.command)
 """Every option that a command can have, by keys of ``OPTIONS``."""
 HUB = ("token", "endpoint", "hub_cache_dir")
 _PANEL = OPTIONS["n_envs"].panel
+_NAMED = 20
 
 Ref = Annotated[
     str,
@@ -187,6 +188,29 @@ class MakeOptions:
             raise ForeignError(text) from error
 
 
+def select(
+    envs: Mapping[str, Mapping[Any, Any]],
+    suites: Sequence[str] | None,
+    tasks: Sequence[str] | None,
+) -> list[tuple[str, Any, Any]]:
+    """``(suite, task, env)`` for each chosen environment; all where nothing is chosen.
+
+    Raises:
+        UsageError: None fits; the text names what there is.
+    """
+    found = [(suite, task, env) for suite, group in envs.items() for task, env in group.items()]
+    chosen = [
+        item
+        for item in found
+        if (not suites or str(item[0]) in suites) and (not tasks or str(item[1]) in tasks)
+    ]
+    if not chosen:
+        names = ", ".join(safe_line(f"{suite}/{task}", 80) for suite, task, _ in found[:_NAMED])
+        more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+        raise UsageError(f"no such suite or task; there are (suite/task): {names}{more}")
+    return chosen
+
+
 def read_gpu(text: str | None) -> bool | list[int] | None:
     """``all`` or indices.
 
@@ -283,7 +307,7 @@ _READERS: dict[str, Callable[[Any], Any]] = {
     "sandbox": lambda name: None if name == "none" else name,
     "env_kwargs": lambda texts: read_env_kwargs(texts or ()),
     "dependencies": read_dependencies,
-    "output": output_policy,
+    "output": lambda name: None if name == "-" else name,  # "-" is logs.logged()
     "gpu": read_gpu,
 }
 """How values are made of what was typed, where the two are not the same."""

@@ -14,9 +14,9 @@ from envhub_sandbox.cli.shared.options import (
     read_env_kwargs,
     read_gpu,
     read_size,
+    select,
     with_options,
 )
-from envhub_sandbox.cli.shared.select import select
 from envhub_sandbox.errors import PolicyError, RemoteEnvError
 from envhub_sandbox.options import OPTIONS
 from envhub_sandbox.policy import policy_from

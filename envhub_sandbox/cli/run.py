@@ -21,7 +21,6 @@ from envhub_sandbox.cli.shared.report import (
     print_results,
     task_document,
 )
-from envhub_sandbox.cli.shared.select import select
 from envhub_sandbox.errors import EnvHubError
 
 if TYPE_CHECKING:
@@ -134,7 +133,7 @@ class _Run:
         with make_env(**arguments) as envs:
             self._make_env_s = time.perf_counter() - self._begun
             try:
-                chosen = select(envs, self._suites, self._tasks)
+                chosen = opt.select(envs, self._suites, self._tasks)
                 for number, (suite, task, env) in enumerate(chosen, start=1):
                     video = self._video_path(number, len(chosen))
                     bar.begin(f"{suite} / {task}", self._play.episodes)
