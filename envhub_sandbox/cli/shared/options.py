@@ -59,18 +59,19 @@ def with_options(*keys: str, **defaults: Any) -> Callable[[_Command], _Command]:
         keys: Of ``OPTIONS``.
         defaults: Those that differ from ``make_env``'s, by key.
     """
-    made = {one.name: one for one in _parameters(keys, defaults)}
+    made = {OPTIONS[key].parameter: _parameter(key, keys, defaults) for key in keys}
 
     def decorate(function: _Command) -> _Command:
         own = inspect.signature(function, eval_str=True).parameters
-        shown = [one for name in own for one in (made.values() if name == "make" else (own[name],))]
-        if "debug" not in own:
-            shown.append(_parameter("debug", False, Debug))
+        shown: dict[str, inspect.Parameter] = {}
+        for name, one in own.items():
+            shown |= made if name == "make" else {name: one}
+        shown.setdefault("debug", _keyword("debug", False, Debug))
 
         @functools.wraps(function)
         def command(**given: Any) -> None:
-            debug = given.get("debug") if "debug" in own else given.pop("debug", False)
-            with reported(debug=bool(debug)):
+            debug = given.get("debug", False) if "debug" in own else given.pop("debug", False)
+            with reported(debug=debug):
                 values = {name: given.pop(name) for name in made}
                 if "make" in own:
                     said = {key: values[OPTIONS[key].parameter] for key in keys}
@@ -79,38 +80,38 @@ def with_options(*keys: str, **defaults: Any) -> Callable[[_Command], _Command]:
 
         # what typer reads
         vars(command)["__signature__"] = inspect.Signature(
-            [_parameter(one.name, one.default, one.annotation) for one in shown]
+            [_keyword(one.name, one.default, one.annotation) for one in shown.values()]
         )
-        command.__annotations__ = {one.name: one.annotation for one in shown}
+        command.__annotations__ = {name: one.annotation for name, one in shown.items()}
         return command
 
     return decorate
 
 
-def _parameter(name: str, default: Any, annotation: Any) -> inspect.Parameter:
-    kind = inspect.Parameter.KEYWORD_ONLY  # so that no order of defaults matters
+def _keyword(name: str, default: Any, annotation: Any) -> inspect.Parameter:
+    """A parameter whose place in a signature says nothing."""
+    kind = inspect.Parameter.KEYWORD_ONLY
     return inspect.Parameter(name, kind, default=default, annotation=annotation)
 
 
-def _parameters(keys: Sequence[str], defaults: Mapping[str, Any]) -> Iterator[inspect.Parameter]:
-    for key in keys:
-        one = OPTIONS[key]
-        if key == "sandbox" and "trust_remote_code" in keys:
-            text = "Where it runs; 'none' is this process, unprotected."
-            one = replace(one, metavar=f"{one.metavar}|none", help=text)
-        option = typer.Option(
-            *one.command.split(),
-            help=one.help,
-            metavar=one.metavar,
-            min=one.least,
-            max=one.most,
-            autocompletion=_completion(one.metavar or ""),
-            rich_help_panel=one.panel,
-        )
-        default = defaults.get(key, one.default)
-        kind: Any = list[str] if one.kind in (list, dict) else one.kind
-        annotation: Any = Annotated[kind if default is not None else kind | None, option]
-        yield _parameter(one.parameter, default, annotation)
+def _parameter(key: str, others: Sequence[str], defaults: Mapping[str, Any]) -> inspect.Parameter:
+    one = OPTIONS[key]
+    if key == "sandbox" and "trust_remote_code" in others:
+        text = "Where it runs; 'none' is this process, unprotected."
+        one = replace(one, metavar=f"{one.metavar}|none", help=text)
+    option = typer.Option(
+        *one.command.split(),
+        help=one.help,
+        metavar=one.metavar,
+        min=one.least,
+        max=one.most,
+        autocompletion=_completion(one.metavar or ""),
+        rich_help_panel=one.panel,
+    )
+    default = defaults.get(key, one.default)
+    kind: Any = list[str] if one.kind in (list, dict) else one.kind
+    annotation: Any = Annotated[kind if default is not None else kind | None, option]
+    return _keyword(one.parameter, default, annotation)
 
 
 def _completion(metavar: str) -> Callable[[], list[str]] | None:
