@@ -74,7 +74,7 @@ def make_env(
         num_workers: Processes over which the sub-environments are spread; by default one, or with
             ``use_async_envs`` as many as are useful for the cores there are.
         prewarm: How many of a suite's next tasks are started in the background when a task is first
-            reset, and so how many jails there are at most that nobody has used yet. By default one,
+            reset, and so how many unused jails there are at most. By default one,
             once tasks are seen to be closed before the next is reset, on this machine and without
             a GPU; else none.
         lane: ``"auto"`` steps over shared memory where that is possible, ``"frames"`` never does.

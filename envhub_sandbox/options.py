@@ -227,6 +227,11 @@ class Options:
         None, "--hub-cache-dir", "huggingface_hub's cache_dir.", metavar="PATH", panel=_HUB
     )
 
+    @property
+    def hub(self) -> dict[str, Any]:
+        """Which Hub, and how."""
+        return {key: getattr(self, key) for key in ("token", "endpoint", "hub_cache_dir")}
+
     def checked(self) -> Options:
         """The same, where each has the form that the rest relies on; nothing has been started yet.
 
@@ -281,7 +286,7 @@ _KEYS: dict[str, dict[str, Option]] = {
             "Write what the worker prints to this file, a further file for each further jail; "
             "- is stderr.",
             "FILE|-",
-            panel="What it tells",
+            panel="What it logs",
         ),
     },
     "limits": {

@@ -23,7 +23,7 @@ _DAY_S = 24 * 3600.0
 
 
 @dataclass(frozen=True)
-class Stored:
+class StoredSnapshot:
     """A snapshot in the store.
 
     Attributes:
@@ -49,7 +49,7 @@ class Stored:
         return name == self.repository or (len(name) >= 7 and self.commit.startswith(name))
 
 
-def stored_snapshots() -> list[Stored]:
+def stored_snapshots() -> list[StoredSnapshot]:
     """Everything in the store, the latest used first. Nothing is verified."""
     from envhub_sandbox.hub import store
 
@@ -59,7 +59,7 @@ def stored_snapshots() -> list[Stored]:
     return sorted((one for one in found if one is not None), key=lambda one: -one.used)
 
 
-def _read(record: Path) -> Stored | None:
+def _read(record: Path) -> StoredSnapshot | None:
     try:
         document = json_module.loads(record.read_bytes())
         size = sum(row[1] for row in document["files"])
@@ -68,7 +68,7 @@ def _read(record: Path) -> Stored | None:
         return None
     home = record.parent
     revision = document.get("revision")
-    return Stored(_repository(home.parent.name), home.name, revision, used, size, home)
+    return StoredSnapshot(_repository(home.parent.name), home.name, revision, used, size, home)
 
 
 def _repository(name: str) -> str:
@@ -97,7 +97,7 @@ def list_(
     say(f"{_told(found, made)}, in {store.cache_root()}")
 
 
-def _told(found: list[Stored], made: list[Environment]) -> str:
+def _told(found: list[StoredSnapshot], made: list[Environment]) -> str:
     total = sum(one.size for one in found) + sum(one.size for one in made)
     snapshots, environments = counted(len(found), "snapshot"), counted(len(made), "environment")
     return f"{snapshots}, {environments}, {size_text(total)}"
@@ -125,7 +125,7 @@ def _print_environments(made: list[Environment]) -> None:
     show_rows([("environment", "Python", "last used", "size", "packages"), *rows], right=(3,))
 
 
-def _data(found: list[Stored]) -> list[dict[str, Any]]:
+def _data(found: list[StoredSnapshot]) -> list[dict[str, Any]]:
     return [
         {
             "repository": one.repository,
@@ -138,7 +138,7 @@ def _data(found: list[Stored]) -> list[dict[str, Any]]:
     ]
 
 
-def _print(found: list[Stored]) -> None:
+def _print(found: list[StoredSnapshot]) -> None:
     rows = [
         (one.repository, one.commit, one.revision or "", _day(one.used), size_text(one.size))
         for one in found
@@ -164,7 +164,8 @@ def remove(
         bool, typer.Option("--all", help="Everything, remembered descriptions included.")
     ] = False,
     unused_for: Annotated[
-        float | None, typer.Option(metavar="DAYS", min=0, help="What nobody used for so long.")
+        float | None,
+        typer.Option(metavar="DAYS", min=0, help="What was not used for so long."),
     ] = None,
 ) -> None:
     """Remove snapshots and environments, and what was left half-made. Not while one is used."""
@@ -188,7 +189,7 @@ def remove(
         say(f"Kept: {why}.")
 
 
-def _users_of(one: Stored) -> str:
+def _users_of(one: StoredSnapshot) -> str:
     """Remove a snapshot; who uses it, if somebody does: then it stays."""
     from envhub_sandbox.hub import store
 
@@ -202,9 +203,9 @@ def _users_of(one: Stored) -> str:
 
 
 def _chosen(
-    found: list[Stored], made: list[Environment], names: list[str], unused_for: float | None
-) -> tuple[list[Stored], list[Environment]]:
-    everyone: list[Stored | Environment] = [*found, *made]
+    found: list[StoredSnapshot], made: list[Environment], names: list[str], unused_for: float | None
+) -> tuple[list[StoredSnapshot], list[Environment]]:
+    everyone: list[StoredSnapshot | Environment] = [*found, *made]
     for name in names:
         if not any(one.answers_to(name) for one in everyone):
             raise UsageError(f"nothing in the store is called {name!r}; see: envhub cache list")
@@ -212,7 +213,7 @@ def _chosen(
     if not names and oldest is None:
         return [], []
 
-    def is_chosen(one: Stored | Environment) -> bool:
+    def is_chosen(one: StoredSnapshot | Environment) -> bool:
         meant = not names or any(one.answers_to(name) for name in names)
         return meant and (oldest is None or one.used < oldest)
 

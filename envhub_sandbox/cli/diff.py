@@ -1,4 +1,4 @@
-"""``envhub diff``: what is different between two commits, for whoever approves a new pin."""
+"""``envhub diff``: what is different between two commits, before a new pin is approved."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ def verify(
 ) -> None:
     """Say whether a repository is still as it was locked, and if not, what differs (exit code 7).
 
-    Files, the packages on the index, Python, and, unless told otherwise, its spaces.
+    Files, the packages on the index, Python, and, except with --no-spaces, its spaces.
     """
     with Bar(quiet=json) as bar:
         bar.begin(f"verifying {file}")

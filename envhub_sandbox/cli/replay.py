@@ -90,7 +90,7 @@ class _Replay:
         if wanted and not self._grant:
             raise UsageError(
                 f"the bundle asks for more than an ordinary run: {', '.join(wanted)}. If that is "
-                "yours, or you trust whoever gave you the bundle, add --grant"
+                "yours, or you trust where the bundle comes from, add --grant"
             )
 
     def _run(self, bundle: Bundle, bar: Bar) -> Replayed:

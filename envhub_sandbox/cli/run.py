@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -10,9 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli.shared import logs
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
+from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, say
 from envhub_sandbox.cli.shared.exits import code_for, describe
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_sandbox.cli.shared.report import (
@@ -22,10 +24,22 @@ from envhub_sandbox.cli.shared.report import (
     task_document,
 )
 from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.options import OPTIONS
 
 if TYPE_CHECKING:
     from envhub_sandbox.rollouts.episodes import EpisodeCounter, Rollout
     from envhub_sandbox.rollouts.video import VideoWriter
+
+
+Verbose = Annotated[
+    bool,
+    typer.Option(
+        "--verbose",
+        "-v",
+        help="Log jails and downloads on stderr.",
+        rich_help_panel=OPTIONS["output"].panel,
+    ),
+]
 
 
 class PolicyName(str, Enum):
@@ -61,7 +75,7 @@ def run(
         ),
     ] = None,
     json: opt.Json = False,
-    verbose: logs.Verbose = False,
+    verbose: Verbose = False,
     suite: opt.Suite = None,
     task: opt.Task = None,
     make: opt.MakeOptions,
@@ -72,7 +86,7 @@ def run(
 
     [bold]envhub run ./examples/cartpole --episodes 20 --n-envs 4 --video cartpole.mp4[/bold]
     """
-    with logs.logged(verbose=verbose, worker_output=make.given["output"]):
+    with _logged(verbose=verbose, worker_output=make.given["output"]):
         _Run(
             make=make,
             episodes=episodes,
@@ -229,3 +243,44 @@ class _Run:
         stopped = [result for result in self.results if not result.rollout.complete]
         if stopped:
             say(f"{len(stopped)} of {len(self.results)} tasks were stopped by --steps.")
+
+
+# --- what --verbose and --worker-output show on stderr -----------------------------------------
+
+
+class _SafeFormatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        return safe_text(super().format(record))
+
+
+@contextlib.contextmanager
+def _logged(*, verbose: bool, worker_output: str | None) -> Iterator[None]:
+    """Show logs on stderr while it lasts."""
+    from envhub_sandbox.log import OUTPUT, ROOT
+
+    shown = []
+    if verbose:
+        shown.append(_show(ROOT, logging.DEBUG, "%(asctime)s %(message)s"))
+        shown[-1][1].addFilter(lambda record: record.name != OUTPUT.name)
+        shown.append((OUTPUT, logging.NullHandler(), OUTPUT.level))
+        OUTPUT.setLevel(logging.INFO)  # else no jail's output is followed
+    if worker_output == "-":
+        shown.append(_show(OUTPUT, logging.DEBUG, "%(message)s"))
+    try:
+        yield
+    finally:
+        for logger, handler, level in reversed(shown):
+            logger.removeHandler(handler)
+            logger.setLevel(level)
+
+
+def _show(
+    logger: logging.Logger, level: int, form: str
+) -> tuple[logging.Logger, logging.Handler, int]:
+    handler = logging.StreamHandler()
+    handler.setLevel(level)
+    handler.setFormatter(_SafeFormatter(form, "%H:%M:%S"))
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(level)
+    return logger, handler, before

@@ -120,7 +120,7 @@ class EnvFactory:
         return EnvSession(source, env, bounds, paces)
 
     def _use(self, loaded: LoadedJail, sessions: list[EnvSession]) -> None:
-        """The jail that told the manifest becomes the only task's; a suite holds none in stock."""
+        """The jail that gave the manifest becomes the only task's; a suite closes it."""
         if len(sessions) == 1:
             with self._repository.named():
                 sessions[0].prewarm.adopt(loaded)

@@ -48,7 +48,7 @@ def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSui
         return _make_here(reference, config, options)
     std_streams.occupy()  # before anything of ours is opened
     wanted = _wanted(options.sandbox, options)
-    snapshot = _snapshot(reference, options)
+    snapshot = named(reference, **options.hub)
     packages = _packages(snapshot, wanted, options)
     load = LoadArguments(
         n_envs=options.n_envs,
@@ -68,7 +68,19 @@ def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSui
             dependencies="auto" if wanted.python is not None else options.dependencies,
         ),
     )
-    repository = _repository(snapshot, load, wanted, packages, options, recipe)
+    own = packages is not None
+    repository = Repository(
+        snapshot,
+        load,
+        wanted.policy,
+        wanted.timeouts,
+        Runtime(packages.python, packages.packages) if packages else wanted.runtime,
+        options.lane,
+        options.copy,
+        recipe=recipe,
+        installed=packages.facts if packages else None,
+        advice=MissingModule(snapshot, wanted.place.name, wanted.choice, wanted.python, own).advice,
+    )
     return EnvFactory(
         Launcher(repository, wanted.place, store.cache_root() / "snapshots"),
         options.num_workers,
@@ -111,21 +123,12 @@ def _wanted(sandbox: str | Sandbox, options: Options) -> _Plan:
     return _Plan(place, policy, timeouts, choice, python, runtime, lock)
 
 
-def _snapshot(reference: str, options: Options) -> Snapshot:
-    return named(
-        reference,
-        hub_cache_dir=options.hub_cache_dir,
-        token=options.token,
-        endpoint=options.endpoint,
-    )
-
-
 def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
     """In this process, without a sandbox, as LeRobot does."""
     if not options.trust_remote_code:
         raise inprocess.refusal(reference)
     options.refuse_sandboxed()
-    snapshot = _snapshot(reference, options)
+    snapshot = named(reference, **options.hub)
     further = dict(options.env_kwargs or {})
     envs = inprocess.make(snapshot, options.n_envs, options.use_async_envs, config, further)
     return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))
@@ -140,29 +143,6 @@ def _packages(snapshot: Snapshot, wanted: _Plan, options: Options) -> PackageSet
         return None
     target = place.package_target() if isinstance(place, PackageSource) else HERE
     return packages_for(snapshot, wanted.choice, target, gpu=bool(wanted.policy.gpu))
-
-
-def _repository(
-    snapshot: Snapshot,
-    load: LoadArguments,
-    wanted: _Plan,
-    packages: PackageSet | None,
-    options: Options,
-    recipe: Recipe,
-) -> Repository:
-    own = packages is not None
-    return Repository(
-        snapshot,
-        load,
-        wanted.policy,
-        wanted.timeouts,
-        Runtime(packages.python, packages.packages) if packages else wanted.runtime,
-        options.lane,
-        options.copy,
-        recipe=recipe,
-        installed=packages.facts if packages else None,
-        advice=MissingModule(snapshot, wanted.place.name, wanted.choice, wanted.python, own).advice,
-    )
 
 
 def _ahead(wanted: _Plan, options: Options) -> int | None:

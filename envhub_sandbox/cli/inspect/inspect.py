@@ -91,14 +91,14 @@ def _print(found: list[dict[str, Any]], provenance: dict[str, Any], *, in_proces
     for env in found:
         title = f"{env['suite']} / {env['task']}"
         out(title if env["spec_id"] is None else f"{title}  ({env['spec_id']})", "bold")
-        told = {
+        lines = {
             "sub-environments": env["num_envs"],
             "observations": env["single_observation_space"],
             "actions": env["single_action_space"],
             "autoreset mode": env["autoreset_mode"] or "not stated",
             "render mode": env["render_mode"] or "None",
         }
-        for name, value in (*told.items(), *env["metadata"].items()):
+        for name, value in (*lines.items(), *env["metadata"].items()):
             show(f"  {safe_line(name, 40)}", value, width=19)
     out()
     print_provenance(provenance, in_process=in_process)

@@ -113,10 +113,10 @@ def _print_files(read: Static) -> None:
     from envhub_sandbox.check.static.contents import LARGE
 
     kinds = Counter(one.kind for one in read.files)
-    told = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
+    counts = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
     total = size_text(sum(one.record.size for one in read.files))
-    show("files", f"{len(read.files)}, {total}: {told}")
-    # what is large or no text first: that is what nobody would read
+    show("files", f"{len(read.files)}, {total}: {counts}")
+    # first what is large or no text: a reader would miss it
     odd = [one for one in read.files if one.record.size >= LARGE or one.kind not in _PLAIN]
     rest = [one for one in read.files if one not in odd]
     for one in (shown := [*odd, *rest][:_SHOWN]):

@@ -308,7 +308,7 @@ _READERS: dict[str, Callable[[Any], Any]] = {
     "sandbox": lambda name: None if name == "none" else name,
     "env_kwargs": lambda texts: read_env_kwargs(texts or ()),
     "dependencies": read_dependencies,
-    "output": lambda name: None if name == "-" else name,  # "-" is logs.logged()
+    "output": lambda name: None if name == "-" else name,  # the log of run
     "gpu": read_gpu,
 }
 """How values are made of what was typed, where the two are not the same."""
