@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -57,7 +58,7 @@ class _Replay:
     """One ``envhub replay``."""
 
     def __init__(self, folder: Path, grant: bool, make: opt.MakeOptions, *, as_json: bool) -> None:
-        self._folder, self._grant, self._sandbox = folder, grant, make.given["sandbox"]
+        self._folder, self._grant, self._sandbox = folder, grant, make["sandbox"]
         given = {name: value for name, value in make.given.items() if name != "sandbox"}
         self._given = {name: value for name, value in given.items() if value is not None}
         self._as_json = as_json
@@ -68,8 +69,6 @@ class _Replay:
         from envhub_sandbox.crash.reader import load_bundle
         from envhub_sandbox.crash.replay import Verdict
 
-        if self._sandbox == "none":
-            raise UsageError("this command needs a sandbox; leave out --sandbox none")
         bundle = load_bundle(self._folder)
         self._refuse_wishes(bundle)
         for doubt in bundle.doubts:
@@ -97,26 +96,22 @@ class _Replay:
         from envhub_sandbox.crash.replay import replay
 
         bar.begin(f"loading {safe_line(bundle.label)}")
-        made: list[Any] = []
-        try:
-            return replay(lambda: self._make(bundle, bar, made), bundle)
-        finally:
-            for envs in made:
-                envs.close()
+        with contextlib.ExitStack() as stack:
+            return replay(lambda: self._make(bundle, bar, stack), bundle)
 
-    def _make(self, bundle: Bundle, bar: Bar, made: list[Any]) -> Any:
+    def _make(self, bundle: Bundle, bar: Bar, stack: contextlib.ExitStack) -> Any:
         """The environment that the bundle is about; None if it is about ``make_env`` alone."""
         from envhub_sandbox.api import make_env
         from envhub_sandbox.crash.replay import changed_files
         from envhub_sandbox.session.recipe import Recipe
 
-        envs = Recipe(
+        recipe = Recipe(
             make_env=make_env,
             reference=bundle.reference,
             config=bundle.load.cfg,
             options=self._options(bundle),
-        ).make()
-        made.append(envs)
+        )
+        envs = stack.enter_context(recipe.make())
         self._changed = list(changed_files(bundle.files, envs.provenance["files"]))
         if self._changed:
             say(f"The files have changed since: {safe_line(', '.join(self._changed))}.")

@@ -17,7 +17,7 @@ from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, say
 from envhub_sandbox.cli.shared.exits import code_for, describe
 from envhub_sandbox.cli.shared.progress import Bar
-from envhub_sandbox.cli.shared.report import (
+from envhub_sandbox.cli.shared.results import (
     TaskResult,
     print_provenance,
     print_results,

@@ -12,7 +12,7 @@ from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, show
 from envhub_sandbox.cli.shared.findings import FailOn
 from envhub_sandbox.cli.shared.progress import Bar
-from envhub_sandbox.cli.shared.report import print_provenance
+from envhub_sandbox.cli.shared.results import print_provenance
 
 _SPACES = ("single_observation_space", "single_action_space", "observation_space", "action_space")
 _SPACE_TEXT = 2000

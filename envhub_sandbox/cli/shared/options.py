@@ -139,6 +139,8 @@ class MakeOptions:
         Raises:
             UsageError: It cannot be read.
         """
+        if key == "sandbox" and self.in_process:
+            self._check_trust()
         return _READERS.get(key, lambda given: given)(self.given[key])
 
     @property
@@ -157,14 +159,6 @@ class MakeOptions:
         Raises:
             UsageError: An option cannot be read.
         """
-        if self.in_process and "trust_remote_code" not in self.given:
-            raise UsageError("this command needs a sandbox; leave out --sandbox none")
-        if self.in_process and not self.given["trust_remote_code"]:
-            raise UsageError(
-                f"--sandbox none runs the code of {self.ref} in this process, with everything that "
-                "you may do. If you trust it, add --trust-remote-code. Otherwise leave out "
-                "--sandbox none: the sandbox needs no trust."
-            )
         made: dict[str, Any] = {"cfg": self.ref, "policy": {}, "limits": {}, "timeouts": {}}
         for key in self.given:
             one, value = OPTIONS[key], self[key]
@@ -175,6 +169,16 @@ class MakeOptions:
         if limits := made.pop("limits"):
             made["policy"]["limits"] = limits
         return made
+
+    def _check_trust(self) -> None:
+        if "trust_remote_code" not in self.given:
+            raise UsageError("this command needs a sandbox; leave out --sandbox none")
+        if not self.given["trust_remote_code"]:
+            raise UsageError(
+                f"--sandbox none runs the code of {self.ref} in this process, with everything that "
+                "you may do. If you trust it, add --trust-remote-code. Otherwise leave out "
+                "--sandbox none: the sandbox needs no trust."
+            )
 
     @contextlib.contextmanager
     def explained(self) -> Iterator[None]:

@@ -24,7 +24,7 @@ from envhub_sandbox.cli.shared.exits import (
     describe,
     reported,
 )
-from envhub_sandbox.cli.shared.report import TaskResult, returns_of, statistics, task_document
+from envhub_sandbox.cli.shared.results import TaskResult, returns_of, statistics, task_document
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.rollouts.episodes import Episode, Rollout, RolloutError
 from envhub_sandbox.rollouts.video import VideoError

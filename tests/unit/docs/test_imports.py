@@ -39,7 +39,7 @@ OPTIONAL = {
     "envhub_sandbox.integrations.sb3": {"stable_baselines3"},
     "envhub_sandbox.integrations.lerobot.config": {"draccus", "lerobot"},
     "envhub_sandbox.integrations.lerobot.features": {"lerobot"},
-    "envhub_sandbox.integrations.lerobot.routing": {"lerobot"},
+    "envhub_sandbox.integrations.lerobot.install": {"lerobot"},
     "envhub_sandbox.integrations.lerobot_eval": {"lerobot"},
     "envhub_worker.protocol.messages.base": {"typing_extensions"},  # for type checkers alone
     "envhub_sandbox.metrics": {"prometheus_client"},
@@ -144,7 +144,7 @@ IMPORTERS = {
 }
 
 # the modules of LeRobot's package that import make_env
-_LEROBOT = ("lerobot.config", "lerobot.routing")
+_LEROBOT = ("lerobot.config", "lerobot.install")
 
 # where tests and benchmarks may name what starts with an underscore, and others' names that they do
 SEAM = "tests/support/inside.py"
