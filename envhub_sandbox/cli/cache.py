@@ -5,6 +5,7 @@ from __future__ import annotations
 import json as json_module
 import shutil
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -87,8 +88,10 @@ def list_(
 
     found, made = stored_snapshots(), environments.every()
     if json:
-        document = {"folder": str(store.cache_root()), "snapshots": _data(found)}
-        print_json({**document, "environments": _environment_data(made)})
+        own = _documents(found, repository="repository", commit="commit", revision="revision")
+        theirs = _documents(made, name="key", python="python", version="version", packages="pins")
+        folder = str(store.cache_root())
+        print_json({"folder": folder, "snapshots": own, "environments": theirs})
         return
     if found:
         _print(found)
@@ -103,20 +106,6 @@ def _told(found: list[StoredSnapshot], made: list[Environment]) -> str:
     return f"{snapshots}, {environments}, {size_text(total)}"
 
 
-def _environment_data(made: list[Environment]) -> list[dict[str, Any]]:
-    return [
-        {
-            "name": one.key,
-            "python": one.python,
-            "version": one.version,
-            "packages": list(one.pins),
-            "last_used": time.strftime("%FT%TZ", time.gmtime(one.used)),
-            "bytes": one.size,
-        }
-        for one in made
-    ]
-
-
 def _print_environments(made: list[Environment]) -> None:
     rows = [
         (one.key[:12], one.version, _day(one.used), size_text(one.size), " ".join(one.pins))
@@ -125,12 +114,11 @@ def _print_environments(made: list[Environment]) -> None:
     show_rows([("environment", "Python", "last used", "size", "packages"), *rows], right=(3,))
 
 
-def _data(found: list[StoredSnapshot]) -> list[dict[str, Any]]:
+def _documents(found: Sequence[StoredSnapshot | Environment], **named: str) -> list[dict[str, Any]]:
+    """What is stored as data: by name, which attribute; and what all have."""
     return [
         {
-            "repository": one.repository,
-            "commit": one.commit,
-            "revision": one.revision,
+            **{name: getattr(one, attribute) for name, attribute in named.items()},
             "last_used": time.strftime("%FT%TZ", time.gmtime(one.used)),
             "bytes": one.size,
         }
