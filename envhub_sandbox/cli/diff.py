@@ -48,13 +48,12 @@ def diff(
     least = None if fail_on is None else level(fail_on)
     from envhub_sandbox.check.static import compare
     from envhub_sandbox.check.static.static import static
-    from envhub_sandbox.hub.snapshot import named
 
     with Bar(quiet=json) as bar:
         read = []
         for ref in (then, now):
             bar.begin(f"reading {ref}")
-            read.append(static(named(ref, **make.hub)))
+            read.append(static(make.snapshot(ref)))
         found = compare.changes(read[0], read[1])
         if run:
             kwargs = make["env_kwargs"]

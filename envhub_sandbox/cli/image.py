@@ -50,9 +50,7 @@ def build(
     """
     with Bar(quiet=json) as bar:
         bar.begin(f"reading {ref}")
-        from envhub_sandbox.hub.snapshot import named
-
-        snapshot = named(ref, **make.hub)
+        snapshot = make.snapshot(ref)
         bar.begin("resolving and building")
         made = _build(snapshot, base, engine, apt or [], exclude_newer, build_network)
     if json:

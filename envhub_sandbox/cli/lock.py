@@ -62,10 +62,9 @@ def lock(
     """
     with Bar(quiet=json) as bar:
         bar.begin(f"locking {ref}")
-        from envhub_sandbox.hub.snapshot import named
         from envhub_sandbox.locks import drift, lockfile, making
 
-        snapshot = named(ref, **make.hub)
+        snapshot = make.snapshot(ref)
         path = _path(output, snapshot)
         old = _old(path, upgrade)
         choice = _choice(make["dependencies"], old)
@@ -103,11 +102,10 @@ def verify(
     """
     with Bar(quiet=json) as bar:
         bar.begin(f"verifying {file}")
-        from envhub_sandbox.hub.snapshot import named
         from envhub_sandbox.locks import drift, lockfile
 
         locked = lockfile.read(file)
-        snapshot = named(_reference(ref, locked, file), **make.hub)
+        snapshot = make.snapshot(_reference(ref, locked, file))
         now = _now(locked, snapshot, no_index=no_index)
         if not no_spaces and not drift.differences(locked, now):
             now = _spaces_again(now, locked, snapshot, make.hub)

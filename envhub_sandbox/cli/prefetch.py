@@ -32,9 +32,7 @@ def prefetch(
     """
     with Bar(quiet=json) as bar:
         bar.begin(f"reading {ref}")
-        from envhub_sandbox.hub.snapshot import named
-
-        snapshot = named(ref, **make.hub)
+        snapshot = make.snapshot(ref)
         given, lock = make["dependencies"], make["lock"]
         environment = (
             _environment(snapshot, given, upgrade)

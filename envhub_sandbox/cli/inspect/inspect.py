@@ -46,7 +46,7 @@ def inspect(
     """
     check_options(context, static=static)
     if static:
-        inspect_static(ref, as_json=json, sarif=sarif, fail_on=fail_on, hub=make.hub)
+        inspect_static(ref, as_json=json, sarif=sarif, fail_on=fail_on, make=make)
         return
     _inspect(make, suite, task, as_json=json)
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
 from envhub_sandbox.cli.shared.console import print_json, show
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_sandbox.cli.shared.findings import level, show_finding
-from envhub_sandbox.cli.shared.options import is_typed
+from envhub_sandbox.cli.shared.options import MakeOptions, is_typed
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_worker.protocol.text import size_text
 
@@ -46,16 +46,15 @@ def inspect_static(
     as_json: bool,
     sarif: Path | None,
     fail_on: str | None,
-    hub: Mapping[str, Any],
+    make: MakeOptions,
 ) -> None:
     """Read a repository, and say what is in it."""
     least = None if fail_on is None else level(fail_on)
     with Bar(quiet=as_json) as bar:
         bar.begin(f"reading {ref}")
         from envhub_sandbox.check.static.static import document, static
-        from envhub_sandbox.hub.snapshot import named
 
-        snapshot = named(ref, **hub)
+        snapshot = make.snapshot(ref)
         read = static(snapshot)
     failures = [one for one in read.findings if least and one.check.severity.reaches(least)]
     if sarif is not None:

@@ -11,7 +11,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,6 +20,9 @@ from envhub_sandbox.cli.shared.exits import ForeignError, UsageError, reported
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.options import OPTIONS
 from envhub_worker.protocol.text import parse_size
+
+if TYPE_CHECKING:
+    from envhub_sandbox.hub.snapshot import Snapshot
 
 ALL = tuple(key for key, one in OPTIONS.items() if one.command)
 """Every option that a command can have, by keys of ``OPTIONS``."""
@@ -142,6 +145,12 @@ class MakeOptions:
         if key == "sandbox" and self.in_process:
             self._check_trust()
         return _READERS.get(key, lambda given: given)(self.given[key])
+
+    def snapshot(self, ref: str) -> Snapshot:
+        """What a reference names, fetched."""
+        from envhub_sandbox.hub.snapshot import named
+
+        return named(ref, **self.hub)
 
     @property
     def hub(self) -> dict[str, Any]:
