@@ -127,18 +127,18 @@ def reported(*, debug: bool) -> Iterator[None]:
         _discard_output()
         raise typer.Exit(Exit.PIPE) from None
     except KeyboardInterrupt:
-        with _to_whom_it_may_reach():
+        with _ignoring_full_or_closed_output():
             say("Interrupted.")
         raise typer.Exit(Exit.INTERRUPTED) from None
     except Exception as error:
-        with _to_whom_it_may_reach():
+        with _ignoring_full_or_closed_output():
             _explain(error, debug)
         raise typer.Exit(code_for(error)) from None
 
 
 @contextlib.contextmanager
-def _to_whom_it_may_reach() -> Iterator[None]:
-    """Last words change no exit code: Ctrl-C ends the reader of a pipe as well, a disk is full."""
+def _ignoring_full_or_closed_output() -> Iterator[None]:
+    """A message that cannot be written changes no exit code: a pipe is closed, a disk is full."""
     with contextlib.suppress(OSError):
         yield
     _discard_output()

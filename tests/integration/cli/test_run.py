@@ -195,8 +195,6 @@ def test_frames_that_are_none_end_the_run(tmp_path: Path, render: str, says: str
 OVER = "return np.zeros(1, np.float32), 1.0, True, False, {}"
 FAILURES: list[tuple[str, Sequence[str], int, str]] = [
     ("raise ValueError('no such luck')", (), 1, "ValueError: no such luck"),
-    (OVER, ("--memory", "lots"), 2, "--memory"),
-    (OVER, ("--profile", "lax"), 2, "strict"),
     (OVER, ("--task", "7"), 2, "hub_env/0"),
     (OVER, ("--policy", "clever"), 2, "clever"),
     (OVER, ("--sandbox", "none"), 2, "--trust-remote-code"),
